@@ -1,0 +1,1 @@
+"""The mathematics that learns: kernels, features, LSSVM, window, evidence, drift, the learner."""

@@ -1,0 +1,1 @@
+"""Bouc-Wen, Prandtl-Ishlinskii and its modified form: models, exact inverses, identification, online forms."""

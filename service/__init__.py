@@ -1,0 +1,1 @@
+"""Processes and the wire: server, client, stage node, recorder, viewer stream, command line."""

@@ -1,0 +1,49 @@
+"""The command line: one table of commands, each a module of `service.commands`, imported only when asked for."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from adaptive.errors import DehystError
+
+#: name -> one line of help. The module is service.commands.NAME with add_arguments(parser) and run(args) -> int.
+COMMANDS: dict[str, str] = {
+    "demo": "watch a simulated stage lose its hysteresis, drift, and be caught again",
+    "identify": "identify the inverse models of a stage from a recording",
+    "serve": "serve and keep learning the inverse models of a stage over zenoh",
+    "stage": "run a simulated stage as a process on zenoh",
+    "query": "ask a running service for voltages",
+    "view": "stream a running service to the Rerun viewer or into an .rrd file",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 asked wrongly, 130 interrupted."""
+    args = sys.argv[1:] if argv is None else list(argv)
+    parser = argparse.ArgumentParser(
+        prog="dehyst", description="Takes the hysteresis out of piezo stages, and keeps it out."
+    )
+    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    chosen = next((a for a in args if not a.startswith("-")), None)
+    for name, line in COMMANDS.items():
+        command = sub.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
+        if name == chosen:
+            module = importlib.import_module(f"service.commands.{name}")
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
+    parsed = parser.parse_args(args)
+    try:
+        return int(parsed.run(parsed))
+    except DehystError as error:
+        print(f"dehyst {parsed.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"dehyst {parsed.command}: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
