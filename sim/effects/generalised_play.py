@@ -1,0 +1,101 @@
+"""A hysteretic actuator of many generalised plays, richer than the models that are fitted to it.
+
+Sixty plays with unevenly spaced thresholds and uneven weights; each lies between a lower and an upper envelope of
+different slope, so that loops are asymmetric and change with the level (generalised plays: Preisach's class, beyond
+Prandtl and Ishlinskii's); the thresholds grow with the smoothed rate of the voltage. Memory is nonlocal. At vanishing
+rate it has return-point memory (wiping-out) and congruency, at a finite rate neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sim.effects.base import Context, Kind, Parameter, Place, block
+
+PLAYS = 60
+#: Volts over which envelopes bend: the parameters of asymmetry are per this voltage.
+BEND_V = 10.0
+
+
+@block
+def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
+    """p: see derive. s: smoothed rate, voltage so far, play outputs."""
+    plays = int(p[0])
+    for k in range(n):
+        u = x[k]
+        s[0] = p[1] * s[0] + p[2] * abs(u - s[1])
+        s[1] = u
+        grown = p[3] * math.log1p(s[0] * p[4])
+        lower, upper = 1.0 + p[5] * u, 1.0 + p[6] * u
+        total = p[7] + p[8] * u + p[9] * u * u
+        for j in range(plays):
+            r = p[10 + j] + grown
+            low, high = u - r * lower, u + r * upper
+            z = s[2 + j]
+            z = low if z < low else z
+            z = high if z > high else z
+            s[2 + j] = z
+            total += p[10 + plays + j] * z
+        x[k] = total
+
+
+def thresholds_V(largest_V: float) -> Any:
+    """Thresholds (60,), V: denser near zero."""
+    return largest_V * ((np.arange(PLAYS) + 1.0) / PLAYS) ** 1.6
+
+
+def weights(values: Mapping[str, float]) -> Any:
+    """Weights (60,), µm/V: a fading density with a fixed, uneven ripple, summing to ``play_um_per_V``."""
+    r = thresholds_V(values["largest_V"])
+    width = np.diff(np.concatenate(([0.0], r)))
+    index = np.arange(PLAYS)
+    ripple = 1.0 + 0.35 * np.sin(2.3 * index + 0.4) * np.cos(0.7 * index * index)
+    raw = width * np.exp(-r / values["spread_V"]) * ripple
+    return values["play_um_per_V"] * raw / raw.sum()
+
+
+def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
+    a = math.exp(-context.dt_s / values["rate_tau_s"])
+    head = (
+        float(PLAYS),
+        a,
+        (1.0 - a) / context.dt_s,
+        values["rate_growth_V"],
+        1.0 / values["rate_corner_V_per_s"],
+        values["lower_slope"] / BEND_V,
+        values["upper_slope"] / BEND_V,
+        values["offset_um"],
+        values["linear_um_per_V"],
+        values["square_um_per_V2"],
+    )
+    return [*head, *thresholds_V(values["largest_V"]), *weights(values)]
+
+
+KIND = Kind(
+    name="generalised_play",
+    place=Place.ACTUATOR,
+    parameters=(
+        Parameter("linear_um_per_V", "µm/V", 0.0, 1e4, 6.0, "reversible part"),
+        Parameter("square_um_per_V2", "µm/V²", -10.0, 10.0, 0.0, "curvature of the reversible part"),
+        Parameter("play_um_per_V", "µm/V", 0.0, 1e4, 4.0, "sum of the weights of the plays"),
+        Parameter("largest_V", "V", 0.1, 1000.0, 4.5, "largest threshold"),
+        Parameter("spread_V", "V", 0.05, 1000.0, 1.5, "decay of the density of thresholds"),
+        Parameter("lower_slope", "1", -0.9, 0.9, 0.10, "growth of the lower half-width per 10 V"),
+        Parameter("upper_slope", "1", -0.9, 0.9, -0.08, "growth of the upper half-width per 10 V"),
+        Parameter("rate_growth_V", "V", 0.0, 10.0, 0.04, "growth of all thresholds with ln(1 + rate/corner)"),
+        Parameter("rate_corner_V_per_s", "V/s", 0.01, 1e5, 20.0, "rate from which thresholds grow"),
+        Parameter("rate_tau_s", "s", 1e-5, 1.0, 0.004, "time over which the rate is felt"),
+        Parameter("offset_um", "µm", -1e4, 1e4, 0.0, "displacement at 0 V"),
+    ),
+    derive=derive,
+    rest=lambda values, context: [0.0] * (2 + PLAYS),
+    block=run,
+    signature="loops that widen with amplitude and rate, rising and falling branches of different shape",
+    source="shape after the generalised Prandtl-Ishlinskii literature; loop widths of the catalogue (10 to 15 % of a "
+    "full stroke, 2 % small-signal); growth with the rate as in Fig. 2.3",
+    cause=False,
+)

@@ -1,0 +1,24 @@
+"""A payload on the stage: the known mode moves to ``f0 sqrt(m/(m+M))``, the DC gain does not.
+
+It acts through the coefficients of `resonance` or `mechanics` in the same chain, whose mass it multiplies; a chain
+without either is refused.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from sim.effects.base import Kind, Parameter, Place
+
+KIND = Kind(
+    name="payload_change",
+    place=Place.MECHANICS,
+    parameters=(Parameter("payload_ratio", "1", 0.0, 20.0, 1.0, "added mass relative to the moved mass"),),
+    derive=lambda values, context: (),
+    block=None,
+    neutral=MappingProxyType({"payload_ratio": 0.0}),
+    signature="the known mode moves, the DC gain does not",
+    mistaken_for=("resonance",),
+    tells_apart="a change of stiffness moves the DC gain too",
+    source="-30 % of f0 when the mass doubles: f0 sqrt(m/(m+M))",
+)

@@ -1,0 +1,20 @@
+"""Compile every compiled loop of the simulation once, so that no process pays for it at start."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.effects import KINDS, Chain, simulate
+from sim.presets import PRESETS
+from sim.stage import Stage
+
+
+def warm() -> None:
+    """Run every effect and every preset over two samples."""
+    u_V = np.zeros(2)
+    for kind in KINDS.values():
+        if kind.block is not None:
+            simulate(Chain((kind(),)), u_V, 1e-3)
+    for make in PRESETS.values():
+        stage = Stage(make())
+        stage.run(stage.initial_state(), u_V)
