@@ -1,0 +1,128 @@
+"""What the online baselines share: the gates of a raw sample, the counters, the running error.
+
+The names of the gates are those of ``adaptive.admission``, so that the service counts all models alike.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from adaptive.admission import (
+    DUPLICATE,
+    GAP,
+    LEARNT,
+    NOT_FINITE,
+    NUMERICS,
+    OUT_OF_ORDER,
+    OUTLIER,
+    PASSED,
+    SETTLING,
+    TIMING,
+    UNEXCITED,
+)
+from adaptive.errors import InputError
+from adaptive.types import Sample, StateDict
+
+REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
+#: Relative error of a time step beyond which a sample's clock is not believed.
+_TIMING_TOLERANCE = 0.5
+#: Beyond these magnitudes a reading cannot be one (µm, V); keeps squares finite.
+_ABSURD = 1e9
+
+
+class OnlineBaseline:
+    """Gates and bookkeeping of one axis; the models derive from it and implement ``_advance``.
+
+    Deterministic, bounded in time and memory. Not for several threads at once.
+    """
+
+    def __init__(self, dt_s: float, settle: int) -> None:
+        self._dt = dt_s
+        self._settle = settle
+        self._seq = -1
+        self._t_s = 0.0
+        self._since_start = 0
+        self._square = 0.0
+        self._counters = dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
+
+    @property
+    def seq(self) -> int:
+        """Sequence number of the last sample handled, -1 before any."""
+        return self._seq
+
+    def counters(self) -> dict[str, int]:
+        """Samples by outcome; every outcome there is appears."""
+        return dict(self._counters)
+
+    def handle(self, sample: Sample) -> str:
+        """Take one raw sample. Returns "learnt", "passed" (good, but none was due) or the gate that refused it."""
+        outcome = self._gate(sample)
+        if not outcome:
+            missing = self._seq >= 0 and sample.seq > self._seq + 1
+            first = self._seq < 0
+            self._seq, self._t_s = sample.seq, sample.t_s
+            if first or missing:
+                self._since_start = 0
+                self._restart(sample.u_V, sample.y_um, first)
+            else:
+                self._since_start += 1
+            if missing:
+                outcome = GAP
+            else:
+                outcome = self._advance(sample.u_V, sample.y_um, self._since_start >= self._settle)
+        self._counters[outcome] += 1
+        return outcome
+
+    def _gate(self, sample: Sample) -> str:
+        if not (math.isfinite(sample.t_s) and abs(sample.u_V) < _ABSURD and abs(sample.y_um) < _ABSURD):
+            return NOT_FINITE
+        if self._seq < 0:
+            return ""
+        if sample.seq == self._seq:
+            return DUPLICATE
+        if sample.seq < self._seq:
+            return OUT_OF_ORDER
+        expected = (sample.seq - self._seq) * self._dt
+        return TIMING if abs(sample.t_s - self._t_s - expected) > _TIMING_TOLERANCE * expected else ""
+
+    def _restart(self, u_V: float, y_um: float, first: bool) -> None:
+        """Called at the first sample and after a gap, in place of ``_advance``'s step through time."""
+        raise NotImplementedError
+
+    def _advance(self, u_V: float, y_um: float, settled: bool) -> str:
+        """Take a good sample; returns the outcome. ``settled``: enough samples since start or gap."""
+        raise NotImplementedError
+
+    def _common_state(self) -> StateDict:
+        counted = {f"count_{name}": value for name, value in self._counters.items()}
+        return {
+            "seq": self._seq,
+            "t_s": self._t_s,
+            "since_start": self._since_start,
+            "square_um2": self._square,
+            **counted,
+        }
+
+    def _restore_common(self, state: StateDict) -> None:
+        self._seq, self._t_s = int(state["seq"]), float(state["t_s"])
+        self._since_start, self._square = int(state["since_start"]), float(state["square_um2"])
+        for name in self._counters:
+            self._counters[name] = int(state[f"count_{name}"])
+
+
+def field_of(state: StateDict, name: str, kind: str) -> Any:
+    """A field of a stored state; raises InputError where it is missing."""
+    if name not in state:
+        raise InputError(f"{name}: missing in the state of a {kind} model; start from a model file instead")
+    return state[name]
+
+
+def prefixed(prefix: str, state: StateDict) -> StateDict:
+    """The same state under prefixed names."""
+    return {f"{prefix}{name}": value for name, value in state.items()}
+
+
+def without_prefix(prefix: str, state: StateDict) -> StateDict:
+    """The part of a state under a prefix, by its own names."""
+    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}

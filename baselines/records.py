@@ -1,0 +1,118 @@
+"""What every identification asks of a recording, and what it reports back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+
+
+def positive(field: str, value: float, unit: str) -> float:
+    """``value`` as a float; raises InputError unless it is finite and above zero."""
+    number = float(value)
+    if not (np.isfinite(number) and number > 0.0):
+        raise InputError(f"{field}: got {value!r}, expected a finite number above 0 {unit}")
+    return number
+
+
+def series(field: str, values: ArrayLike, minimum: int = 1) -> FloatArray:
+    """``values`` as a contiguous (n,) array of finite doubles; raises InputError naming ``field`` otherwise."""
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim != 1 or array.size < minimum:
+        raise InputError(f"{field}: got shape {array.shape}, expected (n,) with n >= {minimum}; record for longer")
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise InputError(
+            f"{field}: {bad.size} of {array.size} values are not finite (first at index {bad[0]}); cut or repair them"
+        )
+    return array
+
+
+def record(u_V: ArrayLike, y_um: ArrayLike, dt_s: float, minimum: int) -> tuple[FloatArray, FloatArray, float]:
+    """Check a recording for identification: equal lengths, finite, long enough, and neither column constant."""
+    u, y, dt = series("u_V", u_V, minimum), series("y_um", y_um, minimum), positive("dt_s", dt_s, "s")
+    if u.size != y.size:
+        raise InputError(f"y_um: got {y.size} values for {u.size} of u_V, expected as many; pair them by time")
+    for field, column in (("u_V", u), ("y_um", y)):
+        if float(np.ptp(column)) == 0.0:
+            raise InputError(f"{field}: got a constant column, expected a moving one; excite the stage over its range")
+    return u, y, dt
+
+
+@dataclass(frozen=True, slots=True)
+class Domain:
+    """The range of motion seen in identification: displacement µm, speed µm/s."""
+
+    y_min_um: float
+    y_max_um: float
+    v_max_um_per_s: float
+
+    @staticmethod
+    def of(y_um: FloatArray, dt_s: float) -> Domain:
+        """Range of a recording; the speed is the largest central difference over two samples."""
+        speed = np.abs(y_um[2:] - y_um[:-2]) / (2.0 * dt_s)
+        return Domain(float(y_um.min()), float(y_um.max()), float(speed.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class IdentificationReport:
+    """How well a model fits the recording it was identified on.
+
+    ``rmse_um``, ``mae_um``, ``max_um`` are of the forward model run freely over the whole recording, with its
+    state started as said by the method. ``converged`` is False where the optimiser stopped at its limit.
+    """
+
+    model: str
+    method: str
+    samples: int
+    dt_s: float
+    range_um: float
+    rmse_um: float
+    mae_um: float
+    max_um: float
+    evaluations: int
+    converged: bool
+    domain: Domain
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rmse_pct(self) -> float:
+        """RMSE in percent of the motion range, as the tables give it."""
+        return 100.0 * self.rmse_um / self.range_um
+
+    @property
+    def mae_pct(self) -> float:
+        """MAE in percent of the motion range."""
+        return 100.0 * self.mae_um / self.range_um
+
+    @staticmethod
+    def of(
+        model: str,
+        method: str,
+        y_um: FloatArray,
+        model_um: FloatArray,
+        dt_s: float,
+        evaluations: int,
+        converged: bool,
+        notes: tuple[str, ...] = (),
+    ) -> IdentificationReport:
+        """Errors (2.43), (2.44) of ``model_um`` against ``y_um``, both (n,) µm."""
+        error = y_um - model_um
+        return IdentificationReport(
+            model=model,
+            method=method,
+            samples=int(y_um.size),
+            dt_s=dt_s,
+            range_um=float(np.ptp(y_um)),
+            rmse_um=float(np.sqrt(np.mean(error**2))),
+            mae_um=float(np.mean(np.abs(error))),
+            max_um=float(np.max(np.abs(error))),
+            evaluations=evaluations,
+            converged=converged,
+            domain=Domain.of(y_um, dt_s),
+            notes=notes,
+        )

@@ -1,0 +1,215 @@
+"""The baselines that learn online: they follow a stage that changes, keep their signs, and refuse bad samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray, Sample
+from baselines.bouc_wen import TABLE_2_1
+from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.linear import LinearInverse, LinearParameters
+from baselines.mpi_inverse import MpiInverse
+from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
+from baselines.online_least_squares import LeastSquaresConfig, LinearOnline, MpiOnline
+from baselines.play import play_run
+from baselines.prandtl_ishlinskii import MpiParameters
+from baselines.records import Domain
+
+DT = 1e-3
+SEEN = Domain(0.0, 80.0, 2000.0)
+R = tuple(float(value) for value in np.arange(7) * 0.6)
+MPI = MpiParameters(R, (7.0, 1.5, 1.0, 0.5, 0.5, 0.2, 0.1), (0.0, 30.0), (1.0, -0.1))
+Online = LinearOnline | MpiOnline | BoucWenOnline
+
+
+def build(kind: str) -> Online:
+    if kind == "linear":
+        return LinearOnline(LinearInverse(LinearParameters(11.0), DT, SEEN, 0.1))
+    if kind == "mpi":
+        return MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01))
+    return BoucWenOnline(BoucWenInverse(TABLE_2_1, DT, SEEN, 0.01))
+
+
+every = pytest.mark.parametrize("kind", ["linear", "mpi", "bouc_wen"])
+
+
+def drive(n: int, seed: int = 0) -> FloatArray:
+    """Voltages of several tones between 0.5 and 5 Hz within 0.3 to 6.7 V."""
+    t, rng = np.arange(n) * DT, np.random.default_rng(seed)
+    u = sum(np.sin(2 * np.pi * f * t + p) for f, p in zip((0.5, 1.3, 2.9, 5.0), rng.uniform(0, 6, 4), strict=True))
+    return np.asarray(3.5 + 0.8 * u * (1 - np.exp(-t)))
+
+
+def feed(model: Online, u: FloatArray, y: FloatArray, first: int = 0) -> list[str]:
+    return [model.handle(Sample(first + k, (first + k) * DT, float(u[k]), float(y[k]))) for k in range(u.size)]
+
+
+def stage(kind: str, gain: float, offset: float) -> LinearParameters | MpiParameters:
+    """The truth: the identified model with its displacement scaled and shifted."""
+    if kind == "linear":
+        return LinearParameters(11.0 * gain, offset)
+    w_s = tuple(gain * w for w in MPI.w_s)
+    return replace(MPI, w_s=w_s, y_ref_um=offset)
+
+
+@every
+def test_follows_gain_and_offset(kind: str) -> None:
+    u = drive(20_000)
+    if kind == "bouc_wen":
+        y = TABLE_2_1.with_gain(0.94 * TABLE_2_1.d_um_per_V, -1.5).simulate(u, DT)
+    else:
+        y = stage(kind, 0.94, -1.5).simulate(u, DT)
+    y = y + np.random.default_rng(1).normal(0.0, 0.005, u.size)
+    model = build(kind)
+    before = model.snapshot()
+    outcomes = feed(model, u, y)
+    assert outcomes.count("learnt") > 1000
+    zero = np.zeros(u.size)
+    v = np.gradient(y, DT)
+    memory = before.track(y[:1], zero[:1], zero[:1], u[:1], np.zeros(before.memory_size))
+
+    def error_V(inverse: LinearInverse | MpiInverse | BoucWenInverse) -> float:
+        answer = inverse.feedforward(y, v if kind == "bouc_wen" else zero, zero, memory).u_V
+        return float(np.mean(np.abs(answer - u)[-5000:]))
+
+    assert error_V(before) > 0.2
+    assert error_V(model.snapshot()) < 0.02
+    assert model.snapshot().voltage_std_V < 0.05
+
+
+def test_bouc_wen_follows_the_shape_too() -> None:
+    truth = replace(TABLE_2_1, alpha=0.40, d_um_per_V=11.0)
+    u = drive(30_000)
+    model = build("bouc_wen")
+    feed(model, u, truth.simulate(u, DT))
+    now = model.snapshot().parameters
+    assert now.alpha == pytest.approx(0.40, abs=0.02)
+    assert now.d_um_per_V == pytest.approx(11.0, rel=0.02)
+
+
+def test_mpi_keeps_its_signs_on_a_stage_of_another_class() -> None:
+    u = drive(15_000)
+    rng = np.random.default_rng(2)
+    y = 60.0 / (1 + np.exp(-(u - 3))) + rng.normal(0, 3.0, u.size)
+    model = build("mpi")
+    feed(model, u, y)
+    now = model.snapshot().parameters  # construction itself refuses what has no inverse
+    assert all(weight >= 0.0 for weight in now.w_h)
+    assert np.all(np.cumsum(now.w_s_) > 0.0)
+    assert model.counters()["numerics"] == 0
+
+
+def test_mpi_keeps_a_floor_under_the_first_play() -> None:
+    """A stage that is one wide play would want no first play at all; its inverse would then jump at a reversal."""
+    u = drive(16_000)
+    y = 10.0 * play_run(u, np.array([0.6]), np.array([0.0]))[:, 0]
+    model = MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01), LeastSquaresConfig(remember=100.0))
+    feed(model, u, y)
+    now = model.snapshot().parameters
+    assert now.w_h[1] > 5.0
+    assert now.w_h[0] > 0.1
+
+
+@every
+def test_identified_model_stays_on_its_own_stage(kind: str) -> None:
+    u = drive(6_000)
+    y = TABLE_2_1.simulate(u, DT) if kind == "bouc_wen" else stage(kind, 1.0, 0.0).simulate(u, DT)
+    model = build(kind)
+    before = model.snapshot()
+    feed(model, u, y)
+    probe = np.linspace(5.0, 60.0, 200)
+    zero = np.zeros(200)
+    old, new = (m.feedforward(probe, zero, zero, m.rest_memory(5.0)).u_V for m in (before, model.snapshot()))
+    assert np.max(np.abs(old - new)) < 2e-3
+
+
+@every
+def test_bad_samples_are_counted_and_change_nothing(kind: str) -> None:
+    u = drive(1500)
+    y = 11.0 * u
+    clean, dirty = build(kind), build(kind)
+    feed(clean, u, y)
+    feed(dirty, u[:700], y[:700])
+    assert dirty.handle(Sample(700, 0.7, float("nan"), 1.0)) == "not_finite"
+    assert dirty.handle(Sample(700, 0.7, 1.0, float("inf"))) == "not_finite"
+    assert dirty.handle(Sample(700, float("nan"), 1.0, 1.0)) == "not_finite"
+    assert dirty.handle(Sample(700, 0.7, 1e300, 1.0)) == "not_finite"
+    assert dirty.handle(Sample(699, 0.699, 1.0, 1.0)) == "duplicate"
+    assert dirty.handle(Sample(500, 0.5, 1.0, 1.0)) == "out_of_order"
+    assert dirty.handle(Sample(700, 5.0, 1.0, 1.0)) == "timing"
+    feed(dirty, u[700:], y[700:], first=700)
+    assert dirty.snapshot() == clean.snapshot()
+    counted = dirty.counters()
+    assert (counted["not_finite"], counted["duplicate"], counted["out_of_order"], counted["timing"]) == (4, 1, 1, 1)
+    assert sum(counted.values()) == 1500 + 7
+    assert dirty.seq == 1499
+
+
+@every
+def test_a_gap_settles_before_it_teaches(kind: str) -> None:
+    u = drive(2000)
+    model = build(kind)
+    feed(model, u[:1000], 11.0 * u[:1000])
+    outcomes = feed(model, u[1100:], 11.0 * u[1100:], first=1100)
+    assert outcomes[0] == "gap"
+    assert set(outcomes[1:50]) == {"settling"}
+    assert "learnt" in outcomes
+
+
+@every
+def test_rest_teaches_nothing(kind: str) -> None:
+    u = np.concatenate([drive(2000), np.full(3000, drive(2000)[-1])])
+    model = build(kind)
+    feed(model, u[:2100], 11.0 * u[:2100])
+    before = model.snapshot()
+    outcomes = feed(model, u[2100:], 11.0 * u[2100:], first=2100)
+    assert "learnt" not in outcomes
+    assert "unexcited" in outcomes
+    assert model.snapshot() == before
+
+
+@every
+def test_a_stored_state_goes_on_to_the_last_bit(kind: str) -> None:
+    u = drive(4000)
+    y = 10.5 * u + 1.0
+    whole, half = build(kind), build(kind)
+    feed(whole, u, y)
+    feed(half, u[:1733], y[:1733])
+    restored = type(half).from_state(half.state_dict())
+    feed(restored, u[1733:], y[1733:], first=1733)
+    assert restored.snapshot() == whole.snapshot()
+    assert restored.counters() == whole.counters()
+    assert restored.seq == whole.seq
+
+
+def test_outliers_are_refused_until_they_persist() -> None:
+    u = drive(6000)
+    y = TABLE_2_1.simulate(u, DT)
+    model = build("bouc_wen")
+    feed(model, u[:3000], y[:3000])
+    before = model.snapshot()
+    jumped = y + 30.0
+    outcomes = feed(model, u[3000:3100], jumped[3000:3100], first=3000)
+    assert "outlier" in outcomes
+    assert "learnt" not in outcomes
+    assert model.snapshot() == before
+    feed(model, u[3100:], jumped[3100:], first=3100)
+    assert model.snapshot().parameters.offset_um == pytest.approx(30.0, abs=3.0)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"learn_every": 1}, {"solve_every": 0}, {"remember": 1.0}, {"trust": 0.0}, {"excitation": -1.0}]
+)
+def test_bad_least_squares_settings_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        LeastSquaresConfig(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [{"learn_every": 0}, {"walk_std": (1.0, -1.0, 0, 0, 0)}, {"model_error": 0.0}])
+def test_bad_tracking_settings_are_refused(bad: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        TrackingConfig(**bad)  # type: ignore[arg-type]
