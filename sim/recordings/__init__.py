@@ -1,0 +1,13 @@
+"""Recordings in: one reader per format, units only as stated, problems reported as data.
+
+``read(path, mapping)`` gives a :class:`Recording` in the canonical columns, ``check`` what is wrong with it,
+``require_usable`` refuses what cannot be used, ``repaired`` puts the rest on a whole time grid.
+"""
+
+from sim.recordings.columns import ColumnMap, load_map
+from sim.recordings.findings import Finding, check, require_usable
+from sim.recordings.reader import read
+from sim.recordings.recording import Recording
+from sim.recordings.repair import Repaired, repaired
+
+__all__ = ["ColumnMap", "Finding", "Recording", "Repaired", "check", "load_map", "read", "repaired", "require_usable"]

@@ -1,0 +1,162 @@
+"""What a foreign column means: names and units as the user states them, never guessed.
+
+A unit comes from one of two places: the end of the column's own name (``y_nm``), or an option. A column without
+either is refused with the option that would mend it.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from adaptive.errors import InputError
+
+_VOLTAGE = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "kV": 1e3}
+_LENGTH = {"um": 1.0, "µm": 1.0, "μm": 1.0, "nm": 1e-3, "pm": 1e-6, "mm": 1e3, "m": 1e6}
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_RATE = {"Hz": 1.0, "hz": 1.0, "kHz": 1e3}
+#: Kelvin also differ by an offset, which the reader takes off.
+_TEMPERATURE = {"C": 1.0, "degC": 1.0, "K": 1.0}
+KELVIN_AT_0_C = 273.15
+
+#: quantity -> (canonical column, factors to its unit by unit name)
+QUANTITIES: dict[str, tuple[str, dict[str, float]]] = {
+    "t": ("t_s", _TIME),
+    "u": ("u_V", _VOLTAGE),
+    "y": ("y_um", _LENGTH),
+    "u2": ("u2_V", _VOLTAGE),
+    "y2": ("y2_um", _LENGTH),
+    "monitor": ("monitor_V", _VOLTAGE),
+    "temperature": ("temperature_C", _TEMPERATURE),
+    "dt": ("dt_s", _TIME),
+    "rate": ("rate_Hz", _RATE),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """How to read a file that does not have the canonical columns.
+
+    Attributes
+    ----------
+    columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 monitor temperature``,
+        and the scalars ``dt`` and ``rate``).
+    units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; ``s ms us ns min``; ``C K``; ``Hz kHz``).
+    scale : quantity -> factor from the file's number to the canonical unit, for what has no unit of its kind (10
+        for a sensor of 10 µm per volt). In place of a unit.
+    index : quantity -> which part of an array of several dimensions, one ``:`` for the samples (``":,0,2"``).
+    dt_s : sample time, s, where the file has no time column.
+    sensor_late : samples by which the sensor's column lies late in the file, as its provenance says; the readings
+        are moved back by as many samples, and as many samples at the end are dropped.
+    delimiter, decimal : of a text file, where its header line does not tell.
+    """
+
+    columns: dict[str, str] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    scale: dict[str, float] = field(default_factory=dict)
+    index: dict[str, str] = field(default_factory=dict)
+    dt_s: float | None = None
+    sensor_late: int = 0
+    delimiter: str | None = None
+    decimal: str = "."
+
+    def __post_init__(self) -> None:
+        for name in ("columns", "units", "scale", "index"):
+            for quantity in getattr(self, name):
+                if quantity not in QUANTITIES:
+                    raise InputError(f"{name}: got quantity {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        for quantity, unit in self.units.items():
+            factors = QUANTITIES[quantity][1]
+            if unit not in factors:
+                raise InputError(f"unit of {quantity}: got {unit!r}, expected one of {', '.join(factors)}")
+            if quantity in self.scale:
+                raise InputError(f"{quantity}: got both a unit and a scale, expected one of the two")
+        for quantity, factor in self.scale.items():
+            if not (abs(factor) > 0.0 and abs(factor) < float("inf")):
+                raise InputError(f"scale of {quantity}: got {factor!r}, expected a finite number other than 0")
+        if self.dt_s is not None and not (0.0 < self.dt_s < 1e6):
+            raise InputError(f"dt_s: got {self.dt_s!r}, expected a positive sample time in s")
+        if self.sensor_late < 0:
+            raise InputError(f"sensor_late: got {self.sensor_late}, expected a number of samples, 0 or more")
+        if self.decimal not in (".", ","):
+            raise InputError(f"decimal: got {self.decimal!r}, expected '.' or ','")
+
+
+_SECTIONS: dict[str, type] = {"columns": str, "units": str, "scale": float, "index": str}
+_SCALARS: dict[str, type] = {"dt_s": float, "sensor_late": int, "delimiter": str, "decimal": str}
+
+
+def load_map(path: Path) -> ColumnMap:
+    """Read a :class:`ColumnMap` from a TOML file with its field names as keys and tables.
+
+    Raises InputError where the file is missing, no TOML, or has an unknown key.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"map {path}: cannot be read ({error.strerror}); expected a TOML file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"map {path}: is not TOML: {error}") from error
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key in _SECTIONS and isinstance(value, dict):
+            values[key] = {q: _typed(path, f"{key}.{q}", v, _SECTIONS[key]) for q, v in value.items()}
+        elif key in _SCALARS:
+            values[key] = _typed(path, key, value, _SCALARS[key])
+        else:
+            known = ", ".join([f"[{name}]" for name in _SECTIONS] + list(_SCALARS))
+            raise InputError(f"map {path}: got unknown key {key!r}, expected {known}")
+    return ColumnMap(**values)
+
+
+def _typed(path: Path, key: str, value: object, kind: type) -> object:
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise InputError(f"map {path}: {key}: got {value!r}, expected {kind.__name__}")
+    return value
+
+
+def unit_of_name(quantity: str, column: str) -> str | None:
+    """The unit that a column's name ends in (``_nm``, `` [nm]``, ``(nm)``), if it is one of the quantity's."""
+    factors = QUANTITIES[quantity][1]
+    match = re.search(r"(?:_|[\s_]*[\[(])([A-Za-zµμ]+)[\])]?$", column)
+    return match.group(1) if match and match.group(1) in factors else None
+
+
+def default_column(source: str, quantity: str, names: list[str]) -> str | None:
+    """The column that bears the quantity's own name with a unit, or without one; None where there is none.
+
+    Raises InputError where several do.
+    """
+    canonical, _ = QUANTITIES[quantity]
+    if canonical in names:
+        return canonical
+    with_unit = [n for n in names if n.startswith(f"{quantity}_") and n == f"{quantity}_{unit_of_name(quantity, n)}"]
+    if len(with_unit) > 1:
+        raise InputError(
+            f"{source}: {quantity}: got columns {', '.join(with_unit)}, expected one: choose by --column {quantity}=..."
+        )
+    return with_unit[0] if with_unit else (quantity if quantity in names else None)
+
+
+def factor_and_unit(source: str, quantity: str, column: str, mapping: ColumnMap) -> tuple[float, str]:
+    """Factor from the file's numbers to the canonical unit, and the unit's name.
+
+    Raises InputError naming the file, the column, the accepted units and the option to add, where no unit is known.
+    """
+    if quantity in mapping.scale:
+        return mapping.scale[quantity], "scaled"
+    canonical, factors = QUANTITIES[quantity]
+    unit = mapping.units.get(quantity) or unit_of_name(quantity, column)
+    if unit is None:
+        own = canonical.rsplit("_", 1)[1]
+        raise InputError(
+            f"{source}: column {column!r} for {quantity} has no unit in its name, and units are never guessed; "
+            f"expected one of {', '.join(factors)}: add --unit {quantity}={own} if it is in {own}"
+            + (", or --scale if it is of another kind" if quantity not in ("t", "dt", "rate") else "")
+        )
+    return factors[unit], unit
