@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -16,6 +17,8 @@ COMMANDS: dict[str, str] = {
     "serve": "serve and keep learning the inverse models of a stage over zenoh",
     "stage": "run a simulated stage as a process on zenoh",
     "query": "ask a running service for voltages",
+    "replay": "run the learner over a recording, offline, and see what its gates and its errors do",
+    "scenarios": "drift of every kind, adapting against not adapting, with a table and pictures",
     "view": "stream a running service to the Rerun viewer or into an .rrd file",
 }
 
@@ -23,6 +26,9 @@ COMMANDS: dict[str, str] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 asked wrongly, 130 interrupted."""
     args = sys.argv[1:] if argv is None else list(argv)
+    # Before numpy is imported: a second BLAS thread makes a solve of 1 ms stall for 65 ms now and then.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
     parser = argparse.ArgumentParser(
         prog="dehyst", description="Takes the hysteresis out of piezo stages, and keeps it out."
     )

@@ -1,0 +1,1 @@
+"""The demonstration: one reference, five models on twin stages, a change half way, a table at the end."""

@@ -1,0 +1,149 @@
+"""The controller as a process: asks the service ahead of time, sends the voltages, keeps what the sensors read.
+
+``python -m service.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: a block is asked
+for when the stage has published the tick that the plan says. Progress goes to standard output as lines of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from adaptive.errors import DehystError
+from service import wire
+from service.client import Client, Trajectory
+from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
+from service.demo.run import empty
+from service.keys import Keys
+
+#: How long to wait for the stage's next samples, and for the service to have learnt far enough, s.
+STALL_S, BEHIND_S = 10.0, 0.5
+
+
+class Twins:
+    """What the sensors of the twin stages have read so far, filled by the wire's thread."""
+
+    def __init__(self, plan: Plan, session: zenoh.Session) -> None:
+        self.y_um, self.u_V = empty(plan), empty(plan)
+        self.seen = {name: 0 for name in MODELS}
+        self._ticks = plan.ticks
+        self._moved = threading.Condition()
+        self._subscribers = [
+            session.declare_subscriber(Keys(STAGE, UNITS[name]).sample, self._taker(name)) for name in MODELS
+        ]
+
+    def _taker(self, name: str) -> Any:
+        def take(sample: zenoh.Sample) -> None:
+            batch = wire.decode_samples(sample.payload.to_bytes())
+            first, stop = int(batch.seq[0]), int(batch.seq[-1]) + 1
+            if stop > self._ticks:
+                return
+            self.y_um[name][first:stop] = batch.y_um
+            self.u_V[name][first:stop] = batch.u_V
+            with self._moved:
+                self.seen[name] = stop
+                self._moved.notify_all()
+
+        return take
+
+    def wait(self, ticks: int) -> bool:
+        """Until every twin has read ``ticks`` samples; False if they stopped coming."""
+        with self._moved:
+            return self._moved.wait_for(lambda: min(self.seen.values()) >= ticks, STALL_S)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def control(plan: Plan, endpoint: str, out: Path) -> int:
+    """Run the plan against the service and the stage behind ``endpoint``; writes ``out``. 1 if the stage stalled."""
+    wanted = plan.reference()
+    n, size = plan.ticks, plan.block
+    std_V = empty(plan)
+    durations: list[float] = []
+    late = 0
+    answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
+    with (
+        Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client,
+        Client.connect(endpoint, STAGE, AXIS) as wire_out,
+    ):
+        session = wire_out._session
+        twins = Twins(plan, session)
+        commands = {name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, express=True) for name in MODELS}
+        event = session.declare_publisher(Keys(STAGE, AXIS).event)
+        try:
+            for block in range(n // size):
+                part = slice(block * size, (block + 1) * size)
+                if not twins.wait(part.start - plan.lead):
+                    print(json.dumps({"stalled": part.start}), flush=True)
+                    return 1
+                client.reference(part.start, wanted[0][part])
+                for name in MODELS:
+                    begin = time.perf_counter()
+                    answer = client.trajectory(
+                        wanted[0][part],
+                        wanted[1][part],
+                        wanted[2][part],
+                        model=name,
+                        after=answers[name],
+                        as_of=plan.as_of(block),
+                        wait_s=BEHIND_S,
+                    )
+                    durations.append(time.perf_counter() - begin)
+                    answers[name] = answer
+                    std_V[name][part] = answer.std_V
+                    commands[name].put(wire.encode_command(part.start, answer.u_V))
+                late += twins.seen[TEACHER] > part.start
+                if part.start <= plan.change_tick < part.stop:
+                    # Told to the viewer only: the service has to find out by itself.
+                    event.put(
+                        json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text})
+                    )
+                if part.stop % 1000 == 0:
+                    _report(plan, wanted[0], twins, max(0, part.start - plan.lead))
+            complete = twins.wait(n)
+        finally:
+            twins.close()
+            for publisher in (*commands.values(), event):
+                publisher.undeclare()  # type: ignore[no-untyped-call]
+    arrays = {f"{kind}/{name}": values[name] for kind, values in _kinds(twins, std_V).items() for name in MODELS}
+    np.savez(out, query_s=np.asarray(durations), late=late, **arrays)
+    print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
+    return 0 if complete else 1
+
+
+def _kinds(twins: Twins, std_V: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": std_V}
+
+
+def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
+    tail = slice(max(0, done - round(1.0 / plan.dt_s)), done)
+    if done > 0:
+        error = {name: float(np.nanmean(np.abs(wanted_um[tail] - twins.y_um[name][tail]))) for name in MODELS}
+        print(json.dumps({"done_ticks": done, "error_um": error}), flush=True)
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process. Returns its exit status."""
+    # The wire's threads must not wait 5 ms for the interpreter.
+    sys.setswitchinterval(5e-5)
+    plan = Plan(**json.loads(Path(argv[0]).read_text()))
+    try:
+        return control(plan, argv[1], Path(argv[2]))
+    except DehystError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

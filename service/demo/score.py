@@ -1,0 +1,49 @@
+"""From errors to the table and to ``summary.json``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from service.demo.plan import MODELS, Plan
+
+PHASE_TITLES = {"before": "before the change", "first_second": "first second after", "settled": "settled"}
+
+
+def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
+    """MAE (2.43), RMSE (2.44) and maximum of an error, in percent of the commanded range, phase by phase."""
+    percent = 100.0 * error_um / plan.range_um
+    return {
+        name: {
+            "mae_pct": float(np.mean(np.abs(percent[part]))),
+            "rmse_pct": float(np.sqrt(np.mean(percent[part] ** 2))),
+            "max_pct": float(np.max(np.abs(percent[part]))),
+        }
+        for name, part in plan.phases().items()
+    }
+
+
+def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
+    """Round trips of queries: how many, median and 99th percentile in µs, and how many came too late to be used."""
+    if seconds.size == 0:
+        return {"count": 0, "p50_us": None, "p99_us": None, "late": late}
+    p50, p99 = np.percentile(seconds * 1e6, [50, 99])
+    return {"count": int(seconds.size), "p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1), "late": late}
+
+
+def table(summary: dict[str, Any]) -> str:
+    """The result as a person reads it: a row a model, three numbers a phase."""
+    width = max(len(title) for title in MODELS.values())
+    head = " " * width + "".join(f" | {title:^23}" for title in PHASE_TITLES.values())
+    units = f"{'% of ' + format(summary['range_um'], '.0f') + ' µm':<{width}}" + " |    MAE    RMSE     max" * 3
+    lines = [head, units, "-" * len(head)]
+    for model, title in MODELS.items():
+        cells = "".join(
+            " | "
+            + " ".join(f"{summary['models'][model][phase][key]:7.3f}" for key in ("mae_pct", "rmse_pct", "max_pct"))
+            for phase in PHASE_TITLES
+        )
+        lines.append(f"{title:<{width}}{cells}")
+    return "\n".join(lines)

@@ -1,0 +1,145 @@
+"""The model followed into the caller's process: fast, and with no wire between the question and the answer."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import zenoh
+from numpy.typing import ArrayLike, NDArray
+
+from adaptive.errors import DehystError
+from adaptive.types import FloatArray, InverseModel
+from service.errors import FieldError
+from service.guard import Limits, check_domain, guard
+from service.motion import derivatives
+from service.wire_model import ModelMessage, decode_model
+
+
+class Follower:
+    """Holds the newest snapshot of one model and the caller's hysteresis memory, and evaluates here.
+
+    Every answer advances :attr:`memory`, so that points asked one after the other are one trajectory. The limits of
+    the service are enforced here as there. One thread asks; snapshots arrive in another.
+
+    Attributes
+    ----------
+    memory : (m,) hysteresis memory after the last point answered.
+    received, refused : snapshots taken over, and those that could not be used.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str | None,
+        name: str,
+        fetch: Callable[[], bytes],
+        limits: Limits,
+        memory: ArrayLike | None = None,
+    ) -> None:
+        self.limits = limits
+        self.name = name
+        self.received = 0
+        self.refused = 0
+        self.last_error = ""
+        self._lock = threading.Lock()
+        self._subscriber: Any = None
+        self._newest: tuple[ModelMessage, float]
+        if key is not None:
+            # Subscribed before the first fetch, so that no snapshot falls between the two.
+            self._subscriber = session.declare_subscriber(key, self._on_model)
+        try:
+            self._take(decode_model(fetch()))
+        except BaseException:
+            self.close()
+            raise
+        self.memory: FloatArray = (
+            self._newest[0].memory.copy() if memory is None else np.array(memory, dtype=np.float64).reshape(-1)
+        )
+        self._u_before_V = math.nan
+        self._one = (np.empty(1), np.empty(1), np.empty(1))
+
+    @property
+    def model(self) -> InverseModel:
+        """The newest snapshot."""
+        return self._newest[0].model
+
+    @property
+    def snapshot_seq(self) -> int:
+        """The last sample that the newest snapshot had seen."""
+        return self._newest[0].snapshot_seq
+
+    @property
+    def age_s(self) -> float:
+        """Time since the newest snapshot arrived, s."""
+        return time.monotonic() - self._newest[1]
+
+    def point(self, y_um: float, v_um_per_s: float = 0.0, a_um_per_s2: float = 0.0) -> float:
+        """The voltage, V, for the next point. Raises InputError beyond the domain or on what is not finite."""
+        limits = self.limits
+        if not (limits.y_min_um <= y_um <= limits.y_max_um and math.isfinite(v_um_per_s + a_um_per_s2 + y_um)):
+            raise FieldError(
+                "y_um, v_um_per_s, a_um_per_s2",
+                f"{y_um:g}, {v_um_per_s:g}, {a_um_per_s2:g}",
+                f"finite numbers, y_um from {limits.y_min_um:g} to {limits.y_max_um:g}",
+            )
+        model = self._newest[0].model
+        y, v, a = self._one
+        y[0], v[0], a[0] = y_um, v_um_per_s, a_um_per_s2
+        forward = model.feedforward(y, v, a, self.memory)
+        # The guard of one point without its arrays: the same order, the same numbers.
+        u = float(forward.u_V[0])
+        before = self._u_before_V
+        if not math.isfinite(u):
+            u = before if math.isfinite(before) else 0.5 * (limits.u_min_V + limits.u_max_V)
+        else:
+            self.memory = forward.memory
+        u = min(max(u, limits.u_min_V), limits.u_max_V)
+        if math.isfinite(before):
+            step = limits.slew_V_per_s * model.dt_s
+            u = min(max(u, before - step), before + step)
+        self._u_before_V = u
+        return u
+
+    def trajectory(
+        self, y_um: ArrayLike, v_um_per_s: ArrayLike | None = None, a_um_per_s2: ArrayLike | None = None
+    ) -> tuple[FloatArray, NDArray[np.uint8]]:
+        """(voltages in V, flags), each (n,), for the next n points; arguments as in ``Client.trajectory``."""
+        y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
+        model = self._newest[0].model
+        v, a = derivatives(y, v_um_per_s, a_um_per_s2, model.dt_s)
+        for field, values in (("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
+            if not np.isfinite(values).all():
+                raise FieldError(field, "NaN or infinity", "finite numbers")
+        check_domain(y, self.limits)
+        forward = model.feedforward(y, v, a, self.memory)
+        u, flags = guard(forward.u_V, forward.inside, model.dt_s, self.limits, self._u_before_V)
+        if np.isfinite(forward.memory).all():
+            self.memory = forward.memory
+        self._u_before_V = float(u[-1])
+        return u, flags
+
+    def close(self) -> None:
+        """Stop to follow; what was received last can still be evaluated."""
+        if self._subscriber is not None:
+            self._subscriber.undeclare()
+            self._subscriber = None
+
+    def _on_model(self, sample: zenoh.Sample) -> None:
+        try:
+            self._take(decode_model(sample.payload.to_bytes()))
+        except DehystError as error:
+            # The last good snapshot stays; the count and the words are there for whoever looks.
+            self.refused += 1
+            self.last_error = str(error)
+
+    def _take(self, message: ModelMessage) -> None:
+        if message.name != self.name:
+            raise FieldError("model", repr(message.name), repr(self.name))
+        with self._lock:
+            self._newest = (message, time.monotonic())
+            self.received += 1

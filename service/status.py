@@ -1,0 +1,51 @@
+"""The status of one axis, as JSON; docs/protocol.md tells the fields."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from service.axis import Axis
+from service.intake import Intake
+from service.keys import Keys
+from service.latency import LatencyMeter
+from service.registry import kind_of
+from service.wire import VERSION
+
+SCHEMA: Final = 1
+
+
+def axis_status(
+    keys: Keys, instance: str, axis: Axis, intake: Intake, latency: LatencyMeter, sample_age_s: float | None
+) -> dict[str, Any]:
+    """All that a client, an operator or a viewer wants to know of an axis; JSON values only."""
+    served = axis.newest
+    return {
+        "schema": SCHEMA,
+        "wire": VERSION,
+        "stage": keys.stage,
+        "axis": keys.axis,
+        "instance": instance,
+        "dt_s": axis.dt_s,
+        "served": axis.config.served,
+        "learning": axis.config.learn if axis.learning else None,
+        "models": {
+            name: {"kind": kind_of(model), "memory_size": model.memory_size} for name, model in served.models.items()
+        },
+        "limits": axis.limits.to_json(),
+        "seq": axis.handled_seq,
+        "snapshot_seq": served.seq,
+        "snapshot_every": axis.config.snapshot_every,
+        "snapshots_kept": axis.config.snapshots_kept,
+        "sample_age_s": sample_age_s,
+        "samples": {
+            **axis.sequence.counters(),
+            "dropped": intake.dropped,
+            "malformed": intake.malformed,
+            "waiting": intake.waiting,
+            "learnt": axis.gates.get("learnt", 0),
+            "gates": axis.gates,
+        },
+        "learner": intake.counters,
+        "recorder": None if intake.sink is None else intake.sink.counters(),
+        "queries": latency.summary(),
+    }

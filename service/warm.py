@@ -1,0 +1,53 @@
+"""Compile every compiled loop once, so that no process pays for it at its start: ``python -m service.warm``.
+
+What was compiled is kept on disk beside the sources. That cache looks at the file of a function only, not at the
+files of what it calls; so the sources are compared as a whole here, and one changed file makes all anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import sys
+import time
+from pathlib import Path
+
+PACKAGES = ("adaptive", "baselines", "sim")
+
+
+def digest(root: Path) -> str:
+    """Of all sources that may be compiled, and of the Python that runs them."""
+    sha = hashlib.sha256(sys.version.encode())
+    for package in PACKAGES:
+        for path in sorted((root / package).rglob("*.py")):
+            sha.update(path.relative_to(root).as_posix().encode())
+            sha.update(path.read_bytes())
+    return sha.hexdigest()
+
+
+def forget(root: Path) -> None:
+    """Remove what was compiled before."""
+    for package in PACKAGES:
+        for path in (root / package).rglob("*.nb[ic]"):
+            path.unlink(missing_ok=True)
+
+
+def main() -> None:
+    """Call each package's ``warm.warm()``, unless nothing has changed since the last time."""
+    root = Path(__file__).resolve().parents[1]
+    stamp = root / "service" / "__pycache__" / "compiled.sha256"
+    now = digest(root)
+    if stamp.exists() and stamp.read_text() == now:
+        return
+    forget(root)
+    start = time.perf_counter()
+    for package in PACKAGES:
+        print(f"compiling the loops of {package} ...", flush=True)
+        importlib.import_module(f"{package}.warm").warm()
+    stamp.parent.mkdir(exist_ok=True)
+    stamp.write_text(now)
+    print(f"compiled in {time.perf_counter() - start:.0f} s (once)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

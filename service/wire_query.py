@@ -1,0 +1,229 @@
+"""Binary payloads of a feedforward query and its reply; docs/protocol.md is the page about them."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptive.types import FloatArray
+from service.errors import FieldError
+from service.wire import (
+    FEEDFORWARD_QUERY,
+    FEEDFORWARD_REPLY,
+    MAX_SEQ,
+    VERSION,
+    check_finite,
+    check_header,
+    check_length,
+    column,
+    doubles,
+)
+
+#: The query carries accelerations (options bit 0) and a memory vector (options bit 1).
+HAS_ACCELERATION: Final = 1
+HAS_MEMORY: Final = 2
+#: Reply options: the learner has not yet handled all that ``as_of`` needs, so this answer may differ from a repeated
+#: one; the query brought no memory, so the service's own was used; another model than the one asked for answered.
+BEHIND: Final = 1
+TRACKED_MEMORY: Final = 2
+FALLBACK: Final = 4
+
+#: What was done to a voltage, one bit each, as documented in docs/protocol.md.
+LIMITED_VOLTAGE: Final = 1
+LIMITED_SLEW: Final = 2
+OUTSIDE_DOMAIN: Final = 4
+NOT_FINITE_REPLACED: Final = 8
+FLAG_NAMES: Final = {
+    LIMITED_VOLTAGE: "limited_voltage",
+    LIMITED_SLEW: "limited_slew",
+    OUTSIDE_DOMAIN: "outside_domain",
+    NOT_FINITE_REPLACED: "not_finite_replaced",
+}
+
+MAX_MEMORY: Final = 4096
+MAX_NAME_BYTES: Final = 64
+#: ``as_of`` of a query that takes the newest snapshot.
+NEWEST: Final = -1
+#: Snapshots from before the first sample have this number.
+_LEAST_SEQ: Final = -1
+
+# version, kind, options, n, as_of, u_before_V, m, bytes of the name
+_QUERY: Final = struct.Struct("<BBHIqdII")
+# version, kind, options, n, snapshot_seq, m, bytes of the name
+_REPLY: Final = struct.Struct("<BBHIqII")
+
+
+@dataclass(frozen=True, slots=True)
+class FeedforwardQuery:
+    """n desired points, one sample time apart.
+
+    Attributes
+    ----------
+    y_um, v_um_per_s, a_um_per_s2 : (n,) each, finite; the motion at the instants of the points.
+    memory : (m,) from the reply before, or None: start from what the service tracks from the samples.
+    model : name of the model to ask; empty for the service's default.
+    as_of : answer from the newest snapshot that had seen no sample after this number; NEWEST for the newest.
+    u_before_V : voltage just before the first point, V, from where the slew limit counts; NaN where there is none.
+    """
+
+    y_um: FloatArray
+    v_um_per_s: FloatArray
+    a_um_per_s2: FloatArray
+    memory: FloatArray | None = None
+    model: str = ""
+    as_of: int = NEWEST
+    u_before_V: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class FeedforwardReply:
+    """Voltages for n desired points.
+
+    Attributes
+    ----------
+    u_V : (n,) finite and within the limits, V.
+    std_V : (n,) one standard deviation, V; NaN where the model has no notion of it.
+    flags : (n,) bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED.
+    memory : (m,) after the last point, for the next query.
+    snapshot_seq : the last sample that the answering snapshot had seen, -1 before any.
+    model : name of the model that answered.
+    behind, tracked_memory, fallback : the reply's options, see the module's constants.
+    """
+
+    u_V: FloatArray
+    std_V: FloatArray
+    flags: NDArray[np.uint8]
+    memory: FloatArray
+    snapshot_seq: int
+    model: str
+    behind: bool = False
+    tracked_memory: bool = False
+    fallback: bool = False
+
+
+def flag_names(bits: int) -> list[str]:
+    """The names of the bits set in a point's flags."""
+    return [name for bit, name in FLAG_NAMES.items() if bits & bit]
+
+
+def encode_query(
+    y_um: ArrayLike,
+    v_um_per_s: ArrayLike,
+    a_um_per_s2: ArrayLike | None = None,
+    memory: ArrayLike | None = None,
+    model: str = "",
+    as_of: int = NEWEST,
+    u_before_V: float = float("nan"),
+) -> bytes:
+    """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError naming what does not fit."""
+    y = column("y_um", y_um)
+    parts = [y]
+    options = 0
+    if memory is not None:
+        vector = np.ascontiguousarray(memory, dtype=np.float64).reshape(-1)
+        options |= HAS_MEMORY
+        parts.insert(0, vector)
+    m = parts[0].size if options else 0
+    parts.append(_same_length("v_um_per_s", v_um_per_s, y.size))
+    if a_um_per_s2 is not None:
+        parts.append(_same_length("a_um_per_s2", a_um_per_s2, y.size))
+        options |= HAS_ACCELERATION
+    name = model.encode()
+    if len(name) > MAX_NAME_BYTES:
+        raise FieldError("model", f"{len(name)} bytes", f"a name of at most {MAX_NAME_BYTES} bytes")
+    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, y.size, as_of, u_before_V, m, len(name))
+    return b"".join((head, *(part.astype("<f8", copy=False).tobytes() for part in parts), name))
+
+
+def decode_query(data: bytes) -> FeedforwardQuery:
+    """The query in a payload. Raises InputError where it is malformed, not finite, or out of bounds."""
+    options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY)
+    *_, as_of, u_before_V, m, name_bytes = _QUERY.unpack_from(data)
+    _check_sizes(m, name_bytes)
+    if m and not options & HAS_MEMORY:
+        raise FieldError("m", m, "0 where the options say that there is no memory")
+    if not NEWEST <= as_of <= MAX_SEQ:
+        raise FieldError("as_of", as_of, "a sequence number from 0 to 2**62, or -1 for the newest")
+    if u_before_V in (float("inf"), float("-inf")):
+        raise FieldError("u_before_V", u_before_V, "a finite voltage in V, or NaN for none")
+    columns = 3 if options & HAS_ACCELERATION else 2
+    end = _QUERY.size + 8 * (m + columns * n)
+    check_length(data, end + name_bytes)
+    values = doubles(data, _QUERY.size, m + columns * n)
+    memory, y, v = values[:m], values[m : m + n], values[m + n : m + 2 * n]
+    a = values[m + 2 * n :] if columns == 3 else np.zeros(n)
+    if not np.isfinite(values).all():
+        for name, part in (("memory", memory), ("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
+            check_finite(name, part)
+    return FeedforwardQuery(
+        y, v, a, memory if options & HAS_MEMORY else None, _name(data[end:]) if name_bytes else "", as_of, u_before_V
+    )
+
+
+def encode_reply(reply: FeedforwardReply) -> bytes:
+    """Payload of a reply."""
+    options = BEHIND * reply.behind | TRACKED_MEMORY * reply.tracked_memory | FALLBACK * reply.fallback
+    name = reply.model.encode()
+    n, m = reply.u_V.size, reply.memory.size
+    return b"".join(
+        (
+            _REPLY.pack(VERSION, FEEDFORWARD_REPLY, options, n, reply.snapshot_seq, m, len(name)),
+            reply.u_V.astype("<f8", copy=False).tobytes(),
+            reply.std_V.astype("<f8", copy=False).tobytes(),
+            reply.memory.astype("<f8", copy=False).tobytes(),
+            reply.flags.tobytes(),
+            name,
+        )
+    )
+
+
+def decode_reply(data: bytes) -> FeedforwardReply:
+    """The reply in a payload. Raises InputError where it is malformed or a voltage is not finite."""
+    options, n = check_header(data, FEEDFORWARD_REPLY, _REPLY.size, BEHIND | TRACKED_MEMORY | FALLBACK)
+    *_, snapshot_seq, m, name_bytes = _REPLY.unpack_from(data)
+    _check_sizes(m, name_bytes)
+    if snapshot_seq < _LEAST_SEQ:
+        raise FieldError("snapshot_seq", snapshot_seq, "-1 or more")
+    end = _REPLY.size + 8 * (2 * n + m)
+    check_length(data, end + n + name_bytes)
+    values = doubles(data, _REPLY.size, 2 * n + m)
+    u, std, memory = values[:n], values[n : 2 * n], values[2 * n :]
+    check_finite("u_V", u)
+    check_finite("memory", memory)
+    flags = np.frombuffer(data, dtype=np.uint8, count=n, offset=end)
+    return FeedforwardReply(
+        u,
+        std,
+        flags,
+        memory,
+        snapshot_seq,
+        _name(data[end + n :]),
+        bool(options & BEHIND),
+        bool(options & TRACKED_MEMORY),
+        bool(options & FALLBACK),
+    )
+
+
+def _same_length(field: str, values: ArrayLike, n: int) -> FloatArray:
+    array = column(field, values)
+    if array.size != n:
+        raise FieldError(field, f"{array.size} values", f"{n}, as many as y_um")
+    return array
+
+
+def _check_sizes(m: int, name_bytes: int) -> None:
+    if m > MAX_MEMORY:
+        raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
+    if name_bytes > MAX_NAME_BYTES:
+        raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
+
+
+def _name(raw: bytes) -> str:
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        raise FieldError("model", repr(raw), "a name in UTF-8") from error

@@ -1,0 +1,132 @@
+"""What several tests of the service need: small honest models, a free port, and a real serving process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.features import FeatureMap
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import InverseModel
+from baselines.linear import LinearInverse, LinearParameters
+from baselines.points import Domain
+from service.modelfile import BundleMeta, write_bundle
+
+DT_S = 1e-3
+GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
+
+
+def make_models() -> dict[str, InverseModel]:
+    """A line, and an LSSVM with plays whose kernel part is small: both good enough to steer a stage of 11 µm/V."""
+    features = FeatureMap(
+        DT_S, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
+        kernel_plays=(0,), asymmetric=True,
+    )  # fmt: skip
+    rng = np.random.default_rng(5)
+    support = rng.uniform(-1.0, 1.0, (20, features.kernel_size))
+    half_V = 45.0 / GAIN_UM_PER_V
+    beta = np.zeros(features.basis_size)
+    beta[:2] = (45.0 - OFFSET_UM) / GAIN_UM_PER_V, half_V
+    beta[2:] = 1e-3 * np.arange(1, beta.size - 1)
+    lssvm = LssvmInverse(
+        "lssvm_adaptive", features, beta, support, 0.01 * rng.normal(size=20), np.ones(features.kernel_size), 1e4,
+        domain=np.array([0.0, 90.0, -2e4, 2e4, -1e7, 1e7]), noise_variance=1e-6, kernel_variance=1e-4,
+    )  # fmt: skip
+    line = LinearInverse(LinearParameters(GAIN_UM_PER_V, OFFSET_UM), DT_S, Domain(0.0, 90.0, 1e4), 0.05)
+    return {"linear": line, "lssvm_adaptive": lssvm}
+
+
+@pytest.fixture
+def models() -> dict[str, InverseModel]:
+    return make_models()
+
+
+def unused_port() -> int:
+    """A port that nobody listens at; zenoh wants to be told one."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def free_port() -> int:
+    return unused_port()
+
+
+def write_config(folder: Path, port: int, axes: tuple[str, ...] = ("x",), extra: str = "") -> Path:
+    """Model files and a configuration of a service in ``folder``."""
+    text = f'stage = "demo"\nlisten = ["tcp/127.0.0.1:{port}"]\n'
+    for axis in axes:
+        write_bundle(folder / f"{axis}.npz", make_models(), BundleMeta("demo", axis, DT_S, y_min_um=0.0, y_max_um=90.0))
+        text += (
+            f'[[axis]]\nname = "{axis}"\nmodel = "{axis}.npz"\n'
+            f"u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n{extra}\n"
+        )
+    path = folder / "serve.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+class ServeProcess:
+    """``dehyst serve`` as a process, ready when constructed."""
+
+    def __init__(self, config: Path, port: int) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{port}"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "serve", "--config", str(config), "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            pytest.fail(f"dehyst serve did not come up: {self.process.communicate(timeout=20)[1]}")
+        self.ready: dict[str, Any] = json.loads(line)
+
+    def stop(self, number: int = signal.SIGTERM) -> tuple[int, dict[str, Any], str]:
+        """(exit status, last line of its output, what it complained of)."""
+        self.process.send_signal(number)
+        out, err = self.process.communicate(timeout=30)
+        return self.process.returncode, json.loads(out.splitlines()[-1]), err
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def shared_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServeProcess]:
+    """One serving process with the axes x and y, for all the tests of a file that only query it and send samples."""
+    port = unused_port()
+    process = ServeProcess(write_config(tmp_path_factory.mktemp("service"), port, ("x", "y")), port)
+    yield process
+    process.kill()
+
+
+@pytest.fixture
+def serve(tmp_path: Path, free_port: int) -> Iterator[Callable[..., ServeProcess]]:
+    """Starts serving processes; all are ended at the end of the test."""
+    started: list[ServeProcess] = []
+
+    def start(axes: tuple[str, ...] = ("x",), extra: str = "") -> ServeProcess:
+        process = ServeProcess(write_config(tmp_path, free_port, axes, extra), free_port)
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()

@@ -1,0 +1,214 @@
+"""A client written from docs/protocol.md alone: zenoh, struct and json, and nothing of this project."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+pytestmark = pytest.mark.e2e
+BASE = "dehyst/v1/demo/x"
+
+
+@pytest.fixture
+def session(shared_service: Any) -> Iterator[zenoh.Session]:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([shared_service.endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    with zenoh.open(config) as opened:
+        yield opened
+
+
+def get(session: zenoh.Session, selector: str, payload: bytes | None = None) -> bytes:
+    until = time.monotonic() + 2.0
+    while not (replies := list(session.get(selector, payload=payload, timeout=5.0))):
+        assert time.monotonic() < until, "nobody answers"
+        time.sleep(0.05)
+    (answer,) = replies
+    assert answer.ok is not None, answer.err.payload.to_bytes()
+    return bytes(answer.ok.payload.to_bytes())
+
+
+def query(
+    y: list[float], v: list[float], a: list[float], memory: list[float] | None, model: bytes = b"", as_of: int = -1
+) -> bytes:
+    n, m = len(y), len(memory or [])
+    head = struct.pack("<BBHI", 1, 4, 1 | (2 if memory is not None else 0), n)
+    head += struct.pack("<qdII", as_of, math.nan, m, len(model))
+    return head + struct.pack(f"<{m + 3 * n}d", *(memory or []), *y, *v, *a) + model
+
+
+def reply(data: bytes) -> dict[str, Any]:
+    version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
+    assert (version, kind) == (1, 5)
+    snapshot_seq, m, b = struct.unpack_from("<qII", data, 8)
+    assert len(data) == 24 + 16 * n + 8 * m + n + b
+    doubles = struct.unpack_from(f"<{2 * n + m}d", data, 24)
+    flags = list(data[24 + 16 * n + 8 * m :][:n])
+    name = data[len(data) - b :].decode()
+    return {
+        "options": options, "snapshot_seq": snapshot_seq, "u_V": doubles[:n], "std_V": doubles[n : 2 * n],
+        "memory": list(doubles[2 * n :]), "flags": flags, "model": name,
+    }  # fmt: skip
+
+
+def samples(first: int, n: int) -> bytes:
+    k = list(range(first, first + n))
+    y = [45.0 + 30.0 * math.sin(2 * math.pi * 3e-3 * i) for i in k]
+    u = [(value - 1.0) / 10.5 for value in y]
+    return struct.pack("<BBHI", 1, 1, 0, n) + struct.pack(f"<{n}q{3 * n}d", *k, *(i * 1e-3 for i in k), *u, *y)
+
+
+def test_a_stranger_asks_continues_teaches_and_is_corrected(session: zenoh.Session) -> None:
+    status = json.loads(get(session, f"{BASE}/status"))
+    assert (status["schema"], status["wire"], status["served"]) == (1, 1, "lssvm_adaptive")
+    size = status["models"]["lssvm_adaptive"]["memory_size"]
+
+    # Five points of a ramp at once, and cut in two with the memory brought back: the same voltages.
+    dt = status["dt_s"]
+    y = [40.0 + 1000.0 * dt * i for i in range(5)]
+    v, a = [1000.0] * 5, [0.0] * 5
+    whole = reply(get(session, f"{BASE}/feedforward", query(y, v, a, None)))
+    assert whole["options"] == 2  # the service's own memory
+    assert len(whole["memory"]) == size
+    assert whole["flags"] == [0] * 5
+    first = reply(get(session, f"{BASE}/feedforward", query(y[:3], v[:3], a[:3], None)))
+    second = reply(get(session, f"{BASE}/feedforward", query(y[3:], v[3:], a[3:], first["memory"])))
+    assert second["options"] == 0
+    assert first["u_V"] + second["u_V"] == whole["u_V"]
+    assert second["memory"] == whole["memory"]
+
+    # Another model by name; the line is one that this page lets us evaluate ourselves.
+    line = reply(get(session, f"{BASE}/feedforward", query(y, v, a, None, b"linear")))
+    assert line["model"] == "linear"
+    values = model(get(session, f"{BASE}/model?name=linear"))["values"]
+    assert line["u_V"] == pytest.approx([(p - values["offset_um"]) / values["gain_um_per_V"] for p in y])
+
+    # A point that asks for too much at once, from a given voltage on, is limited and says so.
+    jump = query([80.0], [0.0], [0.0], None)
+    jump = jump[:16] + struct.pack("<d", 1.0) + jump[24:]
+    limited = reply(get(session, f"{BASE}/feedforward", jump))
+    assert limited["flags"] == [2]
+    assert limited["u_V"][0] == pytest.approx(1.0 + status["limits"]["slew_V_per_s"] * dt)
+
+    # Samples teach; the snapshots' numbers follow.
+    for k in range(0, 1000, 50):  # the first samples that this service ever gets
+        session.put(f"{BASE}/sample", samples(k, 50), congestion_control=zenoh.CongestionControl.BLOCK)
+    until = time.monotonic() + 30.0
+    while json.loads(get(session, f"{BASE}/status"))["seq"] < 999 and time.monotonic() < until:
+        time.sleep(0.02)
+    taught = reply(get(session, f"{BASE}/feedforward", query(y, v, a, whole["memory"])))
+    assert taught["snapshot_seq"] == 980
+    assert taught["u_V"] != whole["u_V"]
+
+    # Errors speak in fields.
+    for payload, field in (
+        (query([float("nan")], [0.0], [0.0], None), "y_um[0]"),
+        (query([1000.0], [0.0], [0.0], None), "y_um[0]"),
+        (query(y, v, a, None)[:-1], "payload"),
+        (b"\x02" + query(y, v, a, None)[1:], "version"),
+    ):
+        (answer,) = list(session.get(f"{BASE}/feedforward", payload=payload, timeout=5.0))
+        error = json.loads(answer.err.payload.to_bytes())
+        assert (error["error"], error["field"]) == ("InputError", field)
+        assert set(error) == {"error", "message", "field", "got", "expected"}
+    assert list(session.get("dehyst/v1/demo/nobody/feedforward", payload=b"", timeout=5.0)) == []
+
+
+def model(data: bytes) -> dict[str, Any]:
+    version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
+    assert (version, kind, options) == (1, 6, 0)
+    snapshot_seq, j, b = struct.unpack_from("<qII", data, 8)
+    assert len(data) == 24 + j + b
+    assert j % 8 == 0
+    text = json.loads(data[24 : 24 + j])
+    assert len(text["arrays"]) == n
+    formats = {"<f8": "d", "<f4": "f", "<i8": "q", "<i4": "i", "|u1": "B", "|b1": "?"}
+    arrays, at = {}, 24 + j
+    for name, dtype, shape in text["arrays"]:
+        assert at % 8 == 0
+        layout = f"<{math.prod(shape)}{formats[dtype]}"
+        arrays[name] = list(struct.unpack_from(layout, data, at))
+        at += -(-struct.calcsize(layout) // 8) * 8
+    assert at == len(data)
+    return {**text, "data": arrays, "snapshot_seq": snapshot_seq}
+
+
+def test_a_stranger_follows_the_model_as_it_is_published(session: zenoh.Session) -> None:
+    arrived: list[dict[str, Any]] = []
+    second = threading.Event()
+
+    def on_model(sample: zenoh.Sample) -> None:
+        arrived.append(model(sample.payload.to_bytes()))
+        if len(arrived) >= 2:
+            second.set()
+
+    session.declare_subscriber(f"{BASE}/model", on_model)
+    k, until = 1000, time.monotonic() + 20.0
+    while not second.is_set() and time.monotonic() < until:
+        session.put(f"{BASE}/sample", samples(k, 20))
+        k += 20
+        time.sleep(0.02)
+    assert second.is_set()
+    assert arrived[0]["name"] == "lssvm_adaptive"
+    assert arrived[1]["snapshot_seq"] > arrived[0]["snapshot_seq"]
+    assert len(arrived[0]["data"]["/memory"]) > 0
+
+
+def lssvm(
+    values: dict[str, Any], data: dict[str, list[float]], memory: list[float], y: float, v: float, a: float
+) -> float:
+    """Steps 1 to 3 of the page for one point; ``memory`` advances in place."""
+    f = {name.removeprefix("features."): value for name, value in {**values, **data}.items()}
+    plays, arcs, slow = f["thresholds_um"], f["arc_lengths_um"], f["time_constants_s"]
+    k, n_arcs = len(plays), len(arcs)
+    for i, r in enumerate(plays):
+        memory[i] = max(y - r, min(y + r, memory[i]))
+    for i, rho in enumerate(arcs):
+        memory[k + i] = y + (memory[k + i] - y) * math.exp(-abs(y - memory[-1]) / rho)
+    for i, tau in enumerate(slow):
+        memory[k + n_arcs + i] = y + (memory[k + n_arcs + i] - y) * math.exp(-f["dt_s"] / tau)
+    if arcs:
+        memory[-1] = y
+    h = (f["y_max_um"] - f["y_min_um"]) / 2
+    yn, vn, an = (y - f["y_min_um"] - h) / h, v / f["v_scale_um_per_s"], a / f["a_scale_um_per_s2"]
+    p = [(y - memory[i]) / r for i, r in enumerate(plays)]
+    basis = [1.0]
+    if f["linear"]:
+        basis += [yn, vn, an, yn**2, yn**3, *p, *([yn * value for value in p] if f["asymmetric"] else [])]
+        basis += [(y - memory[k + i]) / rho for i, rho in enumerate(arcs)]
+        basis += [(y - memory[k + n_arcs + i]) / h for i in range(len(slow))]
+    x = [yn, vn, *(p[i] for i in f["kernel_plays"])]
+    u = sum(b * c for b, c in zip(f["beta"], basis, strict=True))
+    for row, alpha in enumerate(f["alpha"]):
+        point = f["support"][row * len(x) : (row + 1) * len(x)]
+        distance = sum(((q - s) / w) ** 2 for q, s, w in zip(x, point, f["widths"], strict=True))
+        u += alpha * math.exp(-distance)
+    return float(u)
+
+
+def test_a_stranger_evaluates_the_lssvm_by_the_formula_of_the_page(session: zenoh.Session) -> None:
+    got = model(get(session, f"{BASE}/model"))
+    values, data = got["values"], got["data"]
+    assert got["kind"] == "lssvm"
+    memory = [0.0] * len(data["/memory"])
+    y = [30.0, 34.0, 33.0, 41.0, 20.0]
+    v = [0.0, 4000.0, -1000.0, 8000.0, -21000.0]
+    a = [0.0, 1e3, -5e3, 0.0, 2e3]
+    mine = [lssvm(values, data, memory, *point) for point in zip(y, v, a, strict=True)]
+    asked = reply(get(session, f"{BASE}/feedforward", query(y, v, a, [0.0] * len(memory), as_of=got["snapshot_seq"])))
+    # The first is free of the slew limit; the others are compared where it did not bite.
+    pairs = [(m, u) for m, u, flag in zip(mine, asked["u_V"], asked["flags"], strict=True) if not flag & 2]
+    assert len(pairs) >= 4
+    for m, u in pairs:
+        assert m == pytest.approx(u, rel=1e-9)
+    assert memory == pytest.approx(asked["memory"], rel=1e-12)
