@@ -14,8 +14,10 @@ export OMP_NUM_THREADS ?= 1
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
-setup: .setup-run ## virtual environment with what running needs (300 MB)
-setup-test: .setup-test ## the same with torch, peers and the checkers (5 GB)
+setup: .setup-run ## virtual environment with what running needs (700 MB)
+	@$(BIN)/python -m service.warm
+setup-test: .setup-test ## the same with torch, peers and the checkers (7 GB)
+	@$(BIN)/python -m service.warm
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else "dehyst needs Python 3.11 or newer, this is %d.%d: call make PYTHON=python3.11" % v[:2])'
@@ -24,13 +26,11 @@ $(BIN)/python:
 .setup-run: requirements.txt pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.txt
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
-	$(BIN)/python -m adaptive.warm
 	@touch $@
 
 .setup-test: requirements-test.txt pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements-test.txt
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
-	$(BIN)/python -m adaptive.warm
 	@touch $@ .setup-run
 
 demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
