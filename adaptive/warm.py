@@ -2,9 +2,64 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from adaptive.features import FeatureMap
+from adaptive.learner import Learner
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import Sample
+from adaptive.window import Window, WindowConfig
+
+
+def warm() -> None:
+    """Call the compiled functions of window and learner on a few samples."""
+    warm_window()
+    warm_learner()
+
+
+def warm_learner() -> None:
+    """Smoother, features, snapshot and one step of the learner."""
+    features = FeatureMap(1e-3, 0.0, 1.0, 1.0, 1.0, (0.1, 0.2), (0.3,), (0.1,), (0,), asymmetric=True)
+    p, d = features.basis_size, features.kernel_size
+    model = LssvmInverse(
+        "warm", features, np.zeros(p), np.linspace(0.0, 1.0, 4 * d).reshape(4, d), np.zeros(4), np.ones(d), 10.0,
+        np.array([0.0, 1.0] * 3),
+    )  # fmt: skip
+    learner = Learner(model)
+    for k in range(120):
+        learner.handle(Sample(k, k * 1e-3, 0.1 * np.sin(0.1 * k), 0.1 * np.sin(0.1 * k)))
+    snapshot = learner.snapshot()
+    still = np.zeros(2)
+    memory = snapshot.feedforward(still, still, still, learner.memory()).memory
+    snapshot.track(still, still, still, still, memory)
+    features.run(still, still, still, memory)
+
+
+def warm_window() -> None:
+    """The window, in both forms."""
+    points = np.linspace(0.0, 1.0, 12).reshape(6, 2) ** 2
+    for form in ("inverse", "cholesky"):
+        window = Window(WindowConfig(4, (0.5, 0.5), 100.0, linear=(0,), form=form))
+        for x in points[:4]:
+            window.append(x, float(x[0]))
+        window.replace(1, points[4], 0.5)
+        window.undo()
+        window.remove(3)
+        window.reweight(0, 0.5)
+        window.rescale_targets(0.1, 0.0)
+        window.shift_targets(np.zeros(3))
+        window.predict(points[5])
+        window.predict_with_variance(points[5])
+        window.leave_one_out()
+        window.worst_residual()
+        window.refine()
+        window.rebuild()
+        window.scale  # noqa: B018
+
 
 def main() -> None:
-    """Nothing to compile yet."""
+    """What ``python -m adaptive.warm`` does."""
+    warm()
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ COMMANDS: dict[str, str] = {
     "query": "ask a running service for voltages",
     "replay": "run the learner over a recording, offline, and see what its gates and its errors do",
     "scenarios": "drift of every kind, adapting against not adapting, with a table and pictures",
+    "bench": "the solver's speed and accuracy beside its yardsticks and peers, from a checkout",
+    "reproduce": "the chapter's tables and figures, computed anew beside its own numbers",
     "view": "stream a running service to the Rerun viewer or into an .rrd file",
 }
 

@@ -1,0 +1,171 @@
+"""Which samples may teach: gates in the order of the data's way, each with a name under which it is counted.
+
+The first gates look at the raw sample (finite, in sequence, sane time step, not a glitch of the sensor); what passes
+them advances the smoother. The later gates look at the pair of smoothed motion and voltage that comes out of it
+(settled, not saturated, in range, moving). Refused samples change no model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from math import isfinite
+
+from adaptive.errors import InputError
+from adaptive.types import Sample, StateDict
+
+#: µm or V that no reading has.
+ABSURD = 1e9
+
+LEARNT = "learnt"
+#: Passed all gates, but neither filter nor window was due: the rates of both are configured.
+PASSED = "passed"
+NOT_FINITE = "not_finite"
+DUPLICATE = "duplicate"
+OUT_OF_ORDER = "out_of_order"
+TIMING = "timing"
+GAP = "gap"
+GLITCH = "glitch"
+SETTLING = "settling"
+SATURATED = "saturated"
+OUT_OF_RANGE = "out_of_range"
+UNEXCITED = "unexcited"
+OUTLIER = "outlier"
+REDUNDANT = "redundant"
+FROZEN = "frozen"
+NUMERICS = "numerics"
+REASONS = (
+    NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, SETTLING, SATURATED, OUT_OF_RANGE, UNEXCITED, OUTLIER,
+    REDUNDANT, FROZEN, NUMERICS,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class AdmissionConfig:
+    """Limits of the gates.
+
+    u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one does not teach.
+    y_min_um, y_max_um : what the sensor can show; beyond it a reading is out of range.
+    glitch_share : a reading this far from the smoother's prediction, as a share of the model's range, is a glitch ...
+    glitch_persistence : ... unless this many in a row are: then the stage has really moved.
+    max_gap : missing samples that the smoother bridges; beyond it, it starts again.
+    settle : samples after a (re)start that do not teach.
+    timing_tolerance : relative error of the time step between two samples.
+    rest_share_per_s : below this speed, in ranges per second, the stage counts as at rest.
+    """
+
+    u_min_V: float = -ABSURD
+    u_max_V: float = ABSURD
+    rail_margin_V: float = 1e-3
+    y_min_um: float = -ABSURD
+    y_max_um: float = ABSURD
+    glitch_share: float = 0.012
+    glitch_persistence: int = 3
+    max_gap: int = 5
+    settle: int = 50
+    timing_tolerance: float = 0.5
+    rest_share_per_s: float = 0.025
+
+    def __post_init__(self) -> None:
+        for low, high in (("u_min_V", "u_max_V"), ("y_min_um", "y_max_um")):
+            if not getattr(self, low) < getattr(self, high):
+                raise InputError(
+                    f"admission.{low}, {high}: got {getattr(self, low)}, {getattr(self, high)}, expected {low} < {high}"
+                )
+        for name in ("glitch_share", "rest_share_per_s", "timing_tolerance"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a positive number")
+        for name in ("glitch_persistence", "max_gap", "settle"):
+            if getattr(self, name) < 0:
+                raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a count, not negative")
+
+
+@dataclass(slots=True)
+class AdmissionState:
+    """seq, t_s : of the last sample taken. glitches : in a row.
+
+    since_start, since_jump : samples since the smoother started, since it was moved to a place that had jumped,
+    and (since_step) since the voltage stepped. u_V, u_before_V : the last two voltages.
+    """
+
+    seq: int = -1
+    t_s: float = 0.0
+    glitches: int = 0
+    since_start: int = 0
+    since_jump: int = 0
+    since_step: int = 0
+    u_V: float = 0.0
+    u_before_V: float = 0.0
+
+    def state_dict(self) -> StateDict:
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> AdmissionState:
+        return cls(
+            seq=int(values["seq"]),
+            t_s=float(values["t_s"]),
+            glitches=int(values["glitches"]),
+            since_start=int(values["since_start"]),
+            since_jump=int(values["since_jump"]),
+            since_step=int(values["since_step"]),
+            u_V=float(values["u_V"]),
+            u_before_V=float(values["u_before_V"]),
+        )
+
+
+def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample, dt_s: float) -> str:
+    """Gate of the raw sample: "" where it may go on. Does not change the state. Never raises on data."""
+    # No instrument reads beyond these, and the square of what it reads must be finite too.
+    if not (isfinite(sample.t_s) and abs(sample.u_V) < ABSURD and abs(sample.y_um) < ABSURD):
+        return NOT_FINITE
+    if state.seq < 0:
+        return ""
+    if sample.seq == state.seq:
+        return DUPLICATE
+    if sample.seq < state.seq:
+        return OUT_OF_ORDER
+    expected_s = (sample.seq - state.seq) * dt_s
+    if abs(sample.t_s - state.t_s - expected_s) > config.timing_tolerance * expected_s:
+        return TIMING
+    return ""
+
+
+def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: float) -> str:
+    """Gate of a smoothed pair: "" where it may teach. The voltage before it counts too: lags carry it over."""
+    low, high = config.u_min_V + config.rail_margin_V, config.u_max_V - config.rail_margin_V
+    if not (low < u_V < high and low < u_before_V < high):
+        return SATURATED
+    if not config.y_min_um <= y_um <= config.y_max_um:
+        return OUT_OF_RANGE
+    return ""
+
+
+def new_counters() -> dict[str, int]:
+    """All reasons at zero, so that a reader sees every gate there is."""
+    return dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
+
+
+def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, span_V: float) -> None:
+    """Notice a commanded step: a kink of the voltage that would move the stage by more than a glitch's share.
+
+    For ``settle`` samples after it, readings that surprise the smoother are the stage's own answer, and no glitch.
+    """
+    kink = abs(u_V - 2.0 * state.u_V + state.u_before_V)
+    state.since_step = 0 if kink > 0.25 * config.glitch_share * span_V else state.since_step + 1
+    state.u_before_V, state.u_V = state.u_V, u_V
+
+
+def check_reading(config: AdmissionConfig, state: AdmissionState, innovation: float) -> str:
+    """Gate of a reading by its distance from the smoother's prediction, in ranges.
+
+    "" to go on, GLITCH to skip it, GAP to go on from there. Counts those in a row: what persists is no glitch, the
+    stage (or its sensor's zero) has really moved.
+    """
+    if abs(innovation) <= config.glitch_share or min(state.since_start, state.since_step) <= config.settle:
+        state.glitches = 0
+        return ""
+    state.glitches += 1
+    if state.glitches <= config.glitch_persistence:
+        return GLITCH
+    state.glitches = 0
+    return GAP

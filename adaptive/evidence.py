@@ -1,0 +1,168 @@
+"""Three levels of Bayesian inference for the LSSVM, (2.33)-(2.36), with gradients and without eigenvectors.
+
+Level 1 gives beta and alpha, level 2 gamma, level 3 the kernel widths. In the notation of `adaptive.lssvm`, with
+D = diag(1/(gamma w)), Pc = P - P H (H'PH)^-1 H'P, alpha = Pc y, 2 J1 = y'alpha and p unpenalised coefficients:
+
+    E_D = ½ sum w_i e_i²,  e_i = alpha_i/(gamma w_i);   E_W = J1 - gamma E_D;   N - Geff = tr(Pc D)
+    mu = (Geff - p)/(2 E_W),  zeta = (N - Geff)/(2 E_D)
+    J2 = log|R| + log|H'PH| - log|H'H| + (N - p) log J1           (minus twice the log evidence, up to a constant)
+    J3 = J2 + log(Geff - p) + log(N - Geff)
+
+For H = [1] these are the chapter's; a wider H has a flat prior on its coefficients. One evaluation with all
+gradients costs one factorisation, one inverse and, for level 3, one matrix product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive import kernels, lapack, lssvm
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """The samples that hyper-parameters are inferred from; made by `problem`."""
+
+    X: FloatArray
+    y: FloatArray
+    H: FloatArray
+    weights: FloatArray
+
+    @property
+    def size(self) -> int:
+        """N."""
+        return int(self.y.size)
+
+    @property
+    def dimension(self) -> int:
+        """d."""
+        return int(self.X.shape[1])
+
+    def subset(self, rows: NDArray[np.int64]) -> Problem:
+        """The same problem on some of its rows."""
+        return Problem(self.X[rows], self.y[rows], self.H[rows], self.weights[rows])
+
+
+def problem(X: FloatArray, y: FloatArray, weights: FloatArray | None = None, linear: tuple[int, ...] = ()) -> Problem:
+    """Check and collect normalised samples; arguments as those of `lssvm.fit`. Raises InputError."""
+    X, y = np.ascontiguousarray(X, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
+    if X.ndim != 2 or y.shape != (X.shape[0],):
+        raise InputError(f"X, y: got shapes {X.shape} and {y.shape}, expected (N, d) and (N,)")
+    linear = lssvm.check_linear(linear, X.shape[1])
+    if y.size < len(linear) + 4:
+        raise InputError(f"X: got {y.size} samples, expected at least {len(linear) + 4} to infer hyper-parameters from")
+    w = np.ones(y.size) if weights is None else np.ascontiguousarray(weights, dtype=np.float64)
+    finite = np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(w))
+    if not finite or w.shape != y.shape or not np.all(w > 0):
+        raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
+    if np.ptp(y) == 0:
+        raise InputError("y: all targets are equal, nothing can be inferred from them; excite the stage")
+    return Problem(X, y, lssvm.design(X, linear), w)
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one pair of gamma and widths is worth; names as in the module's formulas.
+
+    Attributes
+    ----------
+    gamma : regularisation.  widths : (d,).
+    E_W, E_D, effective, mu, zeta, J2, J3 : see the module; ``effective`` is Geff.
+    J2_gradient : (1 + d,) by log gamma, then by each log width.
+    J3_gradient : (d,) of J3 by each log width *along the optimum of J2 in gamma*; NaN where not asked for.
+    J2_curvature : second derivative of J2 by log gamma; NaN where not asked for.
+    """
+
+    gamma: float
+    widths: FloatArray
+    E_W: float
+    E_D: float
+    effective: float
+    mu: float
+    zeta: float
+    J2: float
+    J3: float
+    J2_gradient: FloatArray
+    J3_gradient: FloatArray
+    J2_curvature: float
+
+
+def evaluate(data: Problem, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
+    """Evidence at one pair of gamma and widths (d,), with its gradients.
+
+    Raises
+    ------
+    NumericsError : R is singular in double precision at these hyper-parameters.
+    """
+    n, p = data.size, data.H.shape[1]
+    K = kernels.gram(data.X, None, widths)
+    noise = 1.0 / (gamma * data.weights)
+    P = K.copy()
+    P[np.diag_indices(n)] += noise
+    lapack.cholesky_lower(P)
+    log_det = 2.0 * float(np.sum(np.log(np.diag(P))))
+    lapack.inverse_from_cholesky(P)
+    Pc = np.tril(P, -1)
+    Pc += Pc.T
+    Pc[np.diag_indices(n)] = np.diag(P)
+    S = Pc @ data.H
+    G = data.H.T @ S
+    Pc -= S @ np.linalg.solve(G, S.T)
+    alpha = Pc @ data.y
+    twice_J1 = float(data.y @ alpha)
+    fit = float(np.sum(noise * alpha * alpha))  # 2 gamma E_D
+    E_D = 0.5 * fit / gamma
+    E_W = 0.5 * (twice_J1 - fit)
+    left = float(np.diag(Pc) @ noise)  # N - Geff
+    effective = n - left
+    log_design = float(np.linalg.slogdet(G)[1] - np.linalg.slogdet(data.H.T @ data.H)[1])
+    J2 = log_det + log_design + (n - p) * np.log(0.5 * twice_J1)
+    J3 = J2 + np.log(max(effective - p, 1e-300)) + np.log(max(left, 1e-300))
+    share = (n - p) / twice_J1
+    by_gamma = -left + share * fit
+    widths_gradient = _by_widths(data.X, widths, K, Pc - share * np.outer(alpha, alpha))
+    third, curvature = np.full(data.dimension, np.nan), np.nan
+    if third_level:
+        half = Pc * np.sqrt(noise)
+        M = half @ half.T  # Pc D Pc
+        v = Pc @ (noise * alpha)
+        along_M = _by_widths(data.X, widths, K, M)
+        along_alpha = _by_widths(data.X, widths, K, np.outer(alpha, alpha))
+        along_v = _by_widths(data.X, widths, K, 0.5 * (np.outer(v, alpha) + np.outer(alpha, v)))
+        left_by_gamma = float(np.diag(M) @ noise) - left
+        fit_by_gamma = 2.0 * float(v @ (noise * alpha)) - fit
+        curvature = -left_by_gamma + share * (fit_by_gamma - fit * fit / twice_J1)
+        mixed = along_M + share * (-2.0 * along_v + fit * along_alpha / twice_J1)
+        by_left = 1.0 / left - 1.0 / (effective - p)
+        shift = -mixed / curvature  # d log gamma / d log width along the optimum of J2
+        third = widths_gradient - by_left * along_M + (by_gamma + by_left * left_by_gamma) * shift
+    return Evidence(
+        gamma,
+        widths.copy(),
+        E_W,
+        E_D,
+        effective,
+        (effective - p) / (2.0 * E_W),
+        left / (2.0 * E_D),
+        float(J2),
+        float(J3),
+        np.concatenate([[by_gamma], widths_gradient]),
+        third,
+        float(curvature),
+    )
+
+
+def _by_widths(X: FloatArray, widths: FloatArray, K: FloatArray, Q: FloatArray) -> FloatArray:
+    """sum(Q * dOmega/dlog sigma_j) for each feature j, (d,), with dOmega = 2 K (x_j - x_j')²/sigma_j².
+
+    With T = Q * K the sum of T_ab (x_a - x_b)² is 2 (sum_a (T1)_a x_a² - x'Tx): products with vectors only.
+    """
+    T = Q * K
+    centred = (X - X.mean(axis=0)) / widths
+    rows = T.sum(axis=1)
+    return np.asarray(4.0 * (rows @ (centred * centred) - np.sum(centred * (T @ centred), axis=0)), dtype=np.float64)

@@ -1,0 +1,296 @@
+"""From motion to the inputs of a model: normalised motion, play operators, arc and slow states.
+
+Displacement and velocity do not determine the voltage: hysteresis has memory. Three kinds of operators carry it.
+Play operators on the displacement (the inverse of a Prandtl-Ishlinskii model is a Prandtl-Ishlinskii model of the
+displacement); *arc states*, which relax towards y over the path travelled and not over time (the Duhem model's way:
+smooth loops without return points); and *slow states*, leaky integrals with log-spaced time constants, for creep.
+They form the flat ``memory`` that travels with the caller, in µm:
+``[play_1 .. play_K, arc_1 .. arc_A, slow_1 .. slow_M, last y]``, the last entry only where there are arcs.
+
+Two vectors come out of a point:
+
+- ``basis`` (p,): inputs of the model's linear part, normalised:
+  ``[1, y, v, a, y², y³, (y - play_r)/r .., y (y - play_r)/r .., (y - arc_rho)/rho .., y - slow_m ..]``,
+  where the products with y let the two branches of a loop differ in shape (asymmetry);
+- ``kernel`` (d,): inputs of its kernel part, ``[y, v, (y - play_r)/r for the chosen r]``.
+
+All operators and inputs see the displacement in the *frame* of the identified stage, (y - offset)/gain: a stage
+whose gain has dropped goes through the same states at other readings, and its memory must not take the drop for a
+motion.
+
+The chapter's two-input model is the special case without memory: basis ``[1]``, kernel ``[y, v]``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.errors import InputError
+from adaptive.types import FloatArray, StateDict
+
+#: basis columns ahead of the plays when the linear part is on: 1, y, v, a, y², y³
+MOTION_COLUMNS = 6
+VELOCITY, ACCELERATION = 2, 3
+
+
+class FeatureArrays(NamedTuple):
+    """A feature map as the compiled loops take it; not to be changed.
+
+    thresholds (K,), arc lengths (A,), both µm; retain (M,) = exp(-dt/tau) of the slow states; scale
+    [y0, 1/y, 1/v, 1/a]; kernel_plays (d - 2,) indices; flags [linear, asymmetric];
+    frame [offset, 1/gain].
+    """
+
+    thresholds: FloatArray
+    arcs: FloatArray
+    retain: FloatArray
+    scale: FloatArray
+    kernel_plays: Any
+    flags: Any
+    frame: FloatArray
+
+
+@compiled
+def advance(y_um: float, memory: FloatArray, m: FeatureArrays) -> None:  # pragma: no cover - compiled
+    """Memory after one point at ``y_um``, in place.
+
+    A play follows y at the distance of its threshold; an arc state relaxes towards y, by exp(-|dy|/rho); a slow
+    state by exp(-dt/tau).
+    """
+    y = (y_um - m.frame[0]) * m.frame[1]
+    n = m.thresholds.shape[0]
+    arcs = m.arcs.shape[0]
+    for i in range(m.retain.shape[0]):
+        memory[n + arcs + i] = y + (memory[n + arcs + i] - y) * m.retain[i]
+    for i in range(n):
+        r = m.thresholds[i]
+        memory[i] = max(y - r, min(y + r, memory[i]))
+    if arcs > 0:
+        last = memory.shape[0] - 1
+        path = abs(y - memory[last])
+        memory[last] = y
+        for i in range(arcs):
+            memory[n + i] = y + (memory[n + i] - y) * np.exp(-path / m.arcs[i])
+
+
+@compiled
+def fill(
+    y_um: float, v: float, a: float, memory: FloatArray, m: FeatureArrays, basis: FloatArray, kernel: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Basis and kernel inputs of one point, from the memory *after* it."""
+    y = (y_um - m.frame[0]) * m.frame[1]
+    yn = (y - m.scale[0]) * m.scale[1]
+    vn = v * m.frame[1] * m.scale[2]
+    kernel[0] = yn
+    kernel[1] = vn
+    for i in range(m.kernel_plays.shape[0]):
+        j = m.kernel_plays[i]
+        kernel[2 + i] = (y - memory[j]) / m.thresholds[j]
+    basis[0] = 1.0
+    if not m.flags[0]:
+        return
+    basis[1] = yn
+    basis[2] = vn
+    basis[3] = a * m.frame[1] * m.scale[3]
+    basis[4] = yn * yn
+    basis[5] = yn * yn * yn
+    at = 6
+    n = m.thresholds.shape[0]
+    for i in range(n):
+        basis[at + i] = (y - memory[i]) / m.thresholds[i]
+    at += n
+    if m.flags[1]:
+        for i in range(n):
+            basis[at + i] = basis[at - n + i] * yn
+        at += n
+    for i in range(m.arcs.shape[0]):
+        basis[at + i] = (y - memory[n + i]) / m.arcs[i]
+    at += m.arcs.shape[0]
+    n += m.arcs.shape[0]
+    for i in range(m.retain.shape[0]):
+        basis[at + i] = (y - memory[n + i]) * m.scale[1]
+
+
+@compiled
+def run_features(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    m: FeatureArrays,
+    basis: FloatArray,
+    kernel: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """``advance`` and ``fill`` over n points, into basis (n, p) and kernel (n, d)."""
+    for i in range(y.shape[0]):
+        advance(y[i], memory, m)
+        fill(y[i], v[i], a[i], memory, m, basis[i], kernel[i])
+
+
+@dataclass(frozen=True)
+class FeatureMap:
+    """Frozen map from motion to model inputs.
+
+    Parameters
+    ----------
+    dt_s : sample time, s.
+    y_min_um, y_max_um : the range that (2.42) maps to [-1, 1], µm.
+    v_scale_um_per_s, a_scale_um_per_s2 : velocity and acceleration that count as 1.
+    thresholds_um : play thresholds, µm, ascending, positive; empty for no memory.
+    arc_lengths_um : of the arc states, µm, ascending, positive; empty for none.
+    time_constants_s : of the slow states, s, ascending, positive; empty for none.
+    kernel_plays : indices into ``thresholds_um`` of the plays that the kernel sees.
+    y_rest_um : where the plays rest, in the frame.
+    gain, offset_um : the frame: a reading y stands for the displacement (y - offset_um)/gain of the identified stage.
+    linear : whether the basis holds more than the constant. asymmetric : whether it holds the plays times y.
+    """
+
+    dt_s: float
+    y_min_um: float
+    y_max_um: float
+    v_scale_um_per_s: float
+    a_scale_um_per_s2: float
+    thresholds_um: tuple[float, ...] = ()
+    arc_lengths_um: tuple[float, ...] = ()
+    time_constants_s: tuple[float, ...] = ()
+    kernel_plays: tuple[int, ...] = ()
+    linear: bool = True
+    asymmetric: bool = False
+    y_rest_um: float = 0.0
+    gain: float = 1.0
+    offset_um: float = 0.0
+
+    _arrays: FeatureArrays = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("dt_s", "v_scale_um_per_s", "a_scale_um_per_s2", "gain"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"{name}: got {value}, expected a positive finite number")
+        if not (np.isfinite(self.y_min_um) and np.isfinite(self.y_max_um) and self.y_min_um < self.y_max_um):
+            raise InputError(f"y_min_um, y_max_um: got {self.y_min_um}, {self.y_max_um}, expected a range in µm")
+        for name in ("thresholds_um", "arc_lengths_um", "time_constants_s"):
+            values = getattr(self, name)
+            if any(not (np.isfinite(x) and x > 0.0) for x in values) or list(values) != sorted(set(values)):
+                raise InputError(f"{name}: got {values}, expected positive values in ascending order")
+        if any(not 0 <= k < len(self.thresholds_um) for k in self.kernel_plays):
+            raise InputError(f"kernel_plays: got {self.kernel_plays}, expected indices below {len(self.thresholds_um)}")
+        half = 0.5 * (self.y_max_um - self.y_min_um)
+        scale = np.array(
+            [
+                self.y_min_um + half,
+                1.0 / half,
+                1.0 / self.v_scale_um_per_s,
+                1.0 / self.a_scale_um_per_s2,
+            ]
+        )
+        arrays = FeatureArrays(
+            np.array(self.thresholds_um, dtype=np.float64),
+            np.array(self.arc_lengths_um, dtype=np.float64),
+            np.exp(-self.dt_s / np.array(self.time_constants_s, dtype=np.float64)),
+            scale,
+            np.array(self.kernel_plays, dtype=np.int64),
+            np.array([self.linear, self.asymmetric], dtype=np.bool_),
+            np.array([self.offset_um, 1.0 / self.gain]),
+        )
+        for array in arrays:
+            array.flags.writeable = False
+        object.__setattr__(self, "_arrays", arrays)
+
+    @property
+    def memory_size(self) -> int:
+        arcs = len(self.arc_lengths_um)
+        return len(self.thresholds_um) + arcs + len(self.time_constants_s) + (arcs > 0)
+
+    @property
+    def basis_size(self) -> int:
+        if not self.linear:
+            return 1
+        plays = len(self.thresholds_um) * (1 + self.asymmetric)
+        return MOTION_COLUMNS + plays + len(self.arc_lengths_um) + len(self.time_constants_s)
+
+    @property
+    def kernel_size(self) -> int:
+        return 2 + len(self.kernel_plays)
+
+    @property
+    def arrays(self) -> FeatureArrays:
+        """The map as the compiled loops take it; not to be changed."""
+        return self._arrays
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """Memory of a stage that moved from its rest position to ``y_um`` in one stroke and has settled there."""
+        r, rho = self._arrays.thresholds, self._arrays.arcs
+        y = (y_um - self.offset_um) / self.gain
+        slow = np.full(len(self.time_constants_s), y)
+        plays = np.clip(np.full(r.size, self.y_rest_um), y - r, y + r)
+        arcs = y + (self.y_rest_um - y) * np.exp(-abs(y - self.y_rest_um) / rho)
+        return np.concatenate([plays, arcs, slow, np.full(1 if rho.size else 0, y)])
+
+    def advance(self, y_um: float, memory: FloatArray) -> None:
+        """Memory after one point, in place."""
+        advance(y_um, memory, self._arrays)
+
+    def fill(
+        self,
+        y_um: float,
+        v_um_per_s: float,
+        a_um_per_s2: float,
+        memory: FloatArray,
+        basis: FloatArray,
+        kernel: FloatArray,
+    ) -> None:
+        """Write basis (p,) and kernel (d,) inputs of a point whose memory has been advanced."""
+        fill(y_um, v_um_per_s, a_um_per_s2, memory, self._arrays, basis, kernel)
+
+    def run(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n,) points to basis (n, p), kernel inputs (n, d) and the memory after the last. Inputs are not changed."""
+        n = y_um.shape[0]
+        after = memory.copy()
+        basis = np.empty((n, self.basis_size))
+        kernel = np.empty((n, self.kernel_size))
+        run_features(y_um, v_um_per_s, a_um_per_s2, after, self._arrays, basis, kernel)
+        return basis, kernel, after
+
+    def state_dict(self) -> StateDict:
+        return {
+            "dt_s": self.dt_s,
+            "y_min_um": self.y_min_um,
+            "y_max_um": self.y_max_um,
+            "v_scale_um_per_s": self.v_scale_um_per_s,
+            "a_scale_um_per_s2": self.a_scale_um_per_s2,
+            "thresholds_um": np.array(self.thresholds_um, dtype=np.float64),
+            "arc_lengths_um": np.array(self.arc_lengths_um, dtype=np.float64),
+            "time_constants_s": np.array(self.time_constants_s, dtype=np.float64),
+            "kernel_plays": np.array(self.kernel_plays, dtype=np.int64),
+            "linear": self.linear,
+            "asymmetric": self.asymmetric,
+            "y_rest_um": self.y_rest_um,
+            "gain": self.gain,
+            "offset_um": self.offset_um,
+        }
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> FeatureMap:
+        return cls(
+            dt_s=float(values["dt_s"]),
+            y_min_um=float(values["y_min_um"]),
+            y_max_um=float(values["y_max_um"]),
+            v_scale_um_per_s=float(values["v_scale_um_per_s"]),
+            a_scale_um_per_s2=float(values["a_scale_um_per_s2"]),
+            thresholds_um=tuple(float(x) for x in values["thresholds_um"]),
+            arc_lengths_um=tuple(float(x) for x in values["arc_lengths_um"]),
+            time_constants_s=tuple(float(x) for x in values["time_constants_s"]),
+            kernel_plays=tuple(int(x) for x in values["kernel_plays"]),
+            linear=bool(values["linear"]),
+            asymmetric=bool(values["asymmetric"]),
+            y_rest_um=float(values["y_rest_um"]),
+            gain=float(values["gain"]),
+            offset_um=float(values["offset_um"]),
+        )

@@ -1,0 +1,116 @@
+"""How good the served model is: prediction errors at the age at which it is served, and what follows from them.
+
+A model is judged by the voltage that it would have given for the motion that was measured, before that sample
+taught it anything, and as old as an answer is when it takes effect. The frozen model that it started from is judged
+beside it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from adaptive.types import FloatArray, StateDict
+
+#: Time constants of the mean square errors, s: one to report and state uncertainty by, one to notice trouble by.
+LONG_S, SHORT_S = 2.0, 0.1
+
+#: The frozen model is served where the learner's short-term error is this many times its own, and a floor more.
+FALLBACK_RATIO = 1.3
+
+
+@dataclass(slots=True)
+class Judgement:
+    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model.
+
+    error_V : the last of the learner. judged : how many. valid : whether the learner vouches for its model.
+    inside : how many errors lay within one stated standard deviation.
+    fallback : whether the frozen model is served, because it predicts better; fallen_s : for how long, s.
+    """
+
+    long_V2: float
+    short_V2: float
+    frozen_V2: float
+    frozen_short_V2: float
+    error_V: float = 0.0
+    judged: int = 0
+    inside: int = 0
+    valid: bool = True
+    fallback: bool = False
+    fallen_s: float = 0.0
+
+    def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
+        """One error of each."""
+        squared = error_V * error_V
+        if self.judged > 0 and squared <= self.variance_V2:
+            self.inside += 1
+        self.error_V = error_V
+        self.judged += 1
+        self.long_V2 += (squared - self.long_V2) * min(1.0, step_s / LONG_S)
+        self.short_V2 += (squared - self.short_V2) * min(1.0, step_s / SHORT_S)
+        frozen = frozen_error_V * frozen_error_V
+        self.frozen_V2 += (frozen - self.frozen_V2) * min(1.0, step_s / LONG_S)
+        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * min(1.0, step_s / SHORT_S)
+
+    def decide(self, enter_V: float, leave_V: float) -> bool:
+        """Validity with hysteresis: left when the short-term rms exceeds ``leave_V``, entered below ``enter_V``."""
+        rms = float(np.sqrt(self.short_V2))
+        if self.valid and rms > leave_V:
+            self.valid = False
+        elif not self.valid and rms < enter_V:
+            self.valid = True
+        return self.valid
+
+    def choose(self, floor_V: float, step_s: float) -> bool:
+        """Whether to serve the frozen model: it must win clearly to be taken, and lose to be left."""
+        learnt, frozen = float(np.sqrt(self.short_V2)), float(np.sqrt(self.frozen_short_V2))
+        if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
+            self.fallback = True
+        elif self.fallback and learnt < frozen:
+            self.fallback = False
+        self.fallen_s = self.fallen_s + step_s if self.fallback else 0.0
+        return self.fallback
+
+    @property
+    def variance_V2(self) -> float:
+        """What an answer's uncertainty is stated from: the worse of long and short term."""
+        return max(self.long_V2, self.short_V2)
+
+    def state_dict(self) -> StateDict:
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Judgement:
+        return cls(
+            long_V2=float(values["long_V2"]),
+            short_V2=float(values["short_V2"]),
+            frozen_V2=float(values["frozen_V2"]),
+            frozen_short_V2=float(values["frozen_short_V2"]),
+            error_V=float(values["error_V"]),
+            judged=int(values["judged"]),
+            inside=int(values["inside"]),
+            valid=bool(values["valid"]),
+            fallback=bool(values["fallback"]),
+            fallen_s=float(values["fallen_s"]),
+        )
+
+
+class Delay:
+    """The last ``steps`` + 1 vectors of a model, so that errors are of the model as it was ``steps`` ago."""
+
+    def __init__(self, steps: int) -> None:
+        self._past: deque[FloatArray] = deque(maxlen=steps + 1)
+
+    def push(self, vector: FloatArray) -> FloatArray:
+        """Take the newest, return the oldest kept."""
+        self._past.append(vector)
+        return self._past[0]
+
+    def array(self) -> FloatArray:
+        """All kept, oldest first, for a state file."""
+        return np.array(self._past, dtype=np.float64)
+
+    def restore(self, vectors: FloatArray) -> None:
+        self._past.extend(np.array(v, dtype=np.float64) for v in vectors)

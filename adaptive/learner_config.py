@@ -1,0 +1,84 @@
+"""The learner's frozen configuration, to and from flat entries of a state file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+
+from adaptive.admission import AdmissionConfig
+from adaptive.drift import DriftConfig
+from adaptive.errors import InputError
+from adaptive.residual import Eviction
+from adaptive.smoothing import SmootherConfig
+from adaptive.types import StateDict
+
+
+def part_of(state: StateDict, name: str) -> StateDict:
+    """The entries under a prefix, without it."""
+    prefix = name + "."
+    return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerConfig:
+    """Frozen configuration of a learner.
+
+    window : samples that the LSSVM holds. learn_every, filter_every : samples between two steps of window and filter.
+    eviction : whose slot a new sample takes: that of its nearest neighbour, or the oldest's ("fifo").
+    cutoff_hz, lag : of the smoother; lag None for what the cut-off needs.
+    serving_age_s : age of the model when its answers take effect, s; errors are judged at that age.
+    valid_enter, valid_leave : rms prediction error, as shares of the voltage span, below which the learner vouches
+    for its model again and above which it no longer does.
+    fallback_floor : share of the voltage span by which the learner may be worse than the model it started from before
+    that one is served in its stead.
+    """
+
+    window: int = 500
+    learn_every: int = 10
+    filter_every: int = 2
+    eviction: Eviction = "nearest"
+    cutoff_hz: float = 120.0
+    lag: int | None = None
+    serving_age_s: float = 0.08
+    valid_enter: float = 0.004
+    valid_leave: float = 0.012
+    fallback_floor: float = 0.002
+    admission: AdmissionConfig = field(default_factory=AdmissionConfig)
+    drift: DriftConfig = field(default_factory=DriftConfig)
+
+    def __post_init__(self) -> None:
+        if self.window < 10:
+            raise InputError(f"window: got {self.window}, expected at least 10 samples")
+        if self.learn_every < 1 or self.filter_every < 1:
+            raise InputError(
+                f"learn_every, filter_every: got {self.learn_every}, {self.filter_every}, expected at least 1 sample"
+            )
+        if self.eviction not in ("nearest", "fifo"):
+            raise InputError(f"eviction: got {self.eviction!r}, expected 'nearest' or 'fifo'")
+        if not 0.0 <= self.serving_age_s <= 10.0:
+            raise InputError(f"serving_age_s: got {self.serving_age_s}, expected 0 to 10 s")
+        if not 0.0 < self.valid_enter <= self.valid_leave:
+            raise InputError(
+                f"valid_enter, valid_leave: got {self.valid_enter}, {self.valid_leave}, expected 0 < enter <= leave"
+            )
+
+    def state_dict(self) -> StateDict:
+        """All fields under flat names."""
+        parts = {"admission": asdict(self.admission), "drift": asdict(self.drift)}
+        flat = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
+        own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
+        return {**own, **flat}
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> LearnerConfig:
+        """Inverse of ``state_dict``."""
+        own = {name: value for name, value in values.items() if "." not in name}
+        return cls(
+            **own,
+            admission=AdmissionConfig(**part_of(values, "admission")),
+            drift=DriftConfig(**part_of(values, "drift")),
+        )
+
+    def smoother(self, dt_s: float) -> SmootherConfig:
+        """The smoother at a sample time."""
+        made = SmootherConfig.for_rate(dt_s, self.cutoff_hz)
+        return made if self.lag is None else replace(made, lag=self.lag)

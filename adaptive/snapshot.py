@@ -1,0 +1,247 @@
+"""The served inverse LSSVM: an immutable model, evaluated over a whole trajectory by one compiled loop.
+
+    u = beta' basis(x) + sum_i alpha_i K(x, x_i)
+
+with basis and kernel inputs from a ``FeatureMap``. The linear part carries the model on where the kernel has no
+samples. One standard deviation comes from the nearest sample alone: with one sample of covariance k to the point, a
+Gaussian process of unit variance has 1 - k²/(1 + 1/gamma) left, an upper bound of what all samples leave, and it
+costs nothing on top of the mean. The learner calibrates its scale on its own prediction errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.errors import InputError, ModelFileError
+from adaptive.features import FeatureArrays, FeatureMap, advance, fill
+from adaptive.kernels import rbf_column
+from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+
+#: Share of the learnt range by which a point may lie outside and still count as inside.
+DOMAIN_MARGIN = 0.05
+
+
+@compiled
+def evaluate(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    m: FeatureArrays,
+    beta: FloatArray,
+    beta_covariance: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+    noise_variance: float,
+    kernel_variance: float,
+    shrink: float,
+    domain: FloatArray,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """Voltages, deviations and domain flags of n points; ``memory`` advances in place."""
+    n = y.shape[0]
+    d, count = scaled.shape
+    p = beta.shape[0]
+    basis = np.empty(p)
+    x = np.empty(d)
+    k = np.empty(count)
+    bits = np.empty(count)
+    for i in range(n):
+        advance(y[i], memory, m)
+        fill(y[i], v[i], a[i], memory, m, basis, x)
+        mean = 0.0
+        variance = noise_variance
+        for j in range(p):
+            mean += beta[j] * basis[j]
+        for j in range(beta_covariance.shape[0]):
+            s = 0.0
+            for i2 in range(beta_covariance.shape[0]):
+                s += beta_covariance[j, i2] * basis[i2]
+            variance += s * basis[j]
+        nearest = 0.0
+        if count > 0:
+            for j in range(d):
+                x[j] *= inverse_widths[j]
+            rbf_column(scaled, count, x, k, bits)
+            for j in range(count):
+                mean += alpha[j] * k[j]
+                nearest = max(nearest, k[j])
+        u[i] = mean
+        std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
+        inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def mean_of(
+    basis: FloatArray,
+    kernel: FloatArray,
+    beta: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Mean at one point whose inputs are known."""
+    count = alpha.shape[0]
+    mean = 0.0
+    for j in range(beta.shape[0]):
+        mean += beta[j] * basis[j]
+    if count > 0:
+        k = np.empty(count)
+        rbf_column(scaled, count, kernel * inverse_widths, k, np.empty(count))
+        for j in range(count):
+            mean += alpha[j] * k[j]
+    return mean
+
+
+@dataclass(frozen=True)
+class LssvmInverse:
+    """Immutable inverse LSSVM; implements ``adaptive.types.InverseModel``.
+
+    Parameters
+    ----------
+    name : by which it is served.
+    features : the map from motion to inputs; its ``dt_s`` is the model's.
+    beta : (p,) linear part, V per normalised input.
+    support : (N, d) kernel inputs of the samples, dimensionless. alpha : (N,) their weights, V.
+    widths : (d,) kernel widths, dimensionless. gamma : regularisation.
+    domain : (6,) learnt range of y (µm), v (µm/s), a (µm/s²), as [y0, y1, v0, v1, a0, a1].
+    noise_variance : of one prediction at a sample, V². kernel_variance : of the kernel part away from samples, V².
+    beta_covariance : (p, p) of the linear part, V², or (0, 0) where unknown.
+    span_V : voltage range of the recording it was identified from, V.
+    seq : sequence number of the last sample that it has seen, -1 for none.
+    valid : whether the learner vouches for it.
+    """
+
+    name: str
+    features: FeatureMap
+    beta: FloatArray
+    support: FloatArray
+    alpha: FloatArray
+    widths: FloatArray
+    gamma: float
+    domain: FloatArray
+    noise_variance: float = 0.0
+    kernel_variance: float = 0.0
+    beta_covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    span_V: float = 1.0
+    seq: int = -1
+    valid: bool = True
+    _scaled: FloatArray = field(init=False, repr=False, compare=False)
+    _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
+    _margins: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        p, d, n = self.features.basis_size, self.features.kernel_size, self.support.shape[0]
+        shapes = {"beta": (p,), "support": (n, d), "alpha": (n,), "widths": (d,), "domain": (6,)}
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.all(np.isfinite(value)):
+                raise InputError(f"{name}: got shape {value.shape}, expected {shape} finite numbers")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        covariance = np.array(self.beta_covariance, dtype=np.float64)
+        if covariance.shape not in ((0, 0), (p, p)):
+            raise InputError(f"beta_covariance: got shape {covariance.shape}, expected ({p}, {p}) or (0, 0)")
+        covariance.flags.writeable = False
+        object.__setattr__(self, "beta_covariance", covariance)
+        scaled = np.ascontiguousarray((self.support / self.widths).T)
+        scaled.flags.writeable = False
+        object.__setattr__(self, "_scaled", scaled)
+        object.__setattr__(self, "_inverse_widths", 1.0 / self.widths)
+        spans = np.repeat(self.domain[1::2] - self.domain[::2], 2) * DOMAIN_MARGIN
+        object.__setattr__(self, "_margins", self.domain + spans * np.array([-1.0, 1.0] * 3))
+
+    @property
+    def dt_s(self) -> float:
+        return self.features.dt_s
+
+    @property
+    def memory_size(self) -> int:
+        return self.features.memory_size
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """(m,) memory, µm, of a stage that has come to rest at ``y_um`` from its rest position."""
+        return self.features.rest_memory(y_um)
+
+    def feedforward(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """Voltages for (n,) desired points; pure. Raises InputError on shapes that do not fit together."""
+        y, v, a = self._points(y_um, v_um_per_s, a_um_per_s2)
+        after = self._memory(memory)
+        n = y.shape[0]
+        u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+        evaluate(
+            y, v, a, after, self.features.arrays, self.beta, self.beta_covariance, self._scaled,
+            self.alpha, self._inverse_widths, self.noise_variance, self.kernel_variance,
+            1.0 / (1.0 + 1.0 / self.gamma), self._margins, u, std, inside,
+        )  # fmt: skip
+        return Feedforward(u, std, inside, after)
+
+    def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
+        """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
+        return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
+
+    def track(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
+    ) -> FloatArray:
+        """(m,) memory after (n,) measured points. This model's memory is of displacement: the voltage is not used."""
+        y, _, _ = self._points(y_um, v_um_per_s, a_um_per_s2)
+        after = self._memory(memory)
+        for value in y:
+            self.features.advance(float(value), after)
+        return after
+
+    def _points(self, *arrays: FloatArray) -> list[FloatArray]:
+        points = [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
+        if any(x.ndim != 1 or x.shape != points[0].shape for x in points):
+            raise InputError(
+                f"y_um, v_um_per_s, a_um_per_s2: got shapes {[x.shape for x in points]}, expected three of equal (n,)"
+            )
+        return points
+
+    def _memory(self, memory: FloatArray) -> FloatArray:
+        after = np.array(memory, dtype=np.float64)
+        if after.shape != (self.memory_size,):
+            raise InputError(
+                f"memory: got shape {after.shape}, expected ({self.memory_size},);"
+                " start from rest_memory() or bring back the memory of the last reply"
+            )
+        return after
+
+    def state_dict(self) -> StateDict:
+        """Flat names to arrays and JSON scalars; ``from_state`` builds an equal model."""
+        state: StateDict = {"kind": "lssvm", "name": self.name, "gamma": self.gamma}
+        state |= {f"features.{key}": value for key, value in self.features.state_dict().items()}
+        for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance"):
+            state[name] = getattr(self, name).copy()
+        for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid"):
+            state[name] = getattr(self, name)
+        return state
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> LssvmInverse:
+        """Inverse of ``state_dict``. Raises ModelFileError on missing or misshapen entries."""
+        try:
+            prefix = "features."
+            features = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+            return cls(
+                name=str(state["name"]),
+                features=FeatureMap.from_state(features),
+                gamma=float(state["gamma"]),
+                noise_variance=float(state["noise_variance"]),
+                kernel_variance=float(state["kernel_variance"]),
+                span_V=float(state["span_V"]),
+                seq=int(state["seq"]),
+                valid=bool(state["valid"]),
+                **{name: np.asarray(state[name], dtype=np.float64) for name in
+                   ("beta", "support", "alpha", "widths", "domain", "beta_covariance")},
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(f"lssvm model: entry missing or damaged: {error}; identify the stage again") from error

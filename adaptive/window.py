@@ -1,0 +1,338 @@
+"""The sliding window: an LSSVM over at most N samples, exact after every sample that comes, goes or changes.
+
+`WindowConfig` says what it is, `WindowArrays` is its state, `Window` joins the two behind one interface with
+two forms (the inverse, the Cholesky factor) and two backends (compiled, numpy). A step costs O(N²): one
+kernel column, one pass over one triangle. Compiled code of other modules steps the arrays directly through
+`adaptive.window_core`. The direct solver `adaptive.lssvm.fit` is the oracle of all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+
+from adaptive import condition, kernels, lapack, lssvm, window_core, window_plain
+from adaptive import window_state as ws
+from adaptive.errors import InputError, NumericsError
+from adaptive.types import FloatArray, StateDict
+from adaptive.window_state import Status, WindowArrays
+
+Form = Literal["inverse", "cholesky", "auto"]
+Backend = Literal["compiled", "plain"]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """What a window is. Features and targets are normalised (dimensionless, of order 1).
+
+    Attributes
+    ----------
+    capacity : N, the number of slots.
+    widths : kernel width of each of the d features, (2.31).
+    gamma : regularisation, > 0; the noise variance of sample i is 1/(gamma w_i) of the kernel's.
+    linear : features that enter an unpenalised linear part beside the bias.
+    form : ``inverse`` is the fastest, its error grows with cond(R)²; ``cholesky`` takes about twice the time, its
+        error grows with cond(R); ``auto`` takes the one that ``accuracy`` and the condition of the samples call
+        for, each time the window is made from samples (an empty one starts as ``inverse``).
+    backend : ``compiled``, or ``plain`` numpy and scipy (inverse form only).
+    accuracy : relative error of alpha to be kept. A step whose checked row shows more than a quarter of it (other
+        rows may be worse) is followed by a step of refinement, some six products long. Infinite: never.
+    """
+
+    capacity: int
+    widths: tuple[float, ...]
+    gamma: float
+    linear: tuple[int, ...] = ()
+    form: Form = "auto"
+    backend: Backend = "compiled"
+    accuracy: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if self.capacity < 1:
+            raise InputError(f"capacity: got {self.capacity}, expected the number of samples to keep, at least 1")
+        if len(self.widths) < 1:
+            raise InputError("widths: got none, expected one kernel width a feature")
+        object.__setattr__(self, "widths", tuple(map(float, kernels.as_widths(self.widths, len(self.widths)))))
+        object.__setattr__(self, "gamma", lssvm.check_gamma(self.gamma))
+        object.__setattr__(self, "linear", lssvm.check_linear(self.linear, len(self.widths)))
+        if self.form not in ("inverse", "cholesky", "auto"):
+            raise InputError(f"form: got {self.form!r}, expected 'inverse', 'cholesky' or 'auto'")
+        if self.backend not in ("compiled", "plain"):
+            raise InputError(f"backend: got {self.backend!r}, expected 'compiled' or 'plain'")
+        if self.backend == "plain" and self.form == "cholesky":
+            raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
+        if not self.accuracy > 0:
+            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-6 say")
+
+    @property
+    def dimension(self) -> int:
+        """Number of features d."""
+        return len(self.widths)
+
+
+class Window:
+    """A window with its state; see the module. Not for two threads at a time.
+
+    Steps return a `Status` and never raise on data; a step that is not ``ACCEPTED`` leaves the window as it was.
+    """
+
+    def __init__(self, config: WindowConfig, arrays: WindowArrays | None = None) -> None:
+        self.config = config
+        form = ws.CHOLESKY_FORM if config.form == "cholesky" else ws.INVERSE_FORM
+        self.arrays = arrays or ws.allocate(
+            config.capacity, np.array(config.widths), config.gamma, config.linear, 0.25 * config.accuracy, form
+        )
+
+    @classmethod
+    def from_samples(
+        cls, config: WindowConfig, X: FloatArray, y: FloatArray, weights: FloatArray | None = None
+    ) -> Window:
+        """A window that holds the samples ``X`` (n, d), ``y`` (n,), n <= N, solved by one factorisation.
+
+        Raises
+        ------
+        InputError : shapes, too many samples, values that are not finite.
+        NumericsError : their kernel matrix is singular in double precision.
+        """
+        X, y = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        w = np.ones(y.shape) if weights is None else np.asarray(weights, dtype=np.float64)
+        n = y.size
+        if X.shape != (n, config.dimension) or y.shape != (n,) or w.shape != (n,) or not 0 < n <= config.capacity:
+            raise InputError(
+                f"X, y, weights: got shapes {X.shape}, {y.shape}, {w.shape}, expected (n, {config.dimension}), (n,), "
+                f"(n,) with 1 <= n <= {config.capacity}, the capacity"
+            )
+        if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(w)) and np.all(w > 0)):
+            raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
+        window = cls(config)
+        A = window.arrays
+        A.C[ws.COUNT] = n
+        A.X[:, :n] = X.T
+        A.scaled[:, :n] = X.T * A.inverse_widths[:, None]
+        A.H[:, :n] = lssvm.design(X, config.linear).T
+        A.V[ws.Y, :n], A.V[ws.W, :n] = y, w
+        A.R[:n, :n] = kernels.gram(A.scaled[:, :n].T, None, np.ones(config.dimension))
+        A.R[np.arange(n), np.arange(n)] = 1.0 + 1.0 / (config.gamma * w)
+        if config.form == "auto" and config.backend == "compiled":
+            serves = condition.inverse_form_serves(window.condition(), config.accuracy)
+            A.C[ws.FORM] = ws.INVERSE_FORM if serves else ws.CHOLESKY_FORM
+        window.rebuild()
+        return window
+
+    # --- what it holds -------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return int(self.arrays.C[ws.COUNT])
+
+    @property
+    def full(self) -> bool:
+        """True where every slot is taken."""
+        return len(self) == self.config.capacity
+
+    @property
+    def form(self) -> str:
+        """``inverse`` or ``cholesky``, whichever is at work."""
+        return "cholesky" if self.arrays.C[ws.FORM] == ws.CHOLESKY_FORM else "inverse"
+
+    @property
+    def X(self) -> FloatArray:
+        """Features by slot, (n, d), a copy."""
+        return np.ascontiguousarray(self.arrays.X[:, : len(self)].T)
+
+    @property
+    def y(self) -> FloatArray:
+        """Targets by slot, (n,), a copy."""
+        return self.arrays.V[ws.Y, : len(self)].copy()
+
+    @property
+    def weights(self) -> FloatArray:
+        """Noise weights by slot, (n,), a copy."""
+        return self.arrays.V[ws.W, : len(self)].copy()
+
+    @property
+    def alpha(self) -> FloatArray:
+        """Dual weights by slot, (n,), a copy."""
+        return self.arrays.V[ws.ALPHA, : len(self)].copy()
+
+    @property
+    def beta(self) -> FloatArray:
+        """Bias, then the slopes of the linear part, (p,), a copy."""
+        return self.arrays.beta.copy()
+
+    # --- steps ---------------------------------------------------------------------------------------------
+
+    def append(self, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+        """Take one more sample; ``x`` is (d,). NO_SLOT where the window is full."""
+        return Status(self._core.append(self.arrays, self._point(x), float(y), float(weight)))
+
+    def replace(self, slot: int, x: FloatArray, y: float, weight: float = 1.0) -> Status:
+        """The sample in ``slot`` makes way for a new one. The heart of it all, O(N²)."""
+        return Status(self._core.replace(self.arrays, int(slot), self._point(x), float(y), float(weight)))
+
+    def undo(self) -> Status:
+        """Take back the last `append` or `replace` if no other change came since; NOTHING_TO_UNDO otherwise."""
+        return Status(self._core.undo(self.arrays))
+
+    def remove(self, slot: int) -> Status:
+        """Drop the sample in ``slot``; the sample of the last slot moves there."""
+        return Status(self._core.remove(self.arrays, int(slot)))
+
+    def reweight(self, slot: int, weight: float) -> Status:
+        """Change the noise weight of the sample in ``slot``: less than 1 for one that is old or doubtful."""
+        return Status(self._core.reweight(self.arrays, int(slot), float(weight)))
+
+    def rescale_targets(self, gain: float, offset: float) -> Status:
+        """All targets y <- (1 + gain) y + offset, O(N): what a filter on gain and offset has found, absorbed."""
+        return Status(self._core.rescale_targets(self.arrays, float(gain), float(offset)))
+
+    def shift_targets(self, delta: FloatArray) -> Status:
+        """All targets y <- y + delta, (n,) by slot; O(N²)."""
+        padded = np.zeros(self.config.capacity)
+        padded[: len(self)] = delta
+        return Status(self._core.shift_targets(self.arrays, padded))
+
+    # --- answers -------------------------------------------------------------------------------------------
+
+    def predict(self, x: FloatArray) -> float:
+        """Mean at one point ``x`` (d,); 0 while the window is empty."""
+        return float(self._core.predict(self.arrays, self._point(x)))
+
+    def predict_with_variance(self, x: FloatArray, include_noise: bool = False) -> tuple[float, float]:
+        """Mean and variance at one point, of the function or of a sample of weight 1, in squared target units."""
+        mean, latent = self._core.predict_with_variance(self.arrays, self._point(x))
+        noise = 1.0 / self.config.gamma if include_noise else 0.0
+        return float(mean), float((latent + noise) * self.scale)
+
+    @property
+    def scale(self) -> float:
+        """Variance of the kernel process, y'alpha/(n - p); the noise variance is scale/gamma."""
+        return float(self._core.scale(self.arrays))
+
+    def leave_one_out(self) -> FloatArray:
+        """y_i minus what the others predict for it, exact, by slot, (n,)."""
+        out = np.zeros(self.config.capacity)
+        self._core.leave_one_out(self.arrays, out)
+        return out[: len(self)]
+
+    def model(self) -> lssvm.LssvmModel:
+        """The solution as an immutable model; copies O(N d) numbers."""
+        sigma = np.array(self.config.widths)
+        return lssvm.LssvmModel(
+            self.X, self.alpha, self.beta, sigma, self.config.gamma, self.weights, self.config.linear, self.scale
+        )
+
+    # --- numerics ------------------------------------------------------------------------------------------
+
+    def worst_residual(self) -> float:
+        """Largest residual of all rows, in target units. O(N²)."""
+        return float(self._core.worst_residual(self.arrays))
+
+    def refine(self) -> None:
+        """One step of iterative refinement of beta and alpha; O(N² p)."""
+        self._core.refine(self.arrays)
+
+    def resum(self) -> bool:
+        """Beta and alpha anew from the factorisation as it stands; O(N² p). False where they are not finite."""
+        return bool(self._core.resum(self.arrays))
+
+    def condition(self) -> float:
+        """Upper bound of cond(R), close for wide kernels; O(N²)."""
+        n = len(self)
+        return condition.condition_bound(self.arrays.R[:n, :n], self.config.gamma, self.arrays.V[ws.W, :n])
+
+    def rebuild(self) -> None:
+        """Factor R anew in place, by Cholesky; O(N³), without the interpreter's lock.
+
+        `adaptive.window_refresh` does the same beside a window that keeps learning. Raises NumericsError where R
+        is not positive definite in double precision; the window is then as it was.
+        """
+        A, n = self.arrays, len(self)
+        P = A.R.copy()
+        if A.C[ws.FORM] == ws.CHOLESKY_FORM:
+            lapack.cholesky_upper(P, n)
+            A.order[:n] = np.arange(n)
+        else:
+            lapack.cholesky_lower(P, n)
+            lapack.inverse_from_cholesky(P, n)
+        A.P[:] = P
+        A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
+        A.C[ws.PENDING], A.C[ws.UNDO] = 0, ws.UNDO_NOTHING
+        A.C[ws.REFRESHES] += 1
+        if not self._core.resum(A):
+            raise NumericsError("window: its solution is not finite after a new factorisation; lower gamma")
+
+    def switch_form(self, form: Literal["inverse", "cholesky"]) -> None:
+        """Go on in the other form; one factorisation."""
+        if form == "cholesky" and self.config.backend == "plain":
+            raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
+        wanted = ws.CHOLESKY_FORM if form == "cholesky" else ws.INVERSE_FORM
+        if self.arrays.C[ws.FORM] != wanted:
+            self.arrays.C[ws.FORM] = wanted
+            self.rebuild()
+
+    def with_hyperparameters(self, widths: tuple[float, ...], gamma: float) -> Window:
+        """A new window over the same samples with other hyper-parameters; counters start anew."""
+        return Window.from_samples(self._config_with(widths, gamma), self.X, self.y, self.weights)
+
+    def counters(self) -> dict[str, int]:
+        """What happened since the window was made."""
+        C = self.arrays.C
+        names = {
+            "steps": ws.STEPS,
+            "bad_inputs": ws.BAD_INPUTS,
+            "ill_conditioned": ws.ILL_STEPS,
+            "undone": ws.UNDONE,
+            "residuals_exceeded": ws.RESIDUALS_EXCEEDED,
+            "residual_rounds": ws.ROUNDS,
+            "refinements": ws.REFINEMENTS,
+            "refreshes": ws.REFRESHES,
+        }
+        return {name: int(C[index]) for name, index in names.items()}
+
+    @property
+    def last_residual(self) -> float:
+        """Residual of the row checked last, in target units."""
+        return float(self.arrays.F[ws.RESIDUAL])
+
+    @property
+    def round_residual(self) -> float:
+        """Largest residual over the last whole round of rows, in target units."""
+        return float(self.arrays.F[ws.LAST_WORST])
+
+    # --- keeping -------------------------------------------------------------------------------------------
+
+    def copy(self) -> Window:
+        """An independent window in the same state, to the last bit."""
+        return Window(self.config, ws.duplicate(self.arrays))
+
+    def state_dict(self) -> StateDict:
+        """All arrays under flat names; `from_state` goes on from them with the same result to the last bit."""
+        return {name: field.copy() for name, field in self.arrays._asdict().items()}
+
+    @classmethod
+    def from_state(cls, config: WindowConfig, state: StateDict) -> Window:
+        """Raises InputError where a field is missing or its shape is not that of ``config``."""
+        window = cls(config)
+        for name, field in window.arrays._asdict().items():
+            if name not in state or np.shape(state[name]) != field.shape:
+                got = np.shape(state[name]) if name in state else "nothing"
+                raise InputError(f"{name}: got {got}, expected an array {field.shape}; the state is of another window")
+            field[...] = state[name]
+        return window
+
+    def _config_with(self, widths: tuple[float, ...], gamma: float) -> WindowConfig:
+        c = self.config
+        return WindowConfig(c.capacity, widths, gamma, c.linear, c.form, c.backend, c.accuracy)
+
+    def _point(self, x: Any) -> FloatArray:
+        point = np.ascontiguousarray(x, dtype=np.float64)
+        if point.shape != (self.config.dimension,):
+            raise InputError(f"x: got shape {point.shape}, expected ({self.config.dimension},), one value a feature")
+        return point
+
+    @property
+    def _core(self) -> ModuleType:
+        return window_core if self.config.backend == "compiled" else window_plain

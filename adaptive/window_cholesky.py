@@ -1,0 +1,346 @@
+"""The sliding window by the Cholesky factor R = L L': for kernels too ill-conditioned for the inverse.
+
+The sample that leaves is a rank-1 *update* of the factor behind it, a chain of rotations and hence stable;
+the sample that comes goes to the end: one forward solve. T = L^-1 [H y] goes through the same rotations, so
+that beta follows in O(N p) and alpha by one back solve. The error of alpha grows with cond(R), not with its
+square as that of the inverse does, for about twice the time.
+
+Column j of L is row j of ``P`` (contiguous). Positions are the order of the factor, ``order`` names their
+slots: the slot a sample lies in never matters to the numerics.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adaptive.compiled import compiled_reassociating
+from adaptive.types import FloatArray
+from adaptive.window_common import (
+    add_scaled,
+    dot,
+    factor_small,
+    finite,
+    half_norm_small,
+    keep_for_undo,
+    move_sample,
+    restore_sample,
+    row_residual,
+    solve_small,
+    write_sample,
+)
+from adaptive.window_pass import backward_columns, forward_columns, rotate_column, shift_columns
+from adaptive.window_state import (
+    ACCEPTED,
+    ALPHA,
+    COLUMN,
+    COUNT,
+    GAMMA,
+    ILL_CONDITIONED,
+    MINUS,
+    PLUS,
+    SY,
+    TRIAL,
+    UNDO,
+    UNDO_APPEND,
+    UNDO_NOTHING,
+    UNDO_REPLACE,
+    UNDO_SLOT,
+    W,
+    WindowArrays,
+    Y,
+    Z,
+)
+
+_SCHUR_SHARE = 0.5
+
+
+@compiled_reassociating
+def position_of(A: WindowArrays, slot: int) -> int:
+    """Where in the factor a slot stands."""
+    for i in range(A.C[COUNT]):
+        if A.order[i] == slot:
+            return i
+    return -1
+
+
+@compiled_reassociating
+def gather(A: WindowArrays, by_slot: FloatArray, by_position: FloatArray) -> None:
+    """Reorder a vector from slots to positions."""
+    for i in range(A.C[COUNT]):
+        by_position[i] = by_slot[A.order[i]]
+
+
+@compiled_reassociating
+def forward(A: WindowArrays, b: FloatArray) -> None:
+    """b <- L^-1 b in place, by position."""
+    forward_columns(A.P, A.C[COUNT], b)
+
+
+@compiled_reassociating
+def backward(A: WindowArrays, b: FloatArray) -> None:
+    """b <- L'^-1 b in place, by position."""
+    backward_columns(A.P, A.C[COUNT], b)
+
+
+@compiled_reassociating
+def _delete(A: WindowArrays, position: int, b: FloatArray) -> None:
+    """Take the sample at ``position`` out of the factor, and b <- L^-1 b with the new factor in the same pass.
+
+    ``b`` is by position without the one that leaves. COUNT is one less afterwards.
+    """
+    n, p = A.C[COUNT], A.H.shape[0]
+    x, tau = A.V[PLUS], A.small[2]
+    row = A.P[position]
+    for i in range(position + 1, n):
+        x[i] = row[i]
+    shift_columns(A.P, n, position, b)
+    for c in range(p):
+        tau[c] = A.S[c, position]
+    tau_y = A.V[SY, position]
+    for k in range(position + 1, n):
+        old, new = A.P[k], A.P[k - 1]
+        r = np.sqrt(old[k] * old[k] + x[k] * x[k])
+        cosine, sine = old[k] / r, x[k] / r
+        new[k - 1] = r
+        t = b[k - 1] / r
+        b[k - 1] = t
+        rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
+        for c in range(p):
+            value = A.S[c, k]
+            A.S[c, k - 1] = cosine * value + sine * tau[c]
+            tau[c] = cosine * tau[c] - sine * value
+        value = A.V[SY, k]
+        A.V[SY, k - 1] = cosine * value + sine * tau_y
+        tau_y = cosine * tau_y - sine * value
+        A.order[k - 1] = A.order[k]
+    A.C[COUNT] = n - 1
+
+
+@compiled_reassociating
+def _add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
+    """Put the sample of ``slot``, already written, at the end; ``half`` is L^-1 of its column. COUNT is one more."""
+    n = A.C[COUNT]
+    for k in range(n):
+        A.P[k, n] = half[k]
+    A.P[n, n] = diagonal
+    for c in range(A.H.shape[0]):
+        A.S[c, n] = (A.H[c, slot] - dot(half, A.S[c], n)) / diagonal
+    A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
+    A.order[n] = slot
+    A.C[COUNT] = n + 1
+
+
+@compiled_reassociating
+def finish(A: WindowArrays) -> bool:
+    """beta and alpha from T = L^-1 [H y]. False, with both spoilt, where they are not finite."""
+    p, n = A.H.shape[0], A.C[COUNT]
+    sy, t = A.V[SY], A.V[Z]
+    good = True
+    for c in range(p):
+        for r in range(c, p):
+            A.G[r, c] = dot(A.S[r], A.S[c], n)
+            good = good and np.isfinite(A.G[r, c])
+        A.beta[c] = dot(A.S[c], sy, n)
+    factor_small(A.G)
+    solve_small(A.G, A.beta)
+    for j in range(n):
+        t[j] = sy[j]
+    for c in range(p):
+        add_scaled(t, -A.beta[c], A.S[c], n)
+    backward(A, t)
+    for i in range(n):
+        A.V[ALPHA, A.order[i]] = t[i]
+    return good and finite(A.beta, p) and finite(t, n)
+
+
+@compiled_reassociating
+def _put_back(A: WindowArrays, slot: int) -> None:
+    """Bring the sample kept in U back to ``slot``, which the factor does not hold at the moment."""
+    n, p, half = A.C[COUNT], A.H.shape[0], A.V[TRIAL]
+    A.C[COUNT] = n + 1
+    restore_sample(A)
+    A.C[COUNT] = n
+    for i in range(n):
+        half[i] = A.U[p + 2, A.order[i]]
+    forward(A, half)
+    noise = 1.0 / (A.F[GAMMA] * A.V[W, slot])
+    _add(A, slot, half, np.sqrt(max(1.0 + noise - dot(half, half, n), noise)))
+
+
+@compiled_reassociating
+def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+    """The sample of ``slot`` makes way for a new one whose kernel column is in COLUMN. Returns a status."""
+    n = A.C[COUNT]
+    column, half = A.V[COLUMN], A.V[TRIAL]
+    position = position_of(A, slot)
+    keep_for_undo(A, slot, UNDO_REPLACE)
+    for i in range(position):
+        half[i] = column[A.order[i]]
+    for i in range(position + 1, n):
+        half[i - 1] = column[A.order[i]]
+    _delete(A, position, half)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(half, half, n - 1)
+    good = s > _SCHUR_SHARE * noise
+    if good:
+        A.C[COUNT] = n
+        write_sample(A, slot, x, y, w)
+        A.C[COUNT] = n - 1
+        _add(A, slot, half, np.sqrt(s))
+        good = finish(A)
+        if not good:
+            A.C[COUNT] = n - 1
+    if not good:
+        # T of the other samples may be spoilt by nothing: only the last position held the bad one.
+        _put_back(A, slot)
+        finish(A)
+        A.C[UNDO] = UNDO_NOTHING
+        return ILL_CONDITIONED
+    return ACCEPTED
+
+
+@compiled_reassociating
+def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+    """A new slot takes a sample whose kernel column is in COLUMN. Returns a status."""
+    n = A.C[COUNT]
+    half = A.V[TRIAL]
+    gather(A, A.V[COLUMN], half)
+    forward(A, half)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(half, half, n)
+    keep_for_undo(A, n, UNDO_APPEND)
+    if not s > _SCHUR_SHARE * noise:
+        A.C[UNDO] = UNDO_NOTHING
+        return ILL_CONDITIONED
+    write_sample(A, n, x, y, w)
+    _add(A, n, half, np.sqrt(s))
+    if not finish(A):
+        A.C[COUNT] = n
+        finish(A)
+        A.C[UNDO] = UNDO_NOTHING
+        return ILL_CONDITIONED
+    return ACCEPTED
+
+
+@compiled_reassociating
+def undo(A: WindowArrays) -> None:
+    """Take back the last replace or append, to round-off; the caller has seen that there is one."""
+    A.C[COUNT] -= 1
+    if A.C[UNDO] == UNDO_REPLACE:
+        _put_back(A, A.C[UNDO_SLOT])
+    finish(A)
+    A.C[UNDO] = UNDO_NOTHING
+
+
+@compiled_reassociating
+def remove(A: WindowArrays, slot: int) -> None:
+    """Empty a slot; the last slot's sample moves into it."""
+    last = A.C[COUNT] - 1
+    scratch = A.V[TRIAL]
+    for i in range(last + 1):
+        scratch[i] = 0.0
+    _delete(A, position_of(A, slot), scratch)
+    if slot != last:
+        A.C[COUNT] = last + 1
+        move_sample(A, last, slot)
+        A.C[COUNT] = last
+        A.order[position_of(A, last)] = slot
+    finish(A)
+    A.C[UNDO] = UNDO_NOTHING
+
+
+@compiled_reassociating
+def reweight(A: WindowArrays, slot: int, w: float) -> int:
+    """Change the noise weight of one sample: out and in again. Returns a status."""
+    n, half = A.C[COUNT], A.V[TRIAL]
+    position = position_of(A, slot)
+    for i in range(position):
+        half[i] = A.R[slot, A.order[i]]
+    for i in range(position + 1, n):
+        half[i - 1] = A.R[slot, A.order[i]]
+    _delete(A, position, half)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = max(1.0 + noise - dot(half, half, n - 1), noise)
+    A.V[W, slot] = w
+    A.R[slot, slot] = 1.0 + noise
+    _add(A, slot, half, np.sqrt(s))
+    finish(A)
+    A.C[UNDO] = UNDO_NOTHING
+    return ACCEPTED
+
+
+@compiled_reassociating
+def resum(A: WindowArrays) -> bool:
+    """T = L^-1 [H y] anew, and all that follows from it. O(N² p)."""
+    for c in range(A.H.shape[0]):
+        gather(A, A.H[c], A.S[c])
+        forward(A, A.S[c])
+    gather(A, A.V[Y], A.V[SY])
+    forward(A, A.V[SY])
+    return finish(A)
+
+
+@compiled_reassociating
+def refine(A: WindowArrays) -> bool:
+    """T anew, and one step of iterative refinement on beta and alpha, by R as it is kept. O(N² p)."""
+    n, p = A.C[COUNT], A.H.shape[0]
+    good = resum(A)
+    t, correction = A.V[MINUS], A.small[2, :p]
+    for i in range(n):
+        t[i] = row_residual(A, A.order[i])
+    forward(A, t)
+    for c in range(p):
+        correction[c] = dot(A.S[c], t, n)
+    solve_small(A.G, correction)
+    for c in range(p):
+        add_scaled(t, -correction[c], A.S[c], n)
+        A.beta[c] += correction[c]
+    backward(A, t)
+    for i in range(n):
+        A.V[ALPHA, A.order[i]] += t[i]
+    return good and finite(t, n)
+
+
+@compiled_reassociating
+def shift_targets(A: WindowArrays, delta: FloatArray) -> None:
+    """T_y gains L^-1 delta; ``delta`` is by slot."""
+    t = A.V[TRIAL]
+    gather(A, delta, t)
+    forward(A, t)
+    add_scaled(A.V[SY], 1.0, t, A.C[COUNT])
+
+
+@compiled_reassociating
+def variance(A: WindowArrays, k: FloatArray, u: FloatArray) -> float:
+    """1 - k'Pk + u'G^-1 u with the design row h of the point in ``u``, which is overwritten. In units of scale."""
+    n, half = A.C[COUNT], A.V[MINUS]
+    gather(A, k, half)
+    forward(A, half)
+    latent = 1.0 - dot(half, half, n)
+    for c in range(u.shape[0]):
+        u[c] -= dot(A.S[c], half, n)
+    return max(latent + half_norm_small(A.G, u), 0.0)
+
+
+@compiled_reassociating
+def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
+    """alpha_i / (P_ii - S_i G^-1 S_i') into ``out``. O(N³): the factor does not know the diagonal of its inverse."""
+    n, p, half, u = A.C[COUNT], A.H.shape[0], A.V[MINUS], A.small[1, : A.H.shape[0]]
+    for r in range(n):
+        # Column r of L^-1 is zero above r: forward substitution from there on.
+        for i in range(n):
+            half[i] = 0.0
+        half[r] = 1.0
+        for k in range(r, n):
+            t = half[k] / A.P[k, k]
+            half[k] = t
+            row = A.P[k]
+            for i in range(k + 1, n):
+                half[i] -= row[i] * t
+        diagonal = 0.0
+        for k in range(r, n):
+            diagonal += half[k] * half[k]
+        for c in range(p):
+            u[c] = dot(A.S[c], half, n)
+        slot = A.order[r]
+        out[slot] = A.V[ALPHA, slot] / (diagonal - half_norm_small(A.G, u))

@@ -1,0 +1,261 @@
+"""What both forms of the window share: small solves, taking a sample in, keeping and restoring, residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adaptive.compiled import compiled_reassociating
+from adaptive.kernels import rbf_column
+from adaptive.types import FloatArray
+from adaptive.window_state import (
+    ALPHA,
+    BITS,
+    COLUMN,
+    COUNT,
+    CURSOR,
+    GAMMA,
+    LAST_WORST,
+    RESIDUAL,
+    RESIDUALS_EXCEEDED,
+    ROUND_WORST,
+    ROUNDS,
+    SY,
+    TOLERANCE,
+    UNDO,
+    UNDO_SLOT,
+    UNDO_W,
+    UNDO_Y,
+    W,
+    WindowArrays,
+    Y,
+)
+
+#: An unpenalised column whose pivot falls below this share is not told apart by the samples: its coefficient is 0.
+_PIVOT_SHARE = 1e-11
+#: A few units in the last place of the terms of a row's residual.
+_ROUND_OFF = 1e-15
+
+
+@compiled_reassociating
+def dot(a: FloatArray, b: FloatArray, n: int) -> float:
+    """Scalar product of the first n elements."""
+    total = 0.0
+    for j in range(n):
+        total += a[j] * b[j]
+    return total
+
+
+@compiled_reassociating
+def add_scaled(a: FloatArray, factor: float, b: FloatArray, n: int) -> None:
+    """a <- a + factor b over the first n elements."""
+    for j in range(n):
+        a[j] += factor * b[j]
+
+
+@compiled_reassociating
+def factor_small(G: FloatArray) -> None:
+    """Cholesky factor of a small matrix in place (lower); pivots that vanish are set to 0 with their column."""
+    p = G.shape[0]
+    for j in range(p):
+        whole = G[j, j]
+        t = whole
+        for k in range(j):
+            t -= G[j, k] * G[j, k]
+        pivot = np.sqrt(t) if t > _PIVOT_SHARE * whole else 0.0
+        G[j, j] = pivot
+        for i in range(j + 1, p):
+            t = G[i, j]
+            for k in range(j):
+                t -= G[i, k] * G[j, k]
+            G[i, j] = t / pivot if pivot > 0.0 else 0.0
+
+
+@compiled_reassociating
+def solve_small(G: FloatArray, rhs: FloatArray) -> None:
+    """rhs <- (G G')^-1 rhs in place; coefficients of columns with a zero pivot become 0."""
+    p = rhs.shape[0]
+    for i in range(p):
+        t = rhs[i]
+        for j in range(i):
+            t -= G[i, j] * rhs[j]
+        rhs[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
+    for r in range(p):
+        i = p - 1 - r
+        t = rhs[i]
+        for j in range(i + 1, p):
+            t -= G[j, i] * rhs[j]
+        rhs[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
+
+
+@compiled_reassociating
+def half_norm_small(G: FloatArray, u: FloatArray) -> float:
+    """u' (G G')^-1 u; ``u`` is overwritten."""
+    total = 0.0
+    for i in range(u.shape[0]):
+        t = u[i]
+        for j in range(i):
+            t -= G[i, j] * u[j]
+        u[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
+        total += u[i] * u[i]
+    return total
+
+
+@compiled_reassociating
+def acceptable(x: FloatArray, y: float, w: float) -> bool:
+    """Finite features and target, positive finite weight."""
+    total = y * 0.0 + w * 0.0
+    for i in range(x.shape[0]):
+        total += x[i] * 0.0
+    return total == 0.0 and w > 0.0
+
+
+@compiled_reassociating
+def kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
+    """K of the samples in use with the point ``x`` (d,) into ``out`` (N,)."""
+    d = A.X.shape[0]
+    scaled = A.small[0, :d]
+    for i in range(d):
+        scaled[i] = x[i] * A.inverse_widths[i]
+    rbf_column(A.scaled, A.C[COUNT], scaled, out, A.V[BITS])
+
+
+@compiled_reassociating
+def design_value(A: WindowArrays, x: FloatArray, c: int) -> float:
+    """Element c of the design row of the point ``x``."""
+    value: float = 1.0 if c == 0 else x[A.linear[c - 1]]
+    return value
+
+
+@compiled_reassociating
+def write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
+    """Put a sample into a slot, its kernel column (in COLUMN, with the slot's own element left out) into R."""
+    column, row, n = A.V[COLUMN], A.R[slot], A.C[COUNT]
+    for j in range(n):
+        row[j] = column[j]
+        A.R[j, slot] = column[j]
+    A.R[slot, slot] = 1.0 + 1.0 / (A.F[GAMMA] * w)
+    for i in range(x.shape[0]):
+        A.X[i, slot] = x[i]
+        A.scaled[i, slot] = x[i] * A.inverse_widths[i]
+    for c in range(A.H.shape[0]):
+        A.H[c, slot] = design_value(A, x, c)
+    A.V[Y, slot] = y
+    A.V[W, slot] = w
+
+
+@compiled_reassociating
+def keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
+    """Copy into U what a step on ``slot`` overwrites, all but P."""
+    p, n = A.H.shape[0], A.C[COUNT]
+    for c in range(p):
+        for j in range(n):
+            A.U[c, j] = A.S[c, j]
+    for j in range(n):
+        A.U[p, j] = A.V[SY, j]
+        A.U[p + 1, j] = A.V[ALPHA, j]
+        A.U[p + 2, j] = A.R[slot, j]
+    for c in range(p):
+        A.U[p + 3, c] = A.beta[c]
+    for i in range(A.X.shape[0]):
+        A.U[p + 3, p + i] = A.X[i, slot]
+    A.F[UNDO_Y] = A.V[Y, slot]
+    A.F[UNDO_W] = A.V[W, slot]
+    A.C[UNDO] = kind
+    A.C[UNDO_SLOT] = slot
+
+
+@compiled_reassociating
+def restore_solution(A: WindowArrays) -> None:
+    """S, Sy, beta and alpha as `keep_for_undo` found them."""
+    p, n = A.H.shape[0], A.C[COUNT]
+    for c in range(p):
+        for j in range(n):
+            A.S[c, j] = A.U[c, j]
+        A.beta[c] = A.U[p + 3, c]
+    for j in range(n):
+        A.V[SY, j] = A.U[p, j]
+        A.V[ALPHA, j] = A.U[p + 1, j]
+
+
+@compiled_reassociating
+def restore_sample(A: WindowArrays) -> None:
+    """The sample of the slot, and its row of R, as `keep_for_undo` found them."""
+    p, n, slot = A.H.shape[0], A.C[COUNT], A.C[UNDO_SLOT]
+    for j in range(n):
+        A.R[slot, j] = A.U[p + 2, j]
+        A.R[j, slot] = A.U[p + 2, j]
+    for i in range(A.X.shape[0]):
+        A.X[i, slot] = A.U[p + 3, p + i]
+        A.scaled[i, slot] = A.X[i, slot] * A.inverse_widths[i]
+    for c in range(p):
+        A.H[c, slot] = 1.0 if c == 0 else A.X[A.linear[c - 1], slot]
+    A.V[Y, slot] = A.F[UNDO_Y]
+    A.V[W, slot] = A.F[UNDO_W]
+
+
+@compiled_reassociating
+def row_residual(A: WindowArrays, i: int) -> float:
+    """y_i - h_i'beta - R_i alpha: zero but for the error of the recursion. In units of the target."""
+    fitted = dot(A.R[i], A.V[ALPHA], A.C[COUNT]) + dot(A.H[:, i], A.beta, A.beta.shape[0])
+    residual: float = A.V[Y, i] - fitted
+    return residual
+
+
+@compiled_reassociating
+def rotate_residual(A: WindowArrays) -> bool:
+    """Check the next row of the round. False where its residual exceeds the tolerance or is not a number.
+
+    The row of the newest sample is blind to the error of P, any other row sees it; a round of N steps has
+    seen all rows. A residual r shows as an error gamma r of alpha, so the tolerance is a share of the training
+    errors' size, rms(alpha)/gamma, and thereby the relative error of alpha that is put up with; what the
+    scalar product itself rounds off is allowed on top.
+    """
+    n = A.C[COUNT]
+    i = A.C[CURSOR]
+    if i >= n:
+        i = 0
+    residual = abs(row_residual(A, i))
+    A.F[RESIDUAL] = residual
+    if not residual <= A.F[ROUND_WORST]:
+        A.F[ROUND_WORST] = residual
+    i += 1
+    if i >= n:
+        i = 0
+        A.F[LAST_WORST] = A.F[ROUND_WORST]
+        A.F[ROUND_WORST] = 0.0
+        A.C[ROUNDS] += 1
+    A.C[CURSOR] = i
+    length = np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
+    allowed = A.F[TOLERANCE] * length / (np.sqrt(n) * A.F[GAMMA])
+    good: bool = residual <= allowed + _ROUND_OFF * (abs(A.V[Y, i]) + abs(A.beta[0]) + length)
+    if not good:
+        A.C[RESIDUALS_EXCEEDED] += 1
+    return good
+
+
+@compiled_reassociating
+def finite(a: FloatArray, n: int) -> bool:
+    """True where the first n elements are all finite."""
+    total = 0.0
+    for j in range(n):
+        total += a[j] * 0.0
+    return total == 0.0
+
+
+@compiled_reassociating
+def move_sample(A: WindowArrays, source: int, target: int) -> None:
+    """Slot ``target`` takes over the sample of slot ``source``; R follows. P and S are the caller's."""
+    n = A.C[COUNT]
+    for i in range(A.X.shape[0]):
+        A.X[i, target] = A.X[i, source]
+        A.scaled[i, target] = A.scaled[i, source]
+    for c in range(A.H.shape[0]):
+        A.H[c, target] = A.H[c, source]
+    A.V[Y, target] = A.V[Y, source]
+    A.V[W, target] = A.V[W, source]
+    own = A.R[source, source]
+    for j in range(n):
+        if j != source and j != target:
+            A.R[target, j] = A.R[source, j]
+            A.R[j, target] = A.R[source, j]
+    A.R[target, target] = own

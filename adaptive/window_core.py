@@ -1,0 +1,244 @@
+"""One compiled step of either form of the window, with its checks: what `Window` and other compiled code call.
+
+Every function takes the window's arrays and returns a status (`window_state.Status`) or a number. Nothing
+allocates, nothing raises, and no step leaves the window non-finite.
+"""
+
+from __future__ import annotations
+
+from adaptive import window_cholesky as cholesky
+from adaptive import window_inverse as inverse
+from adaptive.compiled import compiled_reassociating
+from adaptive.types import FloatArray
+from adaptive.window_common import (
+    acceptable,
+    add_scaled,
+    design_value,
+    dot,
+    kernel_column,
+    rotate_residual,
+    row_residual,
+)
+from adaptive.window_state import (
+    ACCEPTED,
+    ALPHA,
+    BAD_INPUT,
+    BAD_INPUTS,
+    COLUMN,
+    COUNT,
+    FORM,
+    ILL_CONDITIONED,
+    ILL_STEPS,
+    INVERSE_FORM,
+    NO_SLOT,
+    NOTHING_TO_UNDO,
+    REFINEMENTS,
+    STEPS,
+    SY,
+    UNDO,
+    UNDO_NOTHING,
+    UNDONE,
+    K,
+    WindowArrays,
+    Y,
+    Z,
+)
+
+
+@compiled_reassociating
+def refine(A: WindowArrays) -> bool:
+    """One step of iterative refinement of beta and alpha, counted. O(N² p). False where it left the finite."""
+    A.C[REFINEMENTS] += 1
+    if A.C[FORM] == INVERSE_FORM:
+        return inverse.refine(A)
+    return cholesky.refine(A)
+
+
+@compiled_reassociating
+def _conclude(A: WindowArrays, status: int) -> int:
+    if status == ACCEPTED:
+        A.C[STEPS] += 1
+        if not rotate_residual(A):
+            refine(A)
+    elif status == ILL_CONDITIONED:
+        A.C[ILL_STEPS] += 1
+    return status
+
+
+@compiled_reassociating
+def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+    """The sample in ``slot`` makes way for (x, y) of noise weight w. O(N²).
+
+    Checks one rotating row's residual afterwards and refines where it exceeds the tolerance.
+    """
+    if not acceptable(x, y, w):
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    if slot < 0 or slot >= A.C[COUNT]:
+        return NO_SLOT
+    kernel_column(A, x, A.V[COLUMN])
+    if A.C[FORM] == INVERSE_FORM:
+        return _conclude(A, inverse.replace(A, slot, x, y, w))
+    return _conclude(A, cholesky.replace(A, slot, x, y, w))
+
+
+@compiled_reassociating
+def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+    """One more slot, for (x, y) of noise weight w. O(N²)."""
+    if not acceptable(x, y, w):
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    if A.C[COUNT] >= A.P.shape[0]:
+        return NO_SLOT
+    kernel_column(A, x, A.V[COLUMN])
+    if A.C[FORM] == INVERSE_FORM:
+        return _conclude(A, inverse.append(A, x, y, w))
+    return _conclude(A, cholesky.append(A, x, y, w))
+
+
+@compiled_reassociating
+def undo(A: WindowArrays) -> int:
+    """Take back the last `replace` or `append`, if nothing but predictions happened since. O(N)."""
+    if A.C[UNDO] == UNDO_NOTHING:
+        return NOTHING_TO_UNDO
+    if A.C[FORM] == INVERSE_FORM:
+        inverse.undo(A)
+    else:
+        cholesky.undo(A)
+    A.C[UNDONE] += 1
+    return ACCEPTED
+
+
+@compiled_reassociating
+def remove(A: WindowArrays, slot: int) -> int:
+    """Empty ``slot``; the sample of the last slot moves into it. O(N²)."""
+    if slot < 0 or slot >= A.C[COUNT]:
+        return NO_SLOT
+    if A.C[FORM] == INVERSE_FORM:
+        inverse.remove(A, slot)
+    else:
+        cholesky.remove(A, slot)
+    return ACCEPTED
+
+
+@compiled_reassociating
+def reweight(A: WindowArrays, slot: int, w: float) -> int:
+    """Give the sample in ``slot`` the noise weight w. O(N²)."""
+    if slot < 0 or slot >= A.C[COUNT]:
+        return NO_SLOT
+    if not (w > 0.0 and w * 0.0 == 0.0):
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    if A.C[FORM] == INVERSE_FORM:
+        status = inverse.reweight(A, slot, w)
+    else:
+        status = cholesky.reweight(A, slot, w)
+    if status != ACCEPTED:
+        A.C[ILL_STEPS] += 1
+    return status
+
+
+@compiled_reassociating
+def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
+    """All targets y <- (1 + gain) y + offset, in O(N p): the offset lies in the span of the unpenalised part."""
+    if not ((gain + offset) * 0.0 == 0.0 and gain > -1.0):
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    n, y, sy, alpha, first = A.C[COUNT], A.V[Y], A.V[SY], A.V[ALPHA], A.S[0]
+    factor = 1.0 + gain
+    for j in range(n):
+        y[j] = factor * y[j] + offset
+        sy[j] = factor * sy[j] + offset * first[j]
+        alpha[j] *= factor
+    for c in range(A.beta.shape[0]):
+        A.beta[c] *= factor
+    A.beta[0] += offset
+    A.C[UNDO] = UNDO_NOTHING
+    return ACCEPTED
+
+
+@compiled_reassociating
+def shift_targets(A: WindowArrays, delta: FloatArray) -> int:
+    """All targets y <- y + delta, (N,) by slot. O(N²): one product."""
+    n = A.C[COUNT]
+    total = 0.0
+    for j in range(n):
+        total += delta[j] * 0.0
+    if total != 0.0:
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    add_scaled(A.V[Y], 1.0, delta, n)
+    if A.C[FORM] == INVERSE_FORM:
+        inverse.solve(A, delta, A.V[Z])
+        add_scaled(A.V[SY], 1.0, A.V[Z], n)
+        inverse.finish(A)
+    else:
+        cholesky.shift_targets(A, delta)
+        cholesky.finish(A)
+    A.C[UNDO] = UNDO_NOTHING
+    return ACCEPTED
+
+
+@compiled_reassociating
+def resum(A: WindowArrays) -> bool:
+    """S, Sy, beta and alpha anew from the inverse or factor as it stands. O(N² p)."""
+    if A.C[FORM] == INVERSE_FORM:
+        return inverse.resum(A)
+    return cholesky.resum(A)
+
+
+@compiled_reassociating
+def predict(A: WindowArrays, x: FloatArray) -> float:
+    """Mean at one point. O(N d). Its scratch is the window's: one thread at a time."""
+    k = A.V[K]
+    kernel_column(A, x, k)
+    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
+    for c in range(A.beta.shape[0]):
+        mean += A.beta[c] * design_value(A, x, c)
+    return mean
+
+
+@compiled_reassociating
+def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float]:
+    """Mean, and variance of the function in units of `scale`, at one point. O(N²)."""
+    k, p = A.V[K], A.beta.shape[0]
+    kernel_column(A, x, k)
+    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
+    u = A.small[1, :p]
+    for c in range(p):
+        u[c] = design_value(A, x, c)
+        mean += A.beta[c] * u[c]
+    if A.C[FORM] == INVERSE_FORM:
+        return mean, inverse.variance(A, k, u)
+    return mean, cholesky.variance(A, k, u)
+
+
+@compiled_reassociating
+def scale(A: WindowArrays) -> float:
+    """Variance of the kernel process by its likelihood, y'alpha/(N - p): the unit of variances; 0 while N <= p."""
+    n, p = A.C[COUNT], A.beta.shape[0]
+    if n <= p:
+        return 0.0
+    total: float = max(dot(A.V[Y], A.V[ALPHA], n), 0.0)
+    degrees: float = n - p
+    return total / degrees
+
+
+@compiled_reassociating
+def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
+    """Exact leave-one-out residuals into ``out`` (N,). O(N p²), in the Cholesky form O(N³)."""
+    if A.C[FORM] == INVERSE_FORM:
+        inverse.leave_one_out(A, out)
+    else:
+        cholesky.leave_one_out(A, out)
+
+
+@compiled_reassociating
+def worst_residual(A: WindowArrays) -> float:
+    """Largest residual of all rows, in units of the target. O(N²)."""
+    n, worst = A.C[COUNT], 0.0
+    for i in range(n):
+        residual = abs(row_residual(A, i))
+        if not residual <= worst:
+            worst = residual
+    return worst

@@ -1,0 +1,65 @@
+"""How far the recursion drifts from the direct solver over very many updates, by condition number and form."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive import lssvm, window_core
+from adaptive.compiled import compiled
+from adaptive.types import FloatArray
+from adaptive.window import Form, Window, WindowConfig
+from adaptive.window_state import WindowArrays
+
+#: gamma and width that give condition numbers from some 1e3 to 1e8 with windows of 100 samples in three dimensions.
+HARDNESS: tuple[tuple[float, float], ...] = ((1e2, 0.5), (1.5e3, 1.0), (1e4, 1.0), (1e5, 1.0), (1.2e6, 1.5))
+SIZE, DIMENSION = 100, 3
+
+
+@compiled
+def _slide(A: WindowArrays, X: FloatArray, y: FloatArray, slots: NDArray[np.int64]) -> int:
+    refused = 0
+    for k in range(y.shape[0]):
+        if window_core.replace(A, slots[k], X[k], y[k], 1.0) != 0:
+            refused += 1
+    return refused
+
+
+def _samples(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+    """Uniform points, a fifth of them within 1e-7 of an earlier one."""
+    X = rng.random((count, DIMENSION))
+    for k in np.flatnonzero(rng.random(count) < 0.2).tolist():
+        X[k] = X[max(k - 1 - int(rng.integers(SIZE // 2)), 0)] + 1e-7 * rng.standard_normal(DIMENSION)
+    return X, np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(count)
+
+
+def bench_drift(updates: int, checks: int = 10, accuracy: float = 1e-8) -> list[dict[str, float | str]]:
+    """Worst relative error of alpha over ``checks`` looks at a stream of ``updates``, slots replaced at random."""
+    report: list[dict[str, float | str]] = []
+    for gamma, width in HARDNESS:
+        forms: tuple[Form, ...] = ("inverse", "cholesky", "auto")
+        for form in forms:
+            rng = np.random.default_rng(1)
+            config = WindowConfig(SIZE, (width,) * DIMENSION, gamma, form=form, accuracy=accuracy)
+            window = Window.from_samples(config, *_samples(rng, SIZE))
+            worst, refused, start = 0.0, 0, time.perf_counter()
+            for _ in range(checks):
+                X, y = _samples(rng, updates // checks)
+                refused += _slide(window.arrays, X, y, rng.integers(0, SIZE, y.size))
+                direct = lssvm.fit(window.X, window.y, width, gamma).model.alpha
+                worst = max(worst, float(np.linalg.norm(window.alpha - direct) / np.linalg.norm(direct)))
+            report.append(
+                {
+                    "form": form,
+                    "at_work": window.form,
+                    "condition": float(np.linalg.cond(window.arrays.R)),
+                    "updates": float(updates),
+                    "worst_alpha_error": worst,
+                    "refinements": float(window.counters()["refinements"]),
+                    "refused": float(refused),
+                    "seconds": time.perf_counter() - start,
+                }
+            )
+    return report

@@ -1,0 +1,62 @@
+"""All benchmarks of the solver, as numbers and as a page of text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from adaptive.warm import warm
+from benchmarks.drift import bench_drift
+from benchmarks.peers import bench_peers
+from benchmarks.solver import bench_window
+
+SIZES = (100, 250, 500, 1000, 2000)
+
+
+def run(quick: bool = False) -> dict[str, Any]:
+    """Run everything with one BLAS thread: ``quick`` in under a minute, otherwise some minutes.
+
+    Returns
+    -------
+    ``{"window": {N: {...}}, "peers": {...}, "drift": [...]}``; times in µs, errors without unit.
+    """
+    warm()
+    with threadpool_limits(1):
+        window = {}
+        for n in SIZES:
+            repeats = 2000 if n <= 500 else 400 if n <= 1000 else 100
+            window[str(n)] = bench_window(n, repeats // 4 if quick else repeats)
+        peers = bench_peers(500, 20 if quick else 100)
+        drift = bench_drift(20_000 if quick else 1_000_000)
+    return {"window": window, "peers": peers, "drift": drift}
+
+
+def page(report: dict[str, Any]) -> str:
+    """The same as tables to read."""
+    lines = ["One step of the window, medians in µs (one BLAS thread)", ""]
+    columns = (
+        ("update_us", "update"),
+        ("update_p99_us", "p99"),
+        ("dsymv_us", "dsymv"),
+        ("update_over_dsymv", "ratio"),
+        ("memory_pass_us", "memory"),
+        ("predict_us", "predict"),
+        ("variance_us", "variance"),
+        ("cholesky_update_us", "Cholesky"),
+        ("plain_update_us", "numpy"),
+        ("refit_us", "refit"),
+    )
+    lines.append(f"{'N':>6}" + "".join(f"{title:>10}" for _, title in columns))
+    for n, row in report["window"].items():
+        lines.append(f"{n:>6}" + "".join(f"{row[key]:>10.2f}" for key, _ in columns))
+    lines += ["", "The same stream, N = 500: learning one sample, and the error of predicting it before", ""]
+    for name, row in report["peers"].items():
+        lines.append(f"{name:>14} {row['update_us']:>12.1f} µs {row['over_dehyst']:>8.1f} x   RMSE {row['rmse']:.5f}")
+    lines += ["", "Relative error of alpha after many updates, near-duplicates in the stream", ""]
+    for row in report["drift"]:
+        lines.append(
+            f"  cond {row['condition']:.1e}  {row['form']:>9} ({row['at_work']})  {row['updates']:.0f} updates  "
+            f"worst {row['worst_alpha_error']:.1e}  refinements {row['refinements']:.0f}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,29 @@
+"""A model identified from the simulated stage with the chapter's signal, once for all tests of the learner."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.snapshot import LssvmInverse
+from sim.presets import preset
+from sim.signals import training_input
+from sim.stage import Stage
+
+DT = 1e-3
+
+
+@pytest.fixture(scope="session")
+def recording() -> tuple[np.ndarray, np.ndarray]:
+    """(u_V, y_um) of 10 s of the chapter's training signal (2.37) at 1 kHz on the rich stage."""
+    stage = Stage(preset("rich", seed=1))
+    _, u = training_input(DT, 10.0)
+    y, _ = stage.run(stage.initial_state(), u)
+    return u, y
+
+
+@pytest.fixture(scope="session")
+def model(recording: tuple[np.ndarray, np.ndarray]) -> LssvmInverse:
+    """What the adaptive model starts from."""
+    return identify_lssvm(*recording, DT, config=IdentifyConfig(tune=False, n=300))[0]

@@ -1,0 +1,393 @@
+"""The sliding window, both forms and both backends, against the direct solver and against itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive import lssvm
+from adaptive.errors import InputError, NumericsError
+from adaptive.window import Backend, Form, Window, WindowConfig
+from adaptive.window_state import Status
+
+KINDS: list[tuple[Form, Backend]] = [("inverse", "compiled"), ("cholesky", "compiled"), ("inverse", "plain")]
+LINEAR: list[tuple[int, ...]] = [(), (1,), (0, 2)]
+kinds = pytest.mark.parametrize(("form", "backend"), KINDS)
+GAMMA, WIDTHS, CAPACITY = 200.0, (0.6, 0.9, 1.5), 17
+
+
+def empty(
+    form: Form = "inverse", backend: Backend = "compiled", linear: tuple[int, ...] = (), n: int = CAPACITY
+) -> Window:
+    return Window(WindowConfig(n, WIDTHS, GAMMA, linear, form, backend))
+
+
+def sample(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
+    x = rng.random(3)
+    return x, float(np.sin(4 * x[0]) + x[1] * x[2] + 0.02 * rng.standard_normal()), float(rng.random() + 0.3)
+
+
+def filled(form: Form, backend: Backend, linear: tuple[int, ...] = (), n: int = CAPACITY, seed: int = 0) -> Window:
+    window, rng = empty(form, backend, linear), np.random.default_rng(seed)
+    for _ in range(n):
+        assert window.append(*sample(rng)) is Status.ACCEPTED
+    return window
+
+
+def assert_exact(window: Window, tolerance: float = 1e-8) -> None:
+    """Solution, variance, leave-one-out and residuals are those of the direct solver on the same samples."""
+    fit = lssvm.fit(window.X, window.y, WIDTHS, GAMMA, window.weights, window.config.linear)
+    size = np.max(np.abs(fit.model.alpha))
+    np.testing.assert_allclose(window.alpha, fit.model.alpha, atol=tolerance * size)
+    np.testing.assert_allclose(window.beta, fit.model.beta, atol=tolerance * 10)
+    points = np.random.default_rng(99).random((3, 3)) * 1.3
+    for x, mean, variance, noisy in zip(
+        points, fit.model.predict(points), fit.variance(points), fit.variance(points, include_noise=True), strict=True
+    ):
+        assert window.predict(x) == pytest.approx(mean, abs=tolerance * 10)
+        got = window.predict_with_variance(x)
+        assert got[0] == pytest.approx(mean, abs=tolerance * 10)
+        assert got[1] == pytest.approx(variance, rel=1e-5, abs=1e-9)
+        assert window.predict_with_variance(x, include_noise=True)[1] == pytest.approx(noisy, rel=1e-5, abs=1e-9)
+    np.testing.assert_allclose(window.leave_one_out(), fit.leave_one_out(), rtol=1e-5, atol=tolerance * 10)
+    assert window.worst_residual() < tolerance
+    assert window.scale == pytest.approx(fit.model.scale, rel=1e-6)
+
+
+Step = Callable[[Window, np.random.Generator], Status]
+STEPS: dict[str, Step] = {
+    "append": lambda w, r: w.append(*sample(r)),
+    "replace": lambda w, r: w.replace(int(r.integers(len(w))), *sample(r)),
+    "remove": lambda w, r: w.remove(int(r.integers(len(w)))),
+    "reweight": lambda w, r: w.reweight(int(r.integers(len(w))), float(r.random() * 3 + 0.1)),
+    "rescale": lambda w, r: w.rescale_targets(float(r.random() * 0.2 - 0.1), float(r.random() - 0.5)),
+    "shift": lambda w, r: w.shift_targets(r.standard_normal(len(w)) * 0.1),
+    "undo": lambda w, r: w.undo(),
+}
+
+
+@kinds
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    steps=st.lists(st.sampled_from(sorted(STEPS)), min_size=1, max_size=25),
+    linear=st.sampled_from(LINEAR),
+)
+def test_any_sequence_of_steps_is_exact(
+    form: Form, backend: Backend, seed: int, steps: list[str], linear: tuple[int, ...]
+) -> None:
+    rng, window = np.random.default_rng(seed), filled(form, backend, linear, 12, seed)
+    for name in steps:
+        if name == "remove" and len(window) <= 6:
+            continue
+        expected = {Status.ACCEPTED}
+        if name == "append" and window.full:
+            expected = {Status.NO_SLOT}
+        if name == "undo":
+            expected = {Status.ACCEPTED, Status.NOTHING_TO_UNDO} if len(window) > 6 else {Status.NOTHING_TO_UNDO}
+            if len(window) <= 6:
+                continue
+        assert STEPS[name](window, rng) in expected, name
+    assert_exact(window)
+
+
+@kinds
+@pytest.mark.parametrize("linear", LINEAR)
+def test_growing_from_empty_is_exact_at_every_size(form: Form, backend: Backend, linear: tuple[int, ...]) -> None:
+    window, rng = empty(form, backend, linear), np.random.default_rng(4)
+    assert window.predict(np.zeros(3)) == 0.0
+    for n in range(1, CAPACITY + 1):
+        assert window.append(*sample(rng)) is Status.ACCEPTED
+        assert len(window) == n
+        assert np.all(np.isfinite(window.alpha))
+        if n > 1 + len(linear):
+            assert_exact(window)
+    assert window.full
+    assert window.append(*sample(rng)) is Status.NO_SLOT
+
+
+@kinds
+@pytest.mark.parametrize("slot", range(0, CAPACITY, 4))
+def test_every_slot_can_be_replaced(form: Form, backend: Backend, slot: int) -> None:
+    window = filled(form, backend, (0,))
+    x, y, w = sample(np.random.default_rng(8))
+    assert window.replace(slot, x, y, w) is Status.ACCEPTED
+    np.testing.assert_array_equal(window.X[slot], x)
+    assert (window.y[slot], window.weights[slot]) == (y, w)
+    assert_exact(window)
+
+
+@kinds
+def test_undo_takes_back_and_goes_on(form: Form, backend: Backend) -> None:
+    window, twin = filled(form, backend, (1,)), filled(form, backend, (1,))
+    rng = np.random.default_rng(5)
+    for step in (lambda: window.replace(3, *sample(rng)), lambda: window.replace(CAPACITY - 1, *sample(rng))):
+        assert step() is Status.ACCEPTED
+        assert not np.allclose(window.alpha, twin.alpha)
+        assert window.undo() is Status.ACCEPTED
+        np.testing.assert_array_equal(window.X, twin.X)
+        np.testing.assert_array_equal(window.y, twin.y)
+        np.testing.assert_allclose(window.alpha, twin.alpha, rtol=1e-9)
+        assert window.undo() is Status.NOTHING_TO_UNDO
+    assert window.counters()["undone"] == 2
+    x, y, w = sample(rng)
+    window.replace(0, x, y, w)
+    twin.replace(0, x, y, w)
+    np.testing.assert_allclose(window.alpha, twin.alpha, rtol=1e-8)
+    assert_exact(window)
+
+
+def test_undo_of_the_compiled_inverse_is_exact_to_the_last_bit() -> None:
+    window, rng = filled("inverse", "compiled", n=CAPACITY - 1), np.random.default_rng(5)
+    before = window.alpha, window.beta, window.predict_with_variance(np.full(3, 0.4))
+    for step in (lambda: window.append(*sample(rng)), lambda: window.replace(2, *sample(rng))):
+        step()
+        window.undo()
+        np.testing.assert_array_equal(window.alpha, before[0])
+        np.testing.assert_array_equal(window.beta, before[1])
+        assert window.predict_with_variance(np.full(3, 0.4))[0] == before[2][0]
+
+
+BAD_SAMPLES = [
+    (np.array([np.nan, 0, 0]), 1.0, 1.0),
+    (np.array([0, np.inf, 0]), 1.0, 1.0),
+    (np.zeros(3), np.nan, 1.0),
+    (np.zeros(3), -np.inf, 1.0),
+    (np.zeros(3), 1.0, 0.0),
+    (np.zeros(3), 1.0, -1.0),
+    (np.zeros(3), 1.0, np.inf),
+    (np.zeros(3), 1.0, np.nan),
+]
+
+
+@kinds
+@pytest.mark.parametrize("bad", BAD_SAMPLES)
+def test_bad_samples_are_refused_and_counted(
+    form: Form, backend: Backend, bad: tuple[np.ndarray, float, float]
+) -> None:
+    window = filled(form, backend, n=CAPACITY - 1)
+    alpha = window.alpha
+    assert window.replace(3, *bad) is Status.BAD_INPUT
+    assert window.append(*bad) is Status.BAD_INPUT
+    np.testing.assert_array_equal(window.alpha, alpha)
+    assert window.counters()["bad_inputs"] == 2
+
+
+@kinds
+@pytest.mark.parametrize("linear", [(), (0,)])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_steps_that_would_leave_the_finite_numbers_are_rolled_back(
+    form: Form, backend: Backend, linear: tuple[int, ...]
+) -> None:
+    window = filled(form, backend, linear, n=CAPACITY - 1)
+    before = window.alpha
+    outrageous = [(np.zeros(3), 1.7e308, 1.0), (np.zeros(3), -1.7e308, 1e-3), (np.full(3, 0.5), 1.0, 1e-320)]
+    for bad in outrageous:
+        for step in (lambda bad=bad: window.replace(2, *bad), lambda bad=bad: window.append(*bad)):
+            if step() is Status.ACCEPTED:
+                window.undo()
+            assert np.all(np.isfinite(window.alpha))
+    assert len(window) == CAPACITY - 1
+    assert window.counters()["ill_conditioned"] >= 1
+    np.testing.assert_allclose(window.alpha, before, rtol=1e-8)
+    assert_exact(window)
+
+
+@kinds
+def test_slots_that_do_not_exist(form: Form, backend: Backend) -> None:
+    window = filled(form, backend, n=5)
+    x, y, w = sample(np.random.default_rng(1))
+    for slot in (-1, 5, 1000):
+        assert window.replace(slot, x, y, w) is Status.NO_SLOT
+        assert window.remove(slot) is Status.NO_SLOT
+        assert window.reweight(slot, 1.0) is Status.NO_SLOT
+    assert window.reweight(0, -1.0) is Status.BAD_INPUT
+    assert window.rescale_targets(np.nan, 0.0) is Status.BAD_INPUT
+    assert window.rescale_targets(-1.0, 0.0) is Status.BAD_INPUT
+    assert window.shift_targets(np.full(5, np.nan)) is Status.BAD_INPUT
+    assert_exact(window)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_the_order_of_samples_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = [sample(rng) for _ in range(CAPACITY)]
+    first, second = empty(), empty()
+    for p in points:
+        first.append(*p)
+    for i in rng.permutation(CAPACITY):
+        second.append(*points[i])
+    x = rng.random(3)
+    assert second.predict(x) == pytest.approx(first.predict(x), abs=1e-9)
+    assert second.scale == pytest.approx(first.scale, rel=1e-8)
+
+
+def test_targets_can_be_rescaled_as_if_learnt_so() -> None:
+    first, second = filled("inverse", "compiled", (0,)), empty("inverse", "compiled", (0,))
+    for x, y, w in zip(first.X, first.y, first.weights, strict=True):
+        second.append(x, 1.06 * y - 0.3, w)
+    first.rescale_targets(0.06, -0.3)
+    np.testing.assert_allclose(first.alpha, second.alpha, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(first.beta, second.beta, rtol=1e-8)
+
+
+def test_linear_columns_that_do_not_differ_get_no_slope() -> None:
+    window, rng = empty(linear=(1,)), np.random.default_rng(0)
+    for _ in range(8):
+        x, y, w = sample(rng)
+        window.append(np.array([x[0], 0.25, x[2]]), y, w)
+    assert window.beta[1] == 0.0
+    assert window.worst_residual() < 1e-9
+
+
+@kinds
+def test_from_samples_and_rebuild(form: Form, backend: Backend) -> None:
+    grown = filled(form, backend, (2,))
+    made = Window.from_samples(grown.config, grown.X, grown.y, grown.weights)
+    np.testing.assert_allclose(made.alpha, grown.alpha, rtol=1e-7, atol=1e-9)
+    rng = np.random.default_rng(3)
+    for k in range(40):
+        made.replace(k % CAPACITY, *sample(rng))
+    made.rebuild()
+    assert_exact(made, 1e-10)
+    made.replace(4, *sample(rng))
+    assert_exact(made)
+
+
+def test_switching_form_keeps_the_solution() -> None:
+    window, rng = filled("inverse", "compiled", (0,)), np.random.default_rng(2)
+    for form in ("cholesky", "inverse", "cholesky"):
+        window.switch_form(form)
+        assert window.form == form
+        assert_exact(window)
+        window.replace(int(rng.integers(CAPACITY)), *sample(rng))
+        assert_exact(window)
+
+
+def test_auto_takes_the_form_that_the_accuracy_needs() -> None:
+    source = filled("inverse", "compiled")
+    for gamma, accuracy, expected in ((1e2, 1e-6, "inverse"), (1e2, 1e-14, "cholesky"), (1e9, 1e-6, "cholesky")):
+        config = WindowConfig(CAPACITY, WIDTHS, gamma, form="auto", accuracy=accuracy)
+        assert Window.from_samples(config, source.X, source.y).form == expected
+
+
+@kinds
+def test_state_goes_on_to_the_last_bit(form: Form, backend: Backend) -> None:
+    window, rng = filled(form, backend, (1,)), np.random.default_rng(6)
+    window.replace(1, *sample(rng))
+    again = Window.from_state(window.config, window.state_dict())
+    twin = window.copy()
+    for _ in range(5):
+        point = sample(rng)
+        for w in (window, again, twin):
+            w.replace(2, *point)
+    np.testing.assert_array_equal(again.alpha, window.alpha)
+    np.testing.assert_array_equal(twin.alpha, window.alpha)
+    assert again.counters() == window.counters()
+
+
+def test_a_copy_is_independent() -> None:
+    window = filled("inverse", "compiled")
+    alpha, twin = window.alpha, window.copy()
+    twin.replace(0, *sample(np.random.default_rng(6)))
+    np.testing.assert_array_equal(window.alpha, alpha)
+
+
+def test_foreign_state_is_refused() -> None:
+    state = filled("inverse", "compiled").state_dict()
+    with pytest.raises(InputError, match="expected an array"):
+        Window.from_state(WindowConfig(CAPACITY + 1, WIDTHS, GAMMA), state)
+    del state["R"]
+    with pytest.raises(InputError, match="R: got nothing"):
+        Window.from_state(WindowConfig(CAPACITY, WIDTHS, GAMMA), state)
+
+
+def test_residuals_rotate_and_refinement_heals() -> None:
+    window, rng = filled("inverse", "compiled"), np.random.default_rng(7)
+    exact = window.alpha
+    # Damage S and Sy as drift would: all rows but the one being replaced feel it.
+    window.arrays.S[:] *= 1 + 1e-4 * rng.standard_normal(window.arrays.S.shape)
+    window.arrays.V[3] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
+    assert window.resum() is True
+    np.testing.assert_allclose(window.alpha, exact, rtol=1e-7)
+    window.arrays.V[3] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
+    before = window.counters()
+    for _ in range(CAPACITY):
+        window.replace(5, *sample(rng))
+    after = window.counters()
+    assert after["residuals_exceeded"] > before["residuals_exceeded"]
+    assert after["refinements"] > before["refinements"]
+    assert after["residual_rounds"] == before["residual_rounds"] + 1
+    assert_exact(window)
+
+
+@pytest.mark.parametrize(("form", "gamma", "bound"), [("inverse", 1e3, 1e-8), ("cholesky", 1e6, 1e-7)])
+def test_long_stream_with_near_duplicates_stays_exact(form: Form, gamma: float, bound: float) -> None:
+    rng, n, steps = np.random.default_rng(1), 60, 4000
+    X = rng.random((steps, 3))
+    for k in np.flatnonzero(rng.random(steps) < 0.2):
+        X[k] = X[max(k - 1 - int(rng.integers(30)), 0)] + 1e-7 * rng.standard_normal(3)
+    y = np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(steps)
+    window = Window(WindowConfig(n, (1.0, 1.0, 1.0), gamma, form=form, accuracy=1e-8))
+    for k in range(steps):
+        status = window.append(X[k], y[k]) if k < n else window.replace(int(rng.integers(n)), X[k], y[k])
+        assert status is Status.ACCEPTED
+    expected = lssvm.fit(window.X, window.y, 1.0, gamma).model.alpha
+    assert np.linalg.norm(window.alpha - expected) < bound * np.linalg.norm(expected)
+
+
+def test_condition_bound_is_a_close_upper_bound() -> None:
+    window = filled("inverse", "compiled")
+    true = np.linalg.cond(window.arrays.R)
+    assert 0.99 * true <= window.condition() <= 3 * true
+
+
+def test_inputs_are_not_changed() -> None:
+    window = filled("inverse", "compiled")
+    x = np.array([0.1, 0.2, 0.3])
+    window.replace(0, x, 1.0)
+    window.predict_with_variance(x)
+    np.testing.assert_array_equal(x, [0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"capacity": 0}, "capacity"),
+        ({"widths": ()}, "widths"),
+        ({"widths": (1.0, -1.0)}, "widths"),
+        ({"gamma": -1.0}, "gamma"),
+        ({"linear": (7,)}, "linear"),
+        ({"form": "lu"}, "form"),
+        ({"backend": "gpu"}, "backend"),
+        ({"form": "cholesky", "backend": "plain"}, "plain"),
+        ({"accuracy": 0.0}, "accuracy"),
+    ],
+)
+def test_bad_configuration(change: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        WindowConfig(**{"capacity": 5, "widths": (1.0, 1.0), "gamma": 10.0, **change})  # type: ignore[arg-type]
+
+
+def test_shapes_are_checked() -> None:
+    window = filled("inverse", "compiled")
+    with pytest.raises(InputError, match="x: got shape"):
+        window.predict(np.zeros(2))
+    with pytest.raises(InputError, match="capacity"):
+        Window.from_samples(window.config, np.zeros((CAPACITY + 1, 3)), np.zeros(CAPACITY + 1))
+
+
+def test_singular_samples_leave_the_window_as_it_was() -> None:
+    window = filled("inverse", "compiled", n=6)
+    alpha, R = window.alpha, window.arrays.R[0, 1]
+    window.arrays.R[0, 1] = window.arrays.R[1, 0] = 50.0
+    with pytest.raises(NumericsError, match="pivot"):
+        window.rebuild()
+    window.arrays.R[0, 1] = window.arrays.R[1, 0] = R
+    np.testing.assert_array_equal(window.alpha, alpha)
+    assert_exact(window)
