@@ -50,7 +50,7 @@ class AdmissionConfig:
     max_gap : missing samples that the smoother bridges; beyond it, it starts again.
     settle : samples after a (re)start that do not teach.
     timing_tolerance : relative error of the time step between two samples.
-    rest_share_per_s : below this speed, in ranges per second, the stage counts as at rest.
+    rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
     """
 
     u_min_V: float = -ABSURD
@@ -63,7 +63,8 @@ class AdmissionConfig:
     max_gap: int = 5
     settle: int = 50
     timing_tolerance: float = 0.5
-    rest_share_per_s: float = 0.025
+    rest_share: float = 0.002
+    rest_s: float = 0.2
 
     def __post_init__(self) -> None:
         for low, high in (("u_min_V", "u_max_V"), ("y_min_um", "y_max_um")):
@@ -71,7 +72,7 @@ class AdmissionConfig:
                 raise InputError(
                     f"admission.{low}, {high}: got {getattr(self, low)}, {getattr(self, high)}, expected {low} < {high}"
                 )
-        for name in ("glitch_share", "rest_share_per_s", "timing_tolerance"):
+        for name in ("glitch_share", "rest_share", "rest_s", "timing_tolerance"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a positive number")
         for name in ("glitch_persistence", "max_gap", "settle"):
@@ -84,7 +85,8 @@ class AdmissionState:
     """seq, t_s : of the last sample taken. glitches : in a row.
 
     since_start, since_jump : samples since the smoother started, since it was moved to a place that had jumped,
-    and (since_step) since the voltage stepped. u_V, u_before_V : the last two voltages.
+    and (since_step) since the voltage stepped. moved, anchor_um : the smoother's
+    count when the stage last left a place, and where it then was. u_V, u_before_V : the last two voltages.
     """
 
     seq: int = -1
@@ -93,6 +95,8 @@ class AdmissionState:
     since_start: int = 0
     since_jump: int = 0
     since_step: int = 0
+    moved: int = 0
+    anchor_um: float = 0.0
     u_V: float = 0.0
     u_before_V: float = 0.0
 
@@ -108,6 +112,8 @@ class AdmissionState:
             since_start=int(values["since_start"]),
             since_jump=int(values["since_jump"]),
             since_step=int(values["since_step"]),
+            moved=int(values["moved"]),
+            anchor_um=float(values["anchor_um"]),
             u_V=float(values["u_V"]),
             u_before_V=float(values["u_before_V"]),
         )

@@ -38,8 +38,8 @@ class DriftConfig:
     gate_persistence : ... unless this many in a row are.
     """
 
-    gain_walk: float = 0.03
-    offset_walk: float = 0.004
+    gain_walk: float = 0.005
+    offset_walk: float = 0.0025
     motion_walk: float = 0.00125
     shape_walk: float = 0.000125
     noise: float = 0.0013

@@ -51,7 +51,7 @@ class IdentifyConfig:
     """
 
     n: int = 500
-    plays: int = 20
+    plays: int = 24
     slow: int = 6
     slow_max_s: float = 100.0
     arcs: tuple[float, ...] = (0.05, 0.15, 0.45)

@@ -28,6 +28,7 @@ class Judgement:
     error_V : the last of the learner. judged : how many. valid : whether the learner vouches for its model.
     inside : how many errors lay within one stated standard deviation.
     fallback : whether the frozen model is served, because it predicts better; fallen_s : for how long, s.
+    doubt_V2 : variance that no error has shown yet, after a jump whose cause is open; fades as errors are seen.
     """
 
     long_V2: float
@@ -40,6 +41,7 @@ class Judgement:
     valid: bool = True
     fallback: bool = False
     fallen_s: float = 0.0
+    doubt_V2: float = 0.0
 
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """One error of each."""
@@ -50,6 +52,7 @@ class Judgement:
         self.judged += 1
         self.long_V2 += (squared - self.long_V2) * min(1.0, step_s / LONG_S)
         self.short_V2 += (squared - self.short_V2) * min(1.0, step_s / SHORT_S)
+        self.doubt_V2 *= 1.0 - min(1.0, step_s / SHORT_S)
         frozen = frozen_error_V * frozen_error_V
         self.frozen_V2 += (frozen - self.frozen_V2) * min(1.0, step_s / LONG_S)
         self.frozen_short_V2 += (frozen - self.frozen_short_V2) * min(1.0, step_s / SHORT_S)
@@ -75,8 +78,8 @@ class Judgement:
 
     @property
     def variance_V2(self) -> float:
-        """What an answer's uncertainty is stated from: the worse of long and short term."""
-        return max(self.long_V2, self.short_V2)
+        """What an answer's uncertainty is stated from: the worse of long and short term, and doubt."""
+        return max(self.long_V2, self.short_V2) + self.doubt_V2
 
     def state_dict(self) -> StateDict:
         return asdict(self)
@@ -94,6 +97,7 @@ class Judgement:
             valid=bool(values["valid"]),
             fallback=bool(values["fallback"]),
             fallen_s=float(values["fallen_s"]),
+            doubt_V2=float(values["doubt_V2"]),
         )
 
 

@@ -36,6 +36,10 @@ __all__ = ["Learner", "LearnerConfig"]
 
 #: A jump of place that scales the displacement by less than this, or more than its inverse, is taken for an offset.
 JUMP_RATIO = 0.85
+#: A reading that surprises the smoother by more than this share of the range may be the first of a jump.
+SURPRISE_SHARE = 0.002
+#: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
+JUMP_DOUBT = 0.3
 #: A reading further from the middle of the identified range than this many ranges is none, however long it lasts.
 FAR_OUT = 1.5
 #: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
@@ -64,6 +68,8 @@ class Learner:
         slots = self._smoother.config.lag + 2
         self._u, self._good = np.zeros(slots), np.zeros(slots, dtype=np.bool_)
         self._state: SmootherState | None = None
+        # The smoother before the first reading that surprised it: where a jump, once it is known for one, began.
+        self._calm: SmootherState | None = None
         self._gates = AdmissionState()
         # Features of the instant that is being learnt, and those to serve with: they differ for a lag after a jump.
         self._features = self._served = model.features
@@ -109,7 +115,7 @@ class Learner:
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number, after the stage itself began anew."""
         self._gates = AdmissionState()
-        self._state = None
+        self._state = self._calm = None
 
     def _handle(self, sample: Sample) -> str:
         c, gates = self.config.admission, self._gates
@@ -126,22 +132,27 @@ class Learner:
             return admission.GAP if missing else admission.SETTLING
         for _ in range(missing):
             self._advance(None, 0.0)
-        refused = check_reading(c, gates, (sample.y_um - float(self._state.x[0])) / self._range_um)
+        innovation = (sample.y_um - float(self._state.x[0])) / self._range_um
+        refused = check_reading(c, gates, innovation)
         if refused == admission.GAP:
             if gates.since_jump <= c.settle:
                 self._restart(sample)
                 return admission.GAP
+            self._forget_surprise()
             self._take_jump(sample.y_um)
         elif refused:
             self._advance(None, sample.u_V)
             return refused
+        elif abs(innovation) <= SURPRISE_SHARE:
+            self._calm = self._state.copy()
         motion = self._advance(sample.y_um, sample.u_V)
         return admission.SETTLING if motion is None else self._teach(*motion)
 
     def _restart(self, sample: Sample) -> None:
         """Begin smoothing anew at a sample; the hysteresis memory follows to where the stage now is."""
-        self._state = self._smoother.initial_state(sample.y_um)
+        self._state, self._calm = self._smoother.initial_state(sample.y_um), None
         self._gates.since_start = self._gates.since_jump = 0
+        self._gates.moved = 0
         self._features = self._served
         if self._memory is None:
             self._memory = self._features.rest_memory(sample.y_um)
@@ -149,6 +160,22 @@ class Learner:
         self._good[:] = False
         self._events["restarts"] += 1
         self._advance(sample.y_um, sample.u_V)
+
+    def _forget_surprise(self) -> None:
+        """Take the smoother back to before the jump's first readings, and on from there on its own prediction.
+
+        The first may have been too small for a glitch; taken for motion, it throws velocity and acceleration off,
+        and the place that the next readings are compared with.
+        """
+        calm, state, slots = self._calm, self._state, self._u.shape[0]
+        assert state is not None
+        if calm is None or state.count - calm.count > self._smoother.config.lag:
+            return
+        # What the smoother held before the last calm reading goes on through that reading's own prediction.
+        while calm.count < state.count:
+            self._good[calm.count % slots] = False
+            self._smoother.skip(calm)
+        self._state, self._calm = calm, None
 
     def _take_jump(self, y_um: float) -> None:
         """The reading has jumped for good: place and frame move, velocity and acceleration go on.
@@ -164,6 +191,7 @@ class Learner:
             self._served = replace(f, gain=f.gain * ratio)
         else:
             self._served = replace(f, offset_um=f.offset_um + y_um - before)
+        self._judgement.doubt_V2 += (JUMP_DOUBT * (y_um - before) / self._range_um * self.base.span_V) ** 2
         self._state.x[0] = y_um
         self._gates.since_jump = 0
         self._cache = None
@@ -206,7 +234,10 @@ class Learner:
         if not (filter_due or window_due):
             return admission.PASSED
         self._features.fill(y, v, a, self._memory, self._basis, self._kernel)
-        rest = abs(v) <= c.admission.rest_share_per_s * self._range_um
+        # By place and not by speed: speed is noisy, and a slow scan is no rest, nor is a turning point.
+        if abs(y - gates.anchor_um) > c.admission.rest_share * self._range_um:
+            gates.anchor_um, gates.moved = y, self._state.count
+        rest = (self._state.count - gates.moved) * self._dt > c.admission.rest_s
         outcome = admission.PASSED
         if filter_due:
             target = u - self._window.mean(self._kernel)
@@ -355,8 +386,9 @@ class Learner:
             "events": dict(self._events),
             "config": self.config.state_dict(),
         }
-        if self._state is not None:
-            parts["smoother"] = self._smoother.state_dict(self._state)
+        for part, smoother in (("smoother", self._state), ("calm", self._calm)):
+            if smoother is not None:
+                parts[part] = self._smoother.state_dict(smoother)
         for part, values in parts.items():
             state |= {f"{part}.{key}": value for key, value in values.items()}
         state |= {"u": self._u.copy(), "good": self._good.copy(), "domain": self._domain.copy()}
@@ -391,6 +423,8 @@ class Learner:
             made._events |= {key: int(value) for key, value in part_of(state, "events").items()}
             smoother = part_of(state, "smoother")
             made._state = made._smoother.from_state(smoother) if smoother else None
+            calm = part_of(state, "calm")
+            made._calm = made._smoother.from_state(calm) if calm else None
             if "memory" in state:
                 made._memory = np.array(state["memory"], dtype=np.float64)
                 made._frozen_memory = np.array(state["frozen_memory"], dtype=np.float64)

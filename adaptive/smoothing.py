@@ -64,6 +64,10 @@ class SmootherState:
     ring: FloatArray
     count: int = 0
 
+    def copy(self) -> SmootherState:
+        """A state that goes its own way from here."""
+        return SmootherState(self.x.copy(), self.ring.copy(), self.count)
+
 
 @compiled
 def _step(

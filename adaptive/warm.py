@@ -1,4 +1,8 @@
-"""Compile every compiled loop once, so that no process pays for it at start: ``python -m adaptive.warm``."""
+"""Compile the compiled loops once, so that no process pays for it at start; see ``service.warm``.
+
+What the learner needs is compiled at every set-up; the rest of the window's operations, most of a minute of compiling,
+only where they are called: by the tests, the benchmarks, and whoever builds on `adaptive.window`.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,7 @@ from adaptive.window import Window, WindowConfig
 
 
 def warm() -> None:
-    """Call the compiled functions of window and learner on a few samples."""
-    warm_window()
-    warm_learner()
-
-
-def warm_learner() -> None:
-    """Smoother, features, snapshot and one step of the learner."""
+    """What serving needs: smoother, features, snapshot and one step of the learner."""
     features = FeatureMap(1e-3, 0.0, 1.0, 1.0, 1.0, (0.1, 0.2), (0.3,), (0.1,), (0,), asymmetric=True)
     p, d = features.basis_size, features.kernel_size
     model = LssvmInverse(
@@ -56,11 +54,3 @@ def warm_window() -> None:
         window.rebuild()
         window.scale  # noqa: B018
 
-
-def main() -> None:
-    """What ``python -m adaptive.warm`` does."""
-    warm()
-
-
-if __name__ == "__main__":
-    main()

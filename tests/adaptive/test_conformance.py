@@ -13,6 +13,14 @@ from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.learner import Learner, LearnerConfig
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import InverseModel, OnlineModel, Sample
+from baselines.bouc_wen import TABLE_2_1
+from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.linear import LinearInverse, LinearParameters
+from baselines.mpi_inverse import MpiInverse
+from baselines.online_bouc_wen import BoucWenOnline
+from baselines.online_least_squares import LinearOnline, MpiOnline
+from baselines.prandtl_ishlinskii import MpiParameters
+from baselines.records import Domain
 
 DT, N = 1e-3, 1500
 Recording = tuple[np.ndarray, np.ndarray]
@@ -23,19 +31,22 @@ def two_inputs(recording: Recording, model: LssvmInverse) -> Learner:
     return Learner(identify_lssvm(*recording, DT, "two", IdentifyConfig(tune=False, n=100))[0])
 
 
+SEEN = Domain(0.0, 90.0, 2000.0)
+MPI = MpiParameters(
+    tuple(float(r) for r in np.arange(7) * 0.6), (7.0, 1.5, 1.0, 0.5, 0.5, 0.2, 0.1), (0.0, 30.0), (1.0, -0.1)
+)
+
+
 def linear(recording: Recording, model: LssvmInverse) -> Any:
-    baselines = pytest.importorskip("baselines")
-    return baselines.LinearOnline(baselines.identify_linear(*recording, DT)[0])
+    return LinearOnline(LinearInverse(LinearParameters(11.0), DT, SEEN, 0.1))
 
 
 def mpi(recording: Recording, model: LssvmInverse) -> Any:
-    baselines = pytest.importorskip("baselines")
-    return baselines.MpiOnline(baselines.identify_mpi(*recording, DT)[0])
+    return MpiOnline(MpiInverse(MPI, DT, SEEN, 0.01))
 
 
 def bouc_wen(recording: Recording, model: LssvmInverse) -> Any:
-    baselines = pytest.importorskip("baselines")
-    return baselines.BoucWenOnline(baselines.identify_bouc_wen(*recording, DT)[0])
+    return BoucWenOnline(BoucWenInverse(TABLE_2_1, DT, SEEN, 0.01))
 
 
 MAKERS: dict[str, Maker] = {

@@ -191,10 +191,10 @@ def test_uncertainty_holds_its_share(quiet: Run) -> None:
     assert 0.6 < quiet.learner.diagnostics()["share_within_std"] < 0.9
 
 
-def test_validity_leaves_and_comes_back(model: LssvmInverse, quiet: Run) -> None:
+def test_bad_seconds_are_noticed_fallen_back_from_and_rolled_back(model: LssvmInverse, quiet: Run) -> None:
     learner = Learner.from_model(model)
     seen = set()
-    for k in range(4000):
+    for k in range(5000):
         # A voltage that the motion has not answered to: no model of this stage can predict it.
         u = float(quiet.u[k]) + (0.6 * np.sin(0.05 * (k - 2000)) if 2000 <= k < 3000 else 0.0)
         learner.handle(Sample(k, k * DT, u, float(quiet.y[k])))
@@ -202,6 +202,8 @@ def test_validity_leaves_and_comes_back(model: LssvmInverse, quiet: Run) -> None
             seen.add(learner.snapshot().valid)
     assert seen == {True, False}
     assert learner.snapshot().valid
+    assert learner.counters()["rollbacks"] >= 1
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.15
 
 
 def test_fifo_is_selectable(model: LssvmInverse, quiet: Run) -> None:
