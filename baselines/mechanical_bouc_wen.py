@@ -74,7 +74,7 @@ def _integrate(
 
 
 def between_samples(u: FloatArray, factor: int) -> FloatArray:
-    """A periodic signal (n,) at ``factor`` times its rate, (n factor,), by its Fourier series: exact if band-limited."""
+    """A periodic signal (n,) at ``factor`` times its rate, (n factor,), by its Fourier series: exact in its band."""
     n = u.size
     spectrum = np.fft.rfft(u)
     if n % 2 == 0:
@@ -89,8 +89,7 @@ class MechanicalBoucWen:
     """The oscillator's seven parameters and its displacement scale.
 
     m_kg, c_N_s_per_m, k_N_per_m, alpha_N_per_m : as in the module's equation. g, d : dimensionless,
-    ``beta gamma (alpha s)^nu s/alpha`` ... in short g = beta gamma z0^nu/alpha with z0 = alpha s, d likewise with
-    delta. nu : power. scale_m : s, m, a given number and no parameter.
+    g = beta gamma (alpha s)^nu/alpha, d likewise with delta. nu : power. scale_m : s, m, given, no parameter.
     """
 
     m_kg: float
@@ -221,12 +220,14 @@ def identify_mechanical(
     s = float(np.sqrt(np.mean(np.concatenate([r.y_m for r in records]) ** 2)))
     m, c, k = _linear_part(records)
     if not (m > 0.0 and k > 0.0):
-        raise InputError(f"records: their linear part has mass {m:.3g} kg, stiffness {k:.3g} N/m, expected both above 0")
+        raise InputError(
+            f"records: their linear part has mass {m:.3g} kg, stiffness {k:.3g} N/m, expected both above 0"
+        )
     evaluations = 0
 
     def model(x: FloatArray) -> MechanicalBoucWen:
-        first = [float(value) for value in np.exp(np.clip(x[:4], -40.0, 40.0))]
-        return MechanicalBoucWen(*first, float(x[4]), float(x[5]), float(x[6]), s)
+        m_kg, c, k, alpha = (float(value) for value in np.exp(np.clip(x[:4], -40.0, 40.0)))
+        return MechanicalBoucWen(m_kg, c, k, alpha, float(x[4]), float(x[5]), float(x[6]), s)
 
     def solve(x: FloatArray, steps: int, limit: int) -> tuple[FloatArray, float, FloatArray]:
         fine = [between_samples(r.u_N, 2 * steps) for r in records]

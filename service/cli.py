@@ -15,6 +15,7 @@ COMMANDS: dict[str, str] = {
     "demo": "watch a simulated stage lose its hysteresis, drift, and be caught again",
     "identify": "identify the inverse models of a stage from a recording",
     "serve": "serve and keep learning the inverse models of a stage over zenoh",
+    "diagnose": "name what a recording holds that the simulation lacks, and measure the gain",
     "stage": "run a simulated stage as a process on zenoh",
     "query": "ask a running service for voltages",
     "replay": "run the learner over a recording, offline, and see what its gates and its errors do",

@@ -1,0 +1,112 @@
+"""Control with a model that learns while it serves: feedforward in blocks, each from a snapshot of the past.
+
+Block by block, the newest snapshot that has seen no sample of the last ``delay`` gives the voltages of the next block;
+the stage is run on them, feedback added sample by sample; then its samples teach. That is what the service does, in
+one process and without a clock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from sim.closed_loop import PID, Run
+from sim.reference import Reference
+from sim.stage import Stage, StageState
+
+
+@dataclass(frozen=True, slots=True)
+class BlockConfig:
+    """block : samples answered at once. delay_blocks : age of the snapshot that answers, blocks, at least 1."""
+
+    block: int = 20
+    delay_blocks: int = 3
+
+    def __post_init__(self) -> None:
+        if self.block < 1 or self.delay_blocks < 1:
+            raise InputError(f"block, delay_blocks: got {self.block}, {self.delay_blocks}, expected at least 1 each")
+
+
+def track_learning(
+    stage: Stage,
+    reference: Reference,
+    online: OnlineModel,
+    *,
+    pid: PID | None = None,
+    state: StageState | None = None,
+    config: BlockConfig | None = None,
+) -> Run:
+    """Follow ``reference`` with the feedforward of a model that learns on the way; ``online`` and ``state`` change.
+
+    Without ``state`` the stage is at rest. The memory begins at rest at 0 µm and travels from block to block.
+    Limits, and the feedback's integral at them, are handled as in ``sim.closed_loop.track``.
+    """
+    config = config or BlockConfig()
+    state = state or stage.initial_state()
+    n, dt_s = reference.y_um.size, stage.config.dt_s
+    first = state.k
+    low, high = stage.config.u_min_V, stage.config.u_max_V
+    y, u, forward, feedback = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
+    memory = snapshots[0].rest_memory(0.0)
+    fed = pid.initial_state() if pid is not None else None
+    for start in range(0, n, config.block):
+        part = slice(start, min(n, start + config.block))
+        answer = snapshots[0].feedforward(
+            reference.y_um[part], reference.v_um_per_s[part], reference.a_um_per_s2[part], memory
+        )
+        memory = answer.memory
+        forward[part] = answer.u_V
+        if pid is None or fed is None:
+            u[part] = np.clip(answer.u_V, low, high)
+            y[part], _ = stage.run(state, u[part])
+        else:
+            for k in range(part.start, part.stop):
+                y[k] = stage.read(state)[0]
+                feedback[k] = pid.step(fed, float(reference.y_um[k]) - y[k])
+                wanted = float(forward[k]) + feedback[k]
+                u[k] = min(max(wanted, low), high)
+                fed.u_V += u[k] - wanted
+                stage.step(state, float(u[k]))
+        for k in range(part.start, part.stop):
+            online.handle(Sample(first + k, (first + k) * dt_s, float(u[k]), float(y[k])))
+        snapshots.append(online.snapshot())
+    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
+    return Run(t_s, reference.y_um, y, u, forward, feedback)
+
+
+def replay(
+    online: OnlineModel,
+    motion: FloatArray,
+    u_V: FloatArray,
+    y_um: FloatArray,
+    dt_s: float,
+    config: BlockConfig | None = None,
+) -> FloatArray:
+    """Voltages (n,) that a learning model would have given for a recorded motion, learning from it block by block.
+
+    ``motion`` (n, 3): smoothed displacement, velocity, acceleration; ``u_V``, ``y_um`` (n,): what was applied and
+    read. A block is answered by a snapshot that has seen nothing of it, nor of the ``delay_blocks - 1`` before.
+    ``online`` changes. Raises InputError on shapes.
+    """
+    config = config or BlockConfig()
+    n = u_V.size
+    if motion.shape != (n, 3) or y_um.shape != (n,):
+        raise InputError(f"motion, y_um: got {motion.shape}, {y_um.shape}, expected ({n}, 3) and ({n},)")
+    y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
+    snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
+    memory = snapshots[0].rest_memory(float(y[0]))
+    out = np.empty(n)
+    for start in range(0, n, config.block):
+        part = slice(start, min(n, start + config.block))
+        model = snapshots[0]
+        out[part] = model.feedforward(y[part], v[part], a[part], memory).u_V
+        memory = model.track(y[part], v[part], a[part], u_V[part], memory)
+        for k in range(part.start, part.stop):
+            online.handle(Sample(k, k * dt_s, float(u_V[k]), float(y_um[k])))
+        snapshots.append(online.snapshot())
+    return out

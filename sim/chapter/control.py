@@ -1,0 +1,200 @@
+"""Table 2.5, Figs. 2.17 to 2.20: feedforward, feedback and both at T = 1 ms, with frozen and with learning models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.identification import identify_lssvm
+from adaptive.learner import Learner
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import FloatArray, InverseModel, OnlineModel
+from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.fit import fit_bouc_wen, fit_mpi
+from baselines.mpi_inverse import MpiInverse
+from baselines.online_bouc_wen import BoucWenOnline
+from baselines.online_least_squares import MpiOnline
+from sim.chapter.adaptive_loop import track_learning
+from sim.chapter.experiments import DT_S, Experiments, Score
+from sim.chapter.references import control_references
+from sim.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
+from sim.effects import effect
+from sim.reference import Reference
+from sim.stage import Stage, StageConfig
+
+Progress = Callable[[str], None]
+Clock = Callable[[], float]
+
+#: Frozen inverse models, in the order of the tables.
+FROZEN = {
+    "bouc_wen": "Bouc-Wen",
+    "mpi": "MPI",
+    "mpi_lag": "MPI with a lag",
+    "lssvm": "LSSVM (y, dy/dt)",
+    "lssvm_memory": "LSSVM with memory",
+}
+#: The same, learning: what each starts from.
+LEARNING = {
+    "bouc_wen_online": ("Bouc-Wen, tracking filter", "bouc_wen"),
+    "mpi_online": ("MPI, recursive least squares", "mpi"),
+    "mpi_lag_online": ("MPI with a lag, recursive", "mpi_lag"),
+    "lssvm_adaptive": ("LSSVM with memory, adaptive", "lssvm_memory"),
+}
+#: The change of the stage that the adapting test makes, and when.
+GAIN_CHANGE = -0.06
+CHANGE_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Inverse:
+    """An identified inverse model and the time its identification took, s."""
+
+    model: InverseModel
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """One run: its model ("none" for feedback alone), controller (FF, FB, FF+FB), reference, and score."""
+
+    model: str
+    controller: str
+    reference: str
+    run: Run
+    score: Score
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """Everything of section 2.5.
+
+    ``pid`` : the gains used, Ziegler-Nichols' PI from ``ultimate``. ``chapter_gains_stable`` : whether the chapter's
+    K_p is below the ultimate gain. ``loops`` : all runs. ``changed`` : runs on the stage whose gain drops.
+    """
+
+    ultimate: UltimateGain
+    pid: PID
+    chapter_gains_stable: bool
+    inverses: dict[str, Inverse]
+    loops: tuple[Loop, ...]
+    changed: tuple[Loop, ...]
+    range_um: float
+
+    def loop(self, model: str, controller: str, reference: str) -> Loop:
+        """The run of that name. Raises InputError where there is none."""
+        for loop in self.loops:
+            if (loop.model, loop.controller, loop.reference) == (model, controller, reference):
+                return loop
+        raise InputError(f"loop: no run of {model!r} with {controller!r} on {reference!r}")
+
+
+def identify_inverses(
+    data: Experiments, clock: Clock = lambda: 0.0, progress: Progress = lambda _: None
+) -> dict[str, Inverse]:
+    """All frozen inverse models from the training record at 1 ms; keys as in `FROZEN`. ``clock`` : time in s."""
+    u, y = data.training.u_V, data.training.y_um
+    makers: dict[str, Callable[[], InverseModel]] = {
+        "bouc_wen": lambda: fit_bouc_wen(u, y, DT_S)[0],
+        "mpi": lambda: fit_mpi(u, y, DT_S)[0],
+        "mpi_lag": lambda: fit_mpi(u, y, DT_S, fit_lag=True)[0],
+        "lssvm": lambda: identify_lssvm(u, y, DT_S, inputs="two")[0],
+        "lssvm_memory": lambda: identify_lssvm(u, y, DT_S, inputs="memory")[0],
+    }
+    found = {}
+    for key, make in makers.items():
+        progress(f"identifying the inverse of {FROZEN[key]}")
+        start = clock()
+        model = make()
+        found[key] = Inverse(model, clock() - start)
+    return found
+
+
+def learner_of(model: InverseModel) -> OnlineModel:
+    """The learning form of a frozen model. Raises InputError for a model that has none here."""
+    if isinstance(model, LssvmInverse):
+        return Learner.from_model(model)
+    if isinstance(model, BoucWenInverse):
+        return BoucWenOnline(model)
+    if isinstance(model, MpiInverse):
+        return MpiOnline(model)
+    raise InputError(f"model: got {type(model).__name__}, expected an LSSVM, a Bouc-Wen or an MPI inverse")
+
+
+def changing(config: StageConfig, at_s: float, gain: float = GAIN_CHANGE) -> StageConfig:
+    """The same stage, whose gain changes by ``gain`` (relative) at ``at_s``; adds the effect where it is missing."""
+    if "gain_drift" not in config.effects:
+        config = replace(config, effects=config.effects + effect("gain_drift", ramp_per_min=0.0))
+    return replace(config, changes=((at_s, {"gain_drift.gain": gain}),))
+
+
+def run_control(
+    data: Experiments, *, quick: bool = False, clock: Clock = lambda: 0.0, progress: Progress = lambda _: None
+) -> Control:
+    """Identify the inverses, find the gains on the stage, and run every model with every controller.
+
+    ``quick`` : fewer and shorter references; learning models with feedback on the first of them only.
+    """
+    stage = Stage(data.config)
+    inverses = identify_inverses(data, clock, progress)
+    progress("searching the ultimate gain on the stage")
+    ultimate = ultimate_gain(stage)
+    pid = ultimate.pi_gains(DT_S)
+    references = control_references(data, quick)
+    loops = []
+    first = next(iter(references))
+
+    def add(model: str, controller: str, name: str, run: Run) -> None:
+        loops.append(Loop(model, controller, name, run, Score.of(run.error_um, data.range_um)))
+
+    for name, reference in references.items():
+        progress(f"following {name}")
+        add("none", "FB", name, track(stage, reference, pid=pid))
+        for key in FROZEN:
+            model = inverses[key].model
+            add(key, "FF", name, track(stage, reference, model=model))
+            add(key, "FF+FB", name, track(stage, reference, model=model, pid=pid))
+        for key, (_, base) in LEARNING.items():
+            hybrid = [("FF+FB", pid)] if name == first or not quick else []
+            for controller, gains in (("FF", None), *hybrid):
+                add(key, controller, name, _learnt(stage, reference, inverses[base].model, gains))
+    stable = CHAPTER_GAINS.k_p < ultimate.gain_V_per_um
+    if stable:
+        run = track(stage, references[first], model=inverses["lssvm_memory"].model, pid=CHAPTER_GAINS)
+        add("lssvm_memory", "FF+FB, chapter's gains", first, run)
+    changed = _changed(data, inverses, list(references.items())[-1], progress)
+    return Control(ultimate, pid, stable, inverses, tuple(loops), changed, data.range_um)
+
+
+def _learnt(stage: Stage, reference: Reference, model: InverseModel, pid: PID | None) -> Run:
+    """A run of a learning model that begins from rest with what identification alone gave it."""
+    return track_learning(stage, reference, learner_of(model), pid=pid)
+
+
+def _changed(
+    data: Experiments, inverses: dict[str, Inverse], named: tuple[str, Reference], progress: Progress
+) -> tuple[Loop, ...]:
+    """Feedforward alone, frozen and learning, on the stage whose gain drops by 6 % while it runs."""
+    name, reference = named
+    progress(f"following {name} while the gain drops by {-100 * GAIN_CHANGE:g} %")
+    stage = Stage(changing(data.config, CHANGE_S))
+    after = round((CHANGE_S + 1.0) / DT_S)
+    loops = []
+    for key in FROZEN:
+        run = track(stage, reference, model=inverses[key].model)
+        loops.append(Loop(key, "FF", name, run, Score.of(run.error_um[after:], data.range_um)))
+    for key, (_, base) in LEARNING.items():
+        run = _learnt(stage, reference, inverses[base].model, None)
+        loops.append(Loop(key, "FF", name, run, Score.of(run.error_um[after:], data.range_um)))
+    return tuple(loops)
+
+
+def moving_mae(error_um: FloatArray, range_um: float, span_s: float = 0.5) -> FloatArray:
+    """(n,) MAE over the last ``span_s``, percent of ``range_um``; fewer samples at the start."""
+    n = max(1, round(span_s / DT_S))
+    total = np.concatenate([[0.0], np.cumsum(np.abs(error_um))])
+    at = np.arange(1, error_um.size + 1)
+    since = np.maximum(at - n, 0)
+    return np.asarray((total[at] - total[since]) / (at - since) * (100.0 / range_um), dtype=np.float64)

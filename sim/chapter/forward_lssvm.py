@@ -1,0 +1,148 @@
+"""Forward LSSVMs, voltage in and displacement out: the chapter's with two inputs, and one with memory.
+
+The two-input model is (2.19)-(2.36) as printed: (u, du/dt) by the backward difference (2.41) at 0.02 s, min-max
+normalised (2.42), gamma and sigma by three levels of Bayesian inference from gamma0 = 100, sigma0 = 1.
+
+The model with memory has a linear part over play operators, arc and slow states of the *voltage* with a Gaussian
+prior, and a radial kernel for what is left, its hyper-parameters by the same evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adaptive import lssvm
+from adaptive.errors import InputError
+from adaptive.evidence import Evidence, problem
+from adaptive.features import FeatureMap
+from adaptive.identification import IdentifyConfig, design_features, prior_deviations
+from adaptive.inference import InferenceConfig, infer
+from adaptive.lssvm import LssvmModel
+from adaptive.scaling import MinMaxScaling
+from adaptive.smoothing import backward_difference
+from adaptive.types import FloatArray
+from sim.chapter.experiments import DT_S, EVERY
+
+#: The chapter's start, one width for both inputs.
+CHAPTER_INFERENCE = InferenceConfig(method="three_level", ard=False, starts=((100.0, 1.0),))
+#: Memory of the forward model: more plays than the inverse is served with, for displacement is free of noise here.
+MEMORY = IdentifyConfig(plays=20, slow=4, kernel_plays=3, arcs=(0.03, 0.1, 0.3, 0.8))
+#: Its evidence: one width for all inputs, for the little that is left over would let single widths run to noise.
+MEMORY_INFERENCE = InferenceConfig(ard=False, width_range=(0.1, 50.0))
+#: Noise of the linear part that its prior reckons with, as a share of the range, and rounds to find it.
+_FLOOR, _ROUNDS = 1e-4, 4
+
+
+def two_inputs(u_V: FloatArray, dt_s: float = DT_S * EVERY) -> FloatArray:
+    """(n, 2): voltage V and its backward difference V/s (2.41) of (n,) samples ``dt_s`` apart."""
+    return np.column_stack([u_V, backward_difference(u_V, dt_s)])
+
+
+@dataclass(frozen=True, slots=True)
+class TwoInputLssvm:
+    """The chapter's forward model; ``evidence`` is that of its hyper-parameters, None where these were given."""
+
+    model: LssvmModel
+    inputs: MinMaxScaling
+    output: MinMaxScaling
+    evidence: Evidence | None
+    leave_one_out_um: float
+
+    def predict(self, u_V: FloatArray) -> FloatArray:
+        """Displacement µm of every `EVERY`-th of the voltages ``u_V`` (n,), 1 ms apart."""
+        rows = two_inputs(np.ascontiguousarray(u_V[::EVERY]))
+        return self.output.denormalise(self.model.predict(self.inputs.normalise(rows)))
+
+
+def fit_two_inputs(
+    u_V: FloatArray, y_um: FloatArray, hyper: tuple[float, float] | None = None, config: InferenceConfig | None = None
+) -> TwoInputLssvm:
+    """From (n,) voltages and displacements 0.02 s apart; ``hyper`` = (gamma, sigma) skips the inference.
+
+    Raises InputError on shapes, NumericsError where the evidence cannot be evaluated.
+    """
+    rows = two_inputs(u_V)
+    inputs, output = MinMaxScaling.fit(rows), MinMaxScaling.fit(y_um)
+    X, target = inputs.normalise(rows), output.normalise(y_um)
+    found = None
+    if hyper is None:
+        found = infer(problem(X, target), config or CHAPTER_INFERENCE).best
+        gamma, widths = found.gamma, found.widths
+    else:
+        gamma, widths = hyper[0], np.full(2, hyper[1])
+    fit = lssvm.fit(X, target, widths, gamma)
+    left_out = float(np.sqrt(np.mean(fit.leave_one_out() ** 2)) * output.span[0])
+    return TwoInputLssvm(fit.model, inputs, output, found, left_out)
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryLssvm:
+    """Forward model with memory: ``y = beta' basis + kernel part``, features of the voltage at 1 ms."""
+
+    features: FeatureMap
+    beta: FloatArray
+    kernel: LssvmModel
+    evidence: Evidence
+
+    def _inputs(self, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return _features(self.features, u_V)
+
+    def predict(self, u_V: FloatArray) -> FloatArray:
+        """Displacement µm of every `EVERY`-th of the voltages ``u_V`` (n,), 1 ms apart, from rest at 0 V."""
+        basis, kernel = self._inputs(u_V)
+        return np.asarray(basis @ self.beta + self.kernel.predict(kernel), dtype=np.float64)
+
+    def linear_part(self, u_V: FloatArray) -> FloatArray:
+        """The same without the kernel, to see what each is worth."""
+        return np.asarray(self._inputs(u_V)[0] @ self.beta, dtype=np.float64)
+
+
+def _motion(u_V: FloatArray) -> FloatArray:
+    """(n, 3) voltage V, V/s, V/s² of a commanded voltage, which carries no noise."""
+    rate = np.gradient(u_V, DT_S)
+    return np.column_stack([u_V, rate, np.gradient(rate, DT_S)])
+
+
+def _features(features: FeatureMap, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
+    u, rate, second = (np.ascontiguousarray(column) for column in _motion(u_V).T)
+    basis, kernel, _ = features.run(u, rate, second, features.rest_memory(0.0))
+    return np.ascontiguousarray(basis[::EVERY]), np.ascontiguousarray(kernel[::EVERY])
+
+
+def posterior_mean(basis: FloatArray, target: FloatArray, deviations: FloatArray, floor: float) -> FloatArray:
+    """(p,) mean of a linear model under a Gaussian prior (p,) deviations; the noise from its own residual.
+
+    ``basis`` (n, p), ``target`` (n,); the noise is never taken below ``floor``.
+    """
+    gram, moment = basis.T @ basis, basis.T @ target
+    variance = float(np.var(target)) * 1e-4
+    beta: FloatArray = np.zeros(basis.shape[1])
+    for _ in range(_ROUNDS):
+        information = np.diag(deviations**-2.0) + gram / variance
+        beta = np.asarray(np.linalg.solve(information, moment / variance), dtype=np.float64)
+        variance = max(float(np.mean((target - basis @ beta) ** 2)), floor * floor)
+    return beta
+
+
+def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = MEMORY) -> MemoryLssvm:
+    """From the commanded voltage (m,), 1 ms apart, and displacements (ceil(m/20),), 0.02 s apart.
+
+    Raises InputError where the lengths do not belong together.
+    """
+    if y_um.shape != u_fine_V[::EVERY].shape:
+        raise InputError(f"y_um: got {y_um.shape}, expected {u_fine_V[::EVERY].shape}: one for {EVERY} of u_fine_V")
+    # Thresholds and scales from the voltage, which plays the part that displacement has in the inverse.
+    features = replace(design_features(_motion(u_fine_V), DT_S, config, True), y_rest_um=0.0)
+    basis, kernel = _features(features, u_fine_V)
+    span = float(np.ptp(y_um))
+    beta = posterior_mean(basis, y_um, prior_deviations(features, span), _FLOOR * span)
+    rest = y_um - basis @ beta
+    scale = max(float(np.std(rest)), 1e-12)
+    evidence = infer(problem(kernel, rest / scale), MEMORY_INFERENCE).best
+    fit = lssvm.fit(kernel, rest / scale, evidence.widths, evidence.gamma)
+    rescaled = replace(
+        fit.model, alpha=fit.model.alpha * scale, beta=fit.model.beta * scale, scale=fit.model.scale * scale**2
+    )
+    return MemoryLssvm(features, beta, rescaled, evidence)
