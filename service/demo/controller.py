@@ -17,14 +17,18 @@ import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
+from adaptive.types import FloatArray
 from service import wire
 from service.client import Client, Trajectory
 from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from service.demo.run import empty
+from service.errors import BehindError, ReplyTimeoutError
 from service.keys import Keys
+from service.session import open_client
+from service.wire_query import NEWEST
 
 #: How long to wait for the stage's next samples, and for the service to have learnt far enough, s.
-STALL_S, BEHIND_S = 10.0, 0.5
+STALL_S, BEHIND_S = 10.0, 0.1
 
 
 class Twins:
@@ -69,13 +73,10 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     n, size = plan.ticks, plan.block
     std_V = empty(plan)
     durations: list[float] = []
-    late = 0
+    late = 0  # answers that came after their block was due, or not from the snapshot they should have come from
     answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
-    with (
-        Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client,
-        Client.connect(endpoint, STAGE, AXIS) as wire_out,
-    ):
-        session = wire_out._session
+    # Two sessions, so that an answer never waits behind the samples of five twins.
+    with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
         commands = {name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, express=True) for name in MODELS}
         event = session.declare_publisher(Keys(STAGE, AXIS).event)
@@ -88,15 +89,9 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                 client.reference(part.start, wanted[0][part])
                 for name in MODELS:
                     begin = time.perf_counter()
-                    answer = client.trajectory(
-                        wanted[0][part],
-                        wanted[1][part],
-                        wanted[2][part],
-                        model=name,
-                        after=answers[name],
-                        as_of=plan.as_of(block),
-                        wait_s=BEHIND_S,
-                    )
+                    motion = (wanted[0][part], wanted[1][part], wanted[2][part])
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(block))
+                    late += waited
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
                     std_V[name][part] = answer.std_V
@@ -118,6 +113,25 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     np.savez(out, query_s=np.asarray(durations), late=late, **arrays)
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
+
+
+def ask(
+    client: Client, motion: tuple[FloatArray, FloatArray, FloatArray], model: str, after: Trajectory | None, as_of: int
+) -> tuple[Trajectory, bool]:
+    """The voltages for a block, and whether they had to be asked for more than once.
+
+    A controller does not give up because the machine stalled: it asks again, and takes the newest snapshot where
+    the right one is not there in time. Raises what the client raises once ``STALL_S`` are over.
+    """
+    until = time.monotonic() + STALL_S
+    wanted, waited = as_of, False
+    while True:
+        try:
+            return client.trajectory(*motion, model=model, after=after, as_of=wanted, wait_s=BEHIND_S), waited
+        except (BehindError, ReplyTimeoutError):
+            if time.monotonic() >= until:
+                raise
+            wanted, waited = NEWEST, True
 
 
 def _kinds(twins: Twins, std_V: dict[str, Any]) -> dict[str, dict[str, Any]]:

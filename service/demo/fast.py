@@ -38,7 +38,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
             for name in MODELS:
                 y_um[name][part] = stage.run(states[name], u_V[name][part])[0]
             seq = np.arange(part.start, part.stop)
-            t_s: FloatArray = seq * plan.dt_s
+            t_s = seq.astype(np.float64) * plan.dt_s
             batch = SampleBatch(seq, t_s, u_V[TEACHER][part], y_um[TEACHER][part])
             verdicts = axis.handle(batch)
             recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)

@@ -57,7 +57,7 @@ class Plan:
     low_um: float = 4.0
     high_um: float = 80.0
     block: int = 20
-    lead: int = 40
+    lead: int = 60
     margin: int = 20
     seed: int = 20
 

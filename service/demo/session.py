@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import InputError
-from adaptive.types import FloatArray
 from service.config import read_config
 from service.demo.fast import run_fast
 from service.demo.live import record_identification, run_live
@@ -175,7 +174,7 @@ def _scene(plan: Plan) -> SceneConfig:
 
 def _records(plan: Plan, done: Run) -> list[Record]:
     seq = np.arange(plan.ticks)
-    t_s: FloatArray = seq * plan.dt_s
+    t_s = seq.astype(np.float64) * plan.dt_s
     wanted_um = plan.reference()[0]
     records: list[Record] = [
         Tracking(name, seq, t_s, done.u_V[name], done.y_um[name], wanted_um, done.std_V[name]) for name in MODELS
