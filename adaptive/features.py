@@ -247,6 +247,12 @@ class FeatureMap:
         """Write basis (p,) and kernel (d,) inputs of a point whose memory has been advanced."""
         fill(y_um, v_um_per_s, a_um_per_s2, memory, self._arrays, basis, kernel)
 
+    def motion_of(self, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacement µm and velocity µm/s, (n,) each, of kernel inputs (n, d): what a person can look at."""
+        m = self._arrays
+        y_um = (kernel[:, 0] / m.scale[1] + m.scale[0]) / m.frame[1] + m.frame[0]
+        return y_um, kernel[:, 1] / (m.scale[2] * m.frame[1])
+
     def run(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ reading that no voltage made moves the frame of the features, and with it everyt
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -345,24 +346,35 @@ class Learner:
             **{f"window_{name}": value for name, value in self._window.counters().items()},
         }
 
-    def diagnostics(self) -> dict[str, float]:
-        """Numbers for a viewer: errors in V and in percent of the voltage span, frame, window, residual."""
+    def diagnostics(self) -> dict[str, Any]:
+        """For a viewer: errors in V and in percent of the voltage span, gain and offset, the window's samples.
+
+        ``gain`` is the stage's, relative to the identified model: that of the frame and of the linear part together.
+        """
         j, percent = self._judgement, 100.0 / self.base.span_V
+        now, before = self._filter.beta[1:], self.base.beta[1:]
+        along = float(now @ before)
+        window_y_um, window_v_um_per_s = self._features.motion_of(self._window.arrays()[0])
         return {
             "error_V": j.error_V,
             "rms_error_pct": float(np.sqrt(j.long_V2)) * percent,
             "recent_rms_error_pct": float(np.sqrt(j.short_V2)) * percent,
             "frozen_rms_error_pct": float(np.sqrt(j.frozen_V2)) * percent,
             "share_within_std": j.inside / max(1, j.judged),
-            "gain": self._served.gain,
-            "offset_um": self._served.offset_um,
-            "bias_V": float(self._filter.beta[0] - self.base.beta[0]),
+            "gain": self._served.gain * (float(before @ before) / along if along > 0.0 else 1.0),
+            "frame_gain": self._served.gain,
+            "frame_offset_um": self._served.offset_um,
+            "offset_V": float(self._filter.beta[0] - self.base.beta[0]),
+            "u_V": self._gates.u_V,
+            "std_V": float(np.sqrt(j.variance_V2)),
             "window_samples": float(len(self._window)),
             "window_residual_V": self._window.residual_V,
             "valid": float(j.valid),
             "fallback": float(j.fallback),
             "frozen": float(self._frozen),
             "lag_s": self._smoother.config.lag * self._dt,
+            "window_y_um": window_y_um.tolist(),
+            "window_v_um_per_s": window_v_um_per_s.tolist(),
         }
 
     def window_samples(self) -> tuple[FloatArray, FloatArray]:

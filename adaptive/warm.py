@@ -53,4 +53,3 @@ def warm_window() -> None:
         window.refine()
         window.rebuild()
         window.scale  # noqa: B018
-

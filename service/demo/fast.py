@@ -44,6 +44,10 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
             recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
             if done % (5 * size) == 0 and axis.learner is not None:
                 told = axis.learner.diagnostics() if hasattr(axis.learner, "diagnostics") else {}
+                if done % 1000:
+                    told = {
+                        key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
+                    }
                 notes.append(Diagnostics(float(batch.t_s[-1]), int(seq[-1]), told))
             if (done + size) % 1000 == 0:
                 tail = slice(max(0, done + size - 1000), done + size)
