@@ -80,6 +80,8 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
         twins = Twins(plan, session)
         commands = {name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, express=True) for name in MODELS}
         event = session.declare_publisher(Keys(STAGE, AXIS).event)
+        # The subscriptions must have reached the stage before the first commands start its clock.
+        time.sleep(0.3)
         try:
             for block in range(n // size):
                 part = slice(block * size, (block + 1) * size)

@@ -61,6 +61,13 @@ class Feed:
         self.stage, self.errors_um = stage, errors_um
         self.sent = 0
 
+    def wait_until_heard(self, session: Any) -> None:
+        """What is published before another process's subscription has made its way here goes to nobody."""
+        for unit in self.errors_um:
+            publisher = session.declare_publisher(Keys(self.stage, unit).sample)
+            wait_for(lambda publisher=publisher: publisher.matching_status.matching)
+            publisher.undeclare()
+
     def send(self, n: int, axis: str = "x") -> None:
         """``n`` samples of every unit, references ahead of them, diagnostics and status with them."""
         k = np.arange(self.sent, self.sent + n)
@@ -174,6 +181,7 @@ def test_the_process_writes_a_recording_that_reads_back(tmp_path: Path) -> None:
             ready = process.stdout.readline()
             assert ready.startswith(f"viewing demo/x at {endpoint} into"), process.communicate(timeout=10)
             feed = Feed(session, "demo", {"x": 0.06, "x_linear": -3.0})
+            feed.wait_until_heard(session)
             for k in range(60):
                 feed.send(BATCH)
                 if k == 30:
