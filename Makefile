@@ -10,7 +10,7 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test check bench requirements clean
+.PHONY: help setup setup-test demo test check bench blind requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -47,6 +47,9 @@ check: setup-test ## ruff, mypy --strict, the import contract
 
 bench: setup-test ## the solver beside its yardsticks and its peers
 	$(BIN)/dehyst bench
+
+blind: setup-test ## score the diagnosis on 200 recordings with hidden effects (an hour or more)
+	$(BIN)/python -m tests.hidden.blind
 
 requirements: ## pin both requirement files anew (needs uv)
 	$(COMPILE) pyproject.toml -o requirements.txt

@@ -109,7 +109,7 @@ class Plan:
     @property
     def change_text(self) -> str:
         """The change as a person would say it."""
-        return f"gain {100.0 * self.gain_change:+.0f} %, payload of {self.payload_ratio:g} x the moved mass"
+        return f"gain {100.0 * self.gain_change:+.0f} %, moved mass x {1.0 + self.payload_ratio:g} by a payload"
 
     def stage(self, *, changing: bool) -> StageConfig:
         """The stage, rested; with ``changing`` its gain drops and its payload grows at ``change_tick``."""

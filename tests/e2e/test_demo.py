@@ -93,17 +93,17 @@ def test_adaptive_is_caught_again_and_better_than_all_frozen_ones(fast: Path) ->
 @pytest.mark.e2e
 @pytest.mark.slow
 def test_fast_gives_the_same_numbers_as_real_time(fast: Path, live: tuple[Path, str]) -> None:
-    """To the last bit where every voltage came in time; a machine that stalled may differ a little, and says so."""
+    """To the last bit, wherever every voltage came in time."""
     quick, real = summary(fast), summary(live[0])
     held = real["ticks"]["late"] + real["queries"]["late"]
-    tolerance = 0.0 if held == 0 else 0.1
+    if held:
+        pytest.skip(f"this machine stalled: {held} ticks or answers came too late in real time, so the runs differ")
     for name in MODELS:
         for phase, figures in quick["models"][name].items():
             for key, value in figures.items():
-                assert real["models"][name][phase][key] == pytest.approx(value, rel=tolerance, abs=0.0), (name, phase)
+                assert real["models"][name][phase][key] == value, (name, phase, key)
     a, b = (pq.read_table(out / "recording").to_pydict() for out in (fast, live[0]))  # type: ignore[no-untyped-call]
-    if held == 0:
-        assert np.array_equal(a["u_V"], b["u_V"])
+    assert np.array_equal(a["u_V"], b["u_V"])
 
 
 @pytest.mark.e2e

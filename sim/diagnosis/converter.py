@@ -1,0 +1,66 @@
+"""Causes that are no smooth change of the reading: the grid of a converter, and readings that repeat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Step of the readings' grid (µm, 0 where there is none that shows) and how many levels were used."""
+
+    step_um: float
+    levels: int
+
+
+def grid_of(y_um: FloatArray) -> Grid:
+    """The grid that all readings lie on, or none.
+
+    The smallest distance between levels is refined to the step that every reading is a multiple of; a record whose
+    levels are nearly as many as its readings has no grid that could matter.
+    """
+    levels = np.unique(y_um)
+    if levels.size < 3 or levels.size > 0.9 * y_um.size:
+        return Grid(0.0, int(levels.size))
+    gaps = np.diff(levels)
+    # Differences of doubles carry rounding; a step is far larger than that.
+    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), 1e-12)]
+    if gaps.size < 2:
+        return Grid(0.0, int(levels.size))
+    step = float(np.min(gaps))
+    for _ in range(3):
+        counts = np.rint(gaps / step)
+        step = float(gaps.sum() / counts.sum())
+    counts = np.rint(gaps / step)
+    off = np.abs(gaps - counts * step) / step
+    return Grid(step if float(np.quantile(off, 0.99)) < 0.05 else 0.0, int(levels.size))
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Readings that repeat the one before although the motion had moved on: how many, of how many that could show."""
+
+    count: int
+    of: int
+    where: FloatArray
+
+    @property
+    def probability(self) -> float:
+        return self.count / self.of if self.of else 0.0
+
+
+def repeats(y_um: FloatArray, sigma_um: float, step_um: float) -> Repeats:
+    """Count exact repeats between two samples that both moved by far more than the noise and the grid.
+
+    Asked of the readings alone: where a clamp or friction holds the stage, they do not move before and after.
+    """
+    moved = np.diff(y_um)
+    least = 8.0 * max(sigma_um, 1e-12) + 1.5 * step_um
+    # Both the same way: at the top of a fast sine a step of zero is no repeat.
+    candidate = (np.minimum(moved[:-2], moved[2:]) > least) | (np.maximum(moved[:-2], moved[2:]) < -least)
+    where = np.flatnonzero(candidate & (moved[1:-1] == 0.0)) + 2
+    return Repeats(int(where.size), int(candidate.sum()), where.astype(np.float64))

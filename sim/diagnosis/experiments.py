@@ -1,0 +1,135 @@
+"""The next experiment: of a few that anybody can run, the one whose simulation separates what is still open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from sim.diagnosis.catalogue import FORMS
+from sim.diagnosis.chain import Model
+from sim.diagnosis.fit import Fit
+from sim.diagnosis.monitor import drive_at_samples
+from sim.diagnosis.setting import Setting
+
+#: What a voltage monitor resolves, relative to the swing.
+MONITOR_NOISE = 2e-4
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A drive of the same length and swing as the record, in words and as voltages."""
+
+    words: str
+    u_V: FloatArray
+    u2_V: FloatArray
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Two fitted explanations of one record."""
+
+    name: str
+    other: str
+    mine: Fit
+    theirs: Fit
+
+
+def experiments(setting: Setting) -> list[Experiment]:
+    """Drives between the record's lowest and highest voltage, as many samples as it has."""
+    n, dt, low, swing = setting.n, setting.dt_s, setting.u_low_V, setting.swing_V
+    t, total, zero = setting.t_s, setting.duration_s, np.zeros(setting.n)
+    x = t / total
+    triangle = 1.0 - np.abs(2.0 * np.mod(x * 3.0, 1.0) - 1.0)
+    fast = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.minimum(20.0, 0.02 / dt) * t)
+    medium = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.minimum(2.0, 0.002 / dt) * t)
+    levels = np.array([0.0, 0.5, 1.0, 0.25, 0.0])
+    short = np.array([0.0, 1.0, 0.2, 0.8, 0.4, 0.6, 0.0])
+    every = max(4, round(0.4 / dt))
+    top = 0.3 / dt
+    sweep = np.sin(2.0 * np.pi * (0.5 * t + (top - 0.5) / (2.0 * total) * t * t))
+    nested = np.interp(x, np.linspace(0.0, 1.0, 12), [0, 1, 0.1, 0.9, 0.2, 0.8, 0.3, 0.7, 0.4, 0.6, 0.5, 0])
+    rates = np.where(x < 0.4, triangle, np.where(x < 0.7, medium, fast)) * np.where(np.mod(x, 0.3) < 0.15, 1.0, 0.4)
+    shapes = [
+        (f"steps to four levels, each held for {total / 5.0:.3g} s", levels[np.minimum((x * 5.0).astype(int), 4)]),
+        ("full steps every 0.4 s", short[(np.arange(n) // every) % 7]),
+        ("triangles and sines at three rates over two decades and at two amplitudes", rates),
+        ("nested triangles, every loop inside the one before", nested),
+        (f"a small chirp of 5 % of the range up to {top:.3g} Hz", 0.5 + 0.025 * sweep),
+    ]
+    out = [Experiment(words, np.ascontiguousarray(low + swing * s), zero) for words, s in shapes]
+    out.append(Experiment("the same record once more after a minute at zero input", setting.u_V, zero))
+    out.append(Experiment("the other axis driven alone over its range, this one at zero", zero, low + swing * medium))
+    return out
+
+
+def _at(model: Model, p: FloatArray, experiment: Experiment) -> FloatArray:
+    home = model.setting
+    setting = replace(home, u_V=experiment.u_V, u2_V=experiment.u2_V)
+    if np.any(experiment.u2_V):
+        other = home.gain_um_per_V * (experiment.u2_V - experiment.u2_V[0])
+        setting = replace(setting, other_um=other, other_um_per_s=np.gradient(other, setting.dt_s))
+    setting = setting.scaled_as(home)
+    return Model(setting, model.nominal, model.forms).simulate(p).reading_um
+
+
+def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: Fit, sigma_um: float) -> str | None:
+    """What to record next, in a sentence with the simulated separation, or None where nothing is open."""
+    setting = fit.model.setting
+    if rivals:
+        rival = rivals[0]
+        here = _apart(rival.mine.signals.reading_um, rival.theirs.signals.reading_um)
+        best, size = "", 0.0
+        for experiment in experiments(setting):
+            both = [_at(f.model, f.p, experiment) for f in (rival.mine, rival.theirs)]
+            apart = _apart(both[0], both[1])
+            if np.isfinite(apart) and apart > size:
+                best, size = experiment.words, apart
+        drive = _apart(drive_at_samples(rival.mine), drive_at_samples(rival.theirs)) / max(setting.swing_V, 1e-12)
+        if drive / MONITOR_NOISE > size / sigma_um:
+            return (
+                f"the same record with a voltage monitor at the actuator (monitor_V): simulated, {rival.name} and "
+                f"{rival.other} then differ there by {drive * setting.swing_V * 1e3:.3g} mV rms"
+            )
+        if size < 2.0 * max(here, 0.2 * sigma_um):
+            return (
+                f"no drive of this stage separates {rival.name} from {rival.other} ({size * 1e3:.2g} nm rms at best, "
+                "simulated); a second sensor, a voltage monitor or a temperature log would"
+            )
+        return (
+            f"{best}: simulated, {rival.name} and {rival.other} then differ by {size * 1e3:.3g} nm rms "
+            f"({size / sigma_um:.2g} times the noise), against {here * 1e3:.2g} nm in this record"
+        )
+    return _excite(missing, fit, sigma_um)
+
+
+def _apart(a: FloatArray, b: FloatArray) -> float:
+    """Rms difference, a common offset left out."""
+    d = a - b
+    return float(np.std(d))
+
+
+def _excite(missing: tuple[str, ...], fit: Fit, sigma_um: float) -> str | None:
+    """The drive in which most of the causes that this record does not excite would show."""
+    wanted = [f for f in FORMS if f.name in missing and f.name != "payload_change"]
+    best: tuple[str, list[str]] = ("", [])
+    for experiment in experiments(fit.model.setting):
+        base = _at(fit.model, fit.p, experiment)
+        names: list[str] = []
+        for form in wanted:
+            setting = fit.model.setting
+            crossing = form.name == "cross_talk" and bool(np.any(experiment.u2_V))
+            if form.applies(setting) and not crossing:
+                continue
+            model = fit.model.plus(form)
+            for trial in form.trials(setting, fit.residual_um)[:3]:
+                moved = _at(model, np.concatenate([fit.p, trial[0]]), experiment)
+                if np.all(np.isfinite(moved)) and np.std(moved - base) * np.sqrt(setting.n) > 30.0 * sigma_um:
+                    names.append(form.name)
+                    break
+        if len(set(names)) > len(set(best[1])):
+            best = (experiment.words, sorted(set(names)))
+    if not best[1]:
+        return None
+    return f"{best[0]}: simulated, it would show {', '.join(best[1])}, which this record does not excite"

@@ -1,0 +1,73 @@
+"""From a recording to the setting of a diagnosis: checked, on its own time grid, holes marked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.setting import Setting
+from sim.recordings import Finding, Recording, check, repaired, require_usable
+
+#: Longer records are diagnosed on their longest head of this many samples: memory stays below 1 GB.
+MOST_SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A recording ready for a diagnosis. ``mask`` is False where a sample was filled in."""
+
+    setting: Setting
+    mask: BoolArray
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    #: Samples that the recorder lost or doubled, by its own time base.
+    dropped: int
+
+
+def prepare(recording: Recording) -> Prepared:
+    """Check, repair and cut. Raises InputError where nothing can be diagnosed, with what to do about it."""
+    findings = check(recording)
+    require_usable(recording, findings)
+    where = recording.source or "recording"
+    for finding in findings:
+        if finding.kind == "swapped":
+            raise InputError(
+                f"{where}: {finding.message}; a diagnosis of exchanged columns would name causes that are not there"
+            )
+    bad = int(np.sum(~(np.isfinite(recording.u_V) & np.isfinite(recording.y_um))))
+    if bad > 0.05 * len(recording):
+        raise InputError(
+            f"{where}: got {bad} of {len(recording)} samples that are no finite numbers, expected at most 5 %: "
+            "record again, or give the part that is whole (--range)"
+        )
+    fixed = repaired(recording)
+    whole = fixed.recording
+    notes = list(fixed.done)
+    if len(whole) < 1000:
+        raise InputError(
+            f"{where}: got {len(whole)} usable samples, expected at least 1000: too few to name a cause; record longer"
+        )
+    if len(whole) > MOST_SAMPLES:
+        notes.append(f"the first {MOST_SAMPLES} of {len(whole)} samples were used (--range chooses others)")
+        whole = whole.part(0, MOST_SAMPLES)
+    lost = sum(f.count for f in findings if f.kind in ("gap", "doubled"))
+    setting = Setting(
+        dt_s=recording.dt_s,
+        u_V=np.ascontiguousarray(whole.u_V),
+        y_um=np.ascontiguousarray(whole.y_um),
+        u2_V=_moving(whole.u2_V),
+        y2_um=_moving(whole.y2_um),
+        temperature_C=whole.temperature_C,
+        monitor_V=_moving(whole.monitor_V),
+    )
+    return Prepared(setting, fixed.valid[: len(whole)], tuple(findings), tuple(notes), lost)
+
+
+def _moving(values: FloatArray | None) -> FloatArray | None:
+    """A column that says something, or None."""
+    if values is None or not np.all(np.isfinite(values)) or float(np.ptp(values)) == 0.0:
+        return None
+    return np.ascontiguousarray(values, dtype=np.float64)

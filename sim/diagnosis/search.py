@@ -1,0 +1,224 @@
+"""The search: add the cause that explains most held-out error, join, remove, substitute, stop at the noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.catalogue import FORMS, same_set
+from sim.diagnosis.chain import Model
+from sim.diagnosis.evidence import HeldOut, Screen, Screened, Split, held_out, p_value
+from sim.diagnosis.fit import Fit, calibrate, evaluate, within
+from sim.diagnosis.forms import Form
+from sim.diagnosis.lines import line_is_there
+from sim.diagnosis.monitor import monitor_misfit
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What is asked of a cause before it is named. The values are those with which `docs/diagnosis.md` was scored."""
+
+    #: Chance level of the null distribution, after correction for the number of candidates.
+    level: float = 0.01
+    #: Least share of the held-out squared error that a cause must remove.
+    least_gain: float = 0.02
+    #: The same, as a share of the noise floor's square: less is a quarter of the noise and no matter.
+    least_of_floor: float = 0.08
+    #: Least share of what stands above the noise floor that the first, and a further, cause must remove.
+    least_excess_first: float = 0.1
+    least_excess_next: float = 0.25
+    #: Cost of a number, as a share of the squared error: of two causes that do as well, the simpler.
+    cost_per_number: float = 0.002
+    #: How many of the linearised guesses are fitted in full.
+    refits: int = 6
+    most_causes: int = 5
+    #: A substitute within this share of the gain, or within this many standard errors, is an alternative.
+    close_share: float = 0.02
+    close_sigmas: float = 2.5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A cause fitted jointly with everything else."""
+
+    form: Form
+    fit: Fit
+    held: HeldOut
+    cost: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted cause at the time of its acceptance."""
+
+    name: str
+    p_value: float
+
+
+@dataclass
+class Search:
+    """Everything that the greedy search works on; `run` gives the accepted model."""
+
+    mask: BoolArray
+    parts: Split
+    sigma_um: float
+    rules: Rules
+    seed: int
+    progress: Progress
+    #: The readings' grid is coarser than their noise.
+    coarse: bool = False
+    forms: tuple[Form, ...] = FORMS
+    first_looks: list[Screened] = field(default_factory=list)
+
+    def cost(self, fit: Fit, held: HeldOut, base: Fit) -> float:
+        """Held-out error, with the price of the numbers that a model has more than ``base``."""
+        extra = len(fit.free) - len(base.free)
+        seen = monitor_misfit(fit, self.mask) * self.sigma_um**2 if fit.model.setting.monitor_V is not None else 0.0
+        return seen + held.sse_um2 * (1.0 + self.rules.cost_per_number * max(extra, 0))
+
+    def held(self, fit: Fit) -> HeldOut:
+        return held_out(fit, self.mask, self.parts)
+
+    def looks(self, fit: Fit, skip: set[str]) -> tuple[list[Screened], list[Form]]:
+        """The best linearised guess of every form that could show, largest gain first."""
+        screen = Screen(fit, self.mask, self.parts)
+        found: list[Screened] = []
+        for i, form in enumerate(self.forms):
+            if form.name in skip or form.applies(fit.model.setting):
+                continue
+            look = screen.look(i, fit.model.plus(form))
+            if look is not None:
+                found.append(look)
+        found.sort(key=lambda s: -s.gain_um2)
+        return found, [self.forms[s.index] for s in found]
+
+    def refit(self, base: Fit, looks: list[Screened], count: int, least_um2: float) -> list[Candidate]:
+        """The most promising guesses fitted jointly, the cheapest in held-out error first."""
+        out: list[Candidate] = []
+        if not looks:
+            return out
+        chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
+        # A line at the mains is small beside anything else and known by its own mark.
+        chosen += [s for s in looks[count:] if self.forms[s.index].name == "mains_hum" and self.is_line(s, base)]
+        for look in chosen:
+            form = self.forms[look.index]
+            fits = [self._quick(base.model.plus(form), base, look.start)]
+            if form.fast:
+                other = replace(base.model, nominal=base.model.nominal.with_other_hold())
+                fits.append(self._quick(other.plus(form), base, look.start))
+            quick = min(fits, key=lambda f: f.sse_um2)
+            held = self.held(quick)
+            out.append(Candidate(form, replace(quick, rows=None), held, self.cost(quick, held, base)))
+        return sorted(out, key=lambda c: c.cost)
+
+    def _quick(self, model: Model, base: Fit, guess: FloatArray) -> Fit:
+        """A few steps of the joint fit from a linearised guess, or from beside neutral where that overshot."""
+        start = np.concatenate([base.p, guess])
+        if evaluate(model, within(model, start), self.mask).sse_um2 > base.sse_um2:
+            slots = model.forms[-1].slots(model.setting)
+            linear = np.array([s.steady for s in slots])
+            neutral = np.array([s.neutral for s in slots])
+            start[base.p.size :] = np.where(linear, neutral, guess)
+        return calibrate(model, start, self.mask, 8, 2e-3)
+
+    def is_line(self, look: Screened, base: Fit) -> bool:
+        return line_is_there(base.residual_um, base.model.setting, float(look.start[0]))
+
+    def polish(self, candidate: Candidate, base: Fit) -> Candidate:
+        """The same cause fitted to the end."""
+        more = 40 if candidate.form.variant == "restoring" else 12
+        fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, more, 1e-5)
+        held = self.held(fit)
+        return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
+
+    def plausible(self, candidate: Candidate) -> bool:
+        """Whether its numbers are of a size and sign that the cause has."""
+        model = candidate.fit.model
+        return candidate.form.plausible(model.part(candidate.fit.p, len(model.forms) - 1), model.setting)
+
+    def acceptable(self, best: Candidate, held: HeldOut, left_um2: FloatArray, p: float, base: Fit) -> bool:
+        """Whether the gain of a cause is more than chance, more than the form's own error, and physical."""
+        rules = self.rules
+        gain = held.sse_um2 - best.held.sse_um2
+        if p > rules.level or gain <= 0.0:
+            return False
+        slots = best.form.slots(best.fit.model.setting)
+        q = best.fit.model.part(best.fit.p, len(best.fit.model.forms) - 1)
+        if best.form.name == "mains_hum":
+            return gain > 30.0 * self.sigma_um**2 and line_is_there(base.residual_um, base.model.setting, float(q[0]))
+        if len(slots) == 1 and (q[0] <= slots[0].low or q[0] >= slots[0].high):
+            return False
+        if not self.plausible(best):
+            return False
+        floor = self.parts.blocks(self.mask.astype(np.float64) * self.sigma_um**2)
+        now, after = held.per_block_um2, best.held.per_block_um2
+        first = not np.any(left_um2)
+        # Blocks that hold hardly more than what the forms of earlier causes leave behind tell nothing of a further one.
+        clean = now > 2.0 * left_um2
+        whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
+        gain = float((now - after)[clean].sum())
+        excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
+        need = rules.least_excess_first if first else rules.least_excess_next
+        # Rounding to a coarse grid errs alike wherever the stage stands still, so that it passes for a cause.
+        least = max(
+            rules.least_gain * float(now.sum()), (0.5 if self.coarse else rules.least_of_floor) * float(floor.sum())
+        )
+        return gain > least and gain > need * excess and whole > 0.5 * need
+
+    def run(self, nominal: Fit) -> tuple[Fit, HeldOut, list[Step]]:
+        """Greedy addition from a calibrated nominal model, with substitution after each step."""
+        current, held = nominal, self.held(nominal)
+        left_um2 = np.zeros_like(held.per_block_um2)
+        steps: list[Step] = []
+        for round_ in range(self.rules.most_causes):
+            self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.rules.most_causes)
+            looks, _ = self.looks(current, same_set({f.name for f in current.model.forms}))
+            if round_ == 0:
+                self.first_looks = looks
+            ranked = self.refit(current, looks, self.rules.refits, 0.3 * self.rules.least_gain * current.sse_um2)
+            accepted: Candidate | None = None
+            p = 1.0
+            fitting = [c for c in ranked if self.plausible(c)]
+            for candidate in fitting[:3]:
+                best = self.polish(candidate, current)
+                gain = held.sse_um2 - best.held.sse_um2
+                # The linearised gain is what the null distribution knows; a full fit may only be judged by as much.
+                p = p_value(looks, gain, self.seed + round_)
+                if self.acceptable(best, held, left_um2, p, current):
+                    accepted = best
+                    break
+            if accepted is None:
+                break
+            left = accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))
+            if (
+                accepted.form.name == "hysteresis_shape"
+                and not accepted.form.variant
+                and left > (1.5 * self.sigma_um) ** 2
+            ):
+                accepted = self._finer(accepted, current)
+            gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
+            left_um2 = left_um2 + accepted.form.form_error**2 * gone
+            current, held = accepted.fit, accepted.held
+            steps.append(Step(accepted.form.name, p))
+        return current, held, steps
+
+    def _finer(self, accepted: Candidate, base: Fit) -> Candidate:
+        """More thresholds where a loop shape is the cause: what it leaves must not be taken for something else."""
+        form = replace(accepted.form, variant="fine")
+        model = base.model.plus(form)
+        start = np.concatenate([accepted.fit.p[: len(base.p)], np.zeros(len(form.slots(model.setting)))])
+        fit = calibrate(model, start, self.mask, 8, 1e-3)
+        held = self.held(fit)
+        cost = self.cost(fit, held, base)
+        return Candidate(form, fit, held, cost) if cost < accepted.cost else accepted
+
+    def without(self, fit: Fit, index: int) -> Fit:
+        """The model less one cause, calibrated anew."""
+        where = fit.model.where(index)
+        start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
+        return calibrate(fit.model.less(index), start, self.mask, 5, 3e-3)
