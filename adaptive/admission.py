@@ -7,7 +7,7 @@ them advances the smoother. The later gates look at the pair of smoothed motion 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 
 from adaptive.errors import InputError
@@ -15,6 +15,8 @@ from adaptive.types import Sample, StateDict
 
 #: µm or V that no reading has.
 ABSURD = 1e9
+#: Sample time up to which ``glitch_share`` holds as it is, s.
+GLITCH_DT_S = 1e-3
 
 LEARNT = "learnt"
 #: Passed all gates, but neither filter nor window was due: the rates of both are configured.
@@ -45,7 +47,8 @@ class AdmissionConfig:
 
     u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one does not teach.
     y_min_um, y_max_um : what the sensor can show; beyond it a reading is out of range.
-    glitch_share : a reading this far from the smoother's prediction, as a share of the model's range, is a glitch ...
+    glitch_share : a reading this far from the smoother's prediction, as a share of the model's range at sample times
+    of up to 1 ms (``at``), is a glitch ...
     glitch_persistence : ... unless this many in a row are: then the stage has really moved.
     max_gap : missing samples that the smoother bridges; beyond it, it starts again.
     settle : samples after a (re)start that do not teach.
@@ -78,6 +81,10 @@ class AdmissionConfig:
         for name in ("glitch_persistence", "max_gap", "settle"):
             if getattr(self, name) < 0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a count, not negative")
+
+    def at(self, dt_s: float) -> AdmissionConfig:
+        """The limits at a sample time, s: predictions over a longer step are worse, and with them what is a glitch."""
+        return replace(self, glitch_share=self.glitch_share * max(1.0, dt_s / GLITCH_DT_S))
 
 
 @dataclass(slots=True)

@@ -5,7 +5,7 @@ Play operators on the displacement (the inverse of a Prandtl-Ishlinskii model is
 displacement); *arc states*, which relax towards y over the path travelled and not over time (the Duhem model's way:
 smooth loops without return points); and *slow states*, leaky integrals with log-spaced time constants, for creep.
 They form the flat ``memory`` that travels with the caller, in µm:
-``[play_1 .. play_K, arc_1 .. arc_A, slow_1 .. slow_M, last y]``, the last entry only where there are arcs.
+``[play_1 .. play_K, arc_1 .. arc_A, slow_1 .. slow_M, end of the path]``, the last entry only where there are arcs.
 
 Two vectors come out of a point:
 
@@ -42,7 +42,7 @@ class FeatureArrays(NamedTuple):
 
     thresholds (K,), arc lengths (A,), both µm; retain (M,) = exp(-dt/tau) of the slow states; scale
     [y0, 1/y, 1/v, 1/a]; kernel_plays (d - 2,) indices; flags [linear, asymmetric];
-    frame [offset, 1/gain].
+    frame [offset, 1/gain, dead band of the arcs].
     """
 
     thresholds: FloatArray
@@ -58,8 +58,9 @@ class FeatureArrays(NamedTuple):
 def advance(y_um: float, memory: FloatArray, m: FeatureArrays) -> None:  # pragma: no cover - compiled
     """Memory after one point at ``y_um``, in place.
 
-    A play follows y at the distance of its threshold; an arc state relaxes towards y, by exp(-|dy|/rho); a slow
-    state by exp(-dt/tau).
+    A play follows y at the distance of its threshold; an arc state relaxes towards y, by exp(-path/rho); a slow
+    state by exp(-dt/tau). The path is counted behind a dead band: the noise of a stage at rest is no path, and would
+    relax the arcs within seconds, where those of the noise-free reference stay.
     """
     y = (y_um - m.frame[0]) * m.frame[1]
     n = m.thresholds.shape[0]
@@ -71,8 +72,9 @@ def advance(y_um: float, memory: FloatArray, m: FeatureArrays) -> None:  # pragm
         memory[i] = max(y - r, min(y + r, memory[i]))
     if arcs > 0:
         last = memory.shape[0] - 1
-        path = abs(y - memory[last])
-        memory[last] = y
+        before = memory[last]
+        memory[last] = max(y - m.frame[2], min(y + m.frame[2], before))
+        path = abs(memory[last] - before)
         for i in range(arcs):
             memory[n + i] = y + (memory[n + i] - y) * np.exp(-path / m.arcs[i])
 
@@ -146,6 +148,7 @@ class FeatureMap:
     kernel_plays : indices into ``thresholds_um`` of the plays that the kernel sees.
     y_rest_um : where the plays rest, in the frame.
     gain, offset_um : the frame: a reading y stands for the displacement (y - offset_um)/gain of the identified stage.
+    dead_um : dead band of the path that the arc states relax over, some deviations of the motion's noise, µm.
     linear : whether the basis holds more than the constant. asymmetric : whether it holds the plays times y.
     """
 
@@ -163,6 +166,7 @@ class FeatureMap:
     y_rest_um: float = 0.0
     gain: float = 1.0
     offset_um: float = 0.0
+    dead_um: float = 0.0
 
     _arrays: FeatureArrays = field(init=False, repr=False, compare=False)
 
@@ -173,6 +177,8 @@ class FeatureMap:
                 raise InputError(f"{name}: got {value}, expected a positive finite number")
         if not (np.isfinite(self.y_min_um) and np.isfinite(self.y_max_um) and self.y_min_um < self.y_max_um):
             raise InputError(f"y_min_um, y_max_um: got {self.y_min_um}, {self.y_max_um}, expected a range in µm")
+        if not (np.isfinite(self.dead_um) and self.dead_um >= 0.0):
+            raise InputError(f"dead_um: got {self.dead_um}, expected a dead band in µm, not negative")
         for name in ("thresholds_um", "arc_lengths_um", "time_constants_s"):
             values = getattr(self, name)
             if any(not (np.isfinite(x) and x > 0.0) for x in values) or list(values) != sorted(set(values)):
@@ -195,7 +201,7 @@ class FeatureMap:
             scale,
             np.array(self.kernel_plays, dtype=np.int64),
             np.array([self.linear, self.asymmetric], dtype=np.bool_),
-            np.array([self.offset_um, 1.0 / self.gain]),
+            np.array([self.offset_um, 1.0 / self.gain, self.dead_um]),
         )
         for array in arrays:
             array.flags.writeable = False
@@ -280,6 +286,7 @@ class FeatureMap:
             "y_rest_um": self.y_rest_um,
             "gain": self.gain,
             "offset_um": self.offset_um,
+            "dead_um": self.dead_um,
         }
 
     @classmethod
@@ -299,4 +306,5 @@ class FeatureMap:
             y_rest_um=float(values["y_rest_um"]),
             gain=float(values["gain"]),
             offset_um=float(values["offset_um"]),
+            dead_um=float(values["dead_um"]),
         )

@@ -38,6 +38,8 @@ EVIDENCE_ROWS = 240
 SEARCH = InferenceConfig(
     starts=((100.0, 1.0), (100.0, 4.0)), gamma_range=(1.0, 1e5), width_range=(0.3, 12.0), iterations=20
 )
+#: Dead band of the arc states' path, in standard deviations of what the smoother takes out.
+DEAD_SIGMA = 4.0
 #: Play thresholds as shares of the displacement range: log-spaced between these.
 THRESHOLD_MIN, THRESHOLD_MAX = 0.006, 0.45
 
@@ -123,6 +125,8 @@ def identify_lssvm(
         smooth = zero_phase_lowpass(y, dt_s)
         motion = np.column_stack([smooth, backward_difference(smooth, dt_s), np.zeros_like(smooth)])
     features = design_features(motion, dt_s, config, memory)
+    if memory:
+        features = replace(features, dead_um=DEAD_SIGMA * float(np.std(y - motion[:, 0])))
     columns = [np.ascontiguousarray(motion[:, i]) for i in range(3)]
     basis, kernel, _ = features.run(columns[0], columns[1], columns[2], features.rest_memory(float(columns[0][0])))
     split = round(u.size * (1.0 - config.heldout))

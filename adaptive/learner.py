@@ -15,14 +15,7 @@ from typing import Any
 import numpy as np
 
 from adaptive import admission
-from adaptive.admission import (
-    AdmissionState,
-    check_pair,
-    check_reading,
-    check_sample,
-    new_counters,
-    watch_voltage,
-)
+from adaptive.admission import AdmissionState, check_pair, check_reading, check_sample, new_counters, watch_voltage
 from adaptive.drift import DriftFilter
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
@@ -65,6 +58,7 @@ class Learner:
         self._dt = model.dt_s
         self._range_um = model.features.y_max_um - model.features.y_min_um
         self._middle_um = 0.5 * (model.features.y_max_um + model.features.y_min_um)
+        self._admission = self.config.admission.at(self._dt)
         self._smoother = FixedLagSmoother(self.config.smoother(self._dt))
         slots = self._smoother.config.lag + 2
         self._u, self._good = np.zeros(slots), np.zeros(slots, dtype=np.bool_)
@@ -119,7 +113,7 @@ class Learner:
         self._state = self._calm = None
 
     def _handle(self, sample: Sample) -> str:
-        c, gates = self.config.admission, self._gates
+        c, gates = self._admission, self._gates
         refused = check_sample(c, gates, sample, self._dt)
         if refused:
             return refused

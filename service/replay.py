@@ -7,6 +7,7 @@ the motion is the recording's own, smoothed with zero phase.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable
@@ -118,9 +119,9 @@ def replay(
         while len(ring) > 1 and ring[1][0] <= part.start - age:
             ring.popleft()
         if part.start < n:
-            points = tuple(np.ascontiguousarray(motion[part, i]) for i in range(3))
+            y_um, v_um_per_s, a_um_per_s2 = (np.ascontiguousarray(motion[part, i]) for i in range(3))
             for i, model in enumerate((ring[0][1], frozen)):
-                forward = model.feedforward(*points, memories[i])
+                forward = model.feedforward(y_um, v_um_per_s, a_um_per_s2, memories[i])
                 error_V[i, part] = forward.u_V - grid.u_V[part]
                 memories[i] = forward.memory
                 if i == 0:
@@ -133,7 +134,8 @@ def replay(
             on_snapshot(axis.newest.seq, axis.newest.models[name])
             ring.append((part.stop, axis.newest.models[name]))
         note_t_s.append(float(grid.t_s[min(part.stop, n) - 1]))
-        notes.append(told())
+        # Some of what a learner tells is more than a number, such as the places of its samples.
+        notes.append({key: float(value) for key, value in told().items() if np.ndim(value) == 0})
         progress(row, len(recording))
     error_V[:, ~whole.valid] = np.nan
     keys = sorted(set.intersection(*(set(note) for note in notes)))
@@ -186,7 +188,7 @@ def score(error_V: FloatArray, span_V: float, gain_um_per_V: float) -> dict[str,
     """Mean absolute, root mean square and largest error in V, in % of the voltage span and seen as µm."""
     size = np.abs(error_V[np.isfinite(error_V)])
     if size.size == 0:
-        return dict.fromkeys((f"{key}_{unit}" for key in ("mae", "rmse", "max") for unit in ("V", "pct", "um")))
+        return dict.fromkeys(f"{key}_{unit}" for key in ("mae", "rmse", "max") for unit in ("V", "pct", "um"))
     values = {"mae": float(size.mean()), "rmse": float(np.sqrt(np.mean(size**2))), "max": float(size.max())}
     scales = {"V": 1.0, "pct": 100.0 / span_V, "um": gain_um_per_V}
     return {f"{key}_{unit}": value * scale for key, value in values.items() for unit, scale in scales.items()}
@@ -198,7 +200,7 @@ def summary(replayed: Replayed, span_V: float, bins: int = 20) -> dict[str, Any]
     edges = np.linspace(0, n, min(bins, n) + 1).round().astype(int)
     gain = replayed.gain_um_per_V
     parts = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         start_s, stop_s = float(replayed.t_s[a]), float(replayed.t_s[b - 1])
         rows = (replayed.row_t_s >= start_s) & (replayed.row_t_s <= stop_s)
         counts = np.bincount(replayed.gate[rows], minlength=len(replayed.gates))

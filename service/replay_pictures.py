@@ -14,7 +14,7 @@ ADAPTIVE_COLOUR, FROZEN_COLOUR, STATED_COLOUR = "#004d40", "#e69f00", "#56b4e9"
 #: Points beyond which a line is drawn by the extremes of what it leaves out.
 MOST_POINTS = 4000
 #: What the learner's diagnostics show, in this order, where it has them.
-SHOWN = (("gain", "gain of the frame"), ("offset_um", "offset of the frame, µm"), ("bias_V", "bias, V"))
+SHOWN = (("gain", "gain"), ("frame_offset_um", "offset of the frame, µm"), ("offset_V", "offset, V"))
 
 
 def _figure(width: float, height: float, rows: int, **options: Any) -> tuple[Any, Any]:

@@ -71,6 +71,11 @@ def test_a_glitch_is_skipped_and_a_persistent_one_believed() -> None:
     assert s.glitches == 0
 
 
+def test_a_slow_sample_rate_widens_what_is_no_glitch() -> None:
+    for dt_s, outcome in ((1e-4, gates.GLITCH), (1e-3, gates.GLITCH), (5e-3, "")):
+        assert gates.check_reading(CONFIG.at(dt_s), state(), 0.05) == outcome
+
+
 def test_a_commanded_step_is_no_glitch() -> None:
     s = state(u_V=4.0, u_before_V=4.0)
     gates.watch_voltage(CONFIG, s, 4.001, 8.0)

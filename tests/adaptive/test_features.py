@@ -115,6 +115,18 @@ def test_frame_hides_gain_and_offset(path: list[float], gain: float, offset: flo
     np.testing.assert_allclose(rows[0][1], rows[1][1], atol=1e-9)
 
 
+def test_noise_at_rest_is_no_path_behind_the_dead_band() -> None:
+    """Arcs stay where the noise-free ones stay; without a dead band, noise relaxes them away. A stroke moves both."""
+    dead = replace(MAP, dead_um=0.04)
+    noise = 30.0 + 0.01 * np.random.default_rng(0).standard_normal(5000)
+    start = MAP.rest_memory(30.0)
+    still, noisy, relaxed = walk([30.0] * 5000, start, dead), walk([*noise], start, dead), walk([*noise], start)
+    assert abs(noisy[3] - still[3]) < 0.05
+    assert abs(relaxed[3] - 30.0) < 0.1 < abs(noisy[3] - 30.0)
+    moved = walk([*np.linspace(30.0, 50.0, 50)], start, dead)
+    np.testing.assert_allclose(moved[3], walk([*np.linspace(30.0, 50.0, 50)], start)[3], atol=0.05)
+
+
 def test_rest_memory_is_one_stroke_and_settled() -> None:
     memory = MAP.rest_memory(30.0)
     np.testing.assert_allclose(memory[:3], [29.0, 25.0, 10.0])
@@ -130,7 +142,7 @@ def test_two_inputs_have_no_memory() -> None:
 
 
 def test_state_round_trip() -> None:
-    framed = replace(MAP, gain=0.94, offset_um=1.5)
+    framed = replace(MAP, gain=0.94, offset_um=1.5, dead_um=0.02)
     assert FeatureMap.from_state(framed.state_dict()) == framed
 
 
@@ -143,6 +155,7 @@ def test_state_round_trip() -> None:
         {"time_constants_s": (0.0,)},
         {"kernel_plays": (7,)},
         {"gain": 0.0},
+        {"dead_um": -0.1},
     ],
 )
 def test_bad_configuration_is_named(bad: dict[str, object]) -> None:

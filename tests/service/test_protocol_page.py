@@ -173,12 +173,13 @@ def lssvm(
     k, n_arcs = len(plays), len(arcs)
     for i, r in enumerate(plays):
         memory[i] = max(y - r, min(y + r, memory[i]))
+    z = max(y - f["dead_um"], min(y + f["dead_um"], memory[-1])) if arcs else 0.0
     for i, rho in enumerate(arcs):
-        memory[k + i] = y + (memory[k + i] - y) * math.exp(-abs(y - memory[-1]) / rho)
+        memory[k + i] = y + (memory[k + i] - y) * math.exp(-abs(z - memory[-1]) / rho)
     for i, tau in enumerate(slow):
         memory[k + n_arcs + i] = y + (memory[k + n_arcs + i] - y) * math.exp(-f["dt_s"] / tau)
     if arcs:
-        memory[-1] = y
+        memory[-1] = z
     h = (f["y_max_um"] - f["y_min_um"]) / 2
     yn, vn, an = (y - f["y_min_um"] - h) / h, v / f["v_scale_um_per_s"], a / f["a_scale_um_per_s2"]
     p = [(y - memory[i]) / r for i, r in enumerate(plays)]

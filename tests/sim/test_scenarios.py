@@ -1,0 +1,152 @@
+"""Scenarios are data: seeded, pure, exact in their derivatives, and they happen when they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from sim.scenarios import KINDS, Readings, Scenario, scenario
+from sim.scenarios.kinds import dwelling
+from sim.scenarios.motion import Parts, Tones, in_band, strokes
+from sim.scenarios.readings import glitch_burst
+from sim.stage import Stage
+
+KINDS_SEEDS = [(kind, seed) for kind in KINDS for seed in (1, 2)]
+
+
+def shortened(kind: str, seed: int) -> Scenario:
+    """The scenario of a kind; the dwell with a rest that a test can afford."""
+    return dwelling(seed, np.random.default_rng(seed), 4.0) if kind == "dwell" else scenario(kind, seed)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_gives_the_same_scenario_again_and_another_seed_another(kind: str) -> None:
+    first, again, other = shortened(kind, 1), shortened(kind, 1), shortened(kind, 2)
+    assert first.changes == again.changes
+    assert first.readings == again.readings
+    assert first.text == again.text
+    assert np.array_equal(first.reference().y_um, again.reference().y_um)
+    assert first.name == f"{kind}/1"
+    assert not np.array_equal(first.reference().y_um, other.reference().y_um[: first.reference().y_um.size])
+
+
+@pytest.mark.parametrize(("kind", "seed"), KINDS_SEEDS)
+def test_the_reference_stays_in_its_range_and_its_derivatives_are_its_own(kind: str, seed: int) -> None:
+    s = shortened(kind, seed)
+    r, dt = s.reference(), s.stage.dt_s
+    assert r.y_um.min() >= s.low_um - 1e-9
+    assert r.y_um.max() <= s.high_um + 1e-9
+    # central differences of a motion of up to 40 Hz at 1 kHz are good to (w dt)²/6, about 1 %
+    for value, slope in ((r.y_um, r.v_um_per_s), (r.v_um_per_s, r.a_um_per_s2)):
+        difference = (value[2:] - value[:-2]) / (2.0 * dt)
+        assert np.max(np.abs(difference - slope[1:-1])) < 0.015 * np.max(np.abs(slope))
+
+
+@pytest.mark.parametrize(("kind", "seed"), [(k, s) for k, s in KINDS_SEEDS if k not in ("glitches", "dwell", "band")])
+def test_the_stage_changes_then_and_not_before(kind: str, seed: int) -> None:
+    s = scenario(kind, seed)
+    begin = round(s.change_s / s.stage.dt_s)
+    t = np.arange(begin + 8000) * s.stage.dt_s
+    u_V = 4.0 - 3.0 * np.cos(2.0 * np.pi * 1.7 * t)
+    readings = []
+    for config in (s.stage, s.changing_stage()):
+        stage = Stage(config)
+        readings.append(stage.run(stage.initial_state(), u_V)[0])
+    assert np.array_equal(readings[0][:begin], readings[1][:begin])
+    difference = np.abs(readings[1] - readings[0])
+    assert np.max(difference[begin:]) > 5e-3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("kind", ["gain_ramp", "creep"])
+def test_what_grows_does_not_jump(kind: str, seed: int) -> None:
+    s = scenario(kind, seed)
+    u_V = np.full(round(s.duration_s / s.stage.dt_s), 5.0)
+    u_V[:1000] *= np.linspace(0.0, 1.0, 1000)
+    true_um = []
+    for config in (s.stage, s.changing_stage()):
+        stage = Stage(config)
+        true_um.append(stage.run_traced(stage.initial_state(), u_V).true_um)
+    grown = np.abs(true_um[1] - true_um[0])
+    assert grown[-1] > 0.5
+    assert np.max(np.abs(np.diff(grown))) < 0.05
+
+
+def test_the_gain_ramp_ends_at_the_gain_it_names() -> None:
+    s = scenario("gain_ramp", 1)
+    assert s.changes[1][1]["gain_drift.gain"] == pytest.approx(s.changes[0][1]["gain_drift.ramp_per_min"] * 15.0 / 60.0)
+
+
+def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:
+    s = dwelling(1, np.random.default_rng(1), 5.0)
+    assert s.quiet_s is not None
+    r, dt = s.reference(), s.stage.dt_s
+    start, stop = (round(t / dt) for t in s.quiet_s)
+    assert np.ptp(r.y_um[start + 400 : stop - 400]) < 1e-9
+    before, after = r.y_um[start - 5000 : start - 400], r.y_um[-5000:]
+    assert np.ptp(before) == pytest.approx(s.range_um, rel=1e-3)
+    assert np.ptp(after) == pytest.approx(s.range_um, rel=1e-3)
+    assert scenario("dwell", 1).quiet_s == (25.0, 625.0)
+
+
+def test_glitches_spoil_their_samples_only_and_the_same_in_blocks() -> None:
+    bad = Readings(((3, 2, 5.0), (9, 1, float("nan")), (12, 4, -1.0)))
+    y = np.arange(20.0)
+    kept = y.copy()
+    whole = bad.spoil(0, y)
+    assert np.array_equal(y, kept)
+    expected = y.copy()
+    expected[3:5] += 5.0
+    expected[9] = np.nan
+    expected[12:16] -= 1.0
+    assert np.array_equal(whole, expected, equal_nan=True)
+    blocks = np.concatenate([bad.spoil(k, y[k : k + 7]) for k in range(0, 20, 7)])
+    assert np.array_equal(blocks, whole, equal_nan=True)
+
+
+def test_glitch_burst_keeps_to_its_time_length_and_size() -> None:
+    bad = glitch_burst(100, 3100, 0.02, 5, (0.5, 40.0), np.random.default_rng(3))
+    assert len(bad.runs) > 20
+    ends = [first + count for first, count, _ in bad.runs]
+    starts = [first for first, _, _ in bad.runs]
+    assert starts[0] >= 100
+    assert ends[-1] <= 3100
+    assert all(a <= b for a, b in zip(ends[:-1], starts[1:], strict=True))
+    assert {count for _, count, _ in bad.runs} == {1, 2, 3, 4, 5}
+    sizes = np.array([size for _, _, size in bad.runs])
+    assert 0 < np.isnan(sizes).sum() < len(sizes) / 3
+    finite = np.abs(sizes[np.isfinite(sizes)])
+    assert finite.min() >= 0.5
+    assert finite.max() <= 40.0
+
+
+def test_tones_in_a_band_keep_to_band_range_and_speed() -> None:
+    tones = in_band(4.0, 80.0, (8.0, 40.0), (1, 2), 900.0)
+    assert all(8.0 <= f <= 40.0 for f in tones.frequency_Hz)
+    r = tones.at(np.arange(0.0, 5.0, 1e-4))
+    assert r.y_um.min() >= 4.0
+    assert r.y_um.max() <= 80.0
+    assert np.max(np.abs(r.v_um_per_s)) <= 900.0
+    assert np.max(np.abs(r.v_um_per_s)) > 300.0
+
+
+def test_what_cannot_be_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="kind: got 'earthquake'"):
+        scenario("earthquake", 1)
+    with pytest.raises(InputError, match="seed: got 0"):
+        scenario("noise", 0)
+    with pytest.raises(InputError, match="runs"):
+        Readings(((3, 0, 1.0),))
+    with pytest.raises(InputError, match="parts"):
+        Parts(((0.3, Tones(1.0)),))
+    with pytest.raises(InputError, match="frequency_Hz"):
+        Tones(1.0, (1.0,), (), ())
+
+
+def test_strokes_begin_at_the_lower_end() -> None:
+    r = strokes(4.0, 80.0, 0.7, 2.0).at(np.array([2.0, 2.0 + 0.5 / 0.7]))
+    assert r.y_um == pytest.approx([4.0, 80.0])
+    assert replace(r).v_um_per_s == pytest.approx([0.0, 0.0], abs=1e-9)
