@@ -314,6 +314,14 @@ class Learner:
         """The feature map that is served."""
         return self._served
 
+    def warm_window(self) -> None:
+        """Load (or compile) the window's steps on a copy: the first sample that teaches must not wait for them."""
+        capacity = self.config.window
+        window = ResidualWindow.from_model(self.base, capacity, self.config.eviction)
+        if len(window) < capacity:
+            window.learn(10.0 + np.zeros(self.base.features.kernel_size), 0.0)
+        window.learn(window.arrays()[0][0], 0.0)
+
     def freeze(self) -> None:
         """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""
         self._frozen = True

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.features import FeatureMap
-from adaptive.learner import Learner
+from adaptive.learner import Learner, LearnerConfig
+from adaptive.smoothing import smooth_recording
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import Sample
 from adaptive.window import Window, WindowConfig
@@ -20,12 +21,16 @@ def warm() -> None:
     features = FeatureMap(1e-3, 0.0, 1.0, 1.0, 1.0, (0.1, 0.2), (0.3,), (0.1,), (0,), asymmetric=True)
     p, d = features.basis_size, features.kernel_size
     model = LssvmInverse(
-        "warm", features, np.zeros(p), np.linspace(0.0, 1.0, 4 * d).reshape(4, d), np.zeros(4), np.ones(d), 10.0,
+        "warm", features, np.zeros(p), np.linspace(0.0, 1.0, 12 * d).reshape(12, d), np.zeros(12), np.ones(d), 10.0,
         np.array([0.0, 1.0] * 3),
     )  # fmt: skip
-    learner = Learner(model)
+    # A full window, as after an identification: growing one is a step of its own, compiled where it is needed.
+    learner = Learner(model, LearnerConfig(window=10))
     for k in range(120):
         learner.handle(Sample(k, k * 1e-3, 0.1 * np.sin(0.1 * k), 0.1 * np.sin(0.1 * k)))
+    # A window step takes the longest to compile; whether the samples above led to one is the gates' affair.
+    learner.warm_window()
+    smooth_recording(np.linspace(0.0, 1.0, 200), learner.config.smoother(1e-3))
     snapshot = learner.snapshot()
     still = np.zeros(2)
     memory = snapshot.feedforward(still, still, still, learner.memory()).memory

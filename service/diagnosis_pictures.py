@@ -51,6 +51,9 @@ def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
     for axis, (residual, colour, label) in zip(axes[1:], pairs, strict=True):
         axis.axhspan(-2e3 * diagnosis.noise_floor_um, 2e3 * diagnosis.noise_floor_um, color=FLOOR, alpha=0.5, lw=0)
         axis.plot(*_envelope(setting.t_s, 1e3 * residual), color=colour, lw=0.6, label=label)
+        # A first moment that nothing knows must not flatten the rest.
+        limit = 1.3 * float(np.quantile(np.abs(1e3 * residual), 0.999))
+        axis.set_ylim(-max(limit, 1e-3), max(limit, 1e-3))
         axis.set_ylabel("residual / nm")
         axis.legend(loc="upper right")
     axes[-1].set_xlabel("time / s (grey: twice the noise floor)")

@@ -32,6 +32,9 @@ def write_report(out: Path, diagnosis: Diagnosis, source: str, findings: list[st
         exported = export(diagnosis)
         save_stage(exported.config, out / "stage.toml")
         draw_residual(out / "residual.png", diagnosis, f"{source}: {diagnosis.verdict}")
+        # Pictures of an earlier diagnosis in this folder would be taken for this one's.
+        for old in out.glob("[0-9]-*.png"):
+            old.unlink()
         for place, cause in enumerate(diagnosis.causes):
             draw_cause(out / picture_name(place, cause), cause, diagnosis)
         (out / "report.md").write_text(markdown(diagnosis, exported, source, findings), encoding="utf-8")
@@ -76,7 +79,7 @@ def markdown(diagnosis: Diagnosis, exported: Exported, source: str, findings: li
         lines += ["## What is left", "", "The residual above repeats with the drive and is far above the noise."]
         if d.partial:
             lines += [
-                f"Of the causes tried, {', '.join(d.partial)} came closest, but together they leave more than half of "
+                f"Of the causes tried, {', '.join(d.partial)} came closest, but together they leave more than 60 % of "
                 "the excess over the noise: none of them is named."
             ]
         lines.append("")

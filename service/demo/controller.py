@@ -22,7 +22,7 @@ from service import wire
 from service.client import Client, Trajectory
 from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from service.demo.run import empty
-from service.errors import BehindError, ReplyTimeoutError
+from service.errors import BehindError, RefusedError, ReplyTimeoutError
 from service.keys import Keys
 from service.session import open_client
 from service.wire_query import NEWEST
@@ -130,8 +130,9 @@ def ask(
     while True:
         try:
             return client.trajectory(*motion, model=model, after=after, as_of=wanted, wait_s=BEHIND_S), waited
-        except (BehindError, ReplyTimeoutError):
-            if time.monotonic() >= until:
+        except (BehindError, ReplyTimeoutError, RefusedError) as error:
+            too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST
+            if time.monotonic() >= until or (isinstance(error, RefusedError) and not too_old):
                 raise
             wanted, waited = NEWEST, True
 

@@ -16,7 +16,7 @@ from sim.diagnosis.fit import Fit, calibrate
 from sim.diagnosis.noise import Floor, noise_floor
 from sim.diagnosis.nominal_fit import begins_at_rest, calibrated, with_other_axis
 from sim.diagnosis.result import Cause, Diagnosis
-from sim.diagnosis.search import Candidate, Progress, Rules, Search
+from sim.diagnosis.search import Candidate, Progress, Rules, Search, Step
 from sim.diagnosis.setting import Setting
 
 
@@ -37,11 +37,14 @@ class Options:
 class _Found:
     """An accepted cause while alternatives are still sought."""
 
-    name: str
-    p_value: float
+    step: Step
     without: Fit
     held_without: HeldOut
     rivals: tuple[Candidate, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.step.name
 
     @property
     def alternatives(self) -> tuple[str, ...]:
@@ -94,11 +97,11 @@ def diagnose(
     search = Search(mask, parts, floor.sigma_um, options.rules, options.seed, progress, coarse)
     held_nominal = search.held(nominal)
     extended, held, steps = search.run(nominal)
-    p_values = {s.name: s.p_value for s in steps}
+    by_name = {s.name: s for s in steps}
     progress("removing each cause once more", 0.85)
-    extended, held, found = _review(search, extended, held, p_values)
+    extended, held, found = _review(search, extended, held, by_name)
     n = int(mask.sum())
-    causes = _in_order(search, nominal, held_nominal, extended, found)
+    causes = _named(search, nominal, extended, held, found)
     causes += _converter_causes(setting, grid, doubles if doubled else None, floor, extended, n, dropped)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     verdict = _verdict(causes, held_nominal, held, floor, n)
@@ -126,7 +129,7 @@ def diagnose(
     )
 
 
-def _review(search: Search, fit: Fit, held: HeldOut, p_values: dict[str, float]) -> tuple[Fit, HeldOut, list[_Found]]:
+def _review(search: Search, fit: Fit, held: HeldOut, steps: dict[str, Step]) -> tuple[Fit, HeldOut, list[_Found]]:
     """Remove each cause once more: drop what has become idle, swap what another explains better, name rivals."""
     rules = search.rules
     found: list[_Found] = []
@@ -146,16 +149,17 @@ def _review(search: Search, fit: Fit, held: HeldOut, p_values: dict[str, float])
         cost = search.cost(fit, held, less)
         polished = (search.polish(c, less) for c in rivals[:2])
         swap = next((c for c in polished if c.cost < 0.9 * cost), None)
-        if swap is not None and swaps < 2 and swap.form.name not in p_values and search.plausible(swap):
+        if swap is not None and swaps < 2 and swap.form.name not in steps and search.plausible(swap):
             swaps += 1
-            p_values[swap.form.name] = p_values.get(form.name, rules.level)
+            before = steps[form.name]
+            steps[swap.form.name] = Step(swap.form.name, before.p_value, before.gain)
             fit, held = swap.fit, swap.held
             found, index = [], 0
             continue
         # Where the voltage was monitored, a rival must agree with that as well.
         rivals = [r for r in rivals if r.cost - r.held.sse_um2 <= 1.2 * (cost - held.sse_um2) + 0.05 * gain]
         names = _rivals(search, rivals, held, gain, held_less)
-        found.append(_Found(form.name, p_values.get(form.name, rules.level), less, held_less, names))
+        found.append(_Found(steps[form.name], less, held_less, names))
         index += 1
     return fit, held, found
 
@@ -177,46 +181,22 @@ def _rivals(
     return tuple(out)
 
 
-def _in_order(
-    search: Search, nominal: Fit, held_nominal: HeldOut, extended: Fit, found: list[_Found]
-) -> tuple[Cause, ...]:
-    """The causes by their own weight, each with its share on top of those before it, and intervals."""
-    order = sorted(range(len(found)), key=lambda i: -found[i].held_without.sse_um2)
-    before, causes = held_nominal.sse_um2, []
-    fit = nominal
-    for place, i in enumerate(order):
-        chosen = [extended.model.forms[j] for j in order[: place + 1]]
-        if place == len(order) - 1:
-            before, now = found[i].held_without.sse_um2, search.held(extended).sse_um2
-        else:
-            model = replace(nominal.model, forms=tuple(chosen))
-            start = np.concatenate(
-                [
-                    extended.p[: nominal.model.n_nominal],
-                    *(extended.model.part(extended.p, j) for j in order[: place + 1]),
-                ]
-            )
-            fit = calibrate(model, start, search.mask, 5, 1e-3)
-            now = search.held(fit).sse_um2
+def _named(search: Search, nominal: Fit, extended: Fit, held: HeldOut, found: list[_Found]) -> tuple[Cause, ...]:
+    """The accepted causes with their numbers, and the share that each removed on top of those before it."""
+    causes = []
+    for i, one in enumerate(found):
         values, spans = numbers(extended, i, search)
-        also = found[i].alternatives
-        if found[i].name == "resonance" and nominal.model.nominal.name != "linear":
+        also = one.alternatives
+        if one.name == "resonance" and nominal.model.nominal.name != "linear":
             # A mode that the nominal stage does not know may always have been there, or a payload moved it here.
             also = (*also, "payload_change")
+        own = 1.0 - held.sse_um2 / one.held_without.sse_um2
+        # The last one's share is known best from removing it once more.
+        share = own if len(found) == 1 else one.step.gain
+        p = one.step.p_value
         causes.append(
-            Cause(
-                found[i].name,
-                also,
-                values,
-                spans,
-                float(max(0.0, 1.0 - now / before)),
-                found[i].p_value,
-                found[i].without.residual_um,
-                extended.residual_um,
-                i,
-            )
+            Cause(one.name, also, values, spans, float(share), p, one.without.residual_um, extended.residual_um, i)
         )
-        before = now
     return tuple(causes)
 
 

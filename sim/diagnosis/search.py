@@ -58,6 +58,8 @@ class Step:
 
     name: str
     p_value: float
+    #: Share of the held-out squared error, as it then was, that it removed.
+    gain: float
 
 
 @dataclass
@@ -201,10 +203,11 @@ class Search:
                 and left > (1.5 * self.sigma_um) ** 2
             ):
                 accepted = self._finer(accepted, current)
+            share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.form.form_error**2 * gone
             current, held = accepted.fit, accepted.held
-            steps.append(Step(accepted.form.name, p))
+            steps.append(Step(accepted.form.name, p, share))
         return current, held, steps
 
     def _finer(self, accepted: Candidate, base: Fit) -> Candidate:
