@@ -1,6 +1,6 @@
 """Takes a picture of an ``.rrd`` in the real Rerun viewer, without a display.
 
-    python docs/screenshot.py RUN.rrd docs/images/viewer.png --at 24.5
+    python docs/screenshot.py RUN.rrd docs/images/demo.png --at 33
 
 Needs a Vulkan driver; where there is no GPU, Mesa's software one will do. On Debian:
 ``apt-get install mesa-vulkan-drivers libgl1-mesa-dri libvulkan1 libegl1 libxkbcommon-x11-0 libx11-xcb1``.
