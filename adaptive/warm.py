@@ -13,7 +13,6 @@ from adaptive.learner import Learner, LearnerConfig
 from adaptive.smoothing import smooth_recording
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import Sample
-from adaptive.window import Window, WindowConfig
 
 
 def warm() -> None:
@@ -36,25 +35,3 @@ def warm() -> None:
     memory = snapshot.feedforward(still, still, still, learner.memory()).memory
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
-
-
-def warm_window() -> None:
-    """The window, in both forms."""
-    points = np.linspace(0.0, 1.0, 12).reshape(6, 2) ** 2
-    for form in ("inverse", "cholesky"):
-        window = Window(WindowConfig(4, (0.5, 0.5), 100.0, linear=(0,), form=form))
-        for x in points[:4]:
-            window.append(x, float(x[0]))
-        window.replace(1, points[4], 0.5)
-        window.undo()
-        window.remove(3)
-        window.reweight(0, 0.5)
-        window.rescale_targets(0.1, 0.0)
-        window.shift_targets(np.zeros(3))
-        window.predict(points[5])
-        window.predict_with_variance(points[5])
-        window.leave_one_out()
-        window.worst_residual()
-        window.refine()
-        window.rebuild()
-        window.scale  # noqa: B018

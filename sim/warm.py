@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sim.diagnosis.warm import warm as warm_diagnosis
 from sim.effects import KINDS, Chain, simulate
 from sim.presets import PRESETS
 from sim.stage import Stage
 
 
 def warm() -> None:
-    """Run every effect and every preset over two samples."""
+    """Run every effect and every preset over two samples, and the diagnosis' loops."""
     u_V = np.zeros(2)
     for kind in KINDS.values():
         if kind.block is not None:
@@ -18,3 +19,4 @@ def warm() -> None:
     for make in PRESETS.values():
         stage = Stage(make())
         stage.run(stage.initial_state(), u_V)
+    warm_diagnosis()
