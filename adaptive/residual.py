@@ -65,17 +65,22 @@ class ResidualWindow:
             slot = int(np.argmax(column))
             value = float(column[slot])
         self._clock += 1
-        if n < self._config.capacity and value < SAME:
+        room = n < self._config.capacity and value < SAME
+        if room:
             slot = n
-            status = window.append(kernel, target_V)
-        else:
-            if self.eviction == "fifo":
-                slot = int(np.argmin(self._born[:n]))
-            status = window.replace(slot, kernel, target_V)
+        elif self.eviction == "fifo":
+            slot = int(np.argmin(self._born[:n]))
+        status = self._step(slot, room, kernel, target_V)
+        # In line and not beside the work, so that a replay heals at the same sample; queries are not held up by it.
+        if status == Status.ILL_CONDITIONED and window.heal():
+            status = self._step(slot, room, kernel, target_V)
         if status != Status.ACCEPTED:
             return admission.NUMERICS
         self._born[slot] = self._clock
         return admission.LEARNT
+
+    def _step(self, slot: int, room: bool, kernel: FloatArray, target_V: float) -> Status:
+        return self._window.append(kernel, target_V) if room else self._window.replace(slot, kernel, target_V)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""

@@ -36,7 +36,7 @@ class WindowConfig:
     linear : features that enter an unpenalised linear part beside the bias.
     form : ``inverse`` is the fastest, its error grows with cond(R)²; ``cholesky`` takes about twice the time, its
         error grows with cond(R); ``auto`` takes the one that ``accuracy`` and the condition of the samples call
-        for, each time the window is made from samples (an empty one starts as ``inverse``).
+        for, each time the window is made from samples or healed (an empty one starts as ``inverse``).
     backend : ``compiled``, or ``plain`` numpy and scipy (inverse form only).
     accuracy : relative error of alpha to be kept. A step whose checked row shows more than a quarter of it (other
         rows may be worse) is followed by a step of refinement, some six products long. Infinite: never.
@@ -272,6 +272,23 @@ class Window:
         if self.arrays.C[ws.FORM] != wanted:
             self.arrays.C[ws.FORM] = wanted
             self.rebuild()
+
+    def heal(self) -> bool:
+        """Factor anew after a refused step, in the form that the samples' condition calls for now (``auto``).
+
+        What a caller does with ILL_CONDITIONED on samples that are good: the step may then be taken again. O(N³),
+        some hundred steps' worth, without the interpreter's lock. False where R itself is not positive definite.
+        """
+        if len(self) == 0:
+            return False
+        free = self.config.form == "auto" and self.config.backend == "compiled"
+        if free and not condition.inverse_form_serves(self.condition(), self.config.accuracy):
+            self.arrays.C[ws.FORM] = ws.CHOLESKY_FORM
+        try:
+            self.rebuild()
+        except NumericsError:
+            return False
+        return True
 
     def with_hyperparameters(self, widths: tuple[float, ...], gamma: float) -> Window:
         """A new window over the same samples with other hyper-parameters; counters start anew."""

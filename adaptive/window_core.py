@@ -25,7 +25,9 @@ from adaptive.window_state import (
     BAD_INPUT,
     BAD_INPUTS,
     COLUMN,
+    CONTRACTION,
     COUNT,
+    CURSOR,
     FORM,
     ILL_CONDITIONED,
     ILL_STEPS,
@@ -33,6 +35,7 @@ from adaptive.window_state import (
     NO_SLOT,
     NOTHING_TO_UNDO,
     REFINEMENTS,
+    RESIDUAL,
     STEPS,
     SY,
     UNDO,
@@ -55,11 +58,27 @@ def refine(A: WindowArrays) -> bool:
 
 
 @compiled_reassociating
+def _refined(A: WindowArrays) -> bool:
+    """Refine after a row's residual was found too large. False where that did not bring the same row down.
+
+    Refinement contracts by the error of P. An inverse that is wrong enough for it not to contract is one that
+    the coming steps would blow up: the step is better refused.
+    """
+    row = A.C[CURSOR] - 1
+    if row < 0:
+        row = A.C[COUNT] - 1
+    before = A.F[RESIDUAL]
+    good = refine(A)
+    return good and abs(row_residual(A, row)) <= CONTRACTION * before
+
+
+@compiled_reassociating
 def _conclude(A: WindowArrays, status: int) -> int:
+    if status == ACCEPTED and not rotate_residual(A) and not _refined(A) and A.C[FORM] == INVERSE_FORM:
+        inverse.undo(A)
+        status = ILL_CONDITIONED
     if status == ACCEPTED:
         A.C[STEPS] += 1
-        if not rotate_residual(A):
-            refine(A)
     elif status == ILL_CONDITIONED:
         A.C[ILL_STEPS] += 1
     return status

@@ -151,11 +151,14 @@ def _take_in(A: WindowArrays, slot: int, b: FloatArray, q: FloatArray, x: FloatA
     return good
 
 
+def _row_residual(A: WindowArrays, i: int) -> float:
+    return float(abs(A.V[ws.Y, i] - A.R[i] @ A.V[ws.ALPHA] - A.H[:, i] @ A.beta))
+
+
 def _conclude(A: WindowArrays) -> int:
-    A.C[ws.STEPS] += 1
     n, i = A.C[ws.COUNT], A.C[ws.CURSOR]
     i = 0 if i >= n else i
-    residual = abs(A.V[ws.Y, i] - A.R[i] @ A.V[ws.ALPHA] - A.H[:, i] @ A.beta)
+    residual = _row_residual(A, i)
     A.F[ws.RESIDUAL] = residual
     A.F[ws.ROUND_WORST] = max(A.F[ws.ROUND_WORST], residual)
     A.C[ws.CURSOR] = i + 1
@@ -167,7 +170,12 @@ def _conclude(A: WindowArrays) -> int:
     allowed = A.F[ws.TOLERANCE] * length / (np.sqrt(n) * A.F[ws.GAMMA])
     if not residual <= allowed + _ROUND_OFF * (abs(A.V[ws.Y, i]) + abs(A.beta[0]) + length):
         A.C[ws.RESIDUALS_EXCEEDED] += 1
-        refine(A)
+        # As in the core: a refinement that does not contract shows an inverse gone wrong.
+        if not (refine(A) and _row_residual(A, i) <= ws.CONTRACTION * residual):
+            _take_back(A)
+            A.C[ws.ILL_STEPS] += 1
+            return ws.ILL_CONDITIONED
+    A.C[ws.STEPS] += 1
     return ws.ACCEPTED
 
 
@@ -219,9 +227,15 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 def undo(A: WindowArrays) -> int:
     """As `window_core.undo`, to round-off."""
-    kind = A.C[ws.UNDO]
-    if kind == ws.UNDO_NOTHING:
+    if A.C[ws.UNDO] == ws.UNDO_NOTHING:
         return ws.NOTHING_TO_UNDO
+    _take_back(A)
+    A.C[ws.UNDONE] += 1
+    return ws.ACCEPTED
+
+
+def _take_back(A: WindowArrays) -> None:
+    kind = A.C[ws.UNDO]
     _rank_one(A, -1.0, A.V[ws.PLUS])
     if kind == ws.UNDO_REPLACE:
         _rank_one(A, 1.0, A.V[ws.MINUS])
@@ -229,8 +243,6 @@ def undo(A: WindowArrays) -> int:
     else:
         A.C[ws.COUNT] -= 1
     _restore(A)
-    A.C[ws.UNDONE] += 1
-    return ws.ACCEPTED
 
 
 def remove(A: WindowArrays, slot: int) -> int:

@@ -77,6 +77,9 @@ FLOATS = 8
 ) = range(14)
 COUNTERS = 14
 
+#: A refinement that leaves more than this share of the residual that asked for it shows an inverse gone wrong.
+CONTRACTION = 0.5
+
 # Values of C[UNDO].
 UNDO_NOTHING, UNDO_REPLACE, UNDO_APPEND = range(3)
 

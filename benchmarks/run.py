@@ -28,7 +28,8 @@ def run(quick: bool = False) -> dict[str, Any]:
             repeats = 2000 if n <= 500 else 400 if n <= 1000 else 100
             window[str(n)] = bench_window(n, repeats // 4 if quick else repeats)
         peers = bench_peers(500, 20 if quick else 100)
-        drift = bench_drift(20_000 if quick else 1_000_000)
+        updates = 20_000 if quick else 1_000_000
+        drift = bench_drift(updates) + bench_drift(updates, 500, forms=("auto",))
     return {"window": window, "peers": peers, "drift": drift}
 
 
@@ -56,7 +57,8 @@ def page(report: dict[str, Any]) -> str:
     lines += ["", "Relative error of alpha after many updates, near-duplicates in the stream", ""]
     for row in report["drift"]:
         lines.append(
-            f"  cond {row['condition']:.1e}  {row['form']:>9} ({row['at_work']})  {row['updates']:.0f} updates  "
+            f"  N {row['size']:.0f}  cond {row['condition']:.1e}  {row['form']:>9} ({row['at_work']})  "
+            f"{row['updates']:.0f} updates  "
             f"worst {row['worst_alpha_error']:.1e}  refinements {row['refinements']:.0f}"
         )
     return "\n".join(lines)

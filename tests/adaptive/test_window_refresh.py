@@ -9,7 +9,7 @@ import pytest
 
 from adaptive import lssvm, window_refresh
 from adaptive.errors import NumericsError
-from adaptive.window import Form, Window, WindowConfig
+from adaptive.window import Backend, Form, Window, WindowConfig
 from adaptive.window_state import TOLERANCE, Status
 
 N, D = 30, 2
@@ -101,3 +101,42 @@ def test_not_swapped_when_it_would_not_fit() -> None:
 def test_an_empty_window_has_nothing_to_refresh() -> None:
     with pytest.raises(NumericsError, match="empty"):
         window_refresh.begin(Window(WindowConfig(3, (1.0,), 10.0)))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "plain"])
+def test_an_inverse_form_pushed_past_its_condition_refuses_instead_of_blowing_up(backend: Backend) -> None:
+    """Forced onto cond 1e9 the recursion has an unstable error: it must stop before the numbers leave the finite."""
+    rng = np.random.default_rng(3)
+    config = WindowConfig(80, (1.0, 1.0, 1.0), 1e8, form="inverse", backend=backend)
+    window = Window(config)
+    X, y = rng.random((1500, 3)), rng.random(1500)
+    refused, healed = 0, 0
+    for k in range(y.size):
+        slot = int(rng.integers(80))
+        status = window.append(X[k], y[k]) if not window.full else window.replace(slot, X[k], y[k])
+        if status is Status.ILL_CONDITIONED:
+            refused += 1
+            healed += window.heal()
+        assert np.all(np.isfinite(window.alpha))
+    assert refused > 0
+    assert healed > 0
+    assert window.counters()["ill_conditioned"] == refused
+    assert window.counters()["refreshes"] == healed
+
+
+def test_healing_changes_to_the_form_that_serves() -> None:
+    rng = np.random.default_rng(3)
+    window = Window(WindowConfig(80, (1.0, 1.0, 1.0), 3e6))
+    assert window.heal() is False  # nothing to factor
+    for _ in range(3000):
+        x, y = rng.random(3), float(rng.random())
+        slot = int(rng.integers(80))
+        if (window.replace(slot, x, y) if window.full else window.append(x, y)) is Status.ILL_CONDITIONED:
+            assert window.heal()
+        if window.form == "cholesky":
+            break
+    assert window.form == "cholesky"
+    refused = window.counters()["ill_conditioned"]
+    for _ in range(300):
+        assert window.replace(int(rng.integers(80)), rng.random(3), float(rng.random())) is Status.ACCEPTED
+    assert window.counters()["ill_conditioned"] == refused
