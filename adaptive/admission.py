@@ -15,6 +15,10 @@ from adaptive.types import Sample, StateDict
 
 #: µm or V that no reading has.
 ABSURD = 1e9
+#: How a kink of the voltage fades, a sample, and by how many times what it moves the stage by predictions may be off.
+KINK_DECAY, KINK_SHARE = 0.9, 2.0
+#: Samples over which the smoother's prediction errors are averaged; one counts as this many rms at most.
+INNOVATION_SAMPLES, FAR_RMS = 500, 2.0
 #: Sample time up to which ``glitch_share`` holds as it is, s.
 GLITCH_DT_S = 1e-3
 
@@ -47,10 +51,14 @@ class AdmissionConfig:
 
     u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one does not teach.
     y_min_um, y_max_um : what the sensor can show; beyond it a reading is out of range.
-    glitch_share : a reading this far from the smoother's prediction, as a share of the model's range at sample times
-    of up to 1 ms (``at``), is a glitch ...
-    glitch_persistence : ... unless this many in a row are: then the stage has really moved.
-    max_gap : missing samples that the smoother bridges; beyond it, it starts again.
+    surprise_share, surprise_sigma : a reading this far from the smoother's prediction, as a share of the model's range
+    at sample times of up to 1 ms (``at``), and this many times the usual error of the prediction, is held back until
+    others tell what it is. glitch_share : a reading this far off is, however wrong the predictions usually are.
+    glitch_persistence : a jump is believed after more readings than that at the new level, ...
+    doubt_persistence : ... or than that where the sensor was wrong within ``doubt_s``, and for jumps outside
+    ``glitch_share`` to ``jump_share`` of the range.
+    undo_s : a jump back within this time undoes a jump.
+    max_gap : missing samples that are bridged; beyond it, the smoother starts again.
     settle : samples after a (re)start that do not teach.
     timing_tolerance : relative error of the time step between two samples.
     rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
@@ -61,8 +69,14 @@ class AdmissionConfig:
     rail_margin_V: float = 1e-3
     y_min_um: float = -ABSURD
     y_max_um: float = ABSURD
+    surprise_share: float = 0.002
+    surprise_sigma: float = 12.0
     glitch_share: float = 0.012
-    glitch_persistence: int = 3
+    jump_share: float = 0.12
+    glitch_persistence: int = 12
+    doubt_persistence: int = 16
+    doubt_s: float = 10.0
+    undo_s: float = 0.5
     max_gap: int = 5
     settle: int = 50
     timing_tolerance: float = 0.5
@@ -75,55 +89,51 @@ class AdmissionConfig:
                 raise InputError(
                     f"admission.{low}, {high}: got {getattr(self, low)}, {getattr(self, high)}, expected {low} < {high}"
                 )
-        for name in ("glitch_share", "rest_share", "rest_s", "timing_tolerance"):
+        positive = ("surprise_share", "surprise_sigma", "glitch_share", "jump_share", "rest_share", "rest_s")
+        for name in (*positive, "timing_tolerance"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a positive number")
-        for name in ("glitch_persistence", "max_gap", "settle"):
+        for name in ("glitch_persistence", "doubt_persistence", "max_gap", "settle", "doubt_s", "undo_s"):
             if getattr(self, name) < 0:
-                raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a count, not negative")
+                raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a number, not negative")
 
     def at(self, dt_s: float) -> AdmissionConfig:
         """The limits at a sample time, s: predictions over a longer step are worse, and with them what is a glitch."""
-        return replace(self, glitch_share=self.glitch_share * max(1.0, dt_s / GLITCH_DT_S))
+        wider = max(1.0, dt_s / GLITCH_DT_S)
+        return replace(self, glitch_share=self.glitch_share * wider, surprise_share=self.surprise_share * wider)
 
 
 @dataclass(slots=True)
 class AdmissionState:
-    """seq, t_s : of the last sample taken. glitches : in a row.
+    """seq, t_s : of the last sample taken.
 
     since_start, since_jump : samples since the smoother started, since it was moved to a place that had jumped,
-    and (since_step) since the voltage stepped. moved, anchor_um : the smoother's
-    count when the stage last left a place, and where it then was. u_V, u_before_V : the last two voltages.
+    since_step, since_glitch : since the voltage stepped, since the sensor was last found to have been wrong.
+    moved, anchor_um : the smoother's count when the stage last left a place, and where it then was.
+    u_V, u_before_V : the last two voltages. kink_V : the largest kink of the voltage of late, fading.
+    innovation2 : mean square error of the smoother's predictions, in ranges².
     """
 
     seq: int = -1
     t_s: float = 0.0
-    glitches: int = 0
     since_start: int = 0
     since_jump: int = 0
     since_step: int = 0
+    since_glitch: int = 1_000_000_000
     moved: int = 0
     anchor_um: float = 0.0
     u_V: float = 0.0
     u_before_V: float = 0.0
+    kink_V: float = 0.0
+    innovation2: float = 0.0
 
     def state_dict(self) -> StateDict:
         return asdict(self)
 
     @classmethod
     def from_state(cls, values: StateDict) -> AdmissionState:
-        return cls(
-            seq=int(values["seq"]),
-            t_s=float(values["t_s"]),
-            glitches=int(values["glitches"]),
-            since_start=int(values["since_start"]),
-            since_jump=int(values["since_jump"]),
-            since_step=int(values["since_step"]),
-            moved=int(values["moved"]),
-            anchor_um=float(values["anchor_um"]),
-            u_V=float(values["u_V"]),
-            u_before_V=float(values["u_before_V"]),
-        )
+        kinds = {name: type(value) for name, value in asdict(cls()).items()}
+        return cls(**{name: kind(values[name]) for name, kind in kinds.items()})
 
 
 def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample, dt_s: float) -> str:
@@ -165,20 +175,38 @@ def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, sp
     """
     kink = abs(u_V - 2.0 * state.u_V + state.u_before_V)
     state.since_step = 0 if kink > 0.25 * config.glitch_share * span_V else state.since_step + 1
+    state.kink_V = max(kink, KINK_DECAY * state.kink_V)
     state.u_before_V, state.u_V = state.u_V, u_V
 
 
-def check_reading(config: AdmissionConfig, state: AdmissionState, innovation: float) -> str:
-    """Gate of a reading by its distance from the smoother's prediction, in ranges.
+def surprise(config: AdmissionConfig, state: AdmissionState, span_V: float) -> float:
+    """Distance from the smoother's prediction beyond which a reading is held back, in ranges.
 
-    "" to go on, GLITCH to skip it, GAP to go on from there. Counts those in a row: what persists is no glitch, the
-    stage (or its sensor's zero) has really moved.
+    What is usual is no surprise, nor is what a kink of the voltage, as a share of its span, makes of the motion.
     """
-    if abs(innovation) <= config.glitch_share or min(state.since_start, state.since_step) <= config.settle:
-        state.glitches = 0
-        return ""
-    state.glitches += 1
-    if state.glitches <= config.glitch_persistence:
-        return GLITCH
-    state.glitches = 0
-    return GAP
+    usual = min(max(config.surprise_share, config.surprise_sigma * state.innovation2**0.5), config.glitch_share)
+    return float(usual + KINK_SHARE * state.kink_V / span_V)
+
+
+def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation: float) -> None:
+    """Keep account of the smoother's prediction errors, in ranges; those far from usual count as a little more."""
+    most = max(FAR_RMS * state.innovation2**0.5, config.surprise_share / config.surprise_sigma)
+    error = min(abs(innovation), most)
+    state.innovation2 += (error * error - state.innovation2) / INNOVATION_SAMPLES
+
+
+def settling(config: AdmissionConfig, state: AdmissionState) -> bool:
+    """Whether the smoother has just started or the voltage stepped: readings that surprise are the stage's own."""
+    return min(state.since_start, state.since_step) <= config.settle
+
+
+def at_rest(
+    config: AdmissionConfig, state: AdmissionState, y_um: float, count: int, range_um: float, dt_s: float
+) -> bool:
+    """Whether the stage, now at ``y_um``, has not left its place for a while; ``count`` is of the smoother's steps.
+
+    By place and not by speed: speed is noisy, and a slow scan is no rest, nor is a turning point.
+    """
+    if abs(y_um - state.anchor_um) > config.rest_share * range_um:
+        state.anchor_um, state.moved = y_um, count
+    return (count - state.moved) * dt_s > config.rest_s

@@ -5,17 +5,21 @@ itself, which is a change of the stage's gain; in the constant, an offset; in ve
 and a payload show; and a little in every other coefficient. A gain drop of 6 % is one direction to find, not twenty,
 so it is found within tens of milliseconds, while what the plays know of the loop's shape stays.
 
-``filterpy.kalman.KalmanFilter`` does the algebra (Joseph form). The measurement is the voltage minus the kernel part
-of the model, so that filter and window learn one model together and neither undoes the other.
+``filterpy.kalman.KalmanFilter`` does the algebra (Joseph form). ``algebra="compiled"`` is the same by
+``adaptive.drift_step``, held to the library by tests: for stages above some 2 kHz, where the library's calls and copies
+would cost as much as all the rest of the learner, and for starts without the half second of its import. The measurement
+is the voltage minus the kernel part of the model, so that filter and window learn one model together and neither undoes
+the other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
+from adaptive import drift_step
 from adaptive.errors import InputError
 from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
 from adaptive.types import FloatArray, StateDict
@@ -36,10 +40,11 @@ class DriftConfig:
     burst_floor : rms innovations below this are never a change.
     gate_sigma : innovations beyond this many standard deviations are refused ...
     gate_persistence : ... unless this many in a row are.
+    algebra : ``filterpy``, or ``compiled``, the same to rounding at a twentieth of the time.
     """
 
     gain_walk: float = 0.005
-    offset_walk: float = 0.0025
+    offset_walk: float = 0.005
     motion_walk: float = 0.00125
     shape_walk: float = 0.000125
     noise: float = 0.0013
@@ -50,9 +55,14 @@ class DriftConfig:
     burst_floor: float = 0.0025
     gate_sigma: float = 8.0
     gate_persistence: int = 6
+    algebra: Literal["filterpy", "compiled"] = "filterpy"
 
     def __post_init__(self) -> None:
+        if self.algebra not in ("filterpy", "compiled"):
+            raise InputError(f"drift.algebra: got {self.algebra!r}, expected 'filterpy' or 'compiled'")
         for name in self.__dataclass_fields__:
+            if name == "algebra":
+                continue
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"drift.{name}: got {value}, expected a finite number, not negative")
@@ -79,6 +89,13 @@ SLOW_S = 2.0
 DEAD_S = 0.25
 
 
+def _library_filter(p: int) -> Any:
+    # Here and not above: who has chosen the compiled algebra is spared the import.
+    from filterpy.kalman import KalmanFilter
+
+    return KalmanFilter(dim_x=p, dim_z=1)
+
+
 class DriftFilter:
     """Random-walk Kalman filter on ``beta`` (p,), in V per normalised input.
 
@@ -101,10 +118,10 @@ class DriftFilter:
         self._noise_V2 = (config.noise * span_V) ** 2
         self._floor_V2 = (config.burst_floor * span_V) ** 2
         self.state = DriftState(slow_V2=self._noise_V2, fast_V2=0.0)
-        self._filter = KalmanFilter(dim_x=p, dim_z=1)
-        self._filter.x = beta.reshape(p, 1).copy()
-        self._filter.P = np.array(covariance, dtype=np.float64)
-        self._filter.R = np.array([[self._noise_V2]])
+        self._x = np.array(beta, dtype=np.float64)
+        self._P = np.array(covariance, dtype=np.float64, order="C")
+        self._k, self._row = np.empty(p), np.empty(p)
+        self._library = _library_filter(p) if config.algebra == "filterpy" else None
         walk, burst = np.full(p, config.shape_walk), np.zeros(p)
         walk[0], burst[0] = config.offset_walk, config.burst_offset
         if p >= MOTION_COLUMNS:
@@ -116,29 +133,29 @@ class DriftFilter:
     @property
     def beta(self) -> FloatArray:
         """(p,) current estimate; a copy."""
-        return np.array(self._filter.x[:, 0])
+        return self._x.copy()
 
     @property
     def covariance(self) -> FloatArray:
         """(p, p) of the estimate, V²; a copy."""
-        return np.array(self._filter.P)
+        return self._P.copy()
 
-    def update(self, basis: FloatArray, target_V: float, moving: bool) -> str:
+    def update(self, basis: FloatArray, target_V: float, moving: bool, weight: float = 1.0) -> str:
         """One measurement of ``basis' beta``. Returns "updated", "outlier" or "burst" (a change was detected).
 
         At rest (``moving`` False) only the constant walks and only it is estimated: nothing else can be told apart
         there. The rest of the covariance is considered, not learnt from (Schmidt's filter), so that minutes in one
         place neither bend what is known of the others nor make the next motion's first samples count for too much.
+        ``weight`` : of the measurement, above 0; its noise variance is 1/weight of the ordinary.
         """
-        c, s, kf = self.config, self.state, self._filter
-        x = kf.x[:, 0]
+        c, s, x, P = self.config, self.state, self._x, self._P
         if moving:
-            kf.P[np.diag_indices_from(kf.P)] += self._walk
-            self._open_gain(c.gain_walk**2 * self.step_s)
+            drift_step.walk(x, P, self._walk, c.gain_walk**2 * self.step_s)
         else:
-            kf.P[0, 0] += self._walk[0]
-        innovation = target_V - float(basis @ x)
-        variance = float(basis @ kf.P @ basis) + self._noise_V2
+            P[0, 0] += self._walk[0]
+        innovation, variance = drift_step.innovation_of(x, P, basis, target_V, self._row)
+        noise_V2 = self._noise_V2 / weight
+        variance += noise_V2
         if innovation * innovation > c.gate_sigma**2 * variance and s.rejected < c.gate_persistence:
             s.rejected += 1
             return "outlier"
@@ -153,46 +170,49 @@ class DriftFilter:
             outcome = "burst"
         # The long-term level must not learn the change itself, or a second change would hide behind the first.
         s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
-        if moving:
-            kf.update(target_V, H=basis.reshape(1, -1))
+        # A burst has opened the covariance since: both begin with its product anew.
+        if moving and self._library is not None:
+            self._take_in(self._library, basis, target_V, noise_V2)
+        elif moving:
+            drift_step.joseph(x, P, basis, target_V, noise_V2, self._k, self._row)
         else:
-            self._update_constant(basis, innovation)
-        kf.P = 0.5 * (kf.P + kf.P.T)
+            drift_step.update_constant(x, P, basis, target_V, noise_V2, self._row)
         s.updates += 1
         return outcome
 
-    def _update_constant(self, basis: FloatArray, innovation: float) -> None:
-        """Joseph's form with a gain that is zero but for the constant."""
-        kf = self._filter
-        towards = kf.P @ basis
-        gain = float(towards[0]) / (float(basis @ towards) + self._noise_V2)
-        kf.x[0, 0] += gain * innovation
-        variance = float(basis @ towards) + self._noise_V2
-        kf.P[0, :] -= gain * towards
-        kf.P[:, 0] -= gain * towards
-        kf.P[0, 0] += gain * gain * variance
+    def _take_in(self, kf: Any, basis: FloatArray, target_V: float, noise_V2: float) -> None:
+        x, P = self._x, self._P
+        # The library's estimate is set and read each time: at rest and in a burst what it stands for changes here.
+        kf.x, kf.P = x[:, None], P
+        kf.update(np.array([[target_V]]), R=noise_V2, H=basis[None, :])
+        x[:] = kf.x[:, 0]
+        # Rounding leaves a little asymmetry, which the recursion would keep.
+        np.add(kf.P, kf.P.T, out=P)
+        P *= 0.5
 
     def expect_change(self) -> None:
         """Open the directions in which a sudden change of the stage shows: gain, offset, velocity, acceleration."""
-        self._filter.P[np.diag_indices_from(self._filter.P)] += self._burst
-        self._open_gain(self.config.burst_gain**2)
+        drift_step.walk(self._x, self._P, self._burst, self.config.burst_gain**2)
         self.state.quiet = 0
         self.state.bursts += 1
-
-    def _open_gain(self, variance: float) -> None:
-        x = self._filter.x[:, 0]
-        self._filter.P += variance * np.outer(x, x)
 
     def mark(self) -> tuple[FloatArray, FloatArray]:
         """What ``go_back`` needs to return to the present estimate."""
         return self.beta, self.covariance
 
+    def restore(self, mark: tuple[FloatArray, FloatArray]) -> None:
+        """Return to a marked estimate as it was."""
+        self._x[:], self._P[:] = mark
+
     def go_back(self, mark: tuple[FloatArray, FloatArray]) -> None:
         """Return to a marked estimate, ready for what may have changed since."""
-        self._filter.x = mark[0].reshape(-1, 1).copy()
-        self._filter.P = mark[1].copy()
+        self.restore(mark)
         self.state.rejected = 0
         self.expect_change()
+
+    def shift_constant(self, by_V: float) -> None:
+        """Add to the constant, V: what another part of the model gives up."""
+        self._x[0] += by_V
 
     def state_dict(self) -> StateDict:
         s = self.state

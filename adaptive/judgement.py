@@ -112,6 +112,11 @@ class Delay:
         self._past.append(vector)
         return self._past[0]
 
+    def shift(self, by: float) -> None:
+        """Add to the first entry of all kept."""
+        for vector in self._past:
+            vector[0] += by
+
     def array(self) -> FloatArray:
         """All kept, oldest first, for a state file."""
         return np.array(self._past, dtype=np.float64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled
+from adaptive.compiled import compiled, compiled_reassociating
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
@@ -118,3 +118,22 @@ def rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatA
             difference = row[j] - xi
             target[j] -= difference * difference
     exp_negative(target, bits[:count])
+
+
+@compiled_reassociating
+def weigh(k: FloatArray, alpha: FloatArray) -> tuple[float, float]:
+    """(sum of alpha k, largest k) of a kernel column (N,); 0 and 0 where it is empty."""
+    n = k.shape[0]
+    total = 0.0
+    for j in range(n):
+        total += alpha[j] * k[j]
+    # Four maxima side by side: one would wait for itself at every step.
+    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(n // 4):
+        m0 = max(m0, k[4 * j])
+        m1 = max(m1, k[4 * j + 1])
+        m2 = max(m2, k[4 * j + 2])
+        m3 = max(m3, k[4 * j + 3])
+    for j in range(n - n % 4, n):
+        m0 = max(m0, k[j])
+    return total, max(max(m0, m1), max(m2, m3))

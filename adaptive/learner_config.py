@@ -10,6 +10,7 @@ from adaptive.errors import InputError
 from adaptive.residual import Eviction
 from adaptive.smoothing import SmootherConfig
 from adaptive.types import StateDict
+from adaptive.weights import WeightConfig
 
 
 def part_of(state: StateDict, name: str) -> StateDict:
@@ -30,6 +31,7 @@ class LearnerConfig:
     for its model again and above which it no longer does.
     fallback_floor : share of the voltage span by which the learner may be worse than the model it started from before
     that one is served in its stead.
+    weights : how much doubtful and old samples count.
     """
 
     window: int = 500
@@ -44,6 +46,7 @@ class LearnerConfig:
     fallback_floor: float = 0.002
     admission: AdmissionConfig = field(default_factory=AdmissionConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
+    weights: WeightConfig = field(default_factory=WeightConfig)
 
     def __post_init__(self) -> None:
         if self.window < 10:
@@ -63,7 +66,7 @@ class LearnerConfig:
 
     def state_dict(self) -> StateDict:
         """All fields under flat names."""
-        parts = {"admission": asdict(self.admission), "drift": asdict(self.drift)}
+        parts = {"admission": asdict(self.admission), "drift": asdict(self.drift), "weights": asdict(self.weights)}
         flat = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
         return {**own, **flat}
@@ -76,6 +79,7 @@ class LearnerConfig:
             **own,
             admission=AdmissionConfig(**part_of(values, "admission")),
             drift=DriftConfig(**part_of(values, "drift")),
+            weights=WeightConfig(**part_of(values, "weights")),
         )
 
     def smoother(self, dt_s: float) -> SmootherConfig:

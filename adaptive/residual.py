@@ -2,19 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from adaptive import admission, kernels
+from adaptive import window_state as ws
+from adaptive.errors import InputError
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, StateDict
+from adaptive.weights import WeightConfig
 from adaptive.window import Window, WindowConfig
-from adaptive.window_state import Status
+from adaptive.window_state import IntArray, Status
 
 Eviction = Literal["nearest", "fifo"]
 #: A sample this close (kernel value) to one that the window holds takes its slot even where there is room.
 SAME = 0.98
+
+
+@dataclass(frozen=True, slots=True)
+class Hyperparameters:
+    """gamma : regularisation, positive. widths : (d,) kernel widths, one an input, dimensionless, positive."""
+
+    gamma: float
+    widths: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class WindowData:
+    """A copy of what the window holds, for tuning it elsewhere.
+
+    Attributes
+    ----------
+    kernel : (n, d) kernel inputs, dimensionless. targets_V : (n,) voltage less the linear part, V.
+    weights : (n,) noise weights. age : (n,) steps of the window since each sample came, 0 for the newest.
+    hyper : what the window works with.
+    """
+
+    kernel: FloatArray
+    targets_V: FloatArray
+    weights: FloatArray
+    age: FloatArray
+    hyper: Hyperparameters
 
 
 class ResidualWindow:
@@ -28,8 +58,12 @@ class ResidualWindow:
         self.eviction: Eviction = eviction
         widths = tuple(float(w) for w in model.widths)
         self._config = WindowConfig(capacity, widths, model.gamma)
+        #: Variance of the kernel part away from samples, V².
+        self.kernel_variance = model.kernel_variance
         self._window = Window(self._config)
         self._born = np.zeros(capacity, dtype=np.int64)
+        # The weights that samples came with, before they faded.
+        self._own = np.ones(capacity)
         self._clock = 0
 
     @classmethod
@@ -56,8 +90,8 @@ class ResidualWindow:
         """Prediction at one point (d,), V."""
         return self._window.predict(kernel)
 
-    def learn(self, kernel: FloatArray, target_V: float) -> str:
-        """Take one sample. Returns "learnt", or "numerics" where the step was refused and rolled back."""
+    def learn(self, kernel: FloatArray, target_V: float, weight: float = 1.0) -> str:
+        """Take one sample, of a noise weight. Returns "learnt", or "numerics" where the step was refused, undone."""
         window, n = self._window, len(self._window)
         slot, value = -1, 0.0
         if n:
@@ -70,17 +104,31 @@ class ResidualWindow:
             slot = n
         elif self.eviction == "fifo":
             slot = int(np.argmin(self._born[:n]))
-        status = self._step(slot, room, kernel, target_V)
+        status = self._step(slot, room, kernel, target_V, weight)
         # In line and not beside the work, so that a replay heals at the same sample; queries are not held up by it.
         if status == Status.ILL_CONDITIONED and window.heal():
-            status = self._step(slot, room, kernel, target_V)
+            status = self._step(slot, room, kernel, target_V, weight)
         if status != Status.ACCEPTED:
             return admission.NUMERICS
         self._born[slot] = self._clock
+        self._own[slot] = weight
         return admission.LEARNT
 
-    def _step(self, slot: int, room: bool, kernel: FloatArray, target_V: float) -> Status:
-        return self._window.append(kernel, target_V) if room else self._window.replace(slot, kernel, target_V)
+    def fade(self, weights: WeightConfig, step_s: float) -> None:
+        """Let one sample count by its age, another at each call; ``step_s`` is the time between two steps, s."""
+        n = len(self._window)
+        if weights.half_life_s <= 0.0 or n == 0:
+            return
+        slot = self._clock % n
+        age_s = float(self._clock - self._born[slot]) * step_s
+        self._window.reweight(slot, weights.faded(float(self._own[slot]), age_s))
+
+    def _step(self, slot: int, room: bool, kernel: FloatArray, target_V: float, weight: float) -> Status:
+        return (
+            self._window.append(kernel, target_V, weight)
+            if room
+            else self._window.replace(slot, kernel, target_V, weight)
+        )
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""
@@ -90,14 +138,75 @@ class ResidualWindow:
         """Of the window's numerics."""
         return self._window.counters()
 
+    # ---- hyper-parameters
+
+    @property
+    def hyper(self) -> Hyperparameters:
+        """Regularisation and kernel widths at work."""
+        return Hyperparameters(self._config.gamma, self._config.widths)
+
+    def data(self) -> WindowData:
+        """A copy of samples and hyper-parameters."""
+        window, n = self._window, len(self._window)
+        age = (self._clock - self._born[:n]).astype(np.float64)
+        return WindowData(window.X, window.y, window.weights, age, self.hyper)
+
+    def newest(self, count: int) -> FloatArray:
+        """(m, d) kernel inputs of the newest samples, m <= count, newest first."""
+        return np.ascontiguousarray(self._window.X[self._newest(count)])
+
+    def newest_error_V(self, count: int) -> float:
+        """rms, V, of what all others foretell for each of the newest samples: exact leave-one-out; 0 without any."""
+        errors = self._window.leave_one_out()[self._newest(count)]
+        return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
+
+    def with_hyperparameters(self, hyper: Hyperparameters) -> ResidualWindow:
+        """A window of the same samples, order of age and counts that works with others.
+
+        Raises InputError on values that are not positive, NumericsError where the kernel matrix can't be factored.
+        """
+        made = object.__new__(ResidualWindow)
+        c = self._config
+        made.eviction, made._clock, made._born = self.eviction, self._clock, self._born.copy()
+        made._own = self._own.copy()
+        widths = tuple(float(w) for w in hyper.widths)
+        if len(widths) != c.dimension:
+            raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
+        made._config = WindowConfig(c.capacity, widths, float(hyper.gamma), c.linear, c.form, c.backend, c.accuracy)
+        made.kernel_variance = self.kernel_variance
+        made._window = Window(made._config)
+        if len(self._window):
+            made._window = self._window.with_hyperparameters(widths, float(hyper.gamma))
+            made.kernel_variance = made._window.scale
+        made._window.arrays.C[ws.STEPS : ws.COUNTERS] += self._window.arrays.C[ws.STEPS : ws.COUNTERS]
+        return made
+
+    def _newest(self, count: int) -> IntArray:
+        return np.argsort(-self._born[: len(self._window)], kind="stable")[:count]
+
+    # ---- keeping
+
     def state_dict(self) -> StateDict:
-        return {**self._window.state_dict(), "born": self._born.copy(), "clock": self._clock}
+        """All arrays under flat names, and the hyper-parameters that they are of."""
+        own = {
+            "born": self._born.copy(),
+            "own_weights": self._own.copy(),
+            "clock": self._clock,
+            "kernel_variance": self.kernel_variance,
+        }
+        hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
+        return {**self._window.state_dict(), **own, **hyper}
 
     def restore(self, values: StateDict) -> None:
-        """Go on from a ``state_dict``. Raises InputError where it is of another configuration."""
+        """Go on from a ``state_dict``. Raises InputError where it is of another capacity or number of inputs."""
+        c = self._config
+        widths = tuple(float(w) for w in values["widths"])
+        self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.linear, c.form, c.backend, c.accuracy)
         self._window = Window.from_state(self._config, values)
         self._born = np.array(values["born"], dtype=np.int64)
+        self._own = np.array(values["own_weights"], dtype=np.float64)
         self._clock = int(values["clock"])
+        self.kernel_variance = float(values["kernel_variance"])
 
 
 ONE = np.ones(1)

@@ -16,7 +16,6 @@ from math import factorial, pi
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
-from scipy.signal import butter, sosfiltfilt
 
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
@@ -217,6 +216,9 @@ def zero_phase_lowpass(y_um: FloatArray, dt_s: float, cutoff_hz: float = 50.0, o
     y = _checked(y_um)
     if cutoff_hz >= 0.45 / dt_s:
         return y.copy()
+    # Here and not above: the serving process has no use for it, and it is slow to import.
+    from scipy.signal import butter, sosfiltfilt
+
     sos = butter(order, cutoff_hz, fs=1.0 / dt_s, output="sos")
     return np.asarray(sosfiltfilt(sos, y, padlen=min(y.size - 1, round(3.0 / (cutoff_hz * dt_s)))), dtype=np.float64)
 

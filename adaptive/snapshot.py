@@ -17,7 +17,7 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
-from adaptive.kernels import rbf_column
+from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 
 #: Share of the learnt range by which a point may lie outside and still count as inside.
@@ -69,12 +69,18 @@ def evaluate(
             for j in range(d):
                 x[j] *= inverse_widths[j]
             rbf_column(scaled, count, x, k, bits)
-            for j in range(count):
-                mean += alpha[j] * k[j]
-                nearest = max(nearest, k[j])
+            kernel_part, nearest = weigh(k, alpha)
+            mean += kernel_part
         u[i] = mean
         std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
         inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def track_memory(y: FloatArray, memory: FloatArray, m: FeatureArrays) -> None:  # pragma: no cover - compiled
+    """Advance ``memory`` (m,) in place by (n,) measured displacements."""
+    for i in range(y.shape[0]):
+        advance(y[i], memory, m)
 
 
 @compiled
@@ -177,12 +183,22 @@ class LssvmInverse:
         after = self._memory(memory)
         n = y.shape[0]
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        evaluate(
-            y, v, a, after, self.features.arrays, self.beta, self.beta_covariance, self._scaled,
-            self.alpha, self._inverse_widths, self.noise_variance, self.kernel_variance,
-            1.0 / (1.0 + 1.0 / self.gamma), self._margins, u, std, inside,
-        )  # fmt: skip
+        self.evaluate_into(y, v, a, after, u, std, inside)
         return Feedforward(u, std, inside, after)
+
+    def evaluate_into(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        std_V: FloatArray, inside: BoolArray,
+    ) -> None:  # fmt: skip
+        """As ``feedforward``, without its checks and its new arrays: (n,) contiguous doubles in, (n,) results out.
+
+        ``memory`` (m,) is advanced in place. For callers that ask point by point at the rate of a controller.
+        """
+        evaluate(
+            y_um, v_um_per_s, a_um_per_s2, memory, self.features.arrays, self.beta, self.beta_covariance, self._scaled,
+            self.alpha, self._inverse_widths, self.noise_variance, self.kernel_variance,
+            1.0 / (1.0 + 1.0 / self.gamma), self._margins, u_V, std_V, inside,
+        )  # fmt: skip
 
     def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
@@ -194,17 +210,21 @@ class LssvmInverse:
         """(m,) memory after (n,) measured points. This model's memory is of displacement: the voltage is not used."""
         y, _, _ = self._points(y_um, v_um_per_s, a_um_per_s2)
         after = self._memory(memory)
-        for value in y:
-            self.features.advance(float(value), after)
+        track_memory(y, after, self.features.arrays)
         return after
 
-    def _points(self, *arrays: FloatArray) -> list[FloatArray]:
-        points = [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
-        if any(x.ndim != 1 or x.shape != points[0].shape for x in points):
+    def _points(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        y = np.ascontiguousarray(y_um, dtype=np.float64)
+        v = np.ascontiguousarray(v_um_per_s, dtype=np.float64)
+        a = np.ascontiguousarray(a_um_per_s2, dtype=np.float64)
+        if y.ndim != 1 or not y.shape == v.shape == a.shape:
             raise InputError(
-                f"y_um, v_um_per_s, a_um_per_s2: got shapes {[x.shape for x in points]}, expected three of equal (n,)"
+                f"y_um, v_um_per_s, a_um_per_s2: got shapes {[x.shape for x in (y, v, a)]}, expected three of equal "
+                "(n,)"
             )
-        return points
+        return y, v, a
 
     def _memory(self, memory: FloatArray) -> FloatArray:
         after = np.array(memory, dtype=np.float64)

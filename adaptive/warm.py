@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.features import FeatureMap
+from adaptive.finite import all_finite
 from adaptive.learner import Learner, LearnerConfig
 from adaptive.smoothing import smooth_recording
 from adaptive.snapshot import LssvmInverse
@@ -35,3 +36,4 @@ def warm() -> None:
     memory = snapshot.feedforward(still, still, still, learner.memory()).memory
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
+    all_finite(still)

@@ -15,6 +15,7 @@ from adaptive.snapshot import LssvmInverse
 from adaptive.types import InverseModel, OnlineModel, Sample
 from baselines.bouc_wen import TABLE_2_1
 from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.competition_making import of_models
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline
@@ -49,6 +50,15 @@ def bouc_wen(recording: Recording, model: LssvmInverse) -> Any:
     return BoucWenOnline(BoucWenInverse(TABLE_2_1, DT, SEEN, 0.01))
 
 
+def competition(recording: Recording, model: LssvmInverse) -> Any:
+    others: dict[str, InverseModel] = {
+        "linear": LinearInverse(LinearParameters(11.0), DT, SEEN, 0.1),
+        "mpi": MpiInverse(MPI, DT, SEEN, 0.01),
+        "bouc_wen": BoucWenInverse(TABLE_2_1, DT, SEEN, 0.01),
+    }
+    return of_models("lssvm", Learner(model), model, others)
+
+
 MAKERS: dict[str, Maker] = {
     "learner": lambda recording, model: Learner(model),
     "learner_fifo": lambda recording, model: Learner(model, LearnerConfig(eviction="fifo", window=100)),
@@ -56,6 +66,7 @@ MAKERS: dict[str, Maker] = {
     "linear": linear,
     "mpi": mpi,
     "bouc_wen": bouc_wen,
+    "competition": competition,
 }
 
 

@@ -102,3 +102,36 @@ def test_bad_configuration_is_named() -> None:
         DriftConfig(gain_walk=-1.0)
     with pytest.raises(InputError, match="covariance"):
         DriftFilter(DriftConfig(), TRUE, np.eye(3), STEP, 8.0)
+
+
+def test_the_librarys_algebra_and_the_compiled_one_agree_through_changes_and_rests() -> None:
+    library, compiled = made(), made(DriftConfig(algebra="compiled"))
+    basis = rows(900)
+    outcomes = set()
+    for k, row in enumerate(basis):
+        truth = TRUE * (0.94 if k > 300 else 1.0)
+        target = float(row @ truth) + 1e-4 * np.sin(37.0 * k)
+        moving = not 600 <= k < 700
+        said = library.update(row, target, moving, 1.0 if k % 5 else 0.3)
+        assert compiled.update(row, target, moving, 1.0 if k % 5 else 0.3) == said
+        outcomes.add(said)
+    assert "burst" in outcomes
+    np.testing.assert_allclose(library.beta, compiled.beta, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(library.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
+
+
+def test_the_default_algebra_is_filterpys(monkeypatch: pytest.MonkeyPatch) -> None:
+    from filterpy.kalman import KalmanFilter
+
+    calls = []
+    update = KalmanFilter.update
+    monkeypatch.setattr(KalmanFilter, "update", lambda self, z, **more: (calls.append(1), update(self, z, **more)))
+    feed(made(), rows(5), TRUE)
+    assert len(calls) == 5
+    feed(made(DriftConfig(algebra="compiled")), rows(5), TRUE)
+    assert len(calls) == 5
+
+
+def test_an_unknown_algebra_is_refused() -> None:
+    with pytest.raises(InputError, match="algebra"):
+        DriftConfig(algebra="magic")  # type: ignore[arg-type]

@@ -63,3 +63,16 @@ def test_compiled_column_is_the_column(count: int, dimension: int, seed: int) ->
 def test_bad_widths_are_refused(widths: object) -> None:
     with pytest.raises(InputError, match="widths"):
         kernels.as_widths(widths, 2)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 4, 7, 500])
+def test_a_column_is_weighed_as_a_sum_and_its_largest(n: int) -> None:
+    rng = np.random.default_rng(n)
+    k, alpha = rng.random(n), rng.standard_normal(n)
+    total, largest = kernels.weigh(k, alpha)
+    assert total == pytest.approx(float(alpha @ k), abs=1e-12)
+    assert largest == max(k.tolist(), default=0.0)
+    for j in range(n):  # wherever it is
+        k[j] += 2.0
+        assert kernels.weigh(k, alpha)[1] == k[j]
+        k[j] -= 2.0

@@ -26,11 +26,11 @@ def test_the_frame_moves_by_the_jump_and_no_further(
     y[at] -= first * SHARE * span
     y[at + 1 :] -= 1.5 * SHARE * span
     learner = Learner.from_model(model)
-    for k in range(at + 12):
+    for k in range(at + 24):
         learner.handle(Sample(k, k * DT, float(u[k]), float(y[k])))
     assert learner.counters()["jumps"] == 1
     frame = learner.features
-    for k in (at + 6, at + 11):
+    for k in (at + 18, at + 23):
         in_frame = frame.offset_um + frame.gain * (clean[k] - frame.offset_um)
         assert in_frame == pytest.approx(y[k], abs=0.15)
 

@@ -1,0 +1,248 @@
+"""From readings to motion: what each sample is, and which steps of the track (``adaptive.track``) it leads to.
+
+Samples go in by ``take``, which says what each is and which steps are to be made for it; ``advance`` makes them and
+returns the pair of smoothed motion and voltage, ``lag`` samples old, that may teach. Readings that surprise are held
+back (``adaptive.surprise``): nothing is taught until they turn out to be a glitch, which is bridged, or a jump. A jump
+of the reading that no voltage made moves the frame of the features, and with it everything that was learnt.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from math import nan
+
+import numpy as np
+
+from adaptive import admission
+from adaptive.admission import (
+    AdmissionState,
+    at_rest,
+    check_sample,
+    settling,
+    surprise,
+    watch_innovation,
+    watch_voltage,
+)
+from adaptive.bridge import Bridging, Voltage
+from adaptive.features import FeatureMap
+from adaptive.learner_config import LearnerConfig, part_of
+from adaptive.smoothing import FixedLagSmoother
+from adaptive.snapshot import LssvmInverse
+from adaptive.surprise import PROBATION, Hold, Verdict, bridged, frame_after, judge, jump_of, steps_of
+from adaptive.track import Pair, Step, Taken, Track
+from adaptive.types import Sample, StateDict
+
+#: A reading further from the middle of the identified range than this many ranges is none, however long it lasts.
+FAR_OUT = 1.5
+#: A jump back differs from the jump by less than this share of it.
+BACK_SHARE = 0.1
+#: Samples without a reading whose voltages are kept.
+MOST_HEARD = 64
+
+
+class Front:
+    """The front end of a learner; ``base`` is the model that it starts from, ``voltage`` the one it has learnt.
+
+    Attributes
+    ----------
+    track : where the stage is and has been, None before the first reading. gates : of the admission.
+    doubt_V : deviation of the model's predictions, V, as far as it is known; the learner tells.
+    """
+
+    def __init__(self, base: LssvmInverse, config: LearnerConfig, voltage: Voltage) -> None:
+        self.base = base
+        self.dt_s = base.dt_s
+        self.range_um = base.features.y_max_um - base.features.y_min_um
+        self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
+        self.gates = AdmissionState()
+        self.track: Track | None = None
+        self.doubt_V = 0.0
+        self.restarts = self.jumps = self.undone = 0
+        self._voltage = voltage
+        self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
+        self._admission = config.admission.at(self.dt_s)
+        self._hold: Hold | None = None
+        self._lost = True  # The smoother has to start again.
+        # (seq, voltage) of samples whose readings were none, since the last one taken.
+        self._heard: deque[tuple[int, float]] = deque(maxlen=MOST_HEARD)
+        self._before: FeatureMap | None = None  # The frame before the last jump.
+        self._jump_um = 0.0
+
+    @property
+    def served(self) -> FeatureMap:
+        """The feature map to serve with."""
+        return self.base.features if self.track is None else self.track.served
+
+    @property
+    def on_probation(self) -> bool:
+        """Whether a jump was taken so recently that it may still be undone."""
+        return self._before is not None and self.gates.since_jump * self.dt_s <= self._admission.undo_s
+
+    def resync(self) -> None:
+        """Forget the sequence: the next sample is taken whatever its number."""
+        self.gates = AdmissionState()
+        self._hold, self._lost = None, True
+        self._heard.clear()
+
+    # ---- what a sample is
+
+    def take(self, sample: Sample) -> Taken:
+        """Judge one sample. Never raises on data."""
+        c, gates, track = self._admission, self.gates, self.track
+        refused = check_sample(c, gates, sample, self.dt_s)
+        if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
+            refused = admission.OUT_OF_RANGE
+        if refused:
+            if gates.seq >= 0 and not check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
+                # No reading, but a voltage: the stage goes on.
+                self._heard.append((sample.seq, sample.u_V))
+            return Taken(refused)
+        missing = sample.seq - gates.seq - 1 if gates.seq >= 0 else 0
+        between, gone = self._missed(sample, missing) if missing else ([], False)
+        self._heard.clear()
+        for u in (*between, sample.u_V):
+            watch_voltage(c, gates, u, self.base.span_V)
+        gates.seq, gates.t_s = sample.seq, sample.t_s
+        gates.since_glitch += 1 + missing
+        if track is None or self._lost or gone or (missing and track.motion is None):
+            return self._restart(sample, admission.GAP if missing else admission.SETTLING)
+        for u in between:
+            self._keep(track, u, nan)
+        innovation = (sample.y_um - track.predicted_um) / self.range_um
+        known = track.motion is not None and not settling(c, gates)
+        limit = surprise(c, gates, self.base.span_V)
+        if self._hold is None and not (known and abs(innovation) > limit):
+            watch_innovation(c, gates, innovation)
+            return Taken("", (Step(sample.y_um, sample.u_V),))
+        return self._decide(sample, track, self._keep(track, sample.u_V, sample.y_um), limit, innovation)
+
+    def _missed(self, sample: Sample, missing: int) -> tuple[list[float], bool]:
+        """Voltages of the samples without a reading before ``sample``, and whether too many never came."""
+        gates, first = self.gates, self.gates.seq + 1
+        heard = {seq: u for seq, u in self._heard if seq < sample.seq}
+        # Nobody knows the voltages of samples that never came; a straight line between is the best guess.
+        slope_V = (sample.u_V - gates.u_V) / (missing + 1)
+        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_HEARD))]
+        return between, missing > MOST_HEARD or missing - len(heard) > self._admission.max_gap
+
+    def _restart(self, sample: Sample, why: str) -> Taken:
+        """Begin smoothing anew at a sample."""
+        self._hold, self._lost = None, False
+        self.gates.since_start = self.gates.since_jump = 0
+        self.gates.moved = 0
+        if self.track is None:
+            self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
+        else:
+            self.track.restart(sample.y_um)
+        self.restarts += 1
+        return Taken(why, (Step(sample.y_um, sample.u_V),))
+
+    # ---- readings held back
+
+    def _keep(self, track: Track, u_V: float, y_um: float) -> Hold:
+        """Hold a sample back; begins a hold where there is none."""
+        hold, made = self._hold, Bridging(track.served, self._voltage, self.base.span_V / self.range_um)
+        if hold is None:
+            hold = self._hold = Hold(made.begin(*track.since_motion(), track.memory), track.copy())
+        old = replace(made, features=hold.track.served)
+        hold.put(u_V, y_um, old.advance(hold.bridge, u_V))
+        return hold
+
+    def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float, innovation: float) -> Taken:
+        """What the last sample held back decides."""
+        c, gates = self._admission, self.gates
+        undone = False
+        if hold.taken:
+            if abs(innovation) <= limit or settling(c, gates):
+                watch_innovation(c, gates, innovation)
+                if len(hold.y_um) >= PROBATION:
+                    self._hold = None
+                return Taken("", (Step(sample.y_um, sample.u_V),))
+            # At another level again within the probation: the sensor can't be trusted, and all is open once more.
+            self.track, self._before, undone = hold.track.copy(), None, True
+            gates.since_jump, gates.since_glitch = c.settle + 1, 0
+            hold.taken, hold.level = False, -1
+            self.undone += 1
+        tolerance = limit + min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
+        trusted = gates.since_glitch * self.dt_s > c.doubt_s
+        verdict = judge(c, hold, tolerance * self.range_um, self.range_um, trusted)
+        if verdict is Verdict.WAIT:
+            return Taken(admission.GLITCH, undone=undone)
+        if verdict is Verdict.LOST:
+            return replace(self._restart(sample, admission.GAP), undone=undone)
+        if verdict is Verdict.JUMP:
+            return self._take_jump(track, hold, undone)
+        self._hold = None
+        y_um = np.array(hold.y_um)
+        bad = np.isnan(y_um)
+        if verdict is Verdict.BACK:
+            if hold.worst_um > c.glitch_share * self.range_um:
+                gates.since_glitch = 0
+            y_um[:-1] = bridged(hold, len(hold.y_um) - 1)
+            bad[:-1] = True
+        return Taken("", steps_of(hold, y_um, bad), undone=undone)
+
+    def _take_jump(self, track: Track, hold: Hold, undone: bool) -> Taken:
+        """The reading has jumped for good: place and frame move from the first sample held back on.
+
+        No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
+        """
+        before, f = self._before, hold.track.served
+        away_um, ratio = jump_of(hold)
+        if before is not None and self.on_probation and abs(away_um + self._jump_um) <= BACK_SHARE * abs(away_um):
+            ratio, shift_um, frame = before.gain / f.gain, before.offset_um - f.offset_um, before
+            self._before, self.gates.since_glitch, undone = None, 0, True
+            self.undone += 1
+        else:
+            ratio, shift_um, frame = frame_after(f, away_um, ratio)
+            self._before, self._jump_um = f, away_um
+            self.jumps += 1
+        hold.taken, self.gates.since_jump = True, 0
+        if self.track is not None:
+            self.track.move(frame, ratio, shift_um)
+        y_um = np.array(hold.y_um)
+        bad = np.isnan(y_um)
+        bad[: hold.level] = True
+        y_um[bad] = f.offset_um + ratio * (np.array(hold.old_um)[bad] - f.offset_um) + shift_um
+        return Taken("", steps_of(hold, y_um, bad), away_um, undone)
+
+    # ---- what it teaches
+
+    def advance(self, step: Step) -> tuple[Pair | None, bool]:
+        """One step of the track; see there."""
+        assert self.track is not None
+        self.gates.since_start += 1
+        self.gates.since_jump += 1
+        return self.track.advance(step)
+
+    def rests(self, y_um: float) -> bool:
+        """Whether the stage, now at ``y_um``, has not left its place for a while."""
+        count = self.track.state.count if self.track is not None else 0
+        return at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
+
+    # ---- keeping
+
+    def state_dict(self) -> StateDict:
+        """All of the state under flat names."""
+        parts = {"gates": self.gates.state_dict()}
+        for name, part in (("track", self.track), ("hold", self._hold), ("before", self._before)):
+            if part is not None:
+                parts[name] = part.state_dict()
+        state = {f"{part}.{key}": value for part, values in parts.items() for key, value in values.items()}
+        state |= {"heard": np.array(self._heard, dtype=np.float64).reshape(-1, 2), "lost": self._lost}
+        counts = {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
+        return state | counts | {"jump_um": self._jump_um}
+
+    def restore(self, state: StateDict) -> None:
+        """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
+        self.gates = AdmissionState.from_state(part_of(state, "gates"))
+        track, hold, before = (part_of(state, name) for name in ("track", "hold", "before"))
+        made = (self.smoother, self.base.features)
+        self.track = Track.from_state(*made, track) if track else None
+        self._hold = Hold.from_state(*made, hold) if hold else None
+        self._before = FeatureMap.from_state(before) if before else None
+        self._heard.clear()
+        self._heard.extend((int(seq), float(u)) for seq, u in state["heard"])
+        self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
+        self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))

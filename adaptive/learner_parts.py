@@ -1,0 +1,136 @@
+"""The parts that a learner is made of, and their state as flat entries of a file."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adaptive.admission import new_counters
+from adaptive.drift import DriftFilter
+from adaptive.errors import ModelFileError
+from adaptive.front import Front
+from adaptive.judgement import Delay, Judgement
+from adaptive.learner_config import LearnerConfig, part_of
+from adaptive.residual import ResidualWindow
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import FloatArray, StateDict
+
+#: Names of what is counted beside the samples.
+EVENTS = ("fallbacks", "rollbacks", "adoptions", "adoptions_refused")
+
+#: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
+#: well, its estimate is marked this often, s.
+ROLLBACK_S, MARK_S = 0.5, 1.0
+
+Mark = tuple[FloatArray, FloatArray]
+
+
+class Parts:
+    """Everything of a learner that changes.
+
+    Attributes
+    ----------
+    front : gates, smoother, frame and hysteresis memory. filter : of the linear part. window : the kernel part.
+    judgement, delay : errors at the age of serving. domain : (6,) learnt range, as of the snapshot.
+    point : (d,) kernel inputs of the last instant that was due to teach, NaN before any.
+    mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
+    some of what went wrong. counters : samples by outcome. events : by name.
+    """
+
+    def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
+        self.config = config
+        self.front = Front(base, config, self.voltage)
+        p = base.features.basis_size
+        covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
+        step_s = config.filter_every * base.dt_s
+        self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
+        self.window = ResidualWindow.from_model(base, config.window, config.eviction)
+        self.mark: Mark = self.filter.mark()
+        self.next_mark: Mark = self.mark
+        self.jump_mark: Mark = self.mark
+        self.domain = base.domain.copy()
+        self.point = np.full(base.features.kernel_size, np.nan)
+        start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
+        self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
+        self.delay = Delay(round(config.serving_age_s / step_s))
+        self.counters = new_counters()
+        self.events = dict.fromkeys(EVENTS, 0)
+
+    def voltage(self, basis: FloatArray, kernel: FloatArray) -> float:
+        """What the learnt model asks for, V, at basis (p,) and kernel inputs (d,)."""
+        return float(basis @ self.filter.beta) + self.window.mean(kernel)
+
+    def judge(self, error_V: float, frozen_error_V: float) -> None:
+        """Take the errors at one instant: of the linear part as it was served for it, and of the frozen model."""
+        c, j, step_s = self.config, self.judgement, self.filter.step_s
+        span_V = self.filter.span_V
+        j.take(error_V, frozen_error_V, step_s)
+        j.decide(c.valid_enter * span_V, c.valid_leave * span_V)
+        before = j.fallback
+        self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
+        if j.fallen_s > ROLLBACK_S:
+            # Half a second of losing to the frozen model: what was learnt since all was well is wrong.
+            j.fallen_s = 0.0
+            self.filter.go_back(self.mark)
+            self.events["rollbacks"] += 1
+        elif j.judged % round(MARK_S / step_s) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
+            self.mark, self.next_mark = self.next_mark, self.filter.mark()
+
+    def shift_constant(self, by_V: float) -> None:
+        """Add to the constant of the linear part, now, in its marks, and as it was served."""
+        self.filter.shift_constant(by_V)
+        for beta, _ in {id(m): m for m in (self.mark, self.next_mark, self.jump_mark)}.values():
+            beta[0] += by_V
+        self.delay.shift(by_V)
+
+
+def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:
+    """All of a learner's state; ``restored`` goes on from it with the same result to the last bit."""
+    groups = {
+        "base": base.state_dict(),
+        "config": config.state_dict(),
+        "front": parts.front.state_dict(),
+        "filter": parts.filter.state_dict(),
+        "window": parts.window.state_dict(),
+        "judgement": parts.judgement.state_dict(),
+        "counters": dict(parts.counters),
+        "events": dict(parts.events),
+        "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
+        "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
+        "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
+    }
+    state = {f"{group}.{key}": value for group, values in groups.items() for key, value in values.items()}
+    return state | {
+        "domain": parts.domain.copy(),
+        "point": parts.point.copy(),
+        "delay": parts.delay.array(),
+        "frozen": frozen,
+    }
+
+
+def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool]:
+    """Inverse of ``state_of``. Raises ModelFileError where entries are missing or do not fit together."""
+    try:
+        base = LssvmInverse.from_state(part_of(state, "base"))
+        config = LearnerConfig.from_state(part_of(state, "config"))
+        parts = Parts(base, config)
+        parts.front.restore(part_of(state, "front"))
+        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, part_of(state, "filter"))
+        parts.window.restore(part_of(state, "window"))
+        parts.judgement = Judgement.from_state(part_of(state, "judgement"))
+        parts.counters |= {key: int(value) for key, value in part_of(state, "counters").items()}
+        parts.events |= {key: int(value) for key, value in part_of(state, "events").items()}
+        parts.domain = np.array(state["domain"], dtype=np.float64)
+        parts.point = np.array(state["point"], dtype=np.float64)
+        parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
+        names = ("mark", "next_mark", "jump_mark")
+        parts.mark, parts.next_mark, parts.jump_mark = (_mark(part_of(state, name)) for name in names)
+        return base, config, parts, bool(state["frozen"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(
+            f"learner state: entry missing or damaged: {error}; start from the model instead"
+        ) from error
+
+
+def _mark(values: StateDict) -> Mark:
+    """A mark of the drift filter from its entries."""
+    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)

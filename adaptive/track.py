@@ -1,0 +1,182 @@
+"""Where the stage is and has been: fixed-lag smoother, the last voltages and readings, frame and hysteresis memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.features import FeatureMap
+from adaptive.learner_config import part_of
+from adaptive.smoothing import FixedLagSmoother, SmootherState
+from adaptive.types import BoolArray, FloatArray, StateDict
+
+Motion = tuple[float, float, float]
+
+
+class Step(NamedTuple):
+    """One step of the smoother: reading, µm, voltage applied from then on, V, and whether it is a good reading.
+
+    Where it is none, ``y_um`` is where the stage must have been.
+    """
+
+    y_um: float
+    u_V: float
+    good: bool = True
+
+
+class Pair(NamedTuple):
+    """What one instant can teach: its number, smoothed motion (µm, µm/s, µm/s²), its voltage and the one before, V.
+
+    good : whether the readings at that instant and before it were. near_bad : whether one that the smoother has looked
+    at for it was not.
+    """
+
+    now: int
+    y_um: float
+    v_um_per_s: float
+    a_um_per_s2: float
+    u_V: float
+    u_before_V: float
+    good: bool
+    near_bad: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What a sample came to: the gate that refused it or "", and the steps to make.
+
+    jump_um : by how much the frame has moved, µm. undone : whether it has gone back to where it was before the last
+    jump, and what was learnt since is to be forgotten.
+    """
+
+    refused: str
+    steps: tuple[Step, ...] = ()
+    jump_um: float = 0.0
+    undone: bool = False
+
+
+@dataclass(slots=True)
+class Track:
+    """A track with its state; ``base`` is the feature map of the model that the learner started from.
+
+    Attributes
+    ----------
+    state : of the smoother. u_V, y_um, good : rings of (lag + 2,) by the smoother's count.
+    features, served : the feature map of the instant that is being learnt, and the one to serve with; they differ for
+    a lag after a jump, until the smoother's count ``switch``.
+    memory, frozen_memory : (m,) hysteresis memory in the learner's frame and in that of ``base``, which knows of no
+    jump. motion : last smoothed motion (µm, µm/s, µm/s²), ``lag`` samples old; None before there is one.
+    """
+
+    smoother: FixedLagSmoother
+    base: FeatureMap
+    state: SmootherState
+    u_V: FloatArray
+    y_um: FloatArray
+    good: BoolArray
+    features: FeatureMap
+    served: FeatureMap
+    memory: FloatArray
+    frozen_memory: FloatArray
+    motion: Motion | None = None
+    switch: int = 0
+
+    @classmethod
+    def begin(cls, smoother: FixedLagSmoother, base: FeatureMap, served: FeatureMap, y_um: float) -> Track:
+        """A stage that came to rest at ``y_um`` in one stroke."""
+        slots = smoother.config.lag + 2
+        rings = np.zeros(slots), np.zeros(slots), np.zeros(slots, dtype=np.bool_)
+        memories = served.rest_memory(y_um), base.rest_memory(y_um)
+        return cls(smoother, base, smoother.initial_state(y_um), *rings, served, served, *memories)
+
+    def restart(self, y_um: float) -> None:
+        """Begin smoothing anew; the hysteresis memory follows to where the stage now is."""
+        self.state = self.smoother.initial_state(y_um)
+        self.good[:] = False
+        self.features, self.motion, self.switch = self.served, None, 0
+
+    @property
+    def lag(self) -> int:
+        return self.smoother.config.lag
+
+    @property
+    def predicted_um(self) -> float:
+        """Where the smoother expects the next reading."""
+        return float(self.state.x[0])
+
+    def copy(self) -> Track:
+        """A track that goes its own way from here."""
+        return Track(
+            self.smoother, self.base, self.state.copy(), self.u_V.copy(), self.y_um.copy(), self.good.copy(),
+            self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion, self.switch,
+        )  # fmt: skip
+
+    def move(self, served: FeatureMap, ratio: float, shift_um: float) -> None:
+        """A jump: the smoother goes on at another place, y <- offset + ratio (y - offset) + shift, in a new frame."""
+        self.state.x *= ratio
+        self.state.x[0] += (1.0 - ratio) * self.served.offset_um + shift_um
+        self.served, self.switch = served, self.state.count + self.lag
+
+    def advance(self, step: Step) -> tuple[Pair | None, bool]:
+        """One step: the pair of ``lag`` samples ago, None before there is one; whether it is the first after a jump."""
+        state, slots = self.state, self.u_V.shape[0]
+        slot = state.count % slots
+        self.y_um[slot], self.u_V[slot], self.good[slot] = step
+        self.motion = self.smoother.step(state, step.y_um)
+        if self.motion is None:
+            return None, False
+        switched = self.features is not self.served and state.count > self.switch
+        if switched:
+            self.features = self.served
+        self.features.advance(self.motion[0], self.memory)
+        self.base.advance(self.motion[0], self.frozen_memory)
+        now = state.count - 1 - self.lag
+        at, before = now % slots, (now - 1) % slots
+        good = bool(self.good[at] and self.good[before])
+        pair = Pair(now, *self.motion, float(self.u_V[at]), float(self.u_V[before]), good, not bool(self.good.all()))
+        return pair, switched
+
+    def since_motion(self) -> tuple[Motion, FloatArray, FloatArray]:
+        """The last smoothed motion, in the frame that is served, and (lag,) voltages and readings since then."""
+        assert self.motion is not None
+        past = np.arange(self.state.count - self.lag, self.state.count) % self.u_V.shape[0]
+        f, g = self.features, self.served
+        y, v, a = self.motion
+        # Just after a jump the smoothed instants are still in the frame from before it.
+        return (g.offset_um + g.gain / f.gain * (y - f.offset_um), v, a), self.u_V[past], self.y_um[past]
+
+    def state_dict(self) -> StateDict:
+        """All of it under flat names, but for what it was made with."""
+        parts = {
+            "smoother": self.smoother.state_dict(self.state),
+            "features": self.features.state_dict(),
+            "served": self.served.state_dict(),
+        }
+        state = {f"{part}.{key}": value for part, values in parts.items() for key, value in values.items()}
+        for name in ("u_V", "y_um", "good", "memory", "frozen_memory"):
+            state[name] = getattr(self, name).copy()
+        return state | {"motion": np.array(self.motion or (), dtype=np.float64), "switch": self.switch}
+
+    @classmethod
+    def from_state(cls, smoother: FixedLagSmoother, base: FeatureMap, values: StateDict) -> Track:
+        """Inverse of ``state_dict``. Raises InputError where it is of another lag."""
+        slots = smoother.config.lag + 2
+        floats = {name: np.array(values[name], dtype=np.float64) for name in ("u_V", "y_um", "memory", "frozen_memory")}
+        if floats["u_V"].shape != (slots,):
+            raise InputError(f"u_V: got {floats['u_V'].shape[0]} slots, expected {slots}; the smoother's lag differs")
+        features, served = (FeatureMap.from_state(part_of(values, name)) for name in ("features", "served"))
+        motion = [float(x) for x in values["motion"]]
+        return cls(
+            smoother=smoother,
+            base=base,
+            state=smoother.from_state(part_of(values, "smoother")),
+            good=np.array(values["good"], dtype=np.bool_),
+            features=served if features == served else features,
+            served=served,
+            motion=(motion[0], motion[1], motion[2]) if motion else None,
+            switch=int(values["switch"]),
+            **floats,
+        )
