@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize_scalar, nnls
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
@@ -98,6 +97,8 @@ class MpiGrid:
 
 def bounded_least_squares(matrix: FloatArray, target: FloatArray, lower: FloatArray) -> FloatArray:
     """Minimise |matrix x - target| over x >= lower; a bound of -inf leaves an unknown free. Returns (p,)."""
+    from scipy.optimize import nnls  # slow to import, and a process that serves may never need it
+
     free = np.isneginf(lower)
     shift = np.where(free, 0.0, lower)
     wide = np.hstack([matrix, -matrix[:, free]])
@@ -141,6 +142,8 @@ def _best_lag(
 
     def cost(lag_s: float) -> float:
         return _solve(plays[thin], (y_um + lag_s * velocity)[thin] - grid.y_ref_um, grid, lower, 0)[1]
+
+    from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(cost, bounds=(0.0, max(0.05, 2.0 * dt_s)), method="bounded", options={"xatol": 1e-5})
     return (float(found.x) if found.fun < cost(0.0) else 0.0), int(found.nfev) + 1

@@ -14,15 +14,20 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from adaptive import drift_step
 from adaptive.admission import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
+from adaptive.finite import all_finite
 from adaptive.types import FloatArray, StateDict
 from baselines.bouc_wen import hysteresis_step, settled, stage_output, stage_step
 from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.online import OnlineBaseline, field_of, prefixed, without_prefix
 
 _NUDGE = 1e-3
+#: Bounds of the relative parameters.
+_LOWEST = np.array([0.3, -1.0, 0.3, 0.3, 0.3])
+_HIGHEST = np.array([3.0, 1.0, 3.0, 3.0, 3.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,26 +155,24 @@ class BoucWenOnline(OnlineBaseline):
         slopes[1] = self._range
         slopes[2:] = d * (self._out[1:] - self._out[0]) / _NUDGE
         innovation = y_um - (d * self._out[0] + p.offset_um + self._range * self._x[1])
-        prior = self._P + np.diag(self._walk)
-        gain_row = prior @ slopes
-        variance = float(slopes @ gain_row) + self._noise
+        P, moved, row = self._P.copy(), np.zeros(5), np.empty(5)
+        drift_step.walk(moved, P, self._walk, 0.0)
+        variance = drift_step.innovation_of(moved, P, slopes, innovation, row)[1] + self._noise
         if innovation**2 > self.config.outlier_sigma**2 * variance:
             self._refused += 1
             if self._refused >= self.config.outlier_persistence:
                 self._P, self._refused = self._P + np.diag(self._first), 0
             return OUTLIER
         self._refused = 0
-        gain = gain_row / variance
-        x = self._x + gain * innovation
         # Joseph's form stays positive; the cap keeps what is not excited from growing for ever.
-        keep = np.eye(5) - np.outer(gain, slopes)
-        P = keep @ prior @ keep.T + self._noise * np.outer(gain, gain)
-        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(P))):
+        drift_step.joseph(moved, P, slopes, innovation, self._noise, np.empty(5), row)
+        x = self._x + moved
+        if not (all_finite(x) and all_finite(P.reshape(-1))):
             self._P = np.diag(self._first)
             return NUMERICS
         shrink = np.sqrt(np.minimum(1.0, 4.0 * self._first / np.maximum(np.diag(P), 1e-300)))
         self._P = P * np.outer(shrink, shrink)
-        self._x = np.clip(x, [0.3, -1.0, 0.3, 0.3, 0.3], [3.0, 1.0, 3.0, 3.0, 3.0])
+        self._x = np.minimum(np.maximum(x, _LOWEST), _HIGHEST)
         self._set_shapes()
         self._square += (innovation**2 - self._square) / 400.0
         return LEARNT

@@ -18,14 +18,20 @@ from adaptive.admission import LEARNT, NUMERICS, PASSED, SETTLING, UNEXCITED
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, StateDict
-from baselines.dead_zone import ramps
-from baselines.identify_mpi import SLOPE_FLOOR, MpiGrid, bounded_least_squares
+from baselines.bounded import bounded_minimum
+from baselines.dead_zone import dead_zone_sum, ramps
+from baselines.gain_filter import GainFilter
+from baselines.identify_mpi import SLOPE_FLOOR, MpiGrid
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
 from baselines.online import OnlineBaseline, field_of, prefixed, without_prefix
 from baselines.play import play_run, play_start, play_step
 from baselines.prandtl_ishlinskii import inverse_thresholds, inverse_weights
 
+#: How gain and offset of the MPI model's frame walk, per root of a second of teaching: of one, and of the stroke.
+GAIN_WALK, OFFSET_WALK = 0.02, 0.01
+#: Errors of the model last for many samples: their deviation counts this many times. Least one, of the stroke.
+FRAME_ERROR, FRAME_NOISE = 3.0, 1e-3
 #: The velocity is a difference over this many samples on each side.
 _HALF = 2
 
@@ -126,13 +132,14 @@ class _LeastSquaresOnline(OnlineBaseline):
         """New weights from the normal matrix; False, and nothing changed, where that fails."""
         raise NotImplementedError
 
-    def _triangle(self, normal: FloatArray) -> FloatArray | None:
-        """Upper triangle of the normal matrix with the target as last column; None where it has none."""
-        tiny = 1e-12 * np.diag(normal).max()
-        try:
-            return np.ascontiguousarray(np.linalg.cholesky(normal + tiny * np.eye(normal.shape[0])).T)
-        except np.linalg.LinAlgError:
-            return None
+    @staticmethod
+    def _minimum(normal: FloatArray, lower: FloatArray) -> FloatArray:
+        """Weights (p,) of least squares above ``lower`` (p,), ``normal`` having the target as its last column.
+
+        Raises RuntimeError where there are none.
+        """
+        matrix = normal[:-1, :-1] + 1e-12 * np.diag(normal).max() * np.eye(lower.size)
+        return bounded_minimum(matrix, normal[:-1, -1], lower)
 
     def _learning_state(self) -> StateDict:
         return {
@@ -189,13 +196,13 @@ class LinearOnline(_LeastSquaresOnline):
         return float(self._gain * row[0] + self._offset - row[2])
 
     def _solve(self) -> bool:
-        triangle = self._triangle(self._normal)
-        if triangle is None:
-            return False
         # The slope keeps its sign: a bound, mirrored where displacement falls with voltage.
-        matrix = triangle[:2, :2] * np.array([self._sign, 1.0])
+        signs = np.array([self._sign, 1.0, 1.0])
         floor = SLOPE_FLOOR * abs(self.base.parameters.gain_um_per_V)
-        gain, offset = bounded_least_squares(matrix, triangle[:2, 2], np.array([floor, -np.inf]))
+        try:
+            gain, offset = self._minimum(self._normal * np.outer(signs, signs), np.array([floor, -np.inf]))
+        except RuntimeError:
+            return False
         self._gain, self._offset = float(gain * self._sign), float(offset)
         return True
 
@@ -222,7 +229,9 @@ class LinearOnline(_LeastSquaresOnline):
 class MpiOnline(_LeastSquaresOnline):
     """Play weights, offset and inverse-saturation slopes that follow the stage, on (2.40) with its scale fixed.
 
-    Implements ``adaptive.types.OnlineModel``. Thresholds stay those of the identified model.
+    Implements ``adaptive.types.OnlineModel``. Thresholds stay those of the identified model. A fast filter follows gain
+    and offset, and the weights are fitted in its frame: least squares over samples from before and after a change of
+    gain would else explain the difference by the shape, and be wrong for as long as it remembers.
     """
 
     def __init__(self, model: MpiInverse, config: LeastSquaresConfig | None = None) -> None:
@@ -245,7 +254,9 @@ class MpiOnline(_LeastSquaresOnline):
         self._states = p.start()
         scale = float(np.mean(self._unknowns[p.r_.size + 1 :]))
         self._square = (model.voltage_std_V * p.w_h_[0] / scale) ** 2 if np.isfinite(model.voltage_std_V) else 0.0
-        self._parameters = p
+        self._shape = p
+        self._floor_um2 = (FRAME_NOISE * stroke) ** 2
+        self._frame = GainFilter.start(GAIN_WALK, OFFSET_WALK * stroke, self.config.learn_every * model.dt_s)
 
     def _step_memory(self, u_V: float, first: bool) -> None:
         play_step(u_V, self._grid.r_V, self._states)
@@ -254,49 +265,68 @@ class MpiOnline(_LeastSquaresOnline):
         return np.append(self._states, 1.0)
 
     def _row(self, pending: FloatArray, y_um: float, v_um_per_s: float) -> FloatArray:
-        lead = y_um - self._grid.y_ref_um + self.base.parameters.lag_s * v_um_per_s
-        curve = ramps(np.array([lead]), self._grid.d_star_um)[0]
+        p, lead = self._shape, y_um + self.base.parameters.lag_s * v_um_per_s
+        model = p.y_ref_um + float(dead_zone_sum(float(p.w_h_ @ pending[:-1]) + p.c_um, p.d_, p.w_s_))
+        self._frame.update(lead, model, max(FRAME_ERROR**2 * self._square, self._floor_um2))
+        curve = ramps(np.array([self._frame.undo(lead) - self._grid.y_ref_um]), self._grid.d_star_um)[0]
         return np.concatenate([pending, -curve, [0.0]])
 
     def _residual(self, row: FloatArray) -> float:
-        slopes = self._unknowns[self._grid.r_V.size + 1 :]
-        return float(row[:-1] @ self._unknowns / np.mean(slopes))
+        # The slopes are one on the mean of what was visited: the error in x is one in displacement.
+        return float(row[:-1] @ self._unknowns)
+
+    def _scale_row(self) -> tuple[FloatArray, float]:
+        """(size,) row and value of the scale constraint, both in parts of the latter: cov(S*(y), y) = var(y).
+
+        Over the samples remembered, and not over the stroke of the identification: slopes that nobody visits would
+        take up the scale, all others would shrink, and with them every error.
+        """
+        size, n = self._grid.size, self._grid.r_V.size
+        ramp = slice(n + 1, size)
+        mean = self._normal[n, ramp] / self._normal[n, n]
+        covariance = self._normal[ramp, ramp] - self._normal[n, n] * np.outer(mean, mean)
+        row = np.zeros(size)
+        row[ramp] = covariance.sum(axis=1)
+        return row / float(row.sum()), 1.0
 
     def _solve(self) -> bool:
         # The scale row is heavy against all samples; a thousandth of a sample holds each weight where it is.
         size = self._grid.size
         normal = self._normal.copy()
         mass = float(np.mean(np.diag(normal)[:size]))
-        scale = np.append(self._grid.scale_row(), self._grid.stroke_um) / self._grid.stroke_um
+        row, one = self._scale_row()
+        present = self._unknowns / float(row @ self._unknowns)
+        scale = np.append(row, one)
         hold = 1e-3 * np.maximum(np.diag(normal)[:size], 1e-3 * mass) / self.config.remember
         normal += 1e4 * mass * np.outer(scale, scale)
         normal[np.arange(size), np.arange(size)] += hold
-        normal[:size, size] += hold * self._unknowns
-        normal[size, :size] += hold * self._unknowns
-        normal[size, size] += float(hold @ self._unknowns**2)
-        triangle = self._triangle(normal)
-        if triangle is None:
-            return False
+        normal[:size, size] += hold * present
+        normal[size, :size] += hold * present
+        normal[size, size] += float(hold @ present**2)
         try:
-            unknowns = bounded_least_squares(triangle[:size, :size], triangle[:size, size], self._lower)
-            parameters = self._grid.model(unknowns, self.base.parameters.lag_s)
+            unknowns = self._minimum(normal, self._lower)
+            shape = self._grid.model(unknowns, self.base.parameters.lag_s)
         except (InputError, RuntimeError):
             return False
-        self._unknowns = unknowns * (self._grid.stroke_um / float(self._grid.scale_row() @ unknowns))
-        self._parameters = parameters
+        self._unknowns = unknowns / float(row @ unknowns)
+        self._shape = shape
         return True
 
     def snapshot(self) -> MpiInverse:
         """The model as it stands; its deviation is that of the recent residuals."""
-        gain = float(np.sum(self._parameters.w_h_) * self._parameters.w_s_[0])
-        return replace(self.base, parameters=self._parameters, voltage_std_V=float(np.sqrt(self._square)) / gain)
+        f, shape = self._frame, self._shape
+        w_s = tuple(f.gain * weight for weight in shape.w_s)
+        now = replace(shape, w_s=w_s, y_ref_um=f.gain * shape.y_ref_um + f.offset_um)
+        std_V = float(np.sqrt(self._square)) / float(np.sum(shape.w_h_) * shape.w_s_[0])
+        return replace(self.base, parameters=now, voltage_std_V=std_V)
 
     def state_dict(self) -> StateDict:
         """Everything; ``from_state`` continues to the same last bit."""
         now = {
             "unknowns": self._unknowns.copy(),
             "states_V": self._states.copy(),
-            **prefixed("now_", self._parameters.state_dict()),
+            **prefixed("now_", self._shape.state_dict()),
+            **prefixed("frame_", self._frame.state_dict()),
         }
         return {**self._learning_state(), **now, **prefixed("base_", self.base.state_dict())}
 
@@ -307,5 +337,6 @@ class MpiOnline(_LeastSquaresOnline):
         made._restore_learning(state)
         made._unknowns = np.array(field_of(state, "unknowns", "mpi"), dtype=np.float64)
         made._states = np.array(field_of(state, "states_V", "mpi"), dtype=np.float64)
-        made._parameters = made._parameters.from_state(without_prefix("now_", state))
+        made._shape = made._shape.from_state(without_prefix("now_", state))
+        made._frame.restore(without_prefix("frame_", state))
         return made

@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 
 from adaptive.errors import InputError
+from adaptive.finite import all_finite
 from adaptive.types import FloatArray, StateDict
 from baselines.records import Domain
 
@@ -37,7 +38,7 @@ def memory_copy(memory: FloatArray, size: int) -> FloatArray:
         raise InputError(
             f"memory: got shape {copy.shape}, expected ({size},); bring back the memory that this model's reply carried"
         )
-    if not np.isfinite(copy).all():
+    if size and not all_finite(copy):
         raise InputError(f"memory: got {copy.tolist()}, expected finite values; start from rest_memory")
     return copy
 

@@ -7,6 +7,7 @@ import numpy as np
 from adaptive.types import Sample
 from baselines.bouc_wen import TABLE_2_1
 from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.bounded import bounded_minimum
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
 from baselines.online_least_squares import LeastSquaresConfig, MpiOnline
@@ -36,6 +37,7 @@ def warm() -> None:
     ):
         for k in range(20):
             online.handle(Sample(k, k * 1e-3, 0.1 * k, k))
+    bounded_minimum(np.eye(2), np.ones(2), np.zeros(2))
 
 
 if __name__ == "__main__":

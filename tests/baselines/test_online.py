@@ -103,6 +103,33 @@ def test_mpi_keeps_its_signs_on_a_stage_of_another_class() -> None:
     assert model.counters()["numerics"] == 0
 
 
+def test_mpi_neither_overshoots_a_change_of_gain_nor_deflates() -> None:
+    """Slow small motion that never sees the top of the range, then the gain falls: the error falls at once, for good.
+
+    The scale of an MPI model is free but for a constraint; held where nobody goes, all else would shrink to nothing.
+    """
+    t = np.arange(24_000) * DT
+    u = 3.0 + 1.2 * np.sin(2 * np.pi * 1.1 * t) + 0.8 * np.sin(2 * np.pi * 2.3 * t + 1.0)
+    # Another class of hysteresis: no weights are right, and each stretch of motion asks for other ones.
+    y = TABLE_2_1.simulate(u, DT)
+    changed = y.copy()
+    changed[12_000:] *= 0.94
+    model = build("mpi")
+    slopes, worst = [], 0.0
+    memory = model.snapshot().rest_memory(float(changed[0]))
+    zero = np.zeros(20)
+    for k in range(0, t.size, 20):
+        part = slice(k, k + 20)
+        said = model.snapshot().feedforward(changed[part], zero, zero, memory)
+        memory = said.memory
+        if k >= 13_000:
+            worst = max(worst, float(np.mean(np.abs(said.u_V - u[part]))))
+        feed(model, u[part], changed[part], first=k)
+        slopes.append(float(np.sum(model._shape.w_h_)))
+    assert worst < 0.12
+    assert min(slopes[100:]) > 0.95 * max(slopes[100:])
+
+
 def test_mpi_keeps_a_floor_under_the_first_play() -> None:
     """A stage that is one wide play would want no first play at all; its inverse would then jump at a reversal."""
     u = drive(16_000)

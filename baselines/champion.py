@@ -1,0 +1,220 @@
+"""What a competition serves: the champion's answer, blended from the one before it, all memories carried along.
+
+The caller's memory holds one share a contestant and then every contestant's own memory. Point by point the shares move
+to the champion, at a rate of one over ``blend_s``: after a change of champion every caller goes over in its own
+stream, without a jump, and a call is still a pure function of its arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.finite import all_finite
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
+from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.linear import LinearInverse
+from baselines.mpi_inverse import MpiInverse
+
+#: Kinds of contestants that a state can be read back into.
+KINDS: Final[dict[str, Any]] = {
+    "lssvm": LssvmInverse,
+    "linear": LinearInverse,
+    "bouc_wen": BoucWenInverse,
+    "mpi": MpiInverse,
+}
+
+
+def kind_of(model: InverseModel) -> str:
+    """Kind of a contestant; raises InputError where its class is none of them."""
+    for kind, known in KINDS.items():
+        if type(model) is known:
+            return kind
+    raise InputError(
+        f"model {model.name!r}: got a {type(model).__name__}, expected one of the kinds {', '.join(KINDS)}"
+    )
+
+
+@dataclass(frozen=True)
+class ChampionInverse:
+    """Immutable; implements ``adaptive.types.InverseModel``.
+
+    Parameters
+    ----------
+    names, models : of the contestants, in order, all of one sample time.
+    champion : index of the one that answers.
+    blend_s : how long a change of champion takes in a caller's stream of points, s.
+    """
+
+    names: tuple[str, ...]
+    models: tuple[InverseModel, ...]
+    champion: int
+    blend_s: float = 0.05
+    name: str = "auto"
+    _cuts: tuple[int, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not self.models or len(self.names) != len(self.models) or not 0 <= self.champion < len(self.models):
+            raise InputError(
+                f"names, models, champion: got {len(self.names)}, {len(self.models)}, {self.champion}, "
+                "expected as many names as models, and the index of one of them"
+            )
+        if len({model.dt_s for model in self.models}) != 1 or not self.blend_s >= 0.0:
+            raise InputError("models, blend_s: expected models of one sample time, and a time of at least 0 s")
+        sizes = [len(self.models), *(model.memory_size for model in self.models)]
+        object.__setattr__(self, "_cuts", tuple(int(cut) for cut in np.cumsum(sizes)))
+
+    @property
+    def dt_s(self) -> float:
+        return self.models[0].dt_s
+
+    @property
+    def memory_size(self) -> int:
+        """One share a contestant, then their memories in order."""
+        return self._cuts[-1]
+
+    @property
+    def served(self) -> InverseModel:
+        """The champion's model itself."""
+        return self.models[self.champion]
+
+    @property
+    def valid(self) -> bool:
+        """Whether the champion vouches for itself."""
+        return bool(getattr(self.served, "valid", True))
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """(m,) memory of a stage at rest at ``y_um``, wholly the champion's."""
+        return np.concatenate([self._settled(), *(model.rest_memory(y_um) for model in self.models)])
+
+    def feedforward(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """Voltages for (n,) points; pure. Raises InputError on shapes that do not fit together."""
+        if self._is_settled(memory):
+            return self._champions(y_um, v_um_per_s, a_um_per_s2, memory)
+        shares, parts = self._parts(memory)
+        answers = [
+            model.feedforward(y_um, v_um_per_s, a_um_per_s2, part)
+            for model, part in zip(self.models, parts, strict=True)
+        ]
+        champion = answers[self.champion]
+        ends = [
+            answer.memory if np.isfinite(answer.memory).all() else part
+            for answer, part in zip(answers, parts, strict=True)
+        ]
+        if shares[self.champion] >= 1.0:
+            return Feedforward(champion.u_V, champion.std_V, champion.inside, np.concatenate([self._settled(), *ends]))
+        weights = self._weights(shares, champion.u_V.size)
+        u, variance = np.zeros(champion.u_V.size), np.zeros(champion.u_V.size)
+        inside = champion.inside.copy()
+        blended = [(weights[:, i], answer) for i, answer in enumerate(answers) if shares[i] > 0.0 or i == self.champion]
+        for weight, answer in blended:
+            # A contestant that has nothing finite to say leaves its share to the champion.
+            u += weight * np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V)
+        for weight, answer in blended:
+            apart = np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V) - u
+            variance += np.where(weight > 0.0, weight * (answer.std_V**2 + apart**2), 0.0)
+            inside &= answer.inside | (weight <= 0.0)
+        return Feedforward(u, np.sqrt(variance), inside, np.concatenate([weights[-1], *ends]))
+
+    def track(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
+    ) -> FloatArray:
+        """(m,) memory after (n,) measured points with the voltages applied."""
+        shares, parts = self._parts(memory)
+        ends = []
+        for model, part in zip(self.models, parts, strict=True):
+            end = model.track(y_um, v_um_per_s, a_um_per_s2, u_V, part)
+            ends.append(end if np.isfinite(end).all() else part)
+        n = np.asarray(y_um).size
+        return np.concatenate([self._weights(shares, n)[-1] if n else shares, *ends])
+
+    def _is_settled(self, memory: FloatArray) -> bool:
+        """Whether a caller's stream of points is wholly the champion's: almost always."""
+        if not isinstance(memory, np.ndarray) or memory.shape != (self.memory_size,) or memory.dtype != np.float64:
+            return False
+        shares = memory[: len(self.models)].tolist()
+        # As it leaves this class; anything else goes the long way, where it is judged.
+        return bool(shares[self.champion] == 1.0 and shares.count(0.0) == len(shares) - 1)
+
+    def _champions(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """The champion's answer, and all memories after it: what a contestant without one would say nobody asks."""
+        champion: Feedforward | None = None
+        after = memory.copy()
+        begin = len(self.models)
+        for i, (model, end) in enumerate(zip(self.models, self._cuts[1:], strict=True)):
+            if end > begin or i == self.champion:
+                answer = model.feedforward(y_um, v_um_per_s, a_um_per_s2, memory[begin:end])
+                if i == self.champion:
+                    champion = answer
+                if end > begin and all_finite(answer.memory):
+                    after[begin:end] = answer.memory
+            begin = end
+        assert champion is not None
+        return Feedforward(champion.u_V, champion.std_V, champion.inside, after)
+
+    def _settled(self) -> FloatArray:
+        shares = np.zeros(len(self.models))
+        shares[self.champion] = 1.0
+        return shares
+
+    def _weights(self, shares: FloatArray, n: int) -> FloatArray:
+        """(n, k) shares at each of n points, going over to the champion from ``shares`` (k,)."""
+        at = float(shares[self.champion])
+        if at >= 1.0 or self.blend_s <= 0.0:
+            return np.tile(self._settled(), (n, 1))
+        own = np.minimum(1.0, at + np.arange(1, n + 1) * (self.dt_s / self.blend_s))
+        weights = np.outer((1.0 - own) / (1.0 - at), shares)
+        weights[:, self.champion] = own
+        return weights
+
+    def _parts(self, memory: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+        memory = np.asarray(memory, dtype=np.float64)
+        if memory.shape != (self.memory_size,):
+            raise InputError(
+                f"memory: got shape {memory.shape}, expected ({self.memory_size},);"
+                " start from rest_memory() or bring back the memory of the last reply"
+            )
+        first, *rest = np.split(memory, self._cuts[:-1])
+        total = float(first.sum())
+        # Shares that are none, such as those of a memory made elsewhere, are taken for the champion's alone.
+        if not (np.all(np.isfinite(first)) and np.all(first >= 0.0) and total > 0.0):
+            return self._settled(), rest
+        return first / total if total != 1.0 else first.copy(), rest
+
+    def state_dict(self) -> StateDict:
+        """Flat names: the contestants' own under ``NAME.``."""
+        kinds = [kind_of(model) for model in self.models]
+        state: StateDict = {
+            "name": self.name,
+            "names": ",".join(self.names),
+            "kinds": ",".join(kinds),
+            "champion": self.champion,
+            "blend_s": self.blend_s,
+        }
+        for name, model in zip(self.names, self.models, strict=True):
+            state |= {f"{name}.{key}": value for key, value in model.state_dict().items()}
+        return state
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> ChampionInverse:
+        """Inverse of ``state_dict``. Raises ModelFileError on missing or misfit entries."""
+        try:
+            names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
+            models = []
+            for name, kind in zip(names, kinds, strict=True):
+                prefix = f"{name}."
+                part = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
+                models.append(KINDS[kind].from_state(part))
+            return cls(tuple(names), tuple(models), int(state["champion"]), float(state["blend_s"]), str(state["name"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(
+                f"champion model: entry missing or damaged: {error}; identify the stage again"
+            ) from error

@@ -1,0 +1,250 @@
+"""Champion and challengers: several online models on the same samples, and what is served is the best of them.
+
+Each is scored on fresh samples (``baselines.judging``); the champion gives way only to one that has been better by a
+margin for a while (``baselines.succession``), and callers go over without a jump (``baselines.champion``). The first
+contestant is the favourite: its verdicts on samples are the competition's, it is champion at the start, and it comes
+back as soon as it is no worse. A contestant that raises is out of the competition, and the others go on; the favourite
+may begin anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.learner import Hyperparameters
+from adaptive.learner_config import part_of
+from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
+from baselines import competition_report
+from baselines.champion import ChampionInverse
+from baselines.competition_state import contestants_of, restore, to_state
+from baselines.contest import NOT_SCORED, Motion
+from baselines.contest_config import CompetitionConfig
+from baselines.contestants import Revive
+from baselines.judging import Judging
+from baselines.succession import Succession
+
+__all__ = ["Competition", "CompetitionConfig"]
+
+
+class Competition:
+    """Several online models of one axis. Implements ``adaptive.types.OnlineModel``; deterministic.
+
+    Parameters
+    ----------
+    contestants : by name, all of one sample time; the first is the favourite. What this class does not know (freezing,
+        going back, looking in) is asked of it.
+    range_um, span_V : displacement and voltage range of the identification.
+    revive : makes the favourite anew from its last snapshot, a while after it has raised; None: it stays out.
+    """
+
+    def __init__(
+        self,
+        contestants: dict[str, OnlineModel],
+        range_um: float,
+        span_V: float,
+        config: CompetitionConfig | None = None,
+        revive: Revive | None = None,
+    ) -> None:
+        if not contestants or not (range_um > 0.0 and span_V > 0.0):
+            raise InputError(
+                f"contestants, range_um, span_V: got {len(contestants)}, {range_um}, {span_V}, expected all positive"
+            )
+        self.config = config or CompetitionConfig()
+        self.names = tuple(contestants)
+        self._models = list(contestants.values())
+        first = tuple(model.snapshot() for model in self._models)
+        self._dt_s, self._range_um, self._span_V = first[0].dt_s, range_um, span_V
+        self._motion = Motion(self.config, self._dt_s, range_um)
+        self._judging = Judging(self.config, first, self._motion.lag, span_V)
+        self._succession = Succession(self.config, span_V)
+        self._newest = first
+        self._serving = ChampionInverse(self.names, first, 0, self.config.blend_s)
+        self._out = [False] * len(first)
+        self._seq = -1
+        self._frozen = False
+        # Whether a contestant may have changed since its snapshot was taken.
+        self._changed = True
+        self._revive, self._failed_seq = revive, -1
+        self._events: deque[tuple[str, str]] = deque(maxlen=64)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only what is not found here comes here; names of our own that are missing are missing.
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self.favourite, name)
+
+    @property
+    def favourite(self) -> OnlineModel:
+        """The first contestant."""
+        return self._models[0]
+
+    @property
+    def champion(self) -> str:
+        """Name of the contestant that is served."""
+        return self.names[self._serving.champion]
+
+    @property
+    def seq(self) -> int:
+        """Sequence number of the last sample handled, -1 before any."""
+        return self._seq
+
+    # ---- samples in
+
+    def handle(self, sample: Sample) -> str:
+        """Give a sample to every contestant. Returns the favourite's verdict, or that of the first still in.
+
+        Raises what the last contestant raised where none is left.
+        """
+        verdict, seq, self._changed = "", self._seq, True
+        for i, model in enumerate(self._models):
+            # Frozen, the favourite still judges and tracks; the others would only learn.
+            if self._out[i] or (self._frozen and i and verdict):
+                continue
+            try:
+                said, now = model.handle(sample), model.seq
+            except Exception as error:
+                self._exclude(i, error)
+                continue
+            if not verdict:
+                verdict, seq = said, now
+        before, self._seq = self._seq, seq
+        if seq == before:
+            return verdict
+        self._motion.take(sample, max(0, seq - before - 1) if before >= 0 else 0, verdict not in NOT_SCORED)
+        if seq // self.config.block > before // self.config.block:
+            self._judge()
+        return verdict
+
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Let the favourite go on with other hyper-parameters: "" if it does, else why not."""
+        self._changed = True
+        return str(getattr(self.favourite, "adopt", lambda _: "it has no hyper-parameters")(hyper))
+
+    def freeze(self) -> None:
+        """Stop learning and keep the champion; samples go on being judged."""
+        self._frozen = self._changed = True
+        getattr(self.favourite, "freeze", lambda: None)()
+
+    def thaw(self) -> None:
+        """Learn again, and let the better one be champion."""
+        self._frozen, self._changed = False, True
+        getattr(self.favourite, "thaw", lambda: None)()
+
+    @property
+    def frozen(self) -> bool:
+        """Whether learning is stopped."""
+        return self._frozen
+
+    def resync(self) -> None:
+        """Forget the sequence: the stage's count has begun anew."""
+        for model in self._models:
+            getattr(model, "resync", lambda: None)()
+
+    def _exclude(self, i: int, error: Exception) -> None:
+        self._out[i] = True
+        if i == 0:
+            self._failed_seq = self._seq
+        name = "contestant_failed" if i else "learner_failed"
+        self._events.append((name, f"{self.names[i]}: {type(error).__name__}: {error}; the others go on"))
+        if all(self._out):
+            raise error
+
+    def _judge(self) -> None:
+        """Score the block that has passed, then see whether another is to be served."""
+        rows = self._motion.block()
+        self._begin_anew()
+        self._newest = tuple(self._snapshot(i) for i in range(len(self._models)))
+        bad = self._judging.judge(self._seq, rows, self._out)
+        self._judging.remember(self._seq, self._newest)
+        if not self._frozen:
+            self._choose(bad, float(rows[4].sum()) * self._dt_s)
+        self._serving = ChampionInverse(self.names, self._newest, self._succession.champion, self.config.blend_s)
+        self._changed = False
+
+    def _choose(self, bad: list[bool], scored_s: float) -> None:
+        errors_V = [math.inf if no else self._judging.rms_V(i) for i, no in enumerate(bad)]
+        before = self._succession.champion
+        why = self._succession.choose(errors_V, scored_s)
+        if why:
+            after, old = (
+                f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in (self._succession.champion, before)
+            )
+            self._events.append(("champion_changed", f"{after} is served in place of {old}: {why}"))
+
+    def _snapshot(self, i: int) -> InverseModel:
+        if not self._out[i]:
+            try:
+                return self._models[i].snapshot()
+            except Exception as error:
+                self._exclude(i, error)
+        return self._newest[i]
+
+    def _begin_anew(self) -> None:
+        """Let a favourite that has failed learn again from its last snapshot, after a while and without its score."""
+        waited_s = (self._seq - self._failed_seq) * self._dt_s
+        if self._revive is None or not self._out[0] or waited_s < self.config.revive_s:
+            return
+        self._failed_seq = self._seq
+        try:
+            self._models[0] = self._revive(self._newest[0])
+        except Exception as error:
+            self._events.append(("learner_failed", f"{self.names[0]}: beginning anew: {error}"))
+            return
+        self._out[0] = False
+        self._judging.begin_anew(0)
+        (self.freeze if self._frozen else self.thaw)()
+        self._events.append(("learner_begun_anew", f"{self.names[0]}: from its last snapshot"))
+
+    # ---- out
+
+    def snapshot(self) -> ChampionInverse:
+        """What is served: the champion of the last judgement as it stands now. Immutable."""
+        if not self._changed:
+            return self._serving
+        self._changed = False
+        newest = tuple(self._snapshot(i) for i in range(len(self._models)))
+        if any(new is not old for new, old in zip(newest, self._newest, strict=True)):
+            self._serving = ChampionInverse(self.names, newest, self._serving.champion, self.config.blend_s)
+            self._newest = newest
+        return self._serving
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """(event, detail for people) since the last call, oldest first."""
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def standing(self) -> dict[str, Any]:
+        """Champion, changes, and the rms error of each contestant in V and in percent of the span."""
+        return competition_report.standing(self)
+
+    def counters(self) -> dict[str, int]:
+        """The favourite's, and the competition's own."""
+        return competition_report.counters(self)
+
+    def diagnostics(self) -> dict[str, Any]:
+        """The favourite's, with ``competition_NAME_rms_pct`` of each contestant and the champion's index."""
+        return competition_report.diagnostics(self)
+
+    # ---- keeping
+
+    def state_dict(self) -> StateDict:
+        """Everything; ``from_state`` continues to the same last bit. Raises InputError on foreign contestants."""
+        return to_state(self)
+
+    @classmethod
+    def from_state(cls, state: StateDict, revive: Revive | None = None) -> Competition:
+        """Inverse of ``state_dict``; ``revive`` as at construction.
+
+        Raises ModelFileError where entries are missing or do not fit together.
+        """
+        try:
+            config = CompetitionConfig(**part_of(state, "config"))
+            made = cls(contestants_of(state), float(state["range_um"]), float(state["span_V"]), config, revive)
+            restore(made, state)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error
+        return made

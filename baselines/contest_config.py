@@ -1,0 +1,53 @@
+"""How a competition judges and exchanges its contestants. Imports nothing heavy: a configuration is read by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from adaptive.errors import InputError
+from adaptive.types import StateDict
+
+
+@dataclass(frozen=True, slots=True)
+class CompetitionConfig:
+    """How contestants are judged and exchanged.
+
+    block : samples between two judgements. serving_age_s : age of the snapshots that are judged, s.
+    horizon_s : time constant of the mean square error, s of motion.
+    margin, floor : a challenger must beat the champion's rms error by this factor, and by this share of the voltage
+    span, ... patience_s : ... for this long, s of motion. The favourite needs no margin and no floor to come back.
+    blend_s : how long callers take to go over, s. cutoff_hz : of the smoother.
+    rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
+    glitch_share : a reading this far from the smoother's prediction, as a share of the range, is not scored.
+    settle : samples after a start, a gap or a jump that are not scored.
+    revive_s : time after which a favourite that has failed begins anew, s.
+    """
+
+    block: int = 20
+    serving_age_s: float = 0.08
+    horizon_s: float = 0.5
+    margin: float = 1.25
+    floor: float = 0.0005
+    patience_s: float = 0.5
+    blend_s: float = 0.05
+    cutoff_hz: float = 120.0
+    rest_share: float = 0.002
+    rest_s: float = 0.2
+    glitch_share: float = 0.012
+    settle: int = 100
+    revive_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if self.block < 1 or self.settle < 0:
+            raise InputError(f"block, settle: got {self.block}, {self.settle}, expected at least 1 and 0 samples")
+        if not (self.margin >= 1.0 and 0.0 <= self.floor < 1.0):
+            raise InputError(f"margin, floor: got {self.margin}, {self.floor}, expected at least 1, and 0 to 1")
+        for name in ("horizon_s", "cutoff_hz", "rest_share", "rest_s", "glitch_share"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"{name}: got {getattr(self, name)}, expected a positive number")
+        for name in ("serving_age_s", "patience_s", "blend_s", "revive_s"):
+            if not 0.0 <= getattr(self, name) <= 100.0:
+                raise InputError(f"{name}: got {getattr(self, name)}, expected 0 to 100 s")
+
+    def state_dict(self) -> StateDict:
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
