@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from sim.diagnosis.causes_drive import AmplifierLag, Saturation, SlewLimit
 from sim.diagnosis.causes_linear import Delay, Resonance, SensorLag
+from sim.diagnosis.causes_modal import CrossModes, StructureModes
 from sim.diagnosis.causes_motion import Creep, CrossTalk, GainDrift, StickSlip, ThermalDrift
+from sim.diagnosis.causes_payload import PayloadChange
 from sim.diagnosis.causes_reading import MainsHum, SensorNonlinearity, Timing
+from sim.diagnosis.causes_restoring import RestoringLoop
 from sim.diagnosis.causes_static import Asymmetry, HysteresisShape, RateDependence
 from sim.diagnosis.forms import Form
+from sim.diagnosis.slips import Slips
 
 #: Every form that is tried; forms of one name are variants of one cause.
 FORMS: tuple[Form, ...] = (
     HysteresisShape(),
     HysteresisShape(variant="restoring"),
+    RestoringLoop(),
     Asymmetry(),
     RateDependence(),
     RateDependence(felt_s=0.04),
@@ -21,10 +26,13 @@ FORMS: tuple[Form, ...] = (
     RateDependence(variant="added", felt_s=0.04),
     Creep(),
     ThermalDrift(),
-    ThermalDrift(variant="temperature"),
+    ThermalDrift(variant="temperature", of_one_recording=False),
     GainDrift(),
-    GainDrift(variant="temperature"),
+    GainDrift(variant="temperature", of_one_recording=False),
     Resonance(),
+    StructureModes(),
+    PayloadChange(),
+    PayloadChange(variant="midway"),
     AmplifierLag(),
     SlewLimit(),
     Saturation(),
@@ -32,10 +40,12 @@ FORMS: tuple[Form, ...] = (
     SensorLag(),
     SensorNonlinearity(),
     CrossTalk(),
+    CrossModes(),
     MainsHum(variant="50"),
     MainsHum(variant="60"),
     StickSlip(),
     Timing(),
+    Slips(),
 )
 
 #: Causes that are one set for a voltage and a sensor: beside one of them another is its form's remainder, not news.
@@ -50,7 +60,7 @@ def same_set(names: set[str]) -> set[str]:
     return names.union(*(s for s in SETS if s & names))
 
 
-#: The names of the catalogue; payload_change and quantisation are found by means of their own.
+#: The names of the catalogue; quantisation is found by means of its own.
 NAMES: tuple[str, ...] = (
     "hysteresis_shape",
     "asymmetry",

@@ -8,7 +8,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.diagnosis.forms import Form, Trial, single
-from sim.diagnosis.loops import lag_mean, slew_mean
+from sim.diagnosis.loops_linear import lag_ends, slew_ends
 from sim.diagnosis.setting import At, Setting, Slot
 
 
@@ -19,6 +19,7 @@ class AmplifierLag(Form):
     name: str = "amplifier_lag"
     fast: bool = True
     substeps: int = 4
+    continuous: bool = True
 
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
         return (Slot("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * setting.dt_s), At.DRIVE),)
@@ -29,7 +30,7 @@ class AmplifierLag(Form):
 
     def drive(self, u_V: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
         ratio = p[0] / setting.dt_s
-        return u_V if ratio < 1e-4 else lag_mean(u_V, ratio)
+        return lag_ends(u_V, max(ratio, 1e-3), setting.straight)
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class SlewLimit(Form):
     name: str = "slew_limit"
     fast: bool = True
     substeps: int = 4
+    continuous: bool = True
 
     def _fastest(self, setting: Setting) -> float:
         return float(np.max(setting.rate_V_per_s))
@@ -56,7 +58,7 @@ class SlewLimit(Form):
         return single([float(v) for v in grid if low < v < top])
 
     def drive(self, u_V: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
-        return slew_mean(u_V, max(float(p[0]) * setting.dt_s, 1e-12))
+        return slew_ends(u_V, max(float(p[0]) * setting.dt_s, 1e-12), setting.straight)
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from adaptive.types import FloatArray
 from sim.diagnosis.forms import Form, Trial
-from sim.diagnosis.loops import friction, slow_poles
+from sim.diagnosis.loops_linear import friction, slow_poles
 from sim.diagnosis.setting import At, Kept, Setting, Slot
 
 _POLES = Kept()
@@ -23,7 +24,7 @@ class Creep(Form):
     spacing: float = 0.6  # decades between the poles
 
     def taus_s(self, setting: Setting) -> FloatArray:
-        top = min(3.0 * setting.duration_s, 300.0)
+        top = setting.slowest_s
         count = max(2, int(np.floor(np.log10(top / 0.05) / self.spacing)) + 1)
         return np.asarray(0.05 * 10.0 ** (self.spacing * np.arange(count)), dtype=np.float64)
 
@@ -34,24 +35,35 @@ class Creep(Form):
         return 5e-4 <= self.physical(p, setting)["gain_per_decade"][0] <= 0.08
 
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
-        return tuple(
+        r = setting.range_um
+        weights = [
             Slot(f"weight{j + 1}", "1", 0.0, 0.0, 0.1, 0.005, At.MOTION, True) for j in range(self.taus_s(setting).size)
-        )
+        ]
+        # A step before the record began is still creeping.
+        return (*weights, Slot("start_um", "µm", 0.0, -r, r, 0.05 * r, At.MOTION))
+
+    def trials(self, setting: Setting, residual_um: FloatArray) -> list[Trial]:
+        return [trial[:-1] for trial in super().trials(setting, residual_um)]
 
     def motion(self, x_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
-        if not np.any(p):
+        if not np.any(p[:-1]):
             return x_um
-        rates = setting.dt_s / self.taus_s(setting)
+        taus = self.taus_s(setting)
+        rates = setting.dt_s / taus
         poles = _POLES.of(x_um, rates.tobytes(), lambda: np.asarray(slow_poles(x_um, rates)))
-        return np.asarray(x_um + p @ poles)
+        out = x_um + p[:-1] @ poles
+        if p[-1] != 0.0:
+            out += p[-1] * (p[:-1] @ _steps(setting, taus))
+        return np.asarray(out)
 
     def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
         # Slope of the step response over log10 t, from the first pole's time to half of the record.
         taus = self.taus_s(setting)
-        t = np.logspace(-1.0, np.log10(max(0.5 * setting.duration_s, 0.3)), 60)
+        t = np.logspace(-1.0, np.log10(max(setting.slowest_s / 6.0, 0.3)), 60)
         rise = 1.0 - np.exp(-t[None, :] / taus[:, None])
         x = np.log10(t) - np.log10(t).mean()
         row = rise @ x / float(x @ x)
+        row = np.append(row, 0.0)
         return {"gain_per_decade": (float(row @ p), row)}
 
 
@@ -81,6 +93,7 @@ class ThermalDrift(Form):
     """A slow additive drift: piecewise linear in time, or following the temperature that was recorded."""
 
     name: str = "thermal_drift"
+    of_one_recording: bool = True
 
     def applies(self, setting: Setting) -> str:
         if self.variant == "temperature" and setting.warmth_K is None:
@@ -117,6 +130,7 @@ class GainDrift(Form):
     """A gain that changes over time, or with the recorded temperature."""
 
     name: str = "gain_drift"
+    of_one_recording: bool = True
 
     def applies(self, setting: Setting) -> str:
         if self.variant == "temperature" and setting.warmth_K is None:
@@ -145,10 +159,23 @@ class GainDrift(Form):
         }
 
 
+def _steps(setting: Setting, taus_s: FloatArray) -> FloatArray:
+    """What a unit step at the start becomes in each pole, (m, n)."""
+    known: FloatArray | None = setting.__dict__.get("_slow_steps")
+    if known is None or known.shape[0] != taus_s.size:
+        known = 1.0 - np.exp(-setting.t_s[None, :] / taus_s[:, None])
+        setting.__dict__["_slow_steps"] = known
+    return known
+
+
 def _spline(p: FloatArray, setting: Setting) -> FloatArray:
-    """Piecewise linear in time through 0 at the start and ``p`` at equal spans."""
-    knots = np.arange(p.size + 1) * (setting.duration_s / p.size)
-    return np.asarray(np.interp(setting.t_s, knots, np.concatenate([[0.0], p])))
+    """A cubic spline in time through 0 at the start and ``p`` at equal spans."""
+    known: FloatArray | None = setting.__dict__.get("_time_splines")
+    if known is None or known.shape[0] != p.size:
+        knots = np.arange(p.size + 1) * (setting.duration_s / p.size)
+        known = np.ascontiguousarray(CubicSpline(knots, np.eye(p.size + 1)[:, 1:])(setting.t_s).T)
+        setting.__dict__["_time_splines"] = known
+    return np.asarray(p @ known)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.diagnosis.forms import Form, Trial, single
-from sim.diagnosis.loops import resample
+from sim.diagnosis.loops_linear import resample
 from sim.diagnosis.setting import At, Setting, Slot
 
 
@@ -26,8 +26,7 @@ class SensorNonlinearity(Form):
 
     def reading(self, y_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
         half = 0.5 * setting.range_um
-        low = float(np.min(y_um))
-        x = (y_um - low) / half - 1.0
+        x = (y_um - setting.centre_um) / half
         # Orthogonal polynomials: their shares of the bend can be read one by one.
         x2 = x * x
         bend = p[0] * (x2 - 1.0) + x * (p[1] * (x2 - 1.0)) + p[2] * (x2 * x2 - x2)
@@ -47,6 +46,7 @@ class MainsHum(Form):
     """Lines at 50 or 60 Hz and their first harmonics, phases free. ``variant`` is the frequency."""
 
     name: str = "mains_hum"
+    of_one_recording: bool = True
     variant: str = "50"
 
     def applies(self, setting: Setting) -> str:
@@ -116,6 +116,7 @@ class Timing(Form):
     """A recorder's clock that runs fast or slow against the stage's: t' = (1 + e) t."""
 
     name: str = "timing"
+    of_one_recording: bool = True
 
     def plausible(self, p: FloatArray, setting: Setting) -> bool:
         return 3.0 <= abs(float(p[0])) <= 1500.0

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.dynamics import Restoring
 from sim.diagnosis.forms import Form, Trial
-from sim.diagnosis.loops import bouc_wen_paced, felt_rate, grown_plays, plays_matrix, plays_sum
+from sim.diagnosis.loops import bouc_wen_paced, felt_rate, grown_plays, plays_nested, plays_sum
 from sim.diagnosis.nominal import loop_numbers
-from sim.diagnosis.setting import At, Kept, Setting, Slot
-
-_PLAYS = Kept()
+from sim.diagnosis.restoring import Restoring, Stops
+from sim.diagnosis.setting import At, Setting, Slot
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class HysteresisShape(Form):
     def restoring(self, p: FloatArray, setting: Setting) -> Restoring | None:
         if self.variant != "restoring" or not np.any(p):
             return None
-        return Restoring(self.radii_um(setting), np.ascontiguousarray(p))
+        return Stops(self.radii_um(setting), np.ascontiguousarray(p))
 
     def radii_um(self, setting: Setting) -> FloatArray:
         """Radii of the plays of the displacement itself, of the variant ``restoring``."""
@@ -63,8 +61,7 @@ class HysteresisShape(Form):
     ) -> FloatArray | None:
         if self.variant == "restoring":
             return None
-        radii = self.radii_V(setting)
-        return np.asarray(p @ _PLAYS.of(u_V, radii.tobytes(), lambda: np.asarray(plays_matrix(u_V, radii))))
+        return np.asarray(plays_nested(u_V, self.radii_V(setting), np.ascontiguousarray(p)))
 
     def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
         """Height of the additional loop over the full swing, and the sum of the plays' weights."""
@@ -92,14 +89,15 @@ class Asymmetry(Form):
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
         near = tuple(Slot(f"dead_zone{j}", "1", 0.0, -0.2, 0.2, 0.01, At.STATIC, True) for j in (1, 2, 3, 4))
         wide = tuple(Slot(f"wide_dead_zone{j}", "1", 0.0, -0.2, 0.2, 0.01, At.STATIC, True) for j in (1, 2, 3))
-        loop = tuple(Slot(name, "1", 0.0, -1.0, 1.0, 0.05, At.STATIC, True) for name in ("branch", "width"))
+        loop = tuple(Slot(name, "1", 0.0, -4.0, 4.0, 0.05, At.STATIC, True) for name in ("branch", "width"))
         return (*near, *wide, *loop)
 
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, setting: Setting
     ) -> FloatArray | None:
         half = 0.5 * setting.range_um
-        x = (w_um - float(np.min(w_um))) / half - 1.0
+        low = float(np.min(w_um)) if setting.fitted_low_um is None else setting.fitted_low_um
+        x = (w_um - low) / half - 1.0
         out = np.zeros_like(w_um)
         for weight, knee in zip(p[:4], (-0.6, -0.2, 0.2, 0.6), strict=True):
             if weight != 0.0:
@@ -112,7 +110,8 @@ class Asymmetry(Form):
         if p[7] != 0.0:
             out += p[7] * h_um * x
         if p[8] != 0.0:
-            out += p[8] * h_um * h_um / max(float(np.max(np.abs(h_um))), 1e-12)
+            loop = float(np.max(np.abs(h_um))) if setting.fitted_loop_um is None else setting.fitted_loop_um
+            out += p[8] * h_um * h_um / max(loop, 1e-12)
         return out
 
     def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
@@ -185,7 +184,7 @@ class RateDependence(Form):
             radii, factor, added = self._growth(setting)
             return np.asarray(grown_plays(u_V, radii, np.ascontiguousarray(p[:3]), 1.0 + factor * pace, added * pace))
         out = -p[0] * h_um * pace
-        if p[1] != 0.0 and nominal.size >= 7:
+        if p[1] != 0.0 and setting.nominal_kind == "bouc_wen":
             slope, beta, gamma = loop_numbers(nominal)
             # The driving term must not change its sign, or the loop would run away.
             pace = np.maximum(pace, -0.9 / p[1]) if p[1] > 0.0 else np.minimum(pace, -0.9 / p[1])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.dynamics import Dynamics, respond
+from sim.diagnosis.dynamics import Dynamics, changed_midway, respond
 from sim.diagnosis.forms import Form
 from sim.diagnosis.nominal import Nominal
 from sim.diagnosis.setting import At, Setting, Slot
@@ -65,6 +65,11 @@ class Model:
         """Sub-steps of a sample at which drive and loop are simulated."""
         return max(self.nominal.substeps, *(form.substeps for form in self.forms), 1)
 
+    @property
+    def continuous(self) -> bool:
+        """Whether a cause smooths the drive, so that nothing behind it jumps."""
+        return any(form.continuous for form in self.forms)
+
     def plus(self, form: Form) -> Model:
         """The model with one cause more, at the end."""
         return Model(self.setting, self.nominal, (*self.forms, form))
@@ -101,7 +106,17 @@ class Model:
                 static = static.copy()
                 static[0] += began
             back = next((r for form, q in pairs if (r := form.restoring(q, s)) is not None), None)
-            moved = respond(static, self.dynamics(p), inner.dt_s, back)
+            system = self.dynamics(p)
+            moved = respond(static, system, inner.dt_s, back)
+            for form, q in pairs:
+                # Beside a loop in the force a mode does not go on by superposition.
+                change = form.later(system, q) if back is None else None
+                if change is not None:
+                    moved = changed_midway(static, moved, system, change, inner.dt_s)
+            for form, q in pairs:
+                more = form.beside(drive, static, q, inner, system)
+                if more is not None:
+                    moved = moved + more
             if substeps > 1:
                 moved = np.ascontiguousarray(moved[::substeps])
         else:
@@ -110,6 +125,7 @@ class Model:
             motion = moved
             for form, q in pairs:
                 motion = form.motion(motion, q, s)
+            motion = self.nominal.behind_um(motion, s)
         else:
             motion = kept.motion_um
         reading = motion
@@ -121,6 +137,8 @@ class Model:
     def dynamics(self, p: FloatArray) -> Dynamics:
         """The linear part: the nominal's and what the causes add to it."""
         system = self.nominal.dynamics(self.part(p, -1), self.setting)
+        if self.continuous:
+            system = replace(system, hold="first")
         for i, form in enumerate(self.forms):
             system = form.dynamics(system, self.part(p, i))
         return system

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
+from sim.diagnosis.fit import Fit
+from sim.diagnosis.noise import Floor
+from sim.diagnosis.result import Cause
+from sim.diagnosis.setting import Setting
 
 
 @dataclass(frozen=True)
@@ -64,3 +68,60 @@ def repeats(y_um: FloatArray, sigma_um: float, step_um: float) -> Repeats:
     candidate = (np.minimum(moved[:-2], moved[2:]) > least) | (np.maximum(moved[:-2], moved[2:]) < -least)
     where = np.flatnonzero(candidate & (moved[1:-1] == 0.0)) + 2
     return Repeats(int(where.size), int(candidate.sum()), where.astype(np.float64))
+
+
+def converter_causes(
+    setting: Setting, grid: Grid, doubles: Repeats | None, floor: Floor, extended: Fit, n: int, dropped: int
+) -> tuple[Cause, ...]:
+    """Quantisation and timing, which are seen in the readings themselves rather than fitted."""
+    out: list[Cause] = []
+    flat = extended.residual_um
+    if grid.step_um > 0.0:
+        own = grid.step_um**2 / 12.0
+        share = own / max(extended.sse_um2 / n, own)
+        if grid.step_um > 1.2 * floor.sigma_um and share > 0.2:
+            step = grid.step_um
+            rounding = 1e-3 * step
+            out.append(
+                Cause(
+                    "quantisation",
+                    (),
+                    {"step_um": step},
+                    {"step_um": (step - rounding, step + rounding)},
+                    share,
+                    0.001,
+                    flat,
+                    flat,
+                )
+            )
+    if doubles is not None:
+        p = doubles.probability
+        half = 1.96 * float(np.sqrt(p * (1.0 - p) / max(1, doubles.of)))
+        out.append(
+            Cause(
+                "timing",
+                (),
+                {"repeat_probability": p},
+                {"repeat_probability": (max(0.0, p - half), p + half)},
+                0.0,
+                0.001,
+                flat,
+                flat,
+            )
+        )
+    elif dropped > 0:
+        share = dropped / setting.n
+        out.append(
+            Cause(
+                "timing",
+                (),
+                {"lost_samples": float(dropped)},
+                {"lost_samples": (float(dropped), float(dropped))},
+                share,
+                0.001,
+                flat,
+                flat,
+            )
+        )
+    names = {f.name for f in extended.model.forms}
+    return tuple(c for c in out if c.name not in names)

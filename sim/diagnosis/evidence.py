@@ -157,7 +157,7 @@ class Screen:
         own = model.forms[-1]
         start = min(s.at for s in own.slots(model.setting))
         # Signals kept at other sub-steps cannot be gone on from.
-        if model.substeps != self.fit.model.substeps:
+        if model.substeps != self.fit.model.substeps or model.continuous != self.fit.model.continuous:
             start = At.DRIVE
         p = self.fit.p.copy()
         for i, slot in enumerate(slots):

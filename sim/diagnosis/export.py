@@ -2,150 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from adaptive.types import FloatArray
+from sim.diagnosis.causes_restoring import RestoringLoop
 from sim.diagnosis.chain import Model
 from sim.diagnosis.fit import Fit
-from sim.diagnosis.forms import Form
-from sim.diagnosis.nominal import loop_numbers
+from sim.diagnosis.library import OFFSET, cause_effects, in_force, make, nominal_effects
+from sim.diagnosis.nominal import Linear
 from sim.diagnosis.result import Diagnosis
 from sim.diagnosis.setting import At, Setting
-from sim.effects import KINDS, Chain, Effect, effect, simulate
+from sim.effects import Chain, Effect, effect, simulate
 from sim.stage import StageConfig
-
-#: Label of the effect that carries the sensor's offset.
-OFFSET = "sensor_offset"
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A stage configuration and how far (rms, µm) its free run is from the extended model that was fitted."""
+    """A stage configuration and how far (rms, µm) its free run is from the extended model that was fitted.
+
+    ``left_out``: causes that the library's chain has no equal of, such as hysteresis in the restoring force.
+    """
 
     config: StageConfig
     rms_um: float
     rms_before_um: float
-
-
-def _clip(name: str, **values: float) -> dict[str, float]:
-    kind = KINDS[name]
-    return {key: float(np.clip(v, kind.parameter(key).low, kind.parameter(key).high)) for key, v in values.items()}
-
-
-def _make(name: str, label: str = "", **values: float) -> Effect:
-    return effect(name, label=label, **_clip(name, **values))
-
-
-def nominal_effects(fit: Fit) -> list[Effect]:
-    """The calibrated nominal stage in the library's effects. The recorder's latch is no part of the stage."""
-    p = fit.model.part(fit.p, -1)
-    # After the mechanics: an offset before them would be travelled to, lag and all, from a start at zero.
-    drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
-    offset = _make("thermal_drift", OFFSET, offset_um=fit.model.nominal.offset_um(p), **drift)
-    if fit.model.nominal.name == "linear":
-        f, z = float(np.exp(p[1])), float(np.exp(p[2]))
-        return [
-            _make("linear_actuator", gain_um_per_V=float(p[0])),
-            offset,
-            _make("resonance", label="nominal_mode", frequency_Hz=f, damping_ratio=z),
-        ]
-    slope, beta, gamma = loop_numbers(p)
-    d = float(p[0])
-    k = KINDS["mechanics"].parameter("stiffness_N_per_m").default
-    return [
-        _make("bouc_wen", d_um_per_V=d, alpha=slope / d, beta_per_V=beta, gamma_per_V=gamma),
-        offset,
-        _make("mechanics", damping_N_s_per_m=float(p[4]) * k, stiffness_N_per_m=k),
-    ]
-
-
-def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Effect], bool]:
-    """One fitted cause in the library's effects, and whether their numbers still want fitting."""
-    v = {name: value for name, (value, _) in form.physical(p, setting).items()}
-    swing, duration = setting.swing_V, setting.duration_s
-    match form.name:
-        case "amplifier_lag" | "sensor_lag":
-            return [_make(form.name, tau_s=v["tau_s"])], False
-        case "slew_limit":
-            return [_make("slew_limit", rate_V_per_s=v["slew_V_per_s"])], False
-        case "saturation":
-            return [_make("saturation", high_V=v["u_max_V"], low_V=min(v["u_min_V"], 0.0) - 1e-3 * swing)], False
-        case "delay":
-            return [_make("delay", delay_s=v["tau_s"])], False
-        case "resonance":
-            return [_make("resonance", frequency_Hz=v["f0_hz"], damping_ratio=v["damping"])], False
-        case "creep":
-            return [_make("creep", gain_per_decade=v["gain_per_decade"])], True
-        case "cross_talk":
-            return [_make("cross_talk", static=v["static"], rate_s=v["rate_s"])], False
-        case "mains_hum":
-            phase = float(np.arctan2(p[2], p[1]) / (2.0 * np.pi))
-            return [
-                _make(
-                    "mains_hum",
-                    amplitude_um=v["amplitude_um"],
-                    frequency_Hz=v["frequency_hz"],
-                    phase_cycles=phase,
-                    third_share=float(np.hypot(*p[-2:]) / max(v["amplitude_um"], 1e-12)) if p.size >= 7 else 0.0,
-                )
-            ], False
-        case "timing":
-            return [_make("timing", repeat_probability=0.0, slow_ppm=max(0.0, -v["clock_ppm"]))], False
-        case "stick_slip":
-            return [_make("stick_slip", width_um=v["width_um"], sliding_share=v["sliding_share"])], False
-        case "thermal_drift":
-            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
-            tau = 0.3 * duration
-            return [_make("thermal_drift", amplitude_um=1e-3, tau_s=tau, ramp_um_per_min=ramp)], True
-        case "gain_drift":
-            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
-            tau = 0.3 * duration
-            return [_make("gain_drift", ramp_per_min=ramp, amplitude=1e-4, tau_s=tau)], True
-        case "sensor_nonlinearity":
-            return [
-                _make("sensor_nonlinearity", square=v["quadratic"], cubic=v["cubic"], range_um=setting.range_um)
-            ], True
-        case "asymmetry":
-            slope = v["bend"] * setting.range_um / swing
-            where = setting.u_low_V
-            return [
-                _make(
-                    "asymmetry",
-                    "asymmetry",
-                    slope_um_per_V=slope,
-                    dead_zone_V=where + 0.35 * swing,
-                    threshold_V=0.02 * swing,
-                ),
-                _make(
-                    "asymmetry",
-                    "asymmetry_2",
-                    slope_um_per_V=0.1 * slope,
-                    dead_zone_V=where + 0.65 * swing,
-                    threshold_V=0.15 * swing,
-                ),
-            ], True
-        case "rate_dependence":
-            return [
-                _make(
-                    "rate_dependence",
-                    growth_per_decade=0.1,
-                    corner_V_per_s=v["corner_V_per_s"],
-                    width_um=0.1 * setting.range_um,
-                    largest_V=0.35 * swing,
-                )
-            ], True
-        case "hysteresis_shape":
-            width = 0.05 * setting.range_um
-            return [
-                _make("hysteresis_shape", "hysteresis_shape", width_um=width, largest_V=0.5 * swing, fading=1.0),
-                _make(
-                    "hysteresis_shape", "hysteresis_shape_2", width_um=0.2 * width, largest_V=0.15 * swing, fading=1.0
-                ),
-            ], True
-    return [], False
+    left_out: tuple[str, ...] = ()
 
 
 def export(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> Exported:
@@ -154,27 +38,42 @@ def export(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> Expo
     """
     fit = diagnosis.extended
     setting = fit.model.setting
-    effects, loose = nominal_effects(fit), {"bouc_wen", "linear_actuator", OFFSET}
+    own, loose = nominal_effects(fit), {"bouc_wen", "linear_actuator", OFFSET}
+    effects, named, missing = list(own), list[str](), list[str]()
     for i, form in enumerate(fit.model.forms):
         if not any(c.form == i for c in diagnosis.causes):
             continue
+        if isinstance(form, RestoringLoop):
+            effects = [in_force(e, form, fit.model.part(fit.p, i), setting) for e in effects]
+            named.append(form.name)
+            continue
         mine, wants = cause_effects(form, fit.model.part(fit.p, i), setting)
+        if not mine:
+            missing.append(form.name)
+        mine = [_apart(e, effects) for e in mine]
         effects += mine
+        named.append(form.name)
         if wants:
             loose |= {e.label for e in mine}
     step = next((c.parameters["step_um"] for c in diagnosis.causes if c.name == "quantisation"), 0.0)
     clean = Chain(tuple(effects))
-    target = _target(fit)
-    before = _rms(_free_run(clean, setting) - target)
+    target, skip = _target(fit), _settling(fit)
+    before = _rms((_free_run(clean, setting) - target)[skip:])
     fitted, after = clean, before
-    if len(loose) > 3:
-        fitted, after = _fit(clean, loose, setting, target)
-    extras: list[Effect] = [_make("sensor_noise", rms_um=_noise(diagnosis, step))]
+    if not loose <= {"bouc_wen", "linear_actuator", OFFSET}:
+        fitted, after = _fit(clean, loose, setting, target, skip)
+    left_out = tuple(missing)
+    plain = Chain(tuple(own))
+    if named and not after < _rms((_free_run(plain, setting) - target)[skip:]):
+        # The library puts it elsewhere in the chain: such an extension would be further off than none.
+        fitted, left_out = plain, tuple(dict.fromkeys(named))
+        after = _rms((_free_run(plain, setting) - target)[skip:])
+    extras: list[Effect] = [make("sensor_noise", rms_um=_noise(diagnosis, step))]
     if step > 0.0:
-        extras.append(_make("quantisation", step_um=step))
+        extras.append(make("quantisation", step_um=step))
     repeat = next((c.parameters.get("repeat_probability", 0.0) for c in diagnosis.causes if c.name == "timing"), 0.0)
     if repeat > 0.0 and "timing" not in fitted:
-        extras.append(_make("timing", repeat_probability=repeat))
+        extras.append(make("timing", repeat_probability=repeat))
     margin = 0.05 * setting.swing_V
     config = StageConfig(
         name,
@@ -184,7 +83,25 @@ def export(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> Expo
         u_min_V=min(0.0, setting.u_low_V - margin),
         u_max_V=max(0.0, setting.u_high_V + margin),
     )
-    return Exported(config, after, before)
+    return Exported(config, after, before, left_out)
+
+
+def _apart(e: Effect, others: list[Effect]) -> Effect:
+    """The effect under a label that none of ``others`` has: a stage file may hold one of its kind already."""
+    taken = {other.label for other in others}
+    if e.label not in taken:
+        return e
+    number = next(k for k in range(2, len(taken) + 3) if f"{e.label}_{k}" not in taken)
+    return effect(e.name, label=f"{e.label}_{number}", **e.values)
+
+
+def _settling(fit: Fit) -> int:
+    """Samples in which a stage that was at rest at 0 V before, as a simulated one is, forgets that it was."""
+    u = fit.model.setting.u_V
+    at_rest = abs(float(u[0])) < 1e-3 * fit.model.setting.swing_V and not getattr(
+        fit.model.nominal, "free_memory", False
+    )
+    return 0 if at_rest else fit.model.setting.n // 5
 
 
 def _noise(diagnosis: Diagnosis, step_um: float) -> float:
@@ -196,8 +113,11 @@ def _rms(values: FloatArray) -> float:
 
 
 def _target(fit: Fit) -> FloatArray:
-    """The extended model's reading without the recorder's own latch."""
+    """The extended model's reading without the recorder's own latch and, of a linear stage, hold."""
     model: Model = fit.model
+    if isinstance(model.nominal, Linear):
+        # A stage is driven by a converter that holds.
+        model = Model(model.setting, replace(model.nominal, hold="zero"), model.forms)
     p = fit.p.copy()
     for i, slot in enumerate(model.slots[: model.n_nominal]):
         if slot.name == "latch_samples":
@@ -209,28 +129,29 @@ def _free_run(chain: Chain, setting: Setting) -> FloatArray:
     return simulate(chain, setting.u_V, setting.dt_s, other_um=setting.other_um)
 
 
-def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray) -> tuple[Chain, float]:
-    """Levenberg-Marquardt on the loose effects' numbers, each on its own natural scale."""
+def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray, skip: int = 0) -> tuple[Chain, float]:
+    """Levenberg-Marquardt on the loose effects' numbers, each on its own natural scale, but for ``skip`` samples."""
     paths: list[str] = []
     for e in chain:
         if e.label in loose:
-            skip = ("walk", "range_um") if e.label == OFFSET else ("walk", "range_um", "offset_um")
-            names = [p.name for p in e.kind.parameters if not p.name.startswith(skip)]
+            fixed = ("walk", "range_um") if e.label == OFFSET else ("walk", "range_um", "offset_um")
+            names = [p.name for p in e.kind.parameters if not p.name.startswith(fixed)]
             paths += [f"{e.label}.{name}" for name in names if e.label != OFFSET or name == "offset_um"]
     spec: dict[str, Any] = {
         path: chain[path.rpartition(".")[0]].kind.parameter(path.rpartition(".")[2]) for path in paths
     }
     now = chain.parameters
     run = _free_run(chain, setting)
-    error = target - run
+    error = (target - run)[skip:]
     best = float(error @ error)
     damping = 1e-3
     for _ in range(12):
         scale = np.array([max(abs(now[path]), 0.02 * abs(spec[path].default), 1e-6) for path in paths])
-        rows = np.empty((len(paths), setting.n))
+        rows = np.empty((len(paths), setting.n - skip))
         for i, path in enumerate(paths):
             h = 1e-3 * scale[i] * (1.0 if now[path] + 1e-3 * scale[i] <= spec[path].high else -1.0)
-            rows[i] = (_free_run(chain.replace({path: now[path] + h}), setting) - run) / h * scale[i]
+            moved = _free_run(chain.replace({path: now[path] + h}), setting)
+            rows[i] = (moved - run)[skip:] / h * scale[i]
         gram, slope = rows @ rows.T, rows @ error
         size = np.maximum(np.diag(gram), 1e-9 * float(np.max(np.diag(gram))))
         improved = False
@@ -242,7 +163,7 @@ def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray) ->
             }
             trial = chain.replace(values)
             there = _free_run(trial, setting)
-            left = target - there
+            left = (target - there)[skip:]
             sse = float(left @ left)
             if np.isfinite(sse) and sse < best:
                 gained = 1.0 - sse / best
@@ -253,4 +174,4 @@ def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray) ->
             damping *= 10.0
         if not improved:
             break
-    return chain, float(np.sqrt(best / setting.n))
+    return chain, float(np.sqrt(best / (setting.n - skip)))

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.chain import Model, Signals
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Derivatives of the reading by numbers of a model, kept from an earlier fit: rows by slot, scaled and masked."""
+
+    rows: FloatArray
+    slots: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -24,6 +32,27 @@ class Fit:
     rows: FloatArray | None = None
     #: The slots of these rows.
     row_slots: tuple[int, ...] = ()
+
+    def columns(self, less: slice | None = None) -> Columns | None:
+        """Its columns for the fit of a model that has more causes, or has one cause (these slots) ``less``."""
+        if self.rows is None:
+            return None
+        if less is None:
+            return Columns(self.rows, self.row_slots)
+        width = less.stop - less.start
+        keep = [i for i, slot in enumerate(self.row_slots) if not less.start <= slot < less.stop]
+        slots = tuple(s if s < less.start else s - width for s in (self.row_slots[i] for i in keep))
+        return Columns(self.rows[keep], slots)
+
+
+def refreshed(fit: Fit, mask: BoolArray) -> Fit:
+    """The fit with columns computed where it stands, for everything that is asked of them later."""
+    slots = fit.model.slots
+    chosen = [i for i in fit.free if slots[i].low < fit.p[i] < slots[i].high]
+    rows = fit.model.jacobian(fit.p, fit.signals, chosen)
+    rows *= np.array([slots[i].step for i in chosen])[:, None]
+    rows *= mask
+    return replace(fit, rows=rows, row_slots=tuple(chosen))
 
 
 def free_slots(model: Model) -> list[int]:
@@ -51,63 +80,104 @@ def evaluate(model: Model, p: FloatArray, mask: BoolArray) -> Fit:
     return Fit(model, p, signals, residual, sse, free_slots(model))
 
 
-def calibrate(model: Model, start: FloatArray, mask: BoolArray, iterations: int = 12, tolerance: float = 1e-4) -> Fit:
-    """Levenberg-Marquardt within bounds, from ``start``, on the samples of ``mask``.
+def calibrate(
+    model: Model,
+    start: FloatArray,
+    mask: BoolArray,
+    iterations: int = 12,
+    tolerance: float = 1e-4,
+    only: frozenset[int] | None = None,
+    known: Columns | None = None,
+) -> Fit:
+    """Levenberg-Marquardt within bounds, from ``start``, on the samples of ``mask``; ``only`` these slots move.
 
     Stops when a step gains less than ``tolerance`` of the squared error. Differences start half way where the
-    number acts, so a column costs a fraction of a simulation.
+    number acts, so a column costs a fraction of a simulation. Columns are computed anew only where a step gained
+    other than they promised; ``known`` ones of a model that this one extends serve until then.
     """
-    free = free_slots(model)
+    free = [i for i in free_slots(model) if only is None or i in only]
     slots = model.slots
     step = np.array([slots[i].step for i in free])
     low = np.array([slots[i].low for i in free])
     high = np.array([slots[i].high for i in free])
-    loose = [i for i, j in enumerate(free) if not slots[j].steady]
     now = evaluate(model, within(model, start), mask)
     damping = 1e-6
-    weight = mask.astype(np.float64)
-    whole = bool(mask.all())
-    kept: FloatArray | None = None
-    kept_slots: tuple[int, ...] = ()
-    rows = np.empty((0, 0))
+    rows = np.zeros((len(free), model.setting.n))
+    stale = np.ones(len(free), dtype=np.bool_)
+    if known is not None:
+        at = {slot: row for row, slot in enumerate(known.slots)}
+        for i, slot in enumerate(free):
+            if slot in at:
+                rows[i], stale[i] = known.rows[at[slot]], False
+    borrowed = known is not None
+    fresh = False
+    kept: Columns | None = None
     for _ in range(iterations):
-        if rows.size == 0:
-            rows = model.jacobian(now.p, now.signals, free)
-            rows *= step[:, None]
-            if not whole:
-                rows *= weight
-        elif loose:
-            fresh = model.jacobian(now.p, now.signals, [free[i] for i in loose]) * step[loose, None]
-            rows[loose] = fresh if whole else fresh * weight
-        if not np.all(np.isfinite(rows)):
-            break
-        gram = rows @ rows.T
+        if np.any(stale):
+            wanted = np.flatnonzero(stale)
+            new = model.jacobian(now.p, now.signals, [free[i] for i in wanted])
+            new *= step[wanted, None]
+            if not np.all(np.isfinite(new)):
+                break
+            rows[wanted] = new * mask
+            fresh = not borrowed
+            stale[:] = False
+            gram = rows @ rows.T
+        elif borrowed and kept is None:
+            gram = rows @ rows.T
         slope = rows @ now.residual_um
-        at = now.p[free]
-        stuck = ((at <= low) & (slope < 0.0)) | ((at >= high) & (slope > 0.0))
+        at_p = now.p[free]
+        stuck = ((at_p <= low) & (slope < 0.0)) | ((at_p >= high) & (slope > 0.0))
         moving = np.flatnonzero(~stuck & (np.diag(gram) > 0.0))
         if moving.size == 0:
             break
-        kept, kept_slots = rows[moving], tuple(free[i] for i in moving)
+        kept = Columns(rows, tuple(int(i) for i in moving))
         size = np.diag(gram)[moving]
         better = None
-        for _ in range(6):
+        ratio = 1.0
+        for attempt in range(6):
             system = gram[np.ix_(moving, moving)] + np.diag(size * damping)
             move = np.linalg.lstsq(system, slope[moving], rcond=1e-13)[0]
             trial = now.p.copy()
             target = np.array(free)[moving]
-            trial[target] = np.clip(at[moving] + move * step[moving], low[moving], high[moving])
+            trial[target] = np.clip(at_p[moving] + move * step[moving], low[moving], high[moving])
             with np.errstate(over="ignore", invalid="ignore"):
                 there = evaluate(model, trial, mask)
             if np.isfinite(there.sse_um2) and there.sse_um2 < now.sse_um2:
                 better = there
+                went = (trial[target] - at_p[moving]) / step[moving]
+                promised = float(2.0 * went @ slope[moving] - went @ gram[np.ix_(moving, moving)] @ went)
+                ratio = (now.sse_um2 - better.sse_um2) / max(promised, 1e-300)
                 damping = max(damping * 0.2, 1e-9)
                 break
             damping = max(damping * 10.0, 1e-5)
+            if not fresh and attempt >= 1:
+                break
+        loose = np.array([not slots[i].steady for i in free])
         if better is None:
-            break
+            if fresh or not np.any(loose):
+                break
+            # The columns may be too old to point downhill.
+            stale, borrowed, damping = loose.copy(), False, 1e-6
+            continue
         gained = (now.sse_um2 - better.sse_um2) / max(now.sse_um2, 1e-300)
         now = better
-        if gained < tolerance:
+        was_fresh, fresh = fresh, False
+        poor = not 0.7 < ratio < 1.4
+        if gained < tolerance and (was_fresh or not poor):
             break
-    return Fit(now.model, now.p, now.signals, now.residual_um, now.sse_um2, free, kept, kept_slots)
+        if poor:
+            stale, borrowed = loose.copy(), False
+    if kept is None:
+        return Fit(now.model, now.p, now.signals, now.residual_um, now.sse_um2, free)
+    chosen = list(kept.slots)
+    return Fit(
+        now.model,
+        now.p,
+        now.signals,
+        now.residual_um,
+        now.sse_um2,
+        free,
+        rows[chosen],
+        tuple(free[i] for i in chosen),
+    )

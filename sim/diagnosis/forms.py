@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.dynamics import Dynamics, Restoring
+from sim.diagnosis.dynamics import Dynamics
+from sim.diagnosis.restoring import Restoring
 from sim.diagnosis.setting import Setting, Slot
 
 #: Vectors whose simulated differences from the neutral span one linearised guess, and whether they may be scaled.
@@ -24,8 +25,12 @@ class Form:
     pins: tuple[str, ...] = ()
     #: Sub-steps of a sample at which drive and loop are simulated while this form is in.
     substeps: int = 1
+    #: What it makes of the drive has no jumps: from one sub-step to the next it runs in a straight line.
+    continuous: bool = False
     #: Acts within a few samples of a step, where the hold between two samples would have been chosen to imitate it.
     fast: bool = False
+    #: Its numbers belong to one recording and say nothing of another (a drift over time, a hum's phase).
+    of_one_recording: bool = False
     #: Share (rms) of what it removes that its fitted form may leave behind in a real stage: no form is exact.
     form_error: float = 0.025
 
@@ -62,6 +67,16 @@ class Form:
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system
+
+    def later(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
+        """A moment (s) from which the linear part is another, and that other one; None where it stays."""
+        return None
+
+    def beside(
+        self, drive_V: FloatArray, static_um: FloatArray, p: FloatArray, setting: Setting, system: Dynamics
+    ) -> FloatArray | None:
+        """What moves beside the nominal mechanics, (n,), driven by the voltage or by the static displacement."""
+        return None
 
     def restoring(self, p: FloatArray, setting: Setting) -> Restoring | None:
         """Hysteresis in the restoring force, or None."""

@@ -13,6 +13,8 @@ def drive_at_samples(fit: Fit) -> FloatArray:
     """The model's voltage at the actuator at the sampling instants, just before the next command acts."""
     drive = fit.signals.drive_V
     m = fit.model.substeps
+    if fit.model.continuous:
+        return np.ascontiguousarray(drive[::m])
     if m == 1:
         return np.concatenate([drive[:1], drive[:-1]])
     return np.concatenate([drive[:1], drive[m - 1 : -1 : m]])

@@ -44,18 +44,21 @@ def repeated_period(u_V: FloatArray) -> int:
         return 0
     # The first of the highest peaks: twice the period is one, too.
     lag = fall + int(np.argmax(likeness[fall:] > (1.0 - 1e-6) * np.max(likeness[fall:])))
-    same = np.max(np.abs(u_V[lag:] - u_V[:-lag])) <= 1e-5 * np.ptp(u_V)
+    same = np.max(np.abs(u_V[lag:] - u_V[:-lag])) <= 1e-3 * np.ptp(u_V)
     return lag if same else 0
 
 
 def noise_floor(setting: Setting) -> Floor:
     """Median over short windows at rest of the readings' spread about a line; without rests, from differences."""
     period = repeated_period(setting.u_V)
-    if period and (setting.u2_V is None or repeated_period(setting.u2_V) == period):
+    others = [u for u in (setting.u2_V, setting.u3_V) if u is not None]
+    if period and all(repeated_period(u) == period for u in others):
         # The first period is still settling where there are more than two.
         y = setting.y_um[period:] if setting.n >= 3 * period else setting.y_um
+        # By blocks, and their median: where the first period came from rest, its beginning differs by more than noise.
         d = y[period:] - y[:-period]
-        return Floor(float(np.std(d) / np.sqrt(2.0)), "repeated periods")
+        block = max(8, d.size // 100)
+        return Floor(float(np.median(_spread(d, block)) / np.sqrt(2.0)), "repeated periods")
     window = max(16, round(0.1 / setting.dt_s))
     quiet = standing(setting)
     starts = np.arange(0, setting.n - window, window)
@@ -69,6 +72,10 @@ def noise_floor(setting: Setting) -> Floor:
         return Floor(float(np.sqrt(np.median(variance))), "rests")
     # The smoothest parts of the record: sixth differences leave nothing of the motion there.
     d = np.diff(setting.y_um, n=4) / np.sqrt(70.0)
-    block = max(8, d.size // 200)
-    spread: FloatArray = np.array([np.std(d[i : i + block]) for i in range(0, d.size - block + 1, block)])
-    return Floor(float(np.quantile(spread, 0.25)), "differences")
+    return Floor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")
+
+
+def _spread(d: FloatArray, block: int) -> FloatArray:
+    """Standard deviation in each whole block."""
+    n = d.size // block * block
+    return np.asarray(np.std(d[:n].reshape(-1, block), axis=1))

@@ -33,13 +33,17 @@ class Nominal(Protocol):
         ...
 
     def dynamics(self, p: FloatArray, setting: Setting) -> Dynamics: ...
+    def behind_um(self, x_um: FloatArray, setting: Setting) -> FloatArray:
+        """What the stage itself makes of the displacement behind the mechanics, before the reading."""
+        ...
+
     def offset_um(self, p: FloatArray) -> float: ...
     def start_um(self, p: FloatArray) -> float:
         """How far from equilibrium with its first voltage the stage was at rest when the record began."""
         ...
 
 
-def _common(setting: Setting) -> tuple[Slot, Slot]:
+def common_slots(setting: Setting) -> tuple[Slot, Slot]:
     """A free sensor offset, and a latch up to one sample early or late: recorders differ in both."""
     span = 4.0 * setting.range_um + abs(setting.middle_um)
     return (
@@ -82,7 +86,7 @@ class BoucWen:
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
         g = max(abs(setting.gain_um_per_V), 1e-9)
         v = max(setting.swing_V, 1e-9)
-        offset, latch = _common(setting)
+        offset, latch = common_slots(setting)
         own = (
             Slot("d_um_per_V", "µm/V", g, 0.2 * g, 5.0 * g, 0.1 * g, At.STATIC),
             Slot("alpha", "1", 0.4754, 0.0, 1.5, 0.1, At.STATIC),
@@ -119,6 +123,9 @@ class BoucWen:
     def dynamics(self, p: FloatArray, setting: Setting) -> Dynamics:
         return Dynamics((float(p[4]),), (), float(p[6]) * setting.dt_s, self.hold)
 
+    def behind_um(self, x_um: FloatArray, setting: Setting) -> FloatArray:
+        return x_um
+
     def offset_um(self, p: FloatArray) -> float:
         return float(p[5])
 
@@ -143,7 +150,7 @@ class Linear:
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
         # Across a resonance the slope of the readings over the voltage says little about the gain.
         g = max(abs(setting.gain_um_per_V), setting.range_um / max(setting.swing_V, 1e-12), 1e-9)
-        offset, latch = _common(setting)
+        offset, latch = common_slots(setting)
         return (
             Slot("gain_um_per_V", "µm/V", setting.gain_um_per_V, -20.0 * g, 20.0 * g, 0.1 * g, At.STATIC),
             Slot(
@@ -187,6 +194,9 @@ class Linear:
     def dynamics(self, p: FloatArray, setting: Setting) -> Dynamics:
         mode = (float(np.exp(p[1])), float(np.exp(p[2])))
         return Dynamics((), (mode,), float(p[4]) * setting.dt_s, self.hold)
+
+    def behind_um(self, x_um: FloatArray, setting: Setting) -> FloatArray:
+        return x_um
 
     def offset_um(self, p: FloatArray) -> float:
         return float(p[3])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.nominal_fit import NAMED
 from sim.diagnosis.setting import Setting
 from sim.recordings import Finding, Recording, check, repaired, require_usable
+from sim.stage import StageConfig
 
 #: Longer records are diagnosed on their longest head of this many samples: memory stays below 1 GB.
 MOST_SAMPLES = 200_000
@@ -25,10 +27,35 @@ class Prepared:
     notes: tuple[str, ...]
     #: Samples that the recorder lost or doubled, by its own time base.
     dropped: int
+    #: What the recording is compared with: ``bouc_wen``, ``linear``, or a stage file's stage.
+    nominal: str | StageConfig = "bouc_wen"
+    #: Another recording of the same stage, on which errors are measured and nothing is fitted.
+    test: Prepared | None = None
 
 
-def prepare(recording: Recording) -> Prepared:
-    """Check, repair and cut. Raises InputError where nothing can be diagnosed, with what to do about it."""
+def prepare(
+    recording: Recording, *, nominal: str | StageConfig = "bouc_wen", test: Recording | None = None
+) -> Prepared:
+    """Check, repair and cut.
+
+    ``nominal``: ``"bouc_wen"`` (the chapter's stage), ``"linear"`` (one mode), or a stage (`sim.stagefile.load_stage`).
+    ``test``: another recording of the same stage with the same sample time, on which the held-out errors are taken.
+    Raises InputError where nothing can be diagnosed, with what to do about it.
+    """
+    if not isinstance(nominal, StageConfig) and nominal not in NAMED:
+        raise InputError(f"nominal: got {nominal!r}, expected one of {', '.join(NAMED)}, or a stage of a stage file")
+    own = _prepared(recording, nominal)
+    if test is None:
+        return own
+    if abs(test.dt_s - recording.dt_s) > 1e-6 * recording.dt_s:
+        raise InputError(
+            f"{test.source or 'test recording'}: got a sample time of {test.dt_s:g} s, expected {recording.dt_s:g} s "
+            "as in the recording; record both alike"
+        )
+    return replace(own, test=_prepared(test, nominal))
+
+
+def _prepared(recording: Recording, nominal: str | StageConfig) -> Prepared:
     findings = check(recording)
     require_usable(recording, findings)
     where = recording.source or "recording"
@@ -60,10 +87,11 @@ def prepare(recording: Recording) -> Prepared:
         y_um=np.ascontiguousarray(whole.y_um),
         u2_V=_moving(whole.u2_V),
         y2_um=_moving(whole.y2_um),
+        u3_V=_moving(whole.u3_V),
         temperature_C=whole.temperature_C,
         monitor_V=_moving(whole.monitor_V),
     )
-    return Prepared(setting, fixed.valid[: len(whole)], tuple(findings), tuple(notes), lost)
+    return Prepared(setting, fixed.valid[: len(whole)], tuple(findings), tuple(notes), lost, nominal)
 
 
 def _moving(values: FloatArray | None) -> FloatArray | None:

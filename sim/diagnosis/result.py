@@ -9,6 +9,7 @@ from adaptive.types import FloatArray
 from sim.diagnosis.fit import Fit
 
 SCHEMA = 1
+FOLDS, TEST = "folds of the recording", "test recording"
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     #: Causes that the search found before it had to admit that they do not explain the record.
     partial: tuple[str, ...] = ()
+    #: Where the held-out errors come from.
+    heldout_source: str = FOLDS
 
     def as_dict(self) -> dict[str, Any]:
         """The form of report.json, schema 1."""

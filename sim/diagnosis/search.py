@@ -9,12 +9,15 @@ import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import FORMS, same_set
-from sim.diagnosis.chain import Model
+from sim.diagnosis.causes_modal import Modes
+from sim.diagnosis.causes_restoring import RestoringLoop
 from sim.diagnosis.evidence import HeldOut, Screen, Screened, Split, held_out, p_value
-from sim.diagnosis.fit import Fit, calibrate, evaluate, within
+from sim.diagnosis.first_fits import first_fits
+from sim.diagnosis.fit import Fit, calibrate, refreshed
 from sim.diagnosis.forms import Form
 from sim.diagnosis.lines import line_is_there
 from sim.diagnosis.monitor import monitor_misfit
+from sim.diagnosis.slips import Slips, slips_of
 
 Progress = Callable[[str, float], None]
 
@@ -76,6 +79,8 @@ class Search:
     coarse: bool = False
     forms: tuple[Form, ...] = FORMS
     first_looks: list[Screened] = field(default_factory=list)
+    #: Numbers of the nominal stage calibrated alone.
+    nominal_p: FloatArray | None = None
 
     def cost(self, fit: Fit, held: HeldOut, base: Fit) -> float:
         """Held-out error, with the price of the numbers that a model has more than ``base``."""
@@ -90,6 +95,7 @@ class Search:
         """The best linearised guess of every form that could show, largest gain first."""
         screen = Screen(fit, self.mask, self.parts)
         found: list[Screened] = []
+        self._refresh(fit)
         for i, form in enumerate(self.forms):
             if form.name in skip or form.applies(fit.model.setting):
                 continue
@@ -99,42 +105,41 @@ class Search:
         found.sort(key=lambda s: -s.gain_um2)
         return found, [self.forms[s.index] for s in found]
 
+    def _refresh(self, fit: Fit) -> None:
+        """Slips have no place, and modes no frequency, until a model says what it leaves."""
+        self.forms = tuple(f.sought(fit) if isinstance(f, Modes) else f for f in self.forms)
+        if any(form.name == "timing" for form in fit.model.forms):
+            return
+        found = slips_of(fit.model.setting.y_um, fit.signals.reading_um, self.mask)
+        self.forms = tuple(replace(f, found=found) if isinstance(f, Slips) else f for f in self.forms)
+
     def refit(self, base: Fit, looks: list[Screened], count: int, least_um2: float) -> list[Candidate]:
         """The most promising guesses fitted jointly, the cheapest in held-out error first."""
         out: list[Candidate] = []
         if not looks:
             return out
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
-        # A line at the mains is small beside anything else and known by its own mark.
-        chosen += [s for s in looks[count:] if self.forms[s.index].name == "mains_hum" and self.is_line(s, base)]
-        for look in chosen:
+        for look in looks:
             form = self.forms[look.index]
-            fits = [self._quick(base.model.plus(form), base, look.start)]
-            if form.fast:
-                other = replace(base.model, nominal=base.model.nominal.with_other_hold())
-                fits.append(self._quick(other.plus(form), base, look.start))
+            # A line at the mains is small but has its own mark; a loop in the force shows once the mode gives way.
+            line = form.name == "mains_hum" and self.is_line(look, base)
+            if (line or isinstance(form, RestoringLoop)) and all(look is not c for c in chosen):
+                chosen.append(look)
+        for look in chosen:
+            form, fits = first_fits(self.forms[look.index], look.start, base, self.mask)
             quick = min(fits, key=lambda f: f.sse_um2)
             held = self.held(quick)
             out.append(Candidate(form, replace(quick, rows=None), held, self.cost(quick, held, base)))
         return sorted(out, key=lambda c: c.cost)
-
-    def _quick(self, model: Model, base: Fit, guess: FloatArray) -> Fit:
-        """A few steps of the joint fit from a linearised guess, or from beside neutral where that overshot."""
-        start = np.concatenate([base.p, guess])
-        if evaluate(model, within(model, start), self.mask).sse_um2 > base.sse_um2:
-            slots = model.forms[-1].slots(model.setting)
-            linear = np.array([s.steady for s in slots])
-            neutral = np.array([s.neutral for s in slots])
-            start[base.p.size :] = np.where(linear, neutral, guess)
-        return calibrate(model, start, self.mask, 8, 2e-3)
 
     def is_line(self, look: Screened, base: Fit) -> bool:
         return line_is_there(base.residual_um, base.model.setting, float(look.start[0]))
 
     def polish(self, candidate: Candidate, base: Fit) -> Candidate:
         """The same cause fitted to the end."""
-        more = 40 if candidate.form.variant == "restoring" else 12
+        more = 40 if candidate.form.variant.startswith("restoring") else 12
         fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, more, 1e-5)
+        fit = refreshed(fit, self.mask)
         held = self.held(fit)
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
@@ -175,6 +180,7 @@ class Search:
     def run(self, nominal: Fit) -> tuple[Fit, HeldOut, list[Step]]:
         """Greedy addition from a calibrated nominal model, with substitution after each step."""
         current, held = nominal, self.held(nominal)
+        self.nominal_p = nominal.p
         left_um2 = np.zeros_like(held.per_block_um2)
         steps: list[Step] = []
         for round_ in range(self.rules.most_causes):
@@ -203,6 +209,7 @@ class Search:
                 and left > (1.5 * self.sigma_um) ** 2
             ):
                 accepted = self._finer(accepted, current)
+            accepted = self._other_hold(accepted, current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.form.form_error**2 * gone
@@ -210,12 +217,24 @@ class Search:
             steps.append(Step(accepted.form.name, p, share))
         return current, held, steps
 
+    def _other_hold(self, accepted: Candidate, base: Fit) -> Candidate:
+        """The hold between two samples once more: a large cause may have hidden which one suits."""
+        fit = accepted.fit
+        model = replace(fit.model, nominal=fit.model.nominal.with_other_hold())
+        dearer = model.nominal.substeps > fit.model.nominal.substeps
+        other = calibrate(model, fit.p, self.mask, 4, 2e-3, known=fit.columns())
+        if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
+            return accepted
+        other = refreshed(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
+        held = self.held(other)
+        return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+
     def _finer(self, accepted: Candidate, base: Fit) -> Candidate:
         """More thresholds where a loop shape is the cause: what it leaves must not be taken for something else."""
         form = replace(accepted.form, variant="fine")
         model = base.model.plus(form)
         start = np.concatenate([accepted.fit.p[: len(base.p)], np.zeros(len(form.slots(model.setting)))])
-        fit = calibrate(model, start, self.mask, 8, 1e-3)
+        fit = refreshed(calibrate(model, start, self.mask, 8, 1e-3), self.mask)
         held = self.held(fit)
         cost = self.cost(fit, held, base)
         return Candidate(form, fit, held, cost) if cost < accepted.cost else accepted
@@ -224,4 +243,8 @@ class Search:
         """The model less one cause, calibrated anew."""
         where = fit.model.where(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
-        return calibrate(fit.model.less(index), start, self.mask, 5, 3e-3)
+        if isinstance(fit.model.forms[index], RestoringLoop) and self.nominal_p is not None:
+            # The mode had given way to the loop: from there no calibration finds back to a linear stage.
+            start[: fit.model.n_nominal] = self.nominal_p
+            return calibrate(fit.model.less(index), start, self.mask, 12, 1e-4)
+        return calibrate(fit.model.less(index), start, self.mask, 5, 3e-3, known=fit.columns(where))

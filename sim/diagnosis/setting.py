@@ -35,6 +35,12 @@ class Kept:
         self._local.__dict__.clear()
 
 
+#: Scales by which numbers fitted in one recording mean the same in another.
+_SCALES = (
+    "u_low_V", "u_high_V", "swing_V", "range_um", "middle_um", "gain_um_per_V", "slowest_s", "centre_um"
+)  # fmt: skip
+
+
 class At(IntEnum):
     """Where along the signal's way a parameter acts; everything before it need not be simulated again."""
 
@@ -72,10 +78,22 @@ class Setting:
     y_um: FloatArray
     u2_V: FloatArray | None = None
     y2_um: FloatArray | None = None
+    #: A third axis or actuator.
+    u3_V: FloatArray | None = None
     temperature_C: FloatArray | None = None
     monitor_V: FloatArray | None = None
+    #: The drive runs in straight lines between its values (only where it was refined so).
+    straight: bool = False
     #: The nominal stage has no hysteresis of its own.
     input_is_linear: bool = False
+    #: Kind of the nominal stage, and its lightly damped modes whose frequency (Hz) is known beforehand.
+    nominal_kind: str = "bouc_wen"
+    known_modes_hz: tuple[float, ...] = ()
+    #: The nominal stage has a lightly damped mode, known or calibrated.
+    has_mode: bool = False
+    #: Lowest static displacement and largest loop of the recording that was fitted, where this is another.
+    fitted_low_um: float | None = None
+    fitted_loop_um: float | None = None
     #: Displacement of the other axis as far as it is known, and its rate (µm, µm/s); set after calibration.
     other_um: FloatArray | None = field(default=None, repr=False)
     other_um_per_s: FloatArray | None = field(default=None, repr=False)
@@ -90,12 +108,22 @@ class Setting:
             u = np.repeat(self.u_V, substeps)
             if hold == "first":
                 u = np.interp(np.arange(u.size) / substeps, np.arange(self.n), self.u_V)
-            known[substeps, hold] = replace(self, dt_s=self.dt_s / substeps, u_V=u).scaled_as(self)
+            finer = replace(self, dt_s=self.dt_s / substeps, u_V=u, straight=hold == "first")
+            known[substeps, hold] = finer.scaled_as(self)
         return known[substeps, hold]
 
     def scaled_as(self, other: Setting) -> Setting:
         """This setting with the scales of another, so that numbers fitted there mean the same here."""
-        for name in ("u_low_V", "u_high_V", "swing_V", "range_um", "middle_um", "gain_um_per_V"):
+        for name in (
+            "u_low_V",
+            "u_high_V",
+            "swing_V",
+            "range_um",
+            "middle_um",
+            "gain_um_per_V",
+            "slowest_s",
+            "centre_um",
+        ):
             self.__dict__[name] = getattr(other, name)
         return self
 
@@ -139,6 +167,16 @@ class Setting:
     @cached_property
     def duration_s(self) -> float:
         return self.n * self.dt_s
+
+    @cached_property
+    def centre_um(self) -> float:
+        """Displacement at the middle of the voltages by the mean slope alone, without the sensor's offset."""
+        return 0.5 * (self.u_low_V + self.u_high_V) * self.gain_um_per_V
+
+    @cached_property
+    def slowest_s(self) -> float:
+        """The slowest time constant that creep is given, the same in every recording of one diagnosis."""
+        return min(3.0 * self.duration_s, 300.0)
 
     @cached_property
     def rate_V_per_s(self) -> FloatArray:

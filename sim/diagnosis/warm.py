@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.diagnosis import loops
-from sim.diagnosis.dynamics import Dynamics, Restoring, respond
+from sim.diagnosis import loops, loops_linear
+from sim.diagnosis.dynamics import Dynamics, respond
+from sim.diagnosis.restoring import Loop, Stops
+from sim.diagnosis.slips import slips_of
 
 
 def warm() -> None:
@@ -17,12 +19,15 @@ def warm() -> None:
     loops.felt_rate(u, 0.5, 1.0)
     loops.grown_plays(u, two, two, u, u)
     loops.plays_sum(u, two, two)
+    loops.plays_nested(u, two, two)
     loops.plays_matrix(u, two)
-    loops.lag_mean(u, 0.5)
-    loops.slew_mean(u, 0.5)
-    loops.slow_poles(u, two)
-    loops.friction(u, 0.1, 0.5)
-    loops.resample(u, 0.0, 0.5)
+    loops_linear.lag_ends(u, 0.5, True)
+    loops_linear.slew_ends(u, 0.5, True)
+    loops_linear.slow_poles(u, two)
+    loops_linear.friction(u, 0.1, 0.5)
+    loops_linear.resample(u, 0.0, 0.5)
+    slips_of(u, u, np.ones(u.size, dtype=np.bool_))
     system = Dynamics((2e-3,), ((300.0, 0.02),))
     respond(u, system, 5e-4)
-    respond(u, system, 5e-4, Restoring(two, two))
+    respond(u, system, 5e-4, Stops(two, two))
+    respond(u, system, 5e-4, Loop(0.5, 1.0, 0.5))

@@ -29,6 +29,7 @@ QUANTITIES: dict[str, tuple[str, dict[str, float]]] = {
     "y": ("y_um", _LENGTH),
     "u2": ("u2_V", _VOLTAGE),
     "y2": ("y2_um", _LENGTH),
+    "u3": ("u3_V", _VOLTAGE),
     "monitor": ("monitor_V", _VOLTAGE),
     "temperature": ("temperature_C", _TEMPERATURE),
     "dt": ("dt_s", _TIME),
@@ -42,7 +43,7 @@ class ColumnMap:
 
     Attributes
     ----------
-    columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 monitor temperature``,
+    columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 u3 monitor temperature``,
         and the scalars ``dt`` and ``rate``).
     units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; ``s ms us ns min``; ``C K``; ``Hz kHz``).
     scale : quantity -> factor from the file's number to the canonical unit, for what has no unit of its kind (10

@@ -211,7 +211,7 @@ def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Find
     same = np.abs(np.diff(values[finite])) == 0.0
     # A sensor that repeats itself often is coarse (or rests): then equal extremes prove nothing.
     noisy = len(same) > 0 and float(np.mean(same)) < 0.3
-    command = name in ("u_V", "u2_V")
+    command = name in ("u_V", "u2_V", "u3_V")
     for which, level in (("top", float(np.max(values[finite]))), ("bottom", float(np.min(values[finite])))):
         flat = runs(values == level)
         long = flat[(flat[:, 1] - flat[:, 0]) >= FLAT_RUN] if len(flat) else flat

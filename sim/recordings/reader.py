@@ -118,7 +118,7 @@ def _recording(table: Table, mapping: ColumnMap, source: str, sha256: str) -> Re
     assert y_um is not None
     t_s, dt_s = _time(table, mapping, len(u_V))
     columns: dict[str, NDArray[Any] | None] = {"t_s": t_s, "u_V": u_V, "y_um": y_um}
-    for quantity in ("u2", "y2", "monitor", "temperature"):
+    for quantity in ("u2", "y2", "u3", "monitor", "temperature"):
         columns[QUANTITIES[quantity][0]] = _column(table, quantity, mapping, needed=False)
     if "seq" in table.arrays and table.arrays["seq"].dtype.kind in "iu":
         columns["seq"] = table.arrays["seq"].astype(np.int64)

@@ -12,7 +12,7 @@ from adaptive.types import FloatArray
 
 #: Columns of a recording: the first three are always there.
 REQUIRED = ("t_s", "u_V", "y_um")
-OPTIONAL = ("u2_V", "y2_um", "monitor_V", "temperature_C")
+OPTIONAL = ("u2_V", "y2_um", "u3_V", "monitor_V", "temperature_C")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,8 @@ class Recording:
     t_s : (n,) time, s. u_V : (n,) voltage command, V, applied from ``t_s`` on. y_um : (n,) sensor, µm.
     dt_s : nominal sample time, s.
     source : where it came from, for people. sha256 : of the bytes read.
-    u2_V, y2_um : (n,) the other axis. monitor_V : (n,) measured voltage at the actuator. temperature_C : (n,).
+    u2_V, y2_um : (n,) the other axis. u3_V : (n,) the voltage of a third axis or actuator.
+    monitor_V : (n,) measured voltage at the actuator. temperature_C : (n,).
     seq : (n,) sequence numbers where the recorder wrote them. reason : (n,) what the learner did with each sample.
     notes : what the reader did that the reader of a report should know.
     """
@@ -37,6 +38,7 @@ class Recording:
     sha256: str = ""
     u2_V: FloatArray | None = None
     y2_um: FloatArray | None = None
+    u3_V: FloatArray | None = None
     monitor_V: FloatArray | None = None
     temperature_C: FloatArray | None = None
     seq: NDArray[np.int64] | None = None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.hidden.stage import Truth
+from tests.hidden.excitation import excitation
+from tests.hidden.stage import Truth, record
 
 #: Causes that one voltage and one sensor cannot tell apart (with the catalogue), whatever the method.
 INSEPARABLE: list[set[str]] = [
@@ -13,7 +14,7 @@ INSEPARABLE: list[set[str]] = [
 
 #: Left out of the score, with the reason.
 LEFT_OUT = {
-    "payload_change": "the nominal Bouc-Wen stage has no mode that a payload could move",
+    "payload_change": "the nominal Bouc-Wen stage has no mode that a payload could move; tests/sim has one that has",
     "hysteresis_shape": "scored with the many-play stage underneath, not as a hidden effect",
 }
 
@@ -107,6 +108,31 @@ def other_class(seed: int) -> Truth:
     truth = single(seed)
     truth.hysteresis = "plays"
     return truth
+
+
+#: Effects whose number scales what they do, so that they can be made as small as one likes.
+SCALABLE = (
+    "creep",
+    "thermal_drift",
+    "gain_drift",
+    "rate_dependence",
+    "asymmetry",
+    "sensor_nonlinearity",
+    "cross_talk",
+    "mains_hum",
+    "stick_slip",
+)
+
+
+def small(seed: int) -> Truth:
+    """One effect that moves the readings by half the noise (rms)."""
+    name = SCALABLE[seed % len(SCALABLE)]
+    truth = Truth(seed, effects={name: _draw(name, np.random.default_rng([seed, 4]))})
+    drive = excitation(np.random.default_rng(seed))
+    rms = float(np.std(record(truth, *drive)["y_um"] - record(Truth(seed), *drive)["y_um"]))
+    share = 0.5 * truth.noise_um / rms
+    own = {key: value * (share if key not in ("f_Hz", "tau_s") else 1.0) for key, value in truth.effects[name].items()}
+    return Truth(seed, effects={name: own})
 
 
 def same(name: str, found: set[str]) -> bool:

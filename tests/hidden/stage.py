@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import signal
+from scipy.interpolate import CubicSpline
 
 from tests.hidden.excitation import FS_HZ, Array
 
@@ -128,15 +129,19 @@ def record(truth: Truth, u_V: Array, u2_V: Array) -> dict[str, Array]:
     y = _first_order(d * u - h, 1.0 / (2.0 * np.pi * 2.527e-3 * rng.uniform(0.9, 1.1)))
     if "resonance" in effects:
         y = _mode(y, effects["resonance"]["f_Hz"], effects["resonance"]["damping"])
+    late_s = effects["delay"]["tau_s"] if "delay" in effects else 0.0
+    if late_s > 0.0:
+        fine = np.arange(y.size) / FINE_HZ
+        y = np.interp(fine - late_s, fine, y)
     # read just before the next voltage is applied, or up to one sample later: recorders differ
-    y = y[::OVER] if truth.seed % 3 else np.roll(y, OVER // 2)[::OVER]
+    y = y[::OVER] if truth.seed % 3 else np.concatenate([y[: OVER // 2], y])[:-OVER:OVER]
     if "creep" in effects:
         y = _creep(y, effects["creep"]["per_decade"])
     t = np.arange(n) / FS_HZ
     y2 = 10.8 * u2_V - 1.1 * np.sign(np.gradient(u2_V)) * (u2_V > 0.0)
     y2 = np.asarray(signal.lfilter(*signal.butter(1, 60.0, fs=FS_HZ), y2))
     if "cross_talk" in effects:
-        y = y + effects["cross_talk"]["share"] * y2
+        y = y + effects["cross_talk"]["share"] * np.interp(t - late_s, t, y2)
     if "stick_slip" in effects:
         y = _friction(y, effects["stick_slip"]["width_um"])
     if "gain_drift" in effects:
@@ -151,8 +156,6 @@ def record(truth: Truth, u_V: Array, u2_V: Array) -> dict[str, Array]:
     if "sensor_lag" in effects:
         fine = np.repeat(y + noise * 1.0, OVER)
         y, noise = _first_order(fine, effects["sensor_lag"]["f_Hz"])[OVER - 1 :: OVER], np.zeros(n)
-    if "delay" in effects:
-        y = np.interp(t - effects["delay"]["tau_s"], t, y)
     y = y + noise
     if "mains_hum" in effects:
         f = effects["mains_hum"]["f_Hz"]
@@ -172,7 +175,8 @@ def _timing(columns: dict[str, Array], what: dict[str, float], rng: np.random.Ge
     """A clock that runs wrong by some ppm, or samples lost and doubled on the way of the sensor's column."""
     y, t = columns["y_um"], columns["t_s"]
     if "ppm" in what:
-        columns["y_um"] = np.interp(t * (1.0 + 1e-6 * what["ppm"]), t, y)
+        # A sensor's clock samples the motion itself: a spline, because straight lines between samples would show.
+        columns["y_um"] = CubicSpline(t, y)(np.minimum(t * (1.0 + 1e-6 * what["ppm"]), t[-1]))
         return columns
     for at in np.sort(rng.integers(2000, y.size - 2000, int(what["dropped"])))[::-1]:
         y = np.concatenate([y[:at], y[at + 1 :], y[-1:]])

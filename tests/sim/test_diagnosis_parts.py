@@ -17,7 +17,8 @@ from sim.diagnosis.dynamics import Dynamics, respond
 from sim.diagnosis.evidence import split
 from sim.diagnosis.fit import calibrate
 from sim.diagnosis.lines import line_is_there
-from sim.diagnosis.loops import bouc_wen_loop, bouc_wen_paced, friction, plays_matrix, plays_sum, resample
+from sim.diagnosis.loops import bouc_wen_loop, bouc_wen_paced, plays_matrix, plays_sum
+from sim.diagnosis.loops_linear import friction, resample
 from sim.diagnosis.noise import noise_floor, repeated_period
 from sim.diagnosis.nominal import BoucWen
 from sim.diagnosis.prepare import prepare
