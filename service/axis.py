@@ -2,53 +2,42 @@
 
 No thread, no wire and no clock here: samples go in by :meth:`Axis.handle`, queries are answered by
 :meth:`Axis.answer`, and the same samples give the same answers to the last bit, live or replayed. One thread may
-handle samples while others answer queries: what they share is replaced whole, never changed.
+handle samples while others answer queries: what they share is replaced whole, never changed. The operator's verbs
+belong to the thread that handles samples, between two batches.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections import deque
-from dataclasses import dataclass
-from operator import attrgetter
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
-import numpy as np
-
-from adaptive.errors import DehystError, InputError
-from adaptive.types import Feedforward, FloatArray, InverseModel, OnlineModel, Sample
-from service.config import AxisConfig
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from service.answering import Served, answer, blends, learns
+from service.axis_learning import AxisLearning
+from service.config import LEARN, AxisConfig
 from service.errors import FieldError
-from service.guard import Limits, check_domain, guard
+from service.guard import Limits
+from service.keys import AUTO
+from service.retuning.adoption import Adoptions
 from service.sequence import LATE, RESTARTED, SequenceTracker
 from service.tracking import MemoryTracker
+from service.watch import Watch, WatchConfig
 from service.wire import SampleBatch
-from service.wire_query import NEWEST, NOT_FINITE_REPLACED, FeedforwardQuery, FeedforwardReply
+from service.wire_model import Safety
+from service.wire_query import FeedforwardQuery, FeedforwardReply
 
-#: The model that stands in, point by point, where another answers with what is not finite.
-FALLBACK_MODEL: Final = "linear"
+__all__ = ["Axis", "Served"]
+
+#: The baselines that may stand in for the model that learns, the best first: the one with hysteresis and a form that
+#: bounds it far from its data, then the one that is always there.
+STAND_INS: Final = ("mpi", "linear", "bouc_wen")
 _MAX_EVENTS: Final = 256
 
 
-@dataclass(frozen=True, slots=True)
-class Served:
-    """What queries read: immutable, and replaced whole.
-
-    Attributes
-    ----------
-    seq : the last sample handled before this snapshot, -1 before any. t_s : its time, s; u_V : its voltage, V.
-    models : by name. memories : by name, (m,) each, tracked from the samples up to ``seq``.
-    """
-
-    seq: int
-    t_s: float
-    u_V: float
-    models: dict[str, InverseModel]
-    memories: dict[str, FloatArray]
-
-
-class Axis:
+class Axis(AxisLearning):
     """The models of one axis.
 
     Parameters
@@ -57,13 +46,23 @@ class Axis:
     models : by name, all of one sample time.
     learner : what learns; its snapshots are served as ``config.learn``. None for a service that does not learn.
     limits : those of ``config``, with a displacement range filled in.
+    revive : makes what learns anew from a model, where the learner has failed; None: it stays dead.
     """
 
     def __init__(
-        self, config: AxisConfig, models: dict[str, InverseModel], learner: OnlineModel | None, limits: Limits
+        self,
+        config: AxisConfig,
+        models: dict[str, InverseModel],
+        learner: OnlineModel | None,
+        limits: Limits,
+        revive: Callable[[InverseModel], OnlineModel] | None = None,
     ) -> None:
+        if config.served == AUTO and AUTO not in models:
+            config = replace(config, served=config.learn or LEARN)  # it is alone, or nothing learns
         if config.served not in models:
             raise FieldError("served", repr(config.served), f"one of the models in the file: {', '.join(models)}")
+        if config.stand_in and config.stand_in not in models:
+            raise FieldError("stand_in", repr(config.stand_in), f"one of the models in the file: {', '.join(models)}")
         steps = {model.dt_s for model in models.values()}
         if len(steps) != 1:
             raise FieldError("dt_s", f"{sorted(steps)}", "one sample time for all models of an axis")
@@ -72,8 +71,12 @@ class Axis:
         self.learner = learner
         self.dt_s = steps.pop()
         self.sequence = SequenceTracker()
-        self._tracker = MemoryTracker(self.dt_s)
+        self.tracker = MemoryTracker(self.dt_s)
+        self.watch = Watch(WatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
+        self._revive = revive
+        self.adoptions = Adoptions()
         self._learner_dead = False
+        self._frozen_by = ""
         self._events: deque[dict[str, Any]] = deque(maxlen=_MAX_EVENTS)
         # Time goes on where a restarted stage begins anew; what learns sees one clock and one count.
         self._t_last_s = self._t_offset_s = 0.0
@@ -81,12 +84,24 @@ class Axis:
         self._gates: dict[str, int] = {}
         # Newest last. A tuple, replaced at each snapshot, so that a query never waits for the learner.
         self._ring: tuple[Served, ...] = (self._first(dict(models)),)
+        # States of the learner, the older one first, and the count of samples at the newer one.
+        self._marks: tuple[StateDict, StateDict] = ({}, {})
+        self._marked = 0
         #: The last sequence number whose snapshot, if it has one, is in the ring.
         self.handled_seq = -1
+        #: Time since the last sample, s, where samples are expected; set by whoever has a clock.
+        self.age_s = 0.0
+        #: Called once, right after the next snapshot, by the thread that handles samples; then None again.
+        self.at_snapshot: Callable[[], None] | None = None
 
     @property
     def newest(self) -> Served:
         return self._ring[-1]
+
+    @property
+    def served(self) -> str:
+        """Name of the model that answers where a query names none."""
+        return self.newest.default
 
     @property
     def learning(self) -> bool:
@@ -105,9 +120,9 @@ class Axis:
             events.append(self._events.popleft())
         return events
 
-    def note(self, event: str, detail: str) -> None:
+    def note(self, event: str, detail: str, **more: Any) -> None:
         """Keep an event for whoever publishes them."""
-        self._events.append({"seq": self.sequence.last, "event": event, "detail": detail})
+        self._events.append({"seq": self.sequence.last, "event": event, "detail": detail, **more})
 
     def handle(self, batch: SampleBatch) -> list[str]:
         """Take the samples of a message; returns what was made of each: "learnt", or the reason why not."""
@@ -126,46 +141,24 @@ class Axis:
             verdict = self._learn(Sample(number, t_going_on_s, u_V, y_um))
             self._gates[verdict] = self._gates.get(verdict, 0) + 1
             verdicts.append(verdict)
+            if self.adoptions:
+                self.adopt_due(number)
             if order == LATE:
                 continue
-            self._tracker.add(seq, u_V, y_um)
+            self.watch.take(u_V, y_um, verdict)
+            self.tracker.add(seq, u_V, y_um)
             if seq // every > self.newest.seq // every:
                 self._publish(seq, t_s, u_V)
             self.handled_seq = seq
+            if self.at_snapshot is not None and self.newest.seq == seq:
+                call, self.at_snapshot = self.at_snapshot, None
+                call()
         return verdicts
 
     def answer(self, query: FeedforwardQuery) -> FeedforwardReply:
         """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for."""
         handled = self.handled_seq  # read before the ring: what is missing then is really not there yet
-        ring = self._ring
-        served, behind = ring[-1], False
-        if query.as_of != NEWEST:
-            served, behind = self._as_of(ring, query.as_of, handled)
-        name = query.model or self.config.served
-        model = served.models.get(name)
-        if model is None:
-            raise FieldError("model", repr(name), f"one of {', '.join(served.models)}, or empty for the default")
-        check_domain(query.y_um, self.limits)
-        memory = served.memories[name] if query.memory is None else query.memory
-        if memory.size != model.memory_size:
-            raise FieldError(
-                "memory",
-                f"{memory.size} values",
-                f"{model.memory_size} for model {name!r}",
-                "bring back the memory of this model's last reply, or none",
-            )
-        forward = model.feedforward(query.y_um, query.v_um_per_s, query.a_um_per_s2, memory)
-        u, std, fallback = forward.u_V, forward.std_V, False
-        after = forward.memory
-        finite = bool(np.isfinite(u).all())
-        if not finite:
-            u, fallback = self._stand_in(served, query, forward), True
-        if not np.isfinite(after).all():
-            after, fallback = memory, True
-        safe, flags = guard(u, forward.inside, self.dt_s, self.limits, query.u_before_V)
-        if not finite:
-            flags[~np.isfinite(forward.u_V)] |= NOT_FINITE_REPLACED
-        return FeedforwardReply(safe, std, flags, after, served.seq, name, behind, query.memory is None, fallback)
+        return answer(query, self._ring, handled, self.config, self.limits, self.age_s)
 
     def model(self, name: str) -> tuple[InverseModel, int, FloatArray]:
         """(model, snapshot_seq, tracked memory) of the newest snapshot. Raises InputError on an unknown name."""
@@ -174,61 +167,41 @@ class Axis:
             raise FieldError("model", repr(name), f"one of {', '.join(served.models)}")
         return served.models[name], served.seq, served.memories[name]
 
+    def safety(self, name: str) -> Safety:
+        """By what rules the model called ``name`` gives way to another, for who evaluates it elsewhere."""
+        served, config = self.newest, self.config
+        return Safety(
+            blends(name, served.default, config),
+            config.blend_share,
+            served.trust if learns(name, config) else 1.0,
+            config.stale_s if learns(name, config) else 0.0,
+            config.last_good_s,
+            served.standing_in_for(name),
+        )
+
     def _first(self, models: dict[str, InverseModel]) -> Served:
+        config = self.config
         if self.learner is not None:
-            models[self.config.learn] = self.learner.snapshot()
-        return Served(-1, 0.0, math.nan, models, {name: model.rest_memory(0.0) for name, model in models.items()})
-
-    def _as_of(self, ring: tuple[Served, ...], as_of: int, handled: int) -> tuple[Served, bool]:
-        at = bisect_right(ring, as_of, key=attrgetter("seq")) - 1
-        if at < 0:
-            raise FieldError(
-                "as_of",
-                as_of,
-                f"{ring[0].seq} or later",
-                "older snapshots are gone: ask sooner, or keep more of them (snapshots_kept)",
-            )
-        every = self.config.snapshot_every
-        following = (ring[at].seq // every + 1) * every
-        return ring[at], following <= as_of and handled < following
-
-    def _learn(self, sample: Sample) -> str:
-        if self.learner is None or self._learner_dead:
-            return "not_learning"
-        try:
-            return self.learner.handle(sample)
-        except Exception as error:
-            # A learner never raises on data. If it does, its state is in doubt: what it last gave stays served.
-            self._learner_dead = True
-            self.note("learner_failed", f"{type(error).__name__}: {error}; the last good model stays in service")
-            return "not_learning"
+            models[config.learn] = self.learner.snapshot()
+        memories = {name: model.rest_memory(0.0) for name, model in models.items()}
+        # A model of the learner's own form is no stand-in for it.
+        known = (name for name in STAND_INS if name in models and name not in (config.learn, config.served))
+        return Served(-1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(known, ""))
 
     def _publish(self, seq: int, t_s: float, u_V: float) -> None:
         last = self.newest
         models = last.models
-        if self.learner is not None and not self._learner_dead:
-            try:
-                models = models | {self.config.learn: self.learner.snapshot()}
-            except (DehystError, ValueError, ArithmeticError) as error:
-                self._learner_dead = True
-                self.note("learner_failed", f"snapshot: {error}; the last good model stays in service")
-        memories = self._tracker.advance(models, last.memories)
-        self._ring = (*self._ring, Served(seq, t_s, u_V, models, memories))[-self.config.snapshots_kept :]
+        if self.learner is not None:
+            models = models | self._judged(last)
+        memories = self.tracker.advance(models, last.memories)
+        served = replace(
+            last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
+            trust=self.watch.trust, trouble=self.watch.trouble,
+        )  # fmt: skip
+        self._ring = (*self._ring, served)[-self.config.snapshots_kept :]
 
     def _restart(self, seq: int) -> None:
         """The stage counts from the beginning again: snapshots of the old count can no longer be named."""
-        last = self.newest
-        self._tracker.forget()
-        self._ring = (Served(-1, last.t_s, last.u_V, last.models, last.memories),)
+        self.tracker.forget()
+        self._ring = (replace(self.newest, seq=-1),)
         self.note("stage_restarted", f"the stage's numbers went back to {seq}; the model is kept")
-
-    def _stand_in(self, served: Served, query: FeedforwardQuery, forward: Feedforward) -> FloatArray:
-        """The fallback's voltage where the model's is not finite."""
-        model = served.models.get(FALLBACK_MODEL)
-        if model is None:
-            return forward.u_V
-        try:
-            other = model.feedforward(query.y_um, query.v_um_per_s, query.a_um_per_s2, served.memories[FALLBACK_MODEL])
-        except InputError:
-            return forward.u_V
-        return np.where(np.isfinite(forward.u_V), forward.u_V, other.u_V)

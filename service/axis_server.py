@@ -1,34 +1,48 @@
-"""The entities of one axis on the wire: three queryables, a subscriber, four publishers and a liveliness token."""
+"""The entities of one axis on the wire: subscriber, queryables, publishers and a liveliness token."""
 
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
 
 import zenoh
 
-from adaptive.errors import DehystError
+from service.answering import trust_by_age
 from service.axis import Axis
-from service.errors import FieldError, error_to_json
-from service.intake import Intake, SampleSink
-from service.keys import Keys
+from service.axis_answers import JSON, Answers, plain
+from service.axis_state import fingerprint
+from service.checkpoint import CheckpointFolder
+from service.intake import Intake, SampleSink, SampleWatcher
+from service.keeper import Keeper
+from service.keys import AUTO, Keys
 from service.latency import LatencyMeter
+from service.operating.journal import Journal
+from service.operating.server import OperationsServer
+from service.operating.verbs import Background, Verbs
+from service.retuning.retuner import Retuner
 from service.status import axis_status
 from service.wire import decode_samples
-from service.wire_model import encode_model
-from service.wire_query import decode_query, encode_reply
 
-JSON: Final = "application/json"
 STATUS_PERIOD_S: Final = 1.0
+PRIMARY: Final = "primary"
+STANDBY: Final = "standby"
 
 
 class AxisServer:
     """Puts one axis on the wire.
 
-    Every callback answers: an exception on the way to an answer becomes an error reply, because a callback that raises
-    leaves its caller without any.
+    Samples are taken from :meth:`listen` on; queries are answered, and anything is
+    published, between :meth:`serve` and :meth:`stand_down`.
+
+    Attributes
+    ----------
+    role : "primary" while it serves, else "standby".
+    synced : whether the model is the one that is to be served: its own, or, in a standby, that of whoever serves.
+    extra : what else comes and goes with serving: each declares on a session and returns what is to be undeclared.
+    keeper : of the checkpoints.
     """
 
     def __init__(
@@ -39,85 +53,218 @@ class AxisServer:
         instance: str,
         wake: Callable[[], None],
         sink: SampleSink | None = None,
+        watcher: SampleWatcher | None = None,
     ) -> None:
         self.keys = keys
         self.axis = axis
         self.instance = instance
+        self.role = STANDBY
+        self.synced = True
+        self.epoch = 0
         self.latency = LatencyMeter()
         self.intake = Intake(axis, wake, sink)
+        self.watcher = self.intake.watcher = watcher
+        tuned = axis.config.retuning.enabled and axis.learner is not None
+        self._retuner = Retuner(axis.config.retuning, axis.config.recorder) if tuned else None
+        self.operations = self._operations()
+        self.extra: list[Callable[[zenoh.Session], list[Any]]] = [self.operations.declare]
+        folder = axis.config.checkpoints
+        self.keeper = Keeper(
+            axis,
+            self.intake,
+            keys.stage,
+            instance,
+            None
+            if folder is None
+            else CheckpointFolder(folder, keys.stage, keys.axis, axis.dt_s, axis.config.checkpoints_kept),
+        )
+        axis.archive = self.keeper.folder
+        self.answers = Answers(keys, axis, self.keeper, self.latency, self.status)
         self._session = session
         self._published = axis.newest
         self._published_at = 0.0
         self._told: dict[str, Any] = {}
         self._status_at = 0.0
         self._sample_at: float | None = None
-        self._entities: list[Any] = []
+        self._stale = False
+        self._inputs: list[Any] = []
+        self._queryables: list[Any] = []
+        self._publishers: dict[str, Any] = {}
+        self._standby_status: Any = None
         self._token: Any = None
+        self._changing = threading.RLock()
 
-    def declare(self) -> None:
-        """Declare everything; the liveliness token last, because alive means callable."""
+    def listen(self) -> None:
+        """Take samples from now on."""
         self.intake.start()
         session, keys = self._session, self.keys
+        self._inputs = [session.declare_subscriber(keys.sample, self._on_sample)]
+        self._standby_status = session.declare_publisher(
+            keys.standby(self.instance), congestion_control=zenoh.CongestionControl.DROP, encoding=JSON
+        )
+
+    def serve(self) -> None:
+        """Answer and publish from now on; the liveliness token comes last, because alive means callable."""
+        session, keys = self._session, self.keys
         drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
-        self._model = session.declare_publisher(keys.model, congestion_control=drop)
-        self._diagnostics = session.declare_publisher(keys.diagnostics, congestion_control=drop, encoding=JSON)
-        self._status = session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON)
-        self._event = session.declare_publisher(keys.event, congestion_control=block, encoding=JSON)
-        self._entities = [
-            session.declare_subscriber(keys.sample, self._on_sample),
-            session.declare_queryable(
-                keys.feedforward, self._guarded(keys.feedforward, self._feedforward, self.latency)
-            ),
-            session.declare_queryable(keys.model, self._guarded(keys.model, self._model_reply)),
-            session.declare_queryable(keys.status, self._guarded(keys.status, self._status_reply)),
-            self._model,
-            self._diagnostics,
-            self._status,
-            self._event,
-        ]
-        self._token = session.liveliness().declare_token(keys.alive(self.instance))
+        with self._changing:
+            self.role = PRIMARY
+            # A standby does not tune: it adopts what the one that serves announces.
+            self.axis.retuner = self._retuner
+            self._queryables = self.answers.declare(session)
+            self._publishers = {
+                "model": session.declare_publisher(keys.model, congestion_control=drop),
+                "champion": session.declare_publisher(keys.champion, congestion_control=drop),
+                "diagnostics": session.declare_publisher(keys.diagnostics, congestion_control=drop, encoding=JSON),
+                "status": session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON),
+                "event": session.declare_publisher(keys.event, congestion_control=block, encoding=JSON),
+            }
+            for declare in self.extra:
+                self._queryables += declare(session)
+            self._token = session.liveliness().declare_token(keys.alive(self.instance))
+
+    def stand_down(self) -> None:
+        """First no longer alive, then no longer callable; samples are still taken."""
+        with self._changing:
+            self.role = STANDBY
+            self.axis.retuner = None
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+            for entity in self._queryables:
+                entity.undeclare()
+            self._queryables = []
+            self._publish_events()
+            publishers, self._publishers = self._publishers, {}
+            for publisher in publishers.values():
+                publisher.undeclare()
+
+    def declare(self) -> None:
+        """Take samples and serve."""
+        self.listen()
+        self.serve()
 
     def undeclare(self) -> None:
-        """First no longer alive, then no longer callable; what is queued is handled, then the rest goes."""
-        if self._token is not None:
-            self._token.undeclare()
-            self._token = None
-        for entity in self._entities[:4]:
-            entity.undeclare()
+        """First no longer callable; what is queued is handled and kept, then the rest goes."""
+        with self._changing:
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+            for entity in (*self._queryables, *self._inputs):
+                entity.undeclare()
+            self._queryables, self._inputs = [], []
         self.intake.close()
-        self._publish_events()
-        for entity in self._entities[4:]:
-            entity.undeclare()
-        self._entities = []
+        if self._retuner is not None:
+            self._retuner.close()
+        self.keeper.close()
+        if self.watcher is not None:
+            self.watcher.close()
+        self.stand_down()
+        if self._standby_status is not None:
+            self._standby_status.undeclare()
+            self._standby_status = None
+
+    def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
+        """Do what an operator wants between two batches of samples, and have the outcome kept; returns what it does.
+
+        Not from a callback of the wire: it waits for the learner.
+        """
+        seq = self.intake.call(lambda: work(self.axis), timeout_s)
+        self.keeper.now(timeout_s)
+        return seq
+
+    def _operations(self) -> OperationsServer:
+        def diagnose() -> Background | None:
+            return None if self.watcher is None else self.watcher.request
+
+        def retune() -> Background | None:
+            return None if self.axis.retuner is None else self.axis.retuner.request
+
+        config = self.axis.config
+        verbs = Verbs(self.axis, self.operate, {"diagnose": diagnose, "retune": retune})
+        journal = Journal(config.recorder or config.checkpoints)
+        return OperationsServer(self.keys, self.instance, verbs, journal, self.axis.note, lambda: self.role)
 
     def tick(self, now_s: float) -> None:
         """Publish what is due at ``now_s`` on a clock that never goes back. Called from one thread."""
+        if self.watcher is not None:
+            self.watcher.tick(now_s)
+        self.keeper.tick(now_s)
+        self._look_at_age(now_s)
+        with self._changing:
+            self._publish(now_s)
+
+    def _look_at_age(self, now_s: float) -> None:
+        """Samples are expected from the first one on."""
+        at = self._sample_at
+        self.axis.age_s = 0.0 if at is None else max(0.0, now_s - at)
+        config = self.axis.config
+        stale = trust_by_age(self.axis.age_s, config.stale_s, config.last_good_s)[1]
+        if stale != self._stale:
+            self._stale = stale
+            if stale:
+                self.axis.note("stale", f"no sample for {self.axis.age_s:.1f} s; answers are flagged as stale")
+            else:
+                self.axis.note("fresh", "samples come again")
+
+    def _publish(self, now_s: float) -> None:
+        publishers = self._publishers
+        due = now_s - self._status_at >= STATUS_PERIOD_S
+        if due:
+            self._status_at = now_s
+        if not publishers:
+            if due and self._standby_status is not None:
+                self._standby_status.put(json.dumps(self.status(), default=plain))
+            return
         newest = self.axis.newest
         if newest is not self._published and now_s - self._published_at >= 1.0 / self.axis.config.model_hz:
-            if self.axis.config.learn and _is_followed(self._model):
-                self._model.put(self._encoded(self.axis.config.learn))
+            if self.axis.config.learn and _is_followed(publishers["model"]):
+                publishers["model"].put(self.answers.encoded(self.axis.config.learn))
+            if AUTO in newest.models and _is_followed(publishers["champion"]):
+                publishers["champion"].put(self.answers.encoded(AUTO))
             self._published, self._published_at = newest, now_s
         told = self.intake.diagnostics
         if told is not self._told:
             self._told = told
             latency = self.latency.summary()
             extra = {"counters": self.intake.counters, "query_us": {"p50": latency["p50_us"], "p99": latency["p99_us"]}}
-            self._diagnostics.put(json.dumps({**told, **extra}, default=_plain))
-        if now_s - self._status_at >= STATUS_PERIOD_S:
-            self._status_at = now_s
-            self.intake.want_diagnostics = _is_followed(self._diagnostics)
-            self._status.put(json.dumps(self.status(), default=_plain))
+            publishers["diagnostics"].put(json.dumps({**told, **extra}, default=plain))
+        if due:
+            self.intake.want_diagnostics = _is_followed(publishers["diagnostics"])
+            publishers["status"].put(json.dumps(self.status(), default=plain))
         self._publish_events()
 
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
         age_s = None if self._sample_at is None else time.monotonic() - self._sample_at
-        return axis_status(self.keys, self.instance, self.axis, self.intake, self.latency, age_s)
+        synced = self.synced
+        newest = self.axis.newest
+        told = axis_status(self.keys, self.instance, self.axis, self.intake, self.latency, age_s)
+        learn = self.axis.config.learn
+        return {
+            **told,
+            # Of the very snapshot that the fingerprint below is of: another may have come since.
+            "snapshot_seq": newest.seq,
+            "role": self.role,
+            "epoch": self.epoch,
+            "synced": synced,
+            "stale": self._stale,
+            "trouble": newest.trouble,
+            "trust": newest.trust,
+            "stand_in": newest.stand_in,
+            "frozen": self.axis.frozen,
+            "checkpoints": self.keeper.counters(),
+            "operations": self.operations.counters(),
+            "fingerprint": fingerprint(newest.models[learn]) if learn else "",
+        }
 
     def _publish_events(self) -> None:
-        # Nothing to tell them by where declaring failed on the way.
-        for event in self.axis.take_events() if self._entities else ():
-            self._event.put(json.dumps({**event, "instance": self.instance, "time_unix_s": time.time()}))
+        # A standby keeps them until it serves, when they tell what has happened.
+        publisher = self._publishers.get("event")
+        if publisher is None:
+            return
+        for event in self.axis.take_events():
+            publisher.put(json.dumps({**event, "instance": self.instance, "time_unix_s": time.time()}))
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         try:
@@ -129,46 +276,6 @@ class AxisServer:
             return
         self._sample_at = time.monotonic()
         self.intake.offer(batch)
-
-    def _feedforward(self, query: zenoh.Query) -> bytes:
-        if query.payload is None:
-            raise FieldError("payload", "none", "a feedforward query")
-        return encode_reply(self.axis.answer(decode_query(query.payload.to_bytes())))
-
-    def _model_reply(self, query: zenoh.Query) -> bytes:
-        return self._encoded(str(query.parameters.get("name") or self.axis.config.served))
-
-    def _status_reply(self, query: zenoh.Query) -> bytes:
-        return json.dumps(self.status(), default=_plain).encode()
-
-    def _encoded(self, name: str) -> bytes:
-        model, seq, memory = self.axis.model(name)
-        return encode_model(name, model, seq, memory)
-
-    def _guarded(
-        self, key: str, answer: Callable[[zenoh.Query], bytes], meter: LatencyMeter | None = None
-    ) -> Callable[[zenoh.Query], None]:
-        def callback(query: zenoh.Query) -> None:
-            start = time.perf_counter()
-            failed = False
-            # Leaving the context finishes the query; without that the caller waits until its time is over.
-            with query:
-                try:
-                    query.reply(key, answer(query))
-                except Exception as error:
-                    failed = True
-                    if not isinstance(error, DehystError):
-                        self.axis.note("internal_error", f"{key}: {type(error).__name__}: {error}")
-                    query.reply_err(error_to_json(error), encoding=JSON)
-            if meter is not None:
-                meter.add(time.perf_counter() - start, failed)
-
-        return callback
-
-
-def _plain(value: Any) -> Any:
-    """numpy's numbers and arrays for JSON."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _is_followed(publisher: Any) -> bool:

@@ -20,9 +20,25 @@ COMMANDS: dict[str, str] = {
     "query": "ask a running service for voltages",
     "replay": "run the learner over a recording, offline, and see what its gates and its errors do",
     "scenarios": "drift of every kind, adapting against not adapting, with a table and pictures",
+    "soak": "run everything under a seeded plan of faults, and judge what must hold",
     "bench": "the solver's speed and accuracy beside its yardsticks and peers, from a checkout",
     "reproduce": "the chapter's tables and figures, computed anew beside its own numbers",
+    "status": "a live table of all axes and instances that serve",
+    "freeze": "stop an axis from learning, until it is thawed",
+    "thaw": "let a frozen axis learn again",
+    "rollback": "set the model of an axis back to a checkpoint",
+    "checkpoints": "list the checkpoints of an axis",
+    "select": "choose the model that answers where a query names none",
+    "retune": "search the learning model's settings anew, in the background",
+    "ask-diagnosis": "let a running service diagnose its recent samples, in the background",
+    "access": "make the certificates, passwords and rules for more than one machine",
+    "router": "pass messages on between stages, services and clients on several hosts",
     "view": "stream a running service to the Rerun viewer or into an .rrd file",
+}
+
+#: Commands that share a module: the operator's verbs differ in their name and one argument.
+MODULES: dict[str, str] = {
+    verb: "operate" for verb in ("freeze", "thaw", "rollback", "checkpoints", "select", "retune", "ask-diagnosis")
 }
 
 
@@ -40,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, line in COMMANDS.items():
         command = sub.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
         if name == chosen:
-            module = importlib.import_module(f"service.commands.{name}")
+            module = importlib.import_module(f"service.commands.{MODULES.get(name, name)}")
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     parsed = parser.parse_args(args)

@@ -5,7 +5,8 @@
         answer = client.trajectory(y_um)          # (n,) points, one sample time apart
         more = client.trajectory(next_y_um, after=answer)
 
-Queries change nothing in the service: after an error any of them may be repeated.
+Queries change nothing in the service: after an error any of them may be repeated, and what gets no answer is, for a
+while, by the client itself. Given the endpoints of a service and of its standby it goes on with the one that is left.
 """
 
 from __future__ import annotations
@@ -13,8 +14,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -23,56 +23,26 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.types import FloatArray
+from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued
 from service.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.follower import Follower
-from service.guard import Limits
-from service.keys import Keys
+from service.guard import Limits, guard
+from service.keys import AUTO, Keys
 from service.motion import derivatives
 from service.session import DEFAULT_ENDPOINT, open_client
-from service.wire import check_seq, encode_command, encode_reference
+from service.wire import check_finite, check_seq, column, encode_command, encode_reference
 from service.wire_query import NEWEST, FeedforwardReply, decode_reply, encode_query
 
 _BEHIND_PAUSE_S: Final = 0.001
 #: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
 _SETTLE_S: Final = 0.5
+#: How long a query without an answer is repeated, and the pause before each time, s: a standby needs some hundredths
+#: of a second where the service has died, and a second where it only stopped.
+RETRY_S: Final = 2.0
+_RETRY_PAUSE_S: Final = 0.003
 
 
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """The answer to a trajectory.
-
-    Attributes
-    ----------
-    u_V, std_V : (n,) voltage and its standard deviation, V.
-    flags : (n,) bits, see :func:`service.wire_query.flag_names`.
-    memory : (m,) hysteresis memory after the last point. model : that answered. snapshot_seq : the last sample it
-    had seen. fallback : whether a stand-in answered for some points. tracked_memory : whether the memory was the
-    service's own.
-    """
-
-    u_V: FloatArray
-    std_V: FloatArray
-    flags: NDArray[np.uint8]
-    memory: FloatArray
-    model: str
-    snapshot_seq: int
-    fallback: bool
-    tracked_memory: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """The answer to one point; as :class:`Trajectory`, with ``u_V``, ``std_V`` and ``flags`` as numbers."""
-
-    u_V: float
-    std_V: float
-    flags: int
-    memory: FloatArray
-    model: str
-    snapshot_seq: int
-    fallback: bool
-    tracked_memory: bool
+__all__ = ["Client", "Point", "Trajectory"]
 
 
 class Client:
@@ -82,9 +52,20 @@ class Client:
     InputError (not even sent). Not for use from several threads at once.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, timeout_s: float = 1.0, owns_session: bool = False) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        timeout_s: float = 1.0,
+        owns_session: bool = False,
+        retry_s: float = RETRY_S,
+    ) -> None:
         self.keys = keys
         self.timeout_s = timeout_s
+        self.retry_s = retry_s
+        #: Queries that were repeated because there was no answer.
+        self.retries = 0
+        self._commanded = (-1, math.nan)
         self._session = session
         self._owns = owns_session
         self._followers: list[Follower] = []
@@ -94,24 +75,25 @@ class Client:
     @classmethod
     def connect(
         cls,
-        endpoint: str = DEFAULT_ENDPOINT,
+        endpoint: str | Sequence[str] = DEFAULT_ENDPOINT,
         stage: str = "demo",
         axis: str = "x",
         timeout_s: float = 1.0,
         wait_s: float = 0.0,
         zenoh_config: Path | None = None,
+        retry_s: float = RETRY_S,
     ) -> Client:
-        """Connect to the service at ``endpoint`` and make sure that it serves this axis.
+        """Connect to the service at ``endpoint``, or to one of several, and make sure that it serves this axis.
 
-        ``timeout_s`` is for each query; ``wait_s`` is how long to wait for the service to come up. ``zenoh_config`` is
-        a file of zenoh's own for TLS and passwords. Raises SessionError where nobody listens, NoReplyError where
-        the axis is not served there.
+        ``timeout_s`` is for each query; ``retry_s`` is how long one that gets no answer is repeated; ``wait_s`` is how
+        long to wait for the service to come up. ``zenoh_config`` is a file of zenoh's own for TLS and passwords. Raises
+        SessionError where nobody listens, NoReplyError where the axis is not served there.
         """
         keys = Keys(stage, axis)
         until = time.monotonic() + max(wait_s, _SETTLE_S)
         session = open_client(endpoint, wait_s, zenoh_config)
         try:
-            client = cls(session, keys, timeout_s, owns_session=True)
+            client = cls(session, keys, timeout_s, owns_session=True, retry_s=retry_s)
             while True:
                 try:
                     client.status()
@@ -173,18 +155,9 @@ class Client:
         wait_s: float = 0.0,
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
-        query = _continued(memory, model, u_before_V, after)
+        query = continued(memory, model, u_before_V, after)
         reply = self._ask(lambda: encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
-        return Point(
-            float(reply.u_V[0]),
-            float(reply.std_V[0]),
-            int(reply.flags[0]),
-            reply.memory,
-            reply.model,
-            reply.snapshot_seq,
-            reply.fallback,
-            reply.tracked_memory,
-        )
+        return as_point(reply)
 
     def trajectory(
         self,
@@ -217,23 +190,15 @@ class Client:
         """
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
-        query = _continued(memory, model, u_before_V, after)
+        query = continued(memory, model, u_before_V, after)
         reply = self._ask(lambda: encode_query(y, v, a, as_of=as_of, **query), wait_s)
-        return Trajectory(
-            reply.u_V,
-            reply.std_V,
-            reply.flags,
-            reply.memory,
-            reply.model,
-            reply.snapshot_seq,
-            reply.fallback,
-            reply.tracked_memory,
-        )
+        return as_trajectory(reply)
 
     def follow(self, model: str = "", memory: ArrayLike | None = None) -> Follower:
         """Follow the model into this process; see :class:`service.follower.Follower`. Closed with this client.
 
-        Only the model that learns is published as it changes; any other is fetched once, which is all there is to it.
+        Only the model that learns and "auto" are published as they change; any other is fetched once, which is all
+        there is to it. "auto" carries every model that competes; the one that learns is quicker to evaluate alone.
         """
         status = self._known()
         name = model or str(status["served"])
@@ -242,14 +207,31 @@ class Client:
             # The selector's own syntax keeps the name from being taken for something else: names are plain chunks.
             return self._one(self._session.get(f"{self.keys.model}?name={name}", timeout=self.timeout_s))
 
-        learns = name == status.get("learning")
-        follower = Follower(self._session, self.keys.model if learns else None, name, fetch, self.limits, memory)
+        key = {str(status.get("learning")): self.keys.model, AUTO: self.keys.champion}.get(name)
+        follower = Follower(self._session, key, name, fetch, self.limits, memory)
         self._followers.append(follower)
         return follower
 
-    def command(self, seq: int, u_V: ArrayLike) -> None:
-        """Publish voltages, (n,) V, for the stage's samples ``seq``, ``seq + 1``, …"""
-        self._session.put(self.keys.command, encode_command(check_seq("seq", seq), u_V), express=True)
+    def command(self, seq: int, u_V: ArrayLike) -> NDArray[np.uint8]:
+        """Publish voltages, (n,) V, for the stage's samples ``seq``, ``seq + 1``, …; returns (n,) flags.
+
+        What leaves is within the limits of the axis and, from the command before on, within its slew limit; flags say
+        where that changed a voltage. Raises InputError on what is not finite.
+        """
+        wanted = column("u_V", u_V)
+        check_finite("u_V", wanted)
+        following, before = self._commanded
+        limits, gap = self.limits, check_seq("seq", seq) - following
+        if following < 0 or gap < 0:
+            before = math.nan  # the first, or one that is to replace others
+        elif gap:
+            # Over samples for which nothing was commanded the stage has held the last one; it had as long to move.
+            reach = gap * limits.slew_V_per_s * self.dt_s
+            before = min(max(float(wanted[0]), before - reach), before + reach)
+        safe, flags = guard(wanted, np.ones(wanted.size, dtype=np.bool_), self.dt_s, limits, before)
+        self._session.put(self.keys.command, encode_command(seq, safe), express=True)
+        self._commanded = (seq + safe.size, float(safe[-1]))
+        return flags
 
     def reference(self, seq: int, y_um: ArrayLike) -> None:
         """Publish what is wanted, (n,) µm, at the stage's samples ``seq``, ``seq + 1``, …; for diagnostics only."""
@@ -260,9 +242,18 @@ class Client:
 
     def _ask(self, encode: Callable[[], bytes], wait_s: float) -> FeedforwardReply:
         payload = encode()
-        until = time.monotonic() + wait_s
+        start = time.monotonic()
+        until = start + wait_s
         while True:
-            reply = decode_reply(self._one(self._querier.get(payload=payload)))
+            try:
+                reply = decode_reply(self._one(self._querier.get(payload=payload)))
+            except (NoReplyError, ReplyTimeoutError):
+                # It may have died while asked; another one takes over, or it comes back.
+                if time.monotonic() - start >= self.retry_s:
+                    raise
+                self.retries += 1
+                time.sleep(_RETRY_PAUSE_S)
+                continue
             if not reply.behind:
                 return reply
             if time.monotonic() >= until:
@@ -287,14 +278,3 @@ class Client:
         if isinstance(failure, ReplyTimeoutError):
             raise ReplyTimeoutError(f"{self.keys.base}: no answer within {self.timeout_s:g} s; ask again")
         raise failure
-
-
-def _continued(
-    memory: ArrayLike | None, model: str, u_before_V: float, after: Point | Trajectory | None
-) -> dict[str, Any]:
-    if after is not None:
-        memory = after.memory if memory is None else memory
-        model = model or after.model
-        if math.isnan(u_before_V):
-            u_before_V = float(np.atleast_1d(after.u_V)[-1])
-    return {"memory": memory, "model": model, "u_before_V": u_before_V}

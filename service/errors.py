@@ -84,7 +84,7 @@ def error_from_json(payload: bytes) -> ServiceError:
     """The exception for the payload of an error reply, whoever made it; never raises."""
     try:
         data: Any = json.loads(payload)
-    except ValueError:
+    except (ValueError, RecursionError):
         data = None
     if not isinstance(data, dict):
         text = payload.decode(errors="replace")

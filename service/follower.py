@@ -13,9 +13,12 @@ import zenoh
 from numpy.typing import ArrayLike, NDArray
 
 from adaptive.errors import DehystError
+from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
+from service.answering import trust_by_age
 from service.errors import FieldError
-from service.guard import Limits, check_domain, guard
+from service.fallback import Answer, Rules, answer_safely
+from service.guard import Limits, check_domain
 from service.motion import derivatives
 from service.wire_model import ModelMessage, decode_model
 
@@ -62,6 +65,7 @@ class Follower:
         )
         self._u_before_V = math.nan
         self._one = (np.empty(1), np.empty(1), np.empty(1))
+        self._result = (np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_))
 
     @property
     def model(self) -> InverseModel:
@@ -87,17 +91,23 @@ class Follower:
                 f"{y_um:g}, {v_um_per_s:g}, {a_um_per_s2:g}",
                 f"finite numbers, y_um from {limits.y_min_um:g} to {limits.y_max_um:g}",
             )
-        model = self._newest[0].model
+        message = self._newest[0]
+        model = message.model
         y, v, a = self._one
         y[0], v[0], a[0] = y_um, v_um_per_s, a_um_per_s2
-        forward = model.feedforward(y, v, a, self.memory)
-        # The guard of one point without its arrays: the same order, the same numbers.
-        u = float(forward.u_V[0])
-        before = self._u_before_V
-        if not math.isfinite(u):
-            u = before if math.isfinite(before) else 0.5 * (limits.u_min_V + limits.u_max_V)
+        if type(model) is LssvmInverse and self.memory.size == model.memory_size:
+            after = self.memory.copy()
+            u_V, std_V, within = self._result
+            model.evaluate_into(y, v, a, after, u_V, std_V, within)
         else:
-            self.memory = forward.memory
+            forward = model.feedforward(y, v, a, self.memory)
+            u_V, within, after = forward.u_V, forward.inside, forward.memory
+        u = u_V.item(0)
+        before = self._u_before_V
+        if not (math.isfinite(u) and (within.item(0) or not message.safety.blends) and self._trust() == 1.0):
+            return float(self._safely((y, v, a)).u_V[0])
+        # The guard of one point without its arrays: the same order, the same numbers.
+        self.memory = after
         u = min(max(u, limits.u_min_V), limits.u_max_V)
         if math.isfinite(before):
             step = limits.slew_V_per_s * model.dt_s
@@ -116,12 +126,34 @@ class Follower:
             if not np.isfinite(values).all():
                 raise FieldError(field, "NaN or infinity", "finite numbers")
         check_domain(y, self.limits)
-        forward = model.feedforward(y, v, a, self.memory)
-        u, flags = guard(forward.u_V, forward.inside, model.dt_s, self.limits, self._u_before_V)
-        if np.isfinite(forward.memory).all():
-            self.memory = forward.memory
-        self._u_before_V = float(u[-1])
-        return u, flags
+        got = self._safely((y, v, a))
+        return got.u_V, got.flags
+
+    @property
+    def stale(self) -> bool:
+        """Whether snapshots have stopped coming."""
+        stale_s = self._newest[0].safety.stale_s
+        return 0.0 < stale_s < self.age_s and self._expected
+
+    @property
+    def _expected(self) -> bool:
+        """Whether snapshots come: some did, after the first one was fetched."""
+        return self._subscriber is not None and self.received > 1
+
+    def _trust(self) -> float:
+        safety = self._newest[0].safety
+        if not self._expected:
+            return safety.trust
+        return safety.trust * trust_by_age(self.age_s, safety.stale_s, safety.last_good_s)[0]
+
+    def _safely(self, points: tuple[FloatArray, FloatArray, FloatArray]) -> Answer:
+        """What the service would answer; advances memory and the voltage from which the slew limit counts."""
+        message = self._newest[0]
+        safety = message.safety
+        rules = Rules(self.limits, safety.blend_share, self._trust(), self.stale)
+        got = answer_safely(message.model, self.memory, points, self._u_before_V, rules, safety.stand_in, safety.blends)
+        self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
+        return got
 
     def close(self) -> None:
         """Stop to follow; what was received last can still be evaluated."""

@@ -63,6 +63,8 @@ class Limits:
 
 def check_domain(y_um: FloatArray, limits: Limits) -> None:
     """InputError naming the first desired point, (n,) µm, that is not within the displacement limits."""
+    if y_um.size == 1 and limits.y_min_um <= y_um.item(0) <= limits.y_max_um:
+        return
     # The two ends decide for all; the search for which one it was is only made for the message.
     if y_um.min() >= limits.y_min_um and y_um.max() <= limits.y_max_um:
         return
@@ -84,12 +86,13 @@ def limit(
     u_max_V: float,
     step_V: float,
     flags: NDArray[np.uint8],
-) -> None:
-    """Make ``u_V`` (n,) safe in place and say in ``flags`` (n,) what was done.
+) -> int:
+    """Make ``u_V`` (n,) safe in place and say in ``flags`` (n,) what was done; returns all of their bits in one.
 
     In order: what is not finite becomes the voltage before it (mid-range where there is none), then the voltage limits,
     then at most ``step_V`` from one point to the next, beginning from ``u_before_V`` where that is finite.
     """
+    found = 0
     previous = u_before_V
     if math.isfinite(previous):
         previous = min(max(previous, u_min_V), u_max_V)
@@ -116,17 +119,26 @@ def limit(
                 bits |= LIMITED_SLEW
         u_V[i] = u
         flags[i] = bits
+        found |= bits
         previous = u
+    return found
 
 
 def guard(
     u_V: FloatArray, inside: BoolArray, dt_s: float, limits: Limits, u_before_V: float = math.nan
 ) -> tuple[FloatArray, NDArray[np.uint8]]:
     """(voltages, flags), both (n,), of what a model answered for points ``dt_s`` apart; the inputs are not changed."""
+    return guarded(u_V, inside, dt_s, limits, u_before_V)[:2]
+
+
+def guarded(
+    u_V: FloatArray, inside: BoolArray, dt_s: float, limits: Limits, u_before_V: float
+) -> tuple[FloatArray, NDArray[np.uint8], int]:
+    """As :func:`guard`, and all bits of the flags in one: 0 where nothing was done and nothing is outside."""
     safe = np.array(u_V, dtype=np.float64)
     flags = np.zeros(safe.size, dtype=np.uint8)
-    limit(safe, inside, u_before_V, limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * dt_s, flags)
-    return safe, flags
+    found = limit(safe, inside, u_before_V, limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * dt_s, flags)
+    return safe, flags, int(found)
 
 
 def warm() -> None:

@@ -9,12 +9,17 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from typing import Any, Final, Protocol, TypeVar
 
 from numpy.typing import ArrayLike
 
 from service.axis import Axis
+from service.errors import ServiceError
 from service.wire import SampleBatch
+
+T = TypeVar("T")
 
 #: Diagnostics are taken every so many seconds of samples, the points of the window every so many of those.
 DIAGNOSTICS_S: Final = 0.05
@@ -38,6 +43,30 @@ class SampleSink(Protocol):
         ...
 
 
+class SampleWatcher(Protocol):
+    """What watches an axis and finds out what has changed: the diagnosis in the background. Nothing here may block."""
+
+    def take(self, batch: SampleBatch) -> None:
+        """Samples that were handled; from the thread that handles them."""
+        ...
+
+    def tick(self, now_s: float) -> None:
+        """Start what is due; from the thread that publishes."""
+        ...
+
+    def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Begin to diagnose now; from any thread."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """For the status."""
+        ...
+
+    def close(self) -> None:
+        """End what runs."""
+        ...
+
+
 class Intake:
     """Queue and thread of one axis.
 
@@ -51,15 +80,22 @@ class Intake:
     def __init__(self, axis: Axis, changed: Callable[[], None], sink: SampleSink | None = None) -> None:
         self.axis = axis
         self.sink = sink
+        #: Sees every batch after it was handled, in this thread; None where nobody watches.
+        self.watcher: SampleWatcher | None = None
         self.dropped = 0
         self.malformed = 0
         self.waiting = 0
         #: Newest values of the learner's own, replaced whole; and whether anybody wants the diagnostics.
         self.counters: dict[str, int] = {}
+        #: Who is champion and how good each contestant is; None without a competition.
+        self.standing: dict[str, Any] | None = None
         self.diagnostics: dict[str, Any] = {}
         self.want_diagnostics = False
         self._changed = changed
-        self._queue: deque[SampleBatch] = deque()
+        #: Samples, and work that is to be done behind those that came before it.
+        self._queue: deque[SampleBatch | tuple[Callable[[], Any], Future[Any]]] = deque()
+        #: What of a batch is to be handled now, None for nothing: a standby keeps its samples back until it may.
+        self.gate: Callable[[SampleBatch], SampleBatch | None] | None = None
         self._ready = threading.Condition()
         self._closing = False
         self._next_diagnostics_s = 0.0
@@ -83,6 +119,27 @@ class Intake:
             self._ready.notify()
         return True
 
+    def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
+        """Do ``work`` in the thread that handles samples, after those that have come; what it returns or raises.
+
+        Not from that thread itself. Raises ServiceError where that thread has ended or is too far behind.
+        """
+        done: Future[T] = Future()
+        with self._ready:
+            if self._closing or not self._thread.is_alive():
+                raise ServiceError(f"axis {self.axis.config.name}: no samples are handled; the service begins or ends")
+            self._queue.append((work, done))
+            self._ready.notify()
+        try:
+            return done.result(timeout_s)
+        except FutureTimeout:
+            if done.done():  # what it raised, and not that it took too long
+                raise
+            done.cancel()
+            raise ServiceError(
+                f"axis {self.axis.config.name}: the learner did not get to it within {timeout_s:g} s"
+            ) from None
+
     def close(self) -> None:
         """Handle what is queued, then end the thread."""
         with self._ready:
@@ -98,16 +155,34 @@ class Intake:
                     self._ready.wait()
                 if not self._queue:
                     return
-                batch = self._queue.popleft()
-            before = self.axis.newest
-            verdicts = self.axis.handle(batch)
-            with self._ready:
-                self.waiting -= len(batch)
-            if self.sink is not None:
-                self.sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
-            if self.axis.newest is not before:
-                self._observe()
+                arrived = self._queue.popleft()
+            if isinstance(arrived, tuple):
+                _do(*arrived)
                 self._changed()
+                continue
+            try:
+                batch = arrived if self.gate is None else self.gate(arrived)
+                if batch is not None:
+                    self.handle(batch)
+            except Exception as error:
+                # The samples after it are as good as ever, and somebody waits for their snapshots.
+                self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
+            with self._ready:
+                self.waiting -= len(arrived)
+
+    def handle(self, batch: SampleBatch) -> None:
+        """Learn and record samples; in the thread that handles samples, or before it has started."""
+        before = self.axis.newest
+        verdicts = self.axis.handle(batch)
+        if self.sink is not None:
+            self.sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
+        if self.watcher is not None:
+            self.watcher.take(batch)
+        if self.axis.retuner is not None:
+            self.axis.retuner.step(self.axis)
+        if self.axis.newest is not before:
+            self._observe()
+            self._changed()
 
     def _observe(self) -> None:
         """Copy what the learner tells of itself, here, where nothing changes it meanwhile."""
@@ -117,12 +192,23 @@ class Intake:
             return
         self._next_diagnostics_s = t_s + DIAGNOSTICS_S
         self.counters = dict(learner.counters())
+        self.standing = getattr(learner, "standing", lambda: None)()
         diagnose = getattr(learner, "diagnostics", None)
-        if diagnose is None or not self.want_diagnostics:
+        ticks, self._ticks = self._ticks, self._ticks + 1
+        # Once a second for the status, even where nobody follows.
+        if diagnose is None or (not self.want_diagnostics and ticks % _WINDOW_EVERY):
             return
         told = dict(diagnose())
-        if self._ticks % _WINDOW_EVERY:
+        if ticks % _WINDOW_EVERY:
             for name in _WINDOW_FIELDS:
                 told.pop(name, None)
-        self._ticks += 1
         self.diagnostics = {"seq": self.axis.newest.seq, "t_s": t_s, **told}
+
+
+def _do(job: Callable[[], Any], done: Future[Any]) -> None:
+    if not done.set_running_or_notify_cancel():
+        return
+    try:
+        done.set_result(job())
+    except Exception as error:
+        done.set_exception(error)

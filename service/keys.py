@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Final
 
 from service.errors import FieldError
 
 ROOT = "dehyst/v1"
 #: One chunk of a key: lower case, digits, underscore and hyphen, beginning with a letter, at most 64 characters.
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}\Z")
+#: The name of the model that is always the best of those that learn.
+AUTO: Final = "auto"
 
 
 def check_name(field: str, name: object) -> str:
@@ -65,6 +68,11 @@ class Keys:
         return f"{self.base}/model"
 
     @property
+    def champion(self) -> str:
+        """Publication: the best of the models that learn, itself."""
+        return f"{self.base}/champion"
+
+    @property
     def status(self) -> str:
         """Query and publication, 1 Hz: JSON."""
         return f"{self.base}/status"
@@ -78,6 +86,29 @@ class Keys:
     def diagnostics(self) -> str:
         """Publication, 20 Hz while somebody listens: JSON, what the learner sees."""
         return f"{self.base}/diagnostics"
+
+    @property
+    def operate(self) -> str:
+        """Query: a verb of the operator, JSON in and out."""
+        return f"{self.base}/operate"
+
+    @property
+    def state(self) -> str:
+        """Query, of services only: a checkpoint of the serving instance as it is, for its standby."""
+        return f"{self.base}/state"
+
+    @property
+    def claim_any(self) -> str:
+        """Matches the claims of every instance that serves this axis or wants to."""
+        return f"{self.base}/claim/*/*"
+
+    def claim(self, epoch: int, instance: str) -> str:
+        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest one counts."""
+        return f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
+
+    def standby(self, instance: str) -> str:
+        """Liveliness, and publication 1 Hz: JSON, the status of an instance that stands by."""
+        return f"{self.base}/standby/{check_name('instance', instance)}"
 
     @property
     def alive_any(self) -> str:

@@ -13,6 +13,7 @@ from adaptive.errors import ModelFileError
 from adaptive.types import InverseModel, OnlineModel, Sample
 from service import guard
 from service.axis import Axis
+from service.competing import champion_of, compete
 from service.config import AxisConfig
 from service.errors import FieldError
 from service.guard import Limits
@@ -57,16 +58,24 @@ def load_axis(
             )
     models = dict(bundle.models)
     limits = _with_domain(config.limits, bundle.meta)
+    others = {name: models[name] for name in config.compete if name in models and name != config.learn}
+
+    def begin(model: InverseModel) -> OnlineModel:
+        return compete(
+            config.learn, model, lambda start: factory(start, config.learner, limits), others, config.competition
+        )
+
     learner = None
     if config.learn:
         if config.learn not in models:
             raise FieldError(
                 "learn", repr(config.learn), f'one of the models in {config.model}: {", ".join(models)}, or "" for none'
             )
-        learner = factory(models[config.learn], config.learner, limits)
+        learner = begin(models[config.learn])
         # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
-        _warm_learner(factory(models[config.learn], config.learner, limits), limits)
-    axis = Axis(config, models, learner, limits)
+        _warm_learner(begin(models[config.learn]), limits)
+        models |= champion_of(learner)
+    axis = Axis(config, models, learner, limits, begin)
     _warm_models(axis)
     return axis
 

@@ -1,9 +1,10 @@
 """Every sample onto disk, in a thread of its own, without ever holding up who hands it over.
 
 ``put`` only appends to a bounded queue; where the queue is full the samples are dropped and counted. The thread
-gathers them into batches, the batches into segments of bounded length, and removes the oldest segment when all of
-them together outgrow their share of the disk. A disk that fails (full, read-only, gone) degrades the recording and
-nothing else: samples are counted as lost, and a new segment is tried again after a while.
+appends them to a journal every few hundredths of a second, has a segment of bounded length made of each journal, and
+removes the oldest segment when all of them together outgrow their share of the disk. A disk that fails (full,
+read-only, gone) degrades the recording and nothing else: samples are counted as lost, and a new segment is tried
+again after a while.
 """
 
 from __future__ import annotations
@@ -11,46 +12,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from service.errors import FieldError
-from service.recorder_files import OPEN, OpenSegment, Rows, claim, make_room, next_number, salvage
+from service.journal import Journal, Rows
+from service.recorder_config import RecorderConfig
+from service.recorder_files import Closer, claim, journal_of, make_room, next_number
 
-
-@dataclass(frozen=True, slots=True)
-class RecorderConfig:
-    """How a recorder writes.
-
-    Attributes
-    ----------
-    directory : where the segments go; made if missing. One axis has one directory.
-    segment_rows : samples a segment holds before it is closed (600,000 are ten minutes at 1 kHz, some 15 MB).
-    max_bytes : all closed segments together, bytes; the oldest are removed beyond that.
-    queue_samples : samples that may wait for the disk.
-    flush_s : longest time that a sample waits in memory, s.
-    retry_s : pause after a failure of the disk, s.
-    """
-
-    directory: Path
-    segment_rows: int = 600_000
-    max_bytes: int = 2_000_000_000
-    queue_samples: int = 100_000
-    flush_s: float = 0.5
-    retry_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name, least in (("segment_rows", 1), ("max_bytes", 1), ("queue_samples", 1)):
-            value = getattr(self, name)
-            if value < least:
-                raise FieldError(name, value, f"a whole number of at least {least}")
-        for name in ("flush_s", "retry_s"):
-            if not getattr(self, name) > 0.0:
-                raise FieldError(name, getattr(self, name), "a positive time in s")
+__all__ = ["Recorder", "RecorderConfig"]
 
 
 class Recorder:
@@ -60,9 +31,11 @@ class Recorder:
     that cannot be made or written to shows in :meth:`counters` and is tried again.
     """
 
-    def __init__(self, config: RecorderConfig) -> None:
+    def __init__(self, config: RecorderConfig, index: int = 0) -> None:
         self.config = config
-        self._queue: deque[Rows] = deque()
+        #: Number of the next sample in the order in which the axis handles them.
+        self.index = index
+        self._queue: deque[tuple[int, Rows]] = deque()
         self._waiting = 0
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -70,10 +43,13 @@ class Recorder:
         self._counts = {"offered": 0, "written": 0, "dropped": 0, "lost": 0, "errors": 0, "segments": 0, "removed": 0}
         self._salvaged = 0
         self._error = ""
-        self._segment: OpenSegment | None = None
+        self._segment: Journal | None = None
         self._claim: IO[bytes] | None = None
-        self._ready = False
+        # Whether journals may lie there that are to be closed; whether one of them is this recorder's own.
+        self._left_open, self._own = True, False
+        self._closer: Closer | None = None
         self._not_before = 0.0
+        self._synced_at = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -94,10 +70,11 @@ class Recorder:
         rows = Rows(numbers, t, u, y, [reason] * len(numbers) if isinstance(reason, str) else list(reason))
         with self._lock:
             self._counts["offered"] += len(rows)
+            first, self.index = self.index, self.index + len(rows)
             if self._stop or self._waiting + len(rows) > self.config.queue_samples:
                 self._counts["dropped"] += len(rows)
                 return False
-            self._queue.append(rows)
+            self._queue.append((first, rows))
             self._waiting += len(rows)
         return True
 
@@ -123,35 +100,44 @@ class Recorder:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    def rebase(self, index: int) -> None:
+        """The next sample handed over is the ``index``-th that its axis handles: it has gone on from another state."""
+        with self._lock:
+            self.index = index
+
     def _run(self) -> None:
         while True:
             # Reading the flag before the queue: what was handed over before the stop is still written.
             stop = self._stop
-            rows = self._take()
-            if rows is not None:
-                self._write(rows)
+            taken = self._take()
+            if taken is not None:
+                self._write(*taken)
             elif stop:
                 break
+            self._look_after_closing()
             if not stop:
                 self._wake.wait(self.config.flush_s)
-        self._close_segment()
+        if self._segment is not None:
+            self._segment.close()
+        self._close_all()
         if self._claim is not None:
             self._claim.close()
 
-    def _take(self) -> Rows | None:
+    def _take(self) -> tuple[Rows, NDArray[np.int64]] | None:
         with self._lock:
             parts = list(self._queue)
             self._queue.clear()
             self._waiting = 0
         if not parts:
             return None
-        return Rows(
-            np.concatenate([p.seq for p in parts]),
-            np.concatenate([p.t_s for p in parts]),
-            np.concatenate([p.u_V for p in parts]),
-            np.concatenate([p.y_um for p in parts]),
-            [word for p in parts for word in p.reason],
+        rows = Rows(
+            np.concatenate([p.seq for _, p in parts]),
+            np.concatenate([p.t_s for _, p in parts]),
+            np.concatenate([p.u_V for _, p in parts]),
+            np.concatenate([p.y_um for _, p in parts]),
+            [word for _, p in parts for word in p.reason],
         )
+        return rows, np.concatenate([first + np.arange(len(p)) for first, p in parts])
 
     def _count(self, **more: int) -> None:
         with self._lock:
@@ -168,12 +154,9 @@ class Recorder:
         self.config.directory.mkdir(parents=True, exist_ok=True)
         if self._claim is None:
             self._claim = claim(self.config.directory)
-        if not self._ready:
-            self._salvaged = len(salvage(self.config.directory))
-            self._ready = True
         self._count(removed=make_room(self.config.directory, self.config.max_bytes))
 
-    def _write(self, rows: Rows) -> None:
+    def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
         # After a failure nothing is tried for a while, except at the end: a last chance costs nobody anything.
         if time.monotonic() < self._not_before and not self._stop:
             self._count(lost=len(rows))
@@ -184,17 +167,17 @@ class Recorder:
                 if self._segment is None:
                     self._prepare()
                     number = next_number(self.config.directory)
-                    self._segment = OpenSegment(self.config.directory / f"segment-{number:06d}{OPEN}")
+                    self._segment = Journal(journal_of(self.config.directory, number))
                 stop = min(len(rows), done + self.config.segment_rows - self._segment.rows)
-                part = Rows(
-                    rows.seq[done:stop], rows.t_s[done:stop], rows.u_V[done:stop], rows.y_um[done:stop],
-                    rows.reason[done:stop],
-                )  # fmt: skip
-                self._segment.write(part)
-                self._count(written=len(part))
+                self._segment.write(rows.part(done, stop), index[done:stop])
+                self._count(written=stop - done)
                 done = stop
                 if self._segment.rows >= self.config.segment_rows:
-                    self._close_segment()
+                    self._segment.close()
+                    self._segment, self._left_open, self._own = None, True, True
+            if self._segment is not None and time.monotonic() - self._synced_at >= self.config.sync_s:
+                self._synced_at = time.monotonic()
+                self._segment.sync()
             if time.monotonic() >= self._not_before:
                 with self._lock:
                     self._error = ""
@@ -202,19 +185,44 @@ class Recorder:
             self._failed(error)
             self._count(lost=len(rows) - done)
             if self._segment is not None:
-                # What this segment already holds is made into Parquet at the next try.
-                self._segment.abandon()
-                self._segment, self._ready = None, False
+                # What this journal already holds is made into Parquet later.
+                self._segment.close()
+                self._segment, self._left_open = None, True
 
-    def _close_segment(self) -> None:
-        segment, self._segment = self._segment, None
-        if segment is None:
-            return
+    def _look_after_closing(self) -> None:
+        """Have segments made of the journals that are full, or that a crash or a failing disk left behind."""
+        closer = self._closer
+        if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
+            self._left_open = False
+            try:
+                self._closer = Closer(self.config.directory, self._segment.path)
+            except OSError as error:
+                self._left_open = True
+                self._failed(error)
+        elif closer is not None and not closer.running:
+            self._closer = None
+            self._take_result(closer)
+
+    def _take_result(self, closer: Closer) -> None:
         try:
-            made = segment.close()
-            self._count(segments=int(made is not None))
+            made = closer.result()
+            if self._own:
+                self._count(segments=made)
+            else:
+                self._salvaged += made
             self._count(removed=make_room(self.config.directory, self.config.max_bytes))
         except OSError as error:
-            segment.abandon()
-            self._ready = False
+            self._left_open = True
+            self._failed(error)
+
+    def _close_all(self) -> None:
+        """At the end: wait for what is being closed, then close the rest."""
+        if self._closer is not None:
+            self._take_result(self._closer)
+        if self._claim is None:
+            return
+        self._own = self._own or self._segment is not None
+        try:
+            self._take_result(Closer(self.config.directory, None))
+        except OSError as error:
             self._failed(error)

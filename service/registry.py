@@ -15,6 +15,7 @@ KINDS: dict[str, str] = {
     "linear": "baselines.linear:LinearInverse",
     "bouc_wen": "baselines.bouc_wen_inverse:BoucWenInverse",
     "mpi": "baselines.mpi_inverse:MpiInverse",
+    "champion": "baselines.champion:ChampionInverse",
 }
 
 
@@ -45,7 +46,7 @@ def build(kind: str, state: StateDict, where: str) -> InverseModel:
         model = from_state(state)
     except (ImportError, AttributeError) as error:
         raise ModelFileError(f"{where}: kind {kind!r} cannot be loaded: {error}") from error
-    except (KeyError, ValueError, TypeError) as error:
+    except (LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ModelFileError(f"{where}: the stored state is not that of a {kind!r} model: {error!r}") from error
     if not isinstance(model, InverseModel):
         raise ModelFileError(f"{where}: {KINDS[kind]} does not build an inverse model")

@@ -10,22 +10,35 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import FrameType
 from typing import Any, Final
 
 import zenoh
 from threadpoolctl import threadpool_limits
 
-from service.axis_server import AxisServer
+from service.axis import Axis
+from service.axis_server import PRIMARY, STANDBY, AxisServer
 from service.config import AxisConfig, ServeConfig
-from service.intake import SampleSink
+from service.errors import FieldError, SessionError
+from service.intake import SampleSink, SampleWatcher
+from service.keeper import learn_again, restore_newest
 from service.keys import Keys
 from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
+from service.standby.estate import Estate, of_standby
+from service.standby.succession import Succession
 
 #: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
 #: would be the latency of a query that meets the learner.
 _SWITCH_S: Final = 1e-4
+#: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, and any other
+#: that is connected to something; and how much longer it may take until that is settled.
+STANDBY_PATIENCE_S: Final = 3.0
+PATIENCE_S: Final = 0.3
+SETTLE_S: Final = 20.0
+#: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
+SYNC_S: Final = 30.0
 #: The publishing thread looks at least this often, s.
 _TICK_S: Final = 0.02
 
@@ -36,7 +49,42 @@ def make_recorder(config: AxisConfig) -> SampleSink | None:
         return None
     from service.recorder import Recorder, RecorderConfig
 
-    return Recorder(RecorderConfig(config.recorder))
+    return Recorder(RecorderConfig(config.recorder, max_bytes=config.recorder_bytes))
+
+
+def make_watcher(axis: Axis) -> SampleWatcher | None:
+    """What finds out in the background what has changed, or None where the configuration switches it off."""
+    if not axis.config.diagnosis.enabled:
+        return None
+    from service.diagnosing.watcher import Watcher
+
+    return Watcher(axis, axis.config.diagnosis)
+
+
+def as_standby(config: ServeConfig) -> ServeConfig:
+    """``config`` for the instance that stands by: other ears, other folders. Raises InputError where it has no ears."""
+    if config.listen and not config.standby_listen:
+        raise FieldError(
+            "standby_listen",
+            "nothing",
+            "an endpoint of the standby's own",
+            "clients look for it there; or use a router",
+        )
+    axes = tuple(
+        replace(axis, recorder=of_standby(axis.recorder), checkpoints=of_standby(axis.checkpoints))
+        for axis in config.axes
+    )
+    return replace(config, axes=axes, listen=config.standby_listen, connect=(*config.connect, *config.listen))
+
+
+def _restore(server: AxisServer) -> None:
+    """Go on from the newest checkpoint, and learn again what the journal holds behind it."""
+    axis, folder, sink = server.axis, server.keeper.folder, server.intake.sink
+    if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
+        learn_again(axis, axis.config.recorder)
+    rebase = getattr(sink, "rebase", None)
+    if rebase is not None:
+        rebase(axis.sequence.received)
 
 
 class Service:
@@ -47,6 +95,8 @@ class Service:
     config : what to serve.
     factory : makes what learns.
     sinks : makes the recorder of an axis, or None.
+    standby : look longer for another that serves before serving; listen at ``standby_listen``, keep files apart.
+    stopped : ends the wait for the state of the one that serves.
     """
 
     def __init__(
@@ -54,10 +104,22 @@ class Service:
         config: ServeConfig,
         factory: LearnerFactory = make_learner,
         sinks: Callable[[AxisConfig], SampleSink | None] = make_recorder,
+        standby: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.config = config
+        self.config = as_standby(config) if standby else config
+        # Where the other one of the two keeps its files.
+        self._estates = [
+            Estate(axis.checkpoints, axis.recorder)
+            if standby
+            else Estate(of_standby(axis.checkpoints), of_standby(axis.recorder))
+            for axis in config.axes
+        ]
+        self.standby = standby
+        self._stopped = stopped
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self.axes: list[AxisServer] = []
+        self._successions: list[Succession] = []
         self._factory = factory
         self._sinks = sinks
         self._session: zenoh.Session | None = None
@@ -73,13 +135,19 @@ class Service:
         self.close()
 
     def start(self) -> None:
-        """Load the models, open the session, declare. Raises ModelFileError, InputError, SessionError."""
+        """Load the models, open the session, declare; a standby waits until it holds the model of the one that serves.
+
+        Raises ModelFileError, InputError, SessionError.
+        """
         config = self.config
         # Everything that can be refused is looked at before anything can be seen on the wire.
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
-        self._session = open_service(config.listen, config.connect, config.zenoh_config)
+        # The one that stands by and the one that serves each connect to where the other listens.
+        connect = config.connect if self.standby else (*config.connect, *config.standby_listen)
+        self._session = open_service(config.listen, connect, config.zenoh_config, config.lease_s)
+        patience_s = STANDBY_PATIENCE_S if self.standby else PATIENCE_S if connect else 0.0
         try:
-            for axis in loaded:
+            for axis, estate in zip(loaded, self._estates, strict=True):
                 server = AxisServer(
                     self._session,
                     Keys(config.stage, axis.config.name),
@@ -87,10 +155,22 @@ class Service:
                     self.instance,
                     self._wake.set,
                     self._sinks(axis.config),
+                    make_watcher(axis),
                 )
                 self.axes.append(server)
-                server.declare()
+                _restore(server)
+                succession = Succession(self._session, server, patience_s, estate)
+                self._successions.append(succession)
+                server.listen()
+                succession.start()
+            for succession in self._successions:
+                if not succession.settled.wait(patience_s + SETTLE_S):
+                    raise SessionError(f"axis {succession.server.keys.axis}: it could not be declared; see its events")
             self._publisher.start()
+            until = time.monotonic() + SYNC_S
+            for succession in self._successions:
+                while not succession.ready.wait(0.1) and time.monotonic() < until and not self._stopped():
+                    pass
         except BaseException:
             self.close()
             raise
@@ -101,6 +181,9 @@ class Service:
         self._wake.set()
         if self._publisher.is_alive():
             self._publisher.join()
+        for succession in self._successions:
+            succession.close()
+        self._successions = []
         for axis in self.axes:
             axis.undeclare()
             if axis.intake.sink is not None:
@@ -115,6 +198,8 @@ class Service:
         return {
             "ready": True,
             "instance": self.instance,
+            "role": PRIMARY if any(axis.role == PRIMARY for axis in self.axes) else STANDBY,
+            "synced": all(axis.synced for axis in self.axes),
             "listen": list(self.config.listen),
             "connect": list(self.config.connect),
             "stage": self.config.stage,

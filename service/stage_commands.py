@@ -18,17 +18,19 @@ class CommandBuffer:
     """Voltages by sequence number, written by the wire's thread and taken by the loop.
 
     A ring of values and of the numbers they belong to: a slot whose number is not the one asked for holds nothing
-    for it. The value is written before its number, so that a reader of both never sees half a command.
+    for it. The value is written before its number, so that a reader of both never sees half a command. ``begin`` is
+    the first tick of all, whose command sets ``first``.
     """
 
-    def __init__(self, size: int = AHEAD) -> None:
+    def __init__(self, size: int = AHEAD, begin: int = 0) -> None:
         self.size = size
+        self.begin = begin
         self.counts = {"blocks": 0, "voltages": 0, "late": 0, "missing": 0, "refused": 0}
         self.first = threading.Event()
         self.error = ""
         self._values = np.zeros(size)
         self._numbers = np.full(size, -1, dtype=np.int64)
-        self._next = 0
+        self._next = begin
         self._last_V = 0.0
 
     def receive(self, payload: bytes) -> None:
@@ -52,7 +54,7 @@ class CommandBuffer:
         slots = numbers[fresh] % self.size
         self._values[slots] = block.values[fresh]
         self._numbers[slots] = numbers[fresh]
-        if block.seq == 0:
+        if block.seq == self.begin:
             self.first.set()
 
     def take(self, k: int) -> float:

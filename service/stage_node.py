@@ -17,95 +17,42 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import zenoh
 
 from service import wire
-from service.errors import FieldError
-from service.keys import Keys
-from service.stage_commands import CommandBuffer
-from service.stage_sender import SampleRing, Sender
-from sim.stage import Stage, StageConfig
+from service.stage_port import NodeConfig, Port, status_key
+from service.stage_sender import Sender
+from service.wire import MAX_SEQ
+from sim.stage import Stage
 
 STATUS_S = 1.0
 
-
-def status_key(stage: str, axis: str) -> str:
-    """Where a stage node says how it is, 1 Hz: JSON. Apart from ``.../status``, which is the service's."""
-    return f"{Keys(stage, axis).base}/stage_status"
-
-
-@dataclass(frozen=True, slots=True)
-class NodeConfig:
-    """What a stage node does.
-
-    Attributes
-    ----------
-    stage : the simulated stage, its changes included. name : of the stage on the wire.
-    units : axis names on the wire, one twin each.
-    batch : samples per message; more where the wire is slow.
-    ticks : how long, in ticks; None: until stopped.
-    free_run : start at once instead of with the first commands.
-    """
-
-    stage: StageConfig
-    name: str
-    units: tuple[str, ...]
-    batch: int = 1
-    ticks: int | None = None
-    free_run: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.units or len(set(self.units)) < len(self.units):
-            raise FieldError("units", ", ".join(self.units) or "none", "one or more different axis names")
-        for unit in self.units:
-            Keys(self.name, unit)
-        if not 1 <= self.batch <= 10_000:
-            raise FieldError("batch", self.batch, "1 to 10000 samples a message")
-        if self.ticks is not None and self.ticks < 1:
-            raise FieldError("ticks", self.ticks, "at least 1")
+__all__ = ["NodeConfig", "StageNode", "status_key"]
 
 
 class _Unit:
-    """One twin: its state, its commands, its samples on their way, its publishers."""
+    """One stage: its state, and a port for each axis that is driven."""
 
-    def __init__(self, config: NodeConfig, stage: Stage, axis: str, session: zenoh.Session) -> None:
-        keys = Keys(config.name, axis)
-        self.axis = axis
+    def __init__(self, config: NodeConfig, stage: Stage, axis: str, second: str, session: zenoh.Session) -> None:
         self.stage = stage
         self.state = stage.initial_state()
-        self.limits = (config.stage.u_min_V, config.stage.u_max_V)
-        self.commands = CommandBuffer()
-        # Samples must not be lost: a full channel holds the sender up, not the loop, and drops nothing.
-        block = zenoh.CongestionControl.BLOCK
-        self.publisher = session.declare_publisher(keys.sample, congestion_control=block, express=True)
-        self.ring = SampleRing(config.stage.dt_s, self.publisher.put)
-        self.status = session.declare_publisher(status_key(config.name, axis))
-        self.subscriber = session.declare_subscriber(keys.command, self._received)
+        self.ports = [Port(config, name, session, self._change) for name in (axis, second) if name]
 
-    def _received(self, sample: zenoh.Sample) -> None:
-        self.commands.receive(sample.payload.to_bytes())
+    def _change(self, values: dict[str, float]) -> None:
+        self.state = self.stage.with_changes(self.state, values)
 
     def step(self, k: int) -> None:
         """Read, then apply: the sample's voltage is the one that the stage really gets."""
-        low, high = self.limits
-        u_V = min(max(self.commands.take(k), low), high)
-        self.ring.write(k, u_V, self.stage.step(self.state, u_V)[0])
-
-    def summary(self) -> dict[str, Any]:
-        return {
-            "published": self.ring.published,
-            "lost": self.ring.lost,
-            "commands": dict(self.commands.counts),
-            "error": self.commands.error,
-        }
-
-    def close(self) -> None:
-        self.subscriber.undeclare()  # type: ignore[no-untyped-call]
-        self.publisher.undeclare()  # type: ignore[no-untyped-call]
-        self.status.undeclare()  # type: ignore[no-untyped-call]
+        if len(self.ports) == 1:
+            port = self.ports[0]
+            u_V = port.take(k)
+            port.write(k, u_V, self.stage.step(self.state, u_V)[0])
+            return
+        u_V, u2_V = (port.take(k) for port in self.ports)
+        for port, applied, y_um in zip(self.ports, (u_V, u2_V), self.stage.step(self.state, u_V, u2_V), strict=True):
+            port.write(k, applied, y_um)
 
 
 class StageNode:
@@ -115,9 +62,15 @@ class StageNode:
         self.config = config
         self._stop = threading.Event()
         stage = Stage(config.stage)
-        self._units = [_Unit(config, stage, axis, session) for axis in config.units]
-        self._sender = Sender([unit.ring for unit in self._units], self._publish_status)
-        self._counts: dict[str, Any] = {"state": "waiting", "tick": 0, "late": 0, "worst_late_ms": 0.0}
+        self._units = [
+            _Unit(config, stage, axis, config.second if axis == config.units[0] else "", session)
+            for axis in config.units
+        ]
+        self._ports = [port for unit in self._units for port in unit.ports]
+        self._sender = Sender([port.ring for port in self._ports], self._publish_status)
+        self._counts: dict[str, Any] = {
+            "state": "waiting", "first": config.first, "tick": config.first, "late": 0, "worst_late_ms": 0.0
+        }  # fmt: skip
 
     def stop(self) -> None:
         """End the run at the next tick; from any thread or signal handler."""
@@ -125,7 +78,7 @@ class StageNode:
 
     def summary(self) -> dict[str, Any]:
         """What happened so far: ticks, late ones, and per unit samples published and commands counted."""
-        units = {unit.axis: unit.summary() for unit in self._units}
+        units = {port.axis: port.summary() for port in self._ports}
         return {
             "stage": self.config.name,
             "dt_s": self.config.stage.dt_s,
@@ -148,8 +101,8 @@ class StageNode:
             self._counts["state"] = "stopped"
             self._sender.wake(status=True)
             self._sender.close()
-            for unit in self._units:
-                unit.close()
+            for port in self._ports:
+                port.close()
         return self.summary()
 
     def _warm(self) -> None:
@@ -166,27 +119,28 @@ class StageNode:
 
     def _wait_for_commands(self) -> bool:
         said = -math.inf
-        while not all(unit.commands.first.is_set() for unit in self._units):
+        while not all(port.commands.first.is_set() for port in self._ports):
             if self._stop.is_set():
                 return False
             if time.monotonic() - said >= STATUS_S:
                 said = time.monotonic()
                 self._sender.wake(status=True)
-            missing = next((u for u in self._units if not u.commands.first.is_set()), None)
+            missing = next((p for p in self._ports if not p.commands.first.is_set()), None)
             if missing is not None:
                 missing.commands.first.wait(0.02)
         return True
 
     def _loop(self) -> None:
         dt_s, batch, units = self.config.stage.dt_s, self.config.batch, self._units
-        ticks = self.config.ticks if self.config.ticks is not None else 2**62
+        first = self.config.first
+        stop = first + self.config.ticks if self.config.ticks is not None else MAX_SEQ
         status_ticks = max(1, round(STATUS_S / dt_s))
-        k = late = 0
+        k, late = first, 0
         worst_s = 0.0
         now, stopped, wake = time.perf_counter, self._stop.is_set, self._sender.wake
         start = now()
-        while k < ticks and not stopped():
-            due = start + k * dt_s
+        while k < stop and not stopped():
+            due = start + (k - first) * dt_s
             rest = due - now()
             if rest > 0.0:
                 time.sleep(rest)
@@ -206,7 +160,7 @@ class StageNode:
 
     def _publish_status(self) -> None:
         common = {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
-        for unit in self._units:
+        for port in self._ports:
             # A status that does not get through is followed by another.
             with contextlib.suppress(zenoh.ZError):
-                unit.status.put(json.dumps({**common, "axis": unit.axis, **unit.summary()}))
+                port.status.put(json.dumps({**common, "axis": port.axis, **port.summary()}))

@@ -12,9 +12,11 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
 from service import wire
+from service.stage_faults import Injector
 
 #: Samples that may wait for the wire: half a minute at 1 kHz.
 RING: Final = 32_768
@@ -23,20 +25,27 @@ MOST: Final = 4096
 
 
 class SampleRing:
-    """Samples by number, written by one thread and sent by another."""
+    """Samples by number, written by one thread and sent by another.
 
-    def __init__(self, dt_s: float, put: Callable[[bytes], None]) -> None:
+    ``injector`` may change what leaves; what it leaves out counts neither as published nor as lost,
+    what it sends twice counts twice as published.
+    """
+
+    def __init__(
+        self, dt_s: float, put: Callable[[bytes], None], injector: Injector | None = None, begin: int = 0
+    ) -> None:
         self.dt_s = dt_s
         self.published = 0
         self.lost = 0
+        self._injector = injector
         self._put = put
         self._u_V: FloatArray = np.zeros(RING)
         self._y_um: FloatArray = np.zeros(RING)
-        self._written = 0
-        self._sent = 0
+        self._written = begin
+        self._sent = begin
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
-        """Take sample k; samples come in order, without gaps, from 0 on."""
+        """Take sample k; samples come in order, without gaps, from ``begin`` on."""
         slot = k % RING
         self._u_V[slot] = u_V
         self._y_um[slot] = y_um
@@ -52,15 +61,24 @@ class SampleRing:
         n = min(end - self._sent, MOST)
         if n <= 0:
             return False
-        seq = np.arange(self._sent, self._sent + n)
+        seq = np.arange(self._sent, self._sent + n, dtype=np.int64)
         slots = seq % RING
-        payload = wire.encode_samples(seq, seq * self.dt_s, self._u_V[slots], self._y_um[slots])
+        rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
         self._sent += n
-        if self._put_quietly(payload):
-            self.published += n
-        else:
-            self.lost += n
+        for message in [rows] if self._injector is None else self._injector.deliver(rows):
+            self._send(*message)
         return self._sent < end
+
+    def finish(self) -> None:
+        """Send what a fault still holds back."""
+        for message in [] if self._injector is None else self._injector.flush():
+            self._send(*message)
+
+    def _send(self, seq: NDArray[np.int64], t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
+        if self._put_quietly(wire.encode_samples(seq, t_s, u_V, y_um)):
+            self.published += len(seq)
+        else:
+            self.lost += len(seq)
 
     def _put_quietly(self, payload: bytes) -> bool:
         import zenoh
@@ -109,4 +127,6 @@ class Sender:
                 self._status_due = False
                 self._status()
             if closing:
+                for ring in self._rings:
+                    ring.finish()
                 return

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+import psutil
+
+from service.access.refusals import refusal_counters
 from service.axis import Axis
 from service.intake import Intake
 from service.keys import Keys
@@ -12,6 +15,11 @@ from service.registry import kind_of
 from service.wire import VERSION
 
 SCHEMA: Final = 1
+#: What of the learner's diagnostics a status repeats, once a second.
+_QUALITY: Final = (
+    "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
+)  # fmt: skip
+_PROCESS: Final = psutil.Process()
 
 
 def axis_status(
@@ -26,7 +34,7 @@ def axis_status(
         "axis": keys.axis,
         "instance": instance,
         "dt_s": axis.dt_s,
-        "served": axis.config.served,
+        "served": axis.served,
         "learning": axis.config.learn if axis.learning else None,
         "models": {
             name: {"kind": kind_of(model), "memory_size": model.memory_size} for name, model in served.models.items()
@@ -46,6 +54,12 @@ def axis_status(
             "gates": axis.gates,
         },
         "learner": intake.counters,
+        "quality": {name: intake.diagnostics[name] for name in _QUALITY if name in intake.diagnostics},
+        "competition": intake.standing,
+        "retuning": None if axis.retuner is None else axis.retuner.status(),
         "recorder": None if intake.sink is None else intake.sink.counters(),
         "queries": latency.summary(),
+        "diagnosis": None if intake.watcher is None else intake.watcher.status(),
+        "refused": refusal_counters(),
+        "memory_bytes": _PROCESS.memory_info().rss,
     }

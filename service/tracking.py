@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,17 @@ class MemoryTracker:
         self._seq = -1
         self._y = math.nan
         self._v = math.nan
+
+    def state_dict(self) -> dict[str, float | FloatArray]:
+        """All of it: numbers, and (n, 4) rows that wait."""
+        rows = np.array(self._rows, dtype=np.float64).reshape(-1, 4)
+        return {"rows": rows, "begun": float(self._begun), "seq": self._seq, "y": self._y, "v": self._v}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from ``state_dict``. Raises KeyError or ValueError, before anything changes, where it is damaged."""
+        rows = [(y, v, a, u) for y, v, a, u in np.asarray(state["rows"], dtype=np.float64).reshape(-1, 4).tolist()]
+        begun, seq, y, v = bool(state["begun"]), int(state["seq"]), float(state["y"]), float(state["v"])
+        self._rows, self._begun, self._seq, self._y, self._v = rows, begun, seq, y, v
 
     def add(self, seq: int, u_V: float, y_um: float) -> None:
         """One sample in order: voltage in V, displacement in µm."""

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptive.finite import all_finite
 from adaptive.types import FloatArray
 from service.errors import FieldError
 
@@ -92,9 +93,8 @@ def check_length(data: bytes, expected: int) -> None:
 
 def check_finite(field: str, values: FloatArray) -> None:
     """InputError naming the first element of ``values`` that is not finite."""
-    finite = np.isfinite(values)
-    if not finite.all():
-        bad = int(np.argmin(finite))
+    if not all_finite(values):
+        bad = int(np.argmin(np.isfinite(values)))
         raise FieldError(f"{field}[{bad}]", float(values[bad]), "a finite number")
 
 

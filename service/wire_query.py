@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptive.finite import all_finite
 from adaptive.types import FloatArray
 from service.errors import FieldError
 from service.wire import (
@@ -27,21 +28,29 @@ from service.wire import (
 HAS_ACCELERATION: Final = 1
 HAS_MEMORY: Final = 2
 #: Reply options: the learner has not yet handled all that ``as_of`` needs, so this answer may differ from a repeated
-#: one; the query brought no memory, so the service's own was used; another model than the one asked for answered.
+#: one; the query brought no memory, so the service's own was used; another model than the one asked for answered in
+#: part or whole because something went wrong; the name of the model that stood in follows that of the one asked.
 BEHIND: Final = 1
 TRACKED_MEMORY: Final = 2
 FALLBACK: Final = 4
+HAS_STAND_IN: Final = 8
 
 #: What was done to a voltage, one bit each, as documented in docs/protocol.md.
 LIMITED_VOLTAGE: Final = 1
 LIMITED_SLEW: Final = 2
 OUTSIDE_DOMAIN: Final = 4
 NOT_FINITE_REPLACED: Final = 8
+BLENDED: Final = 16
+STAND_IN: Final = 32
+STALE: Final = 64
 FLAG_NAMES: Final = {
     LIMITED_VOLTAGE: "limited_voltage",
     LIMITED_SLEW: "limited_slew",
     OUTSIDE_DOMAIN: "outside_domain",
     NOT_FINITE_REPLACED: "not_finite_replaced",
+    BLENDED: "blended",
+    STAND_IN: "stand_in",
+    STALE: "stale",
 }
 
 MAX_MEMORY: Final = 4096
@@ -53,6 +62,8 @@ _LEAST_SEQ: Final = -1
 
 # version, kind, options, n, as_of, u_before_V, m, bytes of the name
 _QUERY: Final = struct.Struct("<BBHIqdII")
+# y, v, a of a query for one point
+_ONE_POINT: Final = struct.Struct("<3d")
 # version, kind, options, n, snapshot_seq, m, bytes of the name
 _REPLY: Final = struct.Struct("<BBHIqII")
 
@@ -87,10 +98,12 @@ class FeedforwardReply:
     ----------
     u_V : (n,) finite and within the limits, V.
     std_V : (n,) one standard deviation, V; NaN where the model has no notion of it.
-    flags : (n,) bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED.
+    flags : (n,) bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE.
     memory : (m,) after the last point, for the next query.
     snapshot_seq : the last sample that the answering snapshot had seen, -1 before any.
-    model : name of the model that answered.
+    model : name of the model that was asked.
+    stand_in : name of the model that answered where the flags say NOT_FINITE_REPLACED or STAND_IN, and with a share
+    where they say BLENDED; empty where no point is of it.
     behind, tracked_memory, fallback : the reply's options, see the module's constants.
     """
 
@@ -103,6 +116,7 @@ class FeedforwardReply:
     behind: bool = False
     tracked_memory: bool = False
     fallback: bool = False
+    stand_in: str = ""
 
 
 def flag_names(bits: int) -> list[str]:
@@ -120,23 +134,28 @@ def encode_query(
     u_before_V: float = float("nan"),
 ) -> bytes:
     """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError naming what does not fit."""
-    y = column("y_um", y_um)
-    parts = [y]
-    options = 0
+    options, m, n = 0, 0, 1
+    parts = []
     if memory is not None:
-        vector = np.ascontiguousarray(memory, dtype=np.float64).reshape(-1)
-        options |= HAS_MEMORY
-        parts.insert(0, vector)
-    m = parts[0].size if options else 0
-    parts.append(_same_length("v_um_per_s", v_um_per_s, y.size))
-    if a_um_per_s2 is not None:
-        parts.append(_same_length("a_um_per_s2", a_um_per_s2, y.size))
+        vector = np.ascontiguousarray(memory, dtype="<f8")
+        options, m = HAS_MEMORY, vector.size
+        parts.append(vector.tobytes())
+    if type(y_um) is float and type(v_um_per_s) is float and type(a_um_per_s2) is float:
         options |= HAS_ACCELERATION
+        parts.append(_ONE_POINT.pack(y_um, v_um_per_s, a_um_per_s2))
+    else:
+        y = column("y_um", y_um)
+        n = y.size
+        columns = [y, _same_length("v_um_per_s", v_um_per_s, n)]
+        if a_um_per_s2 is not None:
+            columns.append(_same_length("a_um_per_s2", a_um_per_s2, n))
+            options |= HAS_ACCELERATION
+        parts += [values.astype("<f8", copy=False).tobytes() for values in columns]
     name = model.encode()
     if len(name) > MAX_NAME_BYTES:
         raise FieldError("model", f"{len(name)} bytes", f"a name of at most {MAX_NAME_BYTES} bytes")
-    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, y.size, as_of, u_before_V, m, len(name))
-    return b"".join((head, *(part.astype("<f8", copy=False).tobytes() for part in parts), name))
+    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, u_before_V, m, len(name))
+    return b"".join((head, *parts, name))
 
 
 def decode_query(data: bytes) -> FeedforwardQuery:
@@ -156,7 +175,7 @@ def decode_query(data: bytes) -> FeedforwardQuery:
     values = doubles(data, _QUERY.size, m + columns * n)
     memory, y, v = values[:m], values[m : m + n], values[m + n : m + 2 * n]
     a = values[m + 2 * n :] if columns == 3 else np.zeros(n)
-    if not np.isfinite(values).all():
+    if not all_finite(values):
         for name, part in (("memory", memory), ("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
             check_finite(name, part)
     return FeedforwardQuery(
@@ -168,6 +187,9 @@ def encode_reply(reply: FeedforwardReply) -> bytes:
     """Payload of a reply."""
     options = BEHIND * reply.behind | TRACKED_MEMORY * reply.tracked_memory | FALLBACK * reply.fallback
     name = reply.model.encode()
+    if reply.stand_in:
+        options |= HAS_STAND_IN
+        name += b"/" + reply.stand_in.encode()
     n, m = reply.u_V.size, reply.memory.size
     return b"".join(
         (
@@ -183,9 +205,9 @@ def encode_reply(reply: FeedforwardReply) -> bytes:
 
 def decode_reply(data: bytes) -> FeedforwardReply:
     """The reply in a payload. Raises InputError where it is malformed or a voltage is not finite."""
-    options, n = check_header(data, FEEDFORWARD_REPLY, _REPLY.size, BEHIND | TRACKED_MEMORY | FALLBACK)
+    options, n = check_header(data, FEEDFORWARD_REPLY, _REPLY.size, BEHIND | TRACKED_MEMORY | FALLBACK | HAS_STAND_IN)
     *_, snapshot_seq, m, name_bytes = _REPLY.unpack_from(data)
-    _check_sizes(m, name_bytes)
+    _check_sizes(m, name_bytes // 2)
     if snapshot_seq < _LEAST_SEQ:
         raise FieldError("snapshot_seq", snapshot_seq, "-1 or more")
     end = _REPLY.size + 8 * (2 * n + m)
@@ -195,16 +217,20 @@ def decode_reply(data: bytes) -> FeedforwardReply:
     check_finite("u_V", u)
     check_finite("memory", memory)
     flags = np.frombuffer(data, dtype=np.uint8, count=n, offset=end)
+    name, stand_in = _name(data[end + n :]), ""
+    if options & HAS_STAND_IN:
+        name, _, stand_in = name.partition("/")
     return FeedforwardReply(
         u,
         std,
         flags,
         memory,
         snapshot_seq,
-        _name(data[end + n :]),
+        name,
         bool(options & BEHIND),
         bool(options & TRACKED_MEMORY),
         bool(options & FALLBACK),
+        stand_in,
     )
 
 

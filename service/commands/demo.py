@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--real-time", action="store_true", help="processes over zenoh at 1 kHz (default)")
     how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
     add("--duration", type=float, default=60.0, metavar="S", help="length of the run after identification, s (60)")
+    add(
+        "--stage", type=Path, metavar="STAGE.toml", help="a stage file in place of the usual stage, e.g. of a diagnosis"
+    )
     add("--seed", type=int, default=20, metavar="N", help="of the stage's noise and of the reference (20)")
     add("--view", action="store_true", help="also spawn the Rerun viewer and watch live (needs a display)")
     add("--connect", metavar="URL", help="also stream to a viewer that runs already, rerun+http://HOST:PORT/proxy")
@@ -52,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
-    done = session.run(args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=_say)
+    done = session.run(
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=_say, stage=args.stage
+    )
     if args.json:
         print(json.dumps(done.summary))
     else:

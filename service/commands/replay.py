@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from service.models import load_axis
     from service.replay import AGE_S, Replayed, replay, summary
     from service.replay_axis import axis_config
+    from service.retuning.adoption import read as read_adoptions
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
@@ -81,6 +82,12 @@ def run(args: argparse.Namespace) -> int:
     axis = load_axis("replay", config, bundle=replace(bundle, meta=replace(bundle.meta, stage="", axis="")))
     recording = load(args.data, args, args.range)
     say(describe(recording, []))
+    if args.data.is_dir():
+        # What was tuned in the background while this was recorded takes effect at the same samples.
+        adopted = read_adoptions(args.data)
+        axis.adoptions.add(*adopted)
+        if adopted:
+            say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -106,6 +113,7 @@ def run(args: argparse.Namespace) -> int:
         "settings": found.settings,
         "duration_s": recording.duration_s,
         "seconds": round(seconds, 3),
+        "competition": getattr(axis.learner, "standing", lambda: None)(),
         **summary(done, span_V),
     }
     (args.out / "replay.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")

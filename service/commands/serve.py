@@ -8,6 +8,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from service.access.check import has_access_control
+from service.access.refusals import count_refusals
 from service.config import EXAMPLE, ServeConfig, read_config
 from service.errors import FieldError
 from service.session import check_endpoint, is_loopback
@@ -19,6 +21,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--config", type=Path, metavar="FILE", help="TOML file: stage, axes, model files, limits in V, V/s and µm")
     add("--example", action="store_true", help="print a configuration with comments, and end")
     add("--listen", action="append", metavar="ENDPOINT", help="listen here instead, on this machine only; repeatable")
+    add(
+        "--insecure-beyond-loopback",
+        action="store_true",
+        help="let everybody in who reaches an address of the configuration beyond this machine",
+    )
+    add(
+        "--standby",
+        action="store_true",
+        help="stand by for the one that serves: learn what it learns, and take over when it goes",
+    )
     add("--duration", type=float, metavar="S", help="end by itself after this time, s")
     add("--json", action="store_true", help="print the ready line and the last status as JSON")
 
@@ -30,21 +42,24 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.config is None:
         raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints one to begin with")
-    config = _with_listen(read_config(args.config), args.listen)
+    config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
     # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from service.server import Service, StopSignal, tune_process
 
     tune_process()
     stop = StopSignal()
-    with Service(config) as service:
+    if has_access_control(config.zenoh_config):
+        count_refusals()
+    with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
         ready = service.ready()
         if args.json:
             print(json.dumps(ready), flush=True)
         else:
             where = ", ".join((*ready["listen"], *ready["connect"]))
             axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
-            print(f"ready at {where}, keys {ready['key']}/..., models {axes}", flush=True)
+            role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the one that serves")
+            print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
         reason = stop.wait(args.duration)
         statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
@@ -60,10 +75,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _with_listen(config: ServeConfig, listen: list[str] | None) -> ServeConfig:
+def _with_listen(config: ServeConfig, listen: list[str] | None, standby: bool) -> ServeConfig:
     if not listen:
         return config
     for endpoint in listen:
         if not is_loopback(check_endpoint("--listen", endpoint)):
             raise FieldError("--listen", endpoint, "an endpoint of this machine", "name others in the configuration")
-    return replace(config, listen=tuple(listen))
+    return replace(config, standby_listen=tuple(listen)) if standby else replace(config, listen=tuple(listen))

@@ -40,6 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait this long for the endpoint, s (10)")
     parser.add_argument("--name", default="demo", help="name of the stage on the wire (demo)")
     parser.add_argument("--axis", default="x", help="name of its axis on the wire (x)")
+    parser.add_argument(
+        "--axis2", default="", metavar="NAME", help="drive the second axis of the stage too, under this name (at 0 V)"
+    )
     parser.add_argument("--twins", default="", metavar="A,B", help="further axes: equal stages with their own commands")
     parser.add_argument("--rate", type=float, metavar="HZ", help="sample rate, Hz (the stage's own, 1000 in presets)")
     parser.add_argument("--duration", type=float, metavar="S", help="stop after this time, s (until Ctrl-C)")
@@ -55,6 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="T:NAME=VALUE[,...]",
         help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; may be repeated",
     )
+    parser.add_argument("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (0)")
+    parser.add_argument(
+        "--slew", type=float, default=math.inf, metavar="V/S", help="follow commands at most so fast, V/s (no limit)"
+    )
+    parser.add_argument(
+        "--inject", action="store_true", help="take faults by command, for tests of what listens (docs/stage.md)"
+    )
+    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own, for TLS and passwords")
     parser.add_argument("--json", action="store_true", help="the ready line is JSON too")
 
 
@@ -97,6 +108,7 @@ def stage_config(args: argparse.Namespace) -> StageConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Run the stage until its end, Ctrl-C or SIGTERM. Returns 0."""
+    from service.access.check import check_reach
     from service.session import open_client, open_service
     from service.stage_node import NodeConfig, StageNode
 
@@ -111,13 +123,21 @@ def run(args: argparse.Namespace) -> int:
         batch=args.batch,
         ticks=None if args.duration is None else max(1, round(args.duration / config.dt_s)),
         free_run=args.free_run,
+        second=args.axis2,
+        inject=args.inject,
+        first=args.first,
+        slew_V_per_s=args.slew,
     )
     endpoint = check_endpoint(
         "--listen" if args.listen else "--endpoint", args.listen or args.endpoint or DEFAULT_ENDPOINT
     )
     # A little more often than zenoh's callbacks need: the loop must not wait 5 ms for the interpreter.
     sys.setswitchinterval(5e-4)
-    session = open_service([endpoint]) if args.listen else open_client(endpoint, args.wait)
+    if args.listen:
+        check_reach("stage", [endpoint], [], args.zenoh_config)
+        session = open_service([endpoint], zenoh_config=args.zenoh_config)
+    else:
+        session = open_client(endpoint, args.wait, args.zenoh_config)
     try:
         node = StageNode(node_config, session)
 
@@ -126,9 +146,10 @@ def run(args: argparse.Namespace) -> int:
 
         before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            ready = {"ready": True, "stage": args.name, "axes": list(node_config.units), "endpoint": endpoint}
+            names = [name for name in (*node_config.units, args.axis2) if name]
+            ready = {"ready": True, "stage": args.name, "axes": names, "endpoint": endpoint}
             begins = "running" if args.free_run else "waiting for commands"
-            text = f"ready: stage {args.name}, axes {', '.join(node_config.units)}, {1 / config.dt_s:g} Hz, {begins}"
+            text = f"ready: stage {args.name}, axes {', '.join(names)}, {1 / config.dt_s:g} Hz, {begins}"
             print(json.dumps(ready) if args.json else f"{text} at {endpoint}", flush=True)
             summary = node.run()
         finally:

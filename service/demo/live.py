@@ -97,6 +97,7 @@ def run_live(
 
 def _stage(plan: Plan, where: list[str], ticks: int, *, changing: bool) -> list[str]:
     arguments = [*CLI, "stage", "--name", STAGE, "--axis", AXIS, "--rate", f"{1.0 / plan.dt_s:g}", *where]
+    arguments += ["--file", plan.stage_file] if plan.stage_file else []
     arguments += ["--seed", str(plan.seed), "--duration", repr(ticks * plan.dt_s)]
     arguments += ["--batch", str(SAMPLES_A_MESSAGE)]
     for t_s, values in plan.stage(changing=changing).changes:

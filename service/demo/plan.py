@@ -13,12 +13,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.presets import preset
 from sim.reference import demo_reference
 from sim.signals import training_input
 from sim.stage import StageConfig
+from sim.stagefile import load_stage
 
 #: Served models in the order of the table, with what the table calls them.
 MODELS: dict[str, str] = {
@@ -47,6 +50,9 @@ class Plan:
     low_um, high_um : the range that the reference commands, µm.
     block, lead, margin : ticks per query, ticks asked ahead, ticks left for samples to arrive.
     seed : of the stage's noise and of the reference.
+    drive_low_V, drive_high_V : voltages that identification spans, V.
+    slowness : factor by which the reference is slower than the usual one.
+    stage_file : a stage file in place of the stage that stands in for hardware; see `service.demo.own_stage`.
     """
 
     dt_s: float = 0.001
@@ -60,6 +66,10 @@ class Plan:
     lead: int = 60
     margin: int = 20
     seed: int = 20
+    drive_low_V: float = 0.0
+    drive_high_V: float = 8.0
+    slowness: float = 1.0
+    stage_file: str = ""
 
     def __post_init__(self) -> None:
         if self.run_s < 8.0:
@@ -97,25 +107,37 @@ class Plan:
         }
 
     def identification_voltage(self) -> FloatArray:
-        """The chapter's training input (2.37) at ``dt_s``, V."""
-        return training_input(self.dt_s, self.identify_s)[1]
+        """The chapter's training input (2.37) at ``dt_s``, V, over the stage's own voltages."""
+        wave_V = training_input(self.dt_s, self.identify_s)[1]
+        if (self.drive_low_V, self.drive_high_V) == (0.0, 8.0):
+            return wave_V
+        return np.asarray(self.drive_low_V + (self.drive_high_V - self.drive_low_V) * wave_V / 8.0)
 
     def reference(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Displacement µm, velocity µm/s, acceleration µm/s² of the reference that no model has seen."""
-        motion = demo_reference(self.ticks * self.dt_s, self.dt_s, (self.low_um, self.high_um), self.seed)
-        n = self.ticks
-        return motion.y_um[:n], motion.v_um_per_s[:n], motion.a_um_per_s2[:n]
+        n, slow, limits = self.ticks, self.slowness, (self.low_um, self.high_um)
+        motion = demo_reference(n * self.dt_s / slow, self.dt_s / slow, limits, self.seed)
+        return motion.y_um[:n], motion.v_um_per_s[:n] / slow, motion.a_um_per_s2[:n] / slow**2
 
     @property
     def change_text(self) -> str:
         """The change as a person would say it."""
-        return f"gain {100.0 * self.gain_change:+.0f} %, moved mass x {1.0 + self.payload_ratio:g} by a payload"
+        text = f"gain {100.0 * self.gain_change:+.0f} %"
+        return f"{text}, moved mass x {1.0 + self.payload_ratio:g} by a payload" if self.payload_ratio else text
 
     def stage(self, *, changing: bool) -> StageConfig:
         """The stage, rested; with ``changing`` its gain drops and its payload grows at ``change_tick``."""
-        config = preset("rich", dt_s=self.dt_s, seed=self.seed)
+        if self.stage_file:
+            config = replace(load_stage(self.stage_file), dt_s=self.dt_s, seed=self.seed)
+        else:
+            config = preset("rich", dt_s=self.dt_s, seed=self.seed)
         if not changing:
             return config
         at_s = self.change_tick * self.dt_s
-        change = {"gain_drift.gain": self.gain_change, "resonance.payload_ratio": self.payload_ratio}
-        return replace(config, changes=((at_s, change),))
+        change = {"gain_drift.gain": config.effects["gain_drift"].values["gain"] + self.gain_change}
+        for e in config.effects:
+            if e.name == "resonance":
+                change[f"{e.label}.payload_ratio"] = self.payload_ratio
+            elif e.name == "mechanics":
+                change[f"{e.label}.payload_kg"] = self.payload_ratio * e.values["mass_kg"]
+        return replace(config, changes=(*config.changes, (at_s, change)))

@@ -79,6 +79,28 @@ class Child:
         """Whether it has not ended yet."""
         return self._process.poll() is None
 
+    @property
+    def pid(self) -> int:
+        """Its number, for whoever measures it or sends it a signal."""
+        return self._process.pid
+
+    def send(self, number: int) -> None:
+        """Send it a signal, if it is still there."""
+        if self.running:
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """End it at once, as kill -9 does."""
+        self.send(signal.SIGKILL)
+        self._process.wait()
+        self._reader.join(5.0)
+
+    def take_lines(self) -> list[str]:
+        """What it has said since the last call; forgotten here, so that a long run does not gather it."""
+        with self._changed:
+            taken, self.lines = self.lines, []
+        return taken
+
     def last_json(self) -> dict[str, Any]:
         """The last line that is a JSON object. Raises ServiceError where there is none."""
         for line in reversed(self.lines):
@@ -114,6 +136,7 @@ class Children:
     def start(self, name: str, arguments: list[str]) -> Child:
         """Start ``python ARGUMENTS``."""
         child = Child(name, arguments, self._logs / f"{name}.log")
+        self._children = [other for other in self._children if other.running]
         self._children.append(child)
         return child
 

@@ -15,6 +15,7 @@ from adaptive.errors import InputError
 from service.config import read_config
 from service.demo.fast import run_fast
 from service.demo.live import record_identification, run_live
+from service.demo.own_stage import plan_for
 from service.demo.pictures import draw_loops, draw_tracking
 from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
 from service.demo.processes import free_port
@@ -42,15 +43,18 @@ class Done:
     summary: dict[str, Any]
 
 
-def run(out: Path, *, fast: bool, duration_s: float, seed: int, view: list[str], say: Say) -> Done:
-    """Run it all and write the results into ``out``.
+def run(
+    out: Path, *, fast: bool, duration_s: float, seed: int, view: list[str], say: Say, stage: Path | None = None
+) -> Done:
+    """Run it all and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
 
     Raises InputError on a folder that cannot be used, ServiceError where a process failed.
     """
-    plan = Plan(run_s=duration_s, seed=seed)
+    own = stage.resolve() if stage is not None else None
     _make_room(out)
     logs = out / "logs"
     logs.mkdir()
+    plan = Plan(run_s=duration_s, seed=seed) if own is None else plan_for(own, logs, duration_s, seed)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
     _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))
     say("[2/4] identifying five inverse models from 10 s at 1 kHz")
@@ -163,6 +167,8 @@ def _configure(plan: Plan, out: Path, logs: Path) -> tuple[Path, str]:
         f'learn = "{TEACHER}"\n'
         f"snapshot_every = {plan.block}\n"
         f"recorder = {json.dumps(str((out / 'recording').resolve()))}\n"
+        # When the background is done depends on the machine; a run in real time and a fast one are to be the same.
+        "[axis.retuning]\nperiod_s = 0.0\n"
     )
     return path, endpoint
 

@@ -26,10 +26,10 @@ DT_S = 1e-3
 GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
 
 
-def make_models() -> dict[str, InverseModel]:
+def make_models(dt_s: float = DT_S) -> dict[str, InverseModel]:
     """A line, and an LSSVM with plays whose kernel part is small: both good enough to steer a stage of 11 µm/V."""
     features = FeatureMap(
-        DT_S, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
+        dt_s, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
         kernel_plays=(0,), asymmetric=True,
     )  # fmt: skip
     rng = np.random.default_rng(5)
@@ -42,7 +42,7 @@ def make_models() -> dict[str, InverseModel]:
         "lssvm_adaptive", features, beta, support, 0.01 * rng.normal(size=20), np.ones(features.kernel_size), 1e4,
         domain=np.array([0.0, 90.0, -2e4, 2e4, -1e7, 1e7]), noise_variance=1e-6, kernel_variance=1e-4,
     )  # fmt: skip
-    line = LinearInverse(LinearParameters(GAIN_UM_PER_V, OFFSET_UM), DT_S, Domain(0.0, 90.0, 1e4), 0.05)
+    line = LinearInverse(LinearParameters(GAIN_UM_PER_V, OFFSET_UM), dt_s, Domain(0.0, 90.0, 1e4), 0.05)
     return {"linear": line, "lssvm_adaptive": lssvm}
 
 

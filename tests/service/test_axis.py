@@ -25,7 +25,7 @@ from service.wire_query import NOT_FINITE_REPLACED, FeedforwardQuery, Feedforwar
 
 DT_S = 1e-3
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
-CONFIG = AxisConfig("x", Path("x.npz"), LIMITS)
+CONFIG = AxisConfig("x", Path("x.npz"), LIMITS, compete=())
 META = BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0)
 
 
@@ -138,6 +138,16 @@ def test_sequence_numbers_that_go_wrong_are_counted(models: dict[str, InverseMod
     assert axis.handled_seq == 159
     assert axis.newest.seq == 140
     assert axis.gates["learnt"] > 0
+
+
+def test_what_was_lost_and_comes_late_after_all_is_no_restart(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(1000))
+    axis.handle(recording(500, first=2500))
+    # A process that was stopped passes on at once what it had not passed on.
+    axis.handle(recording(1500, first=1000))
+    assert axis.sequence.counters() == {"received": 3000, "lost": 1500, "late": 1500, "restarts": 0}
+    assert axis.handled_seq == 2999
 
 
 def test_a_stage_that_counts_anew_goes_on_being_learnt(models: dict[str, InverseModel]) -> None:

@@ -31,7 +31,7 @@ from service.errors import (
 from service.keys import Keys
 from service.motion import derivatives
 from service.session import open_service
-from service.wire_query import LIMITED_SLEW
+from service.wire_query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
@@ -123,6 +123,34 @@ def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -
     np.testing.assert_array_equal(np.concatenate([u, ones]), asked.u_V)
     np.testing.assert_array_equal(flags, asked.flags[:25])
     np.testing.assert_array_equal(follower.memory, asked.memory)
+
+
+def test_the_follower_passes_to_the_baseline_outside_the_domain_as_the_service_does(client: Client) -> None:
+    follower = client.follow("lssvm_adaptive")
+    y, v = np.full(40, 40.0), np.linspace(0.0, 70_000.0, 40)
+    asked = client.trajectory(
+        y, v, np.zeros(40), memory=follower.memory, model="lssvm_adaptive", as_of=max(0, follower.snapshot_seq)
+    )
+    assert asked.stand_in == "linear"
+    assert {BLENDED, STAND_IN} <= set((asked.flags & (BLENDED | STAND_IN)).tolist())
+    u, flags = follower.trajectory(y[:15], v[:15], np.zeros(15))
+    ones = [follower.point(*point) for point in zip(y[15:].tolist(), v[15:].tolist(), strict=True)]
+    np.testing.assert_array_equal(np.concatenate([u, ones]), asked.u_V)
+    np.testing.assert_array_equal(flags & ~np.uint8(STALE), asked.flags[:15])
+
+
+def test_commands_leave_within_the_limits_and_say_so(client: Client) -> None:
+    got: list[float] = []
+    subscriber = client._session.declare_subscriber(
+        client.keys.command, lambda sample: got.extend(wire.decode_command(sample.payload.to_bytes()).values.tolist())
+    )
+    flags = [client.command(100, [1.0, 9.0, 50.0]), client.command(103, [9.0]), client.command(110, [9.5])]
+    assert [f.tolist() for f in flags] == [[0, LIMITED_SLEW, LIMITED_VOLTAGE | LIMITED_SLEW], [LIMITED_SLEW], [0]]
+    until = time.monotonic() + 5.0
+    while len(got) < 5 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert got == pytest.approx([1.0, 3.0, 5.0, 7.0, 9.5])
+    subscriber.undeclare()
 
 
 def test_the_follower_guards_what_leaves_too(client: Client) -> None:

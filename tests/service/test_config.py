@@ -32,7 +32,7 @@ def test_a_short_configuration_has_safe_defaults(tmp_path: Path) -> None:
     assert (axis.limits.u_min_V, axis.limits.u_max_V, axis.limits.slew_V_per_s) == (0.0, 10.0, 2000.0)
     assert math.isinf(axis.limits.y_max_um)
     assert axis.learner == {"window": 300}
-    assert (axis.served, axis.learn, axis.recorder) == ("lssvm_adaptive", "lssvm_adaptive", None)
+    assert (axis.served, axis.learn, axis.recorder) == ("auto", "lssvm_adaptive", None)
 
 
 def test_the_example_is_a_good_configuration_with_every_key(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_two_axes_of_one_name_are_refused(tmp_path: Path) -> None:
 
 
 def test_other_machines_only_when_said_so(tmp_path: Path) -> None:
-    text = 'beyond_loopback = true\nlisten = ["tcp/0.0.0.0:7447"]\n' + GOOD
+    text = 'insecure_beyond_loopback = true\nlisten = ["tcp/0.0.0.0:7447"]\n' + GOOD
     assert parse_config(text, "f", tmp_path).listen == ("tcp/0.0.0.0:7447",)
 
 

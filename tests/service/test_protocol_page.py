@@ -70,8 +70,8 @@ def samples(first: int, n: int) -> bytes:
 
 def test_a_stranger_asks_continues_teaches_and_is_corrected(session: zenoh.Session) -> None:
     status = json.loads(get(session, f"{BASE}/status"))
-    assert (status["schema"], status["wire"], status["served"]) == (1, 1, "lssvm_adaptive")
-    size = status["models"]["lssvm_adaptive"]["memory_size"]
+    assert (status["schema"], status["wire"], status["served"]) == (1, 1, "auto")
+    size = status["models"]["auto"]["memory_size"]
 
     # Five points of a ramp at once, and cut in two with the memory brought back: the same voltages.
     dt = status["dt_s"]
@@ -198,7 +198,7 @@ def lssvm(
 
 
 def test_a_stranger_evaluates_the_lssvm_by_the_formula_of_the_page(session: zenoh.Session) -> None:
-    got = model(get(session, f"{BASE}/model"))
+    got = model(get(session, f"{BASE}/model?name=lssvm_adaptive"))
     values, data = got["values"], got["data"]
     assert got["kind"] == "lssvm"
     memory = [0.0] * len(data["/memory"])
@@ -206,7 +206,9 @@ def test_a_stranger_evaluates_the_lssvm_by_the_formula_of_the_page(session: zeno
     v = [0.0, 4000.0, -1000.0, 8000.0, -21000.0]
     a = [0.0, 1e3, -5e3, 0.0, 2e3]
     mine = [lssvm(values, data, memory, *point) for point in zip(y, v, a, strict=True)]
-    asked = reply(get(session, f"{BASE}/feedforward", query(y, v, a, [0.0] * len(memory), as_of=got["snapshot_seq"])))
+    asked = reply(
+        get(session, f"{BASE}/feedforward", query(y, v, a, [0.0] * len(memory), b"lssvm_adaptive", got["snapshot_seq"]))
+    )
     # The first is free of the slew limit; the others are compared where it did not bite.
     pairs = [(m, u) for m, u, flag in zip(mine, asked["u_V"], asked["flags"], strict=True) if not flag & 2]
     assert len(pairs) >= 4

@@ -16,6 +16,7 @@ import pytest
 
 from adaptive.errors import InputError
 from service import recorder_files
+from service.journal import Journal, Rows, read_journal
 from service.recorder import Recorder, RecorderConfig
 from service.recorder_files import segments
 from sim.recordings import check, read
@@ -87,13 +88,13 @@ def test_the_oldest_segments_go_when_the_disks_share_is_used_up(tmp_path: Path) 
 
 def test_a_full_queue_drops_and_counts_and_never_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hold = threading.Event()
-    write = recorder_files.OpenSegment.write
+    write = Journal.write
 
-    def slow(self: recorder_files.OpenSegment, rows: recorder_files.Rows) -> None:
+    def slow(self: Journal, rows: Rows, index: np.ndarray) -> None:
         hold.wait(10.0)
-        write(self, rows)
+        write(self, rows, index)
 
-    monkeypatch.setattr(recorder_files.OpenSegment, "write", slow)
+    monkeypatch.setattr(Journal, "write", slow)
     recorder = Recorder(config(tmp_path, queue_samples=500))
     try:
         recorder.put(*block(0, 100), reason="learnt")
@@ -111,7 +112,7 @@ def test_a_full_queue_drops_and_counts_and_never_blocks(tmp_path: Path, monkeypa
     assert not recorder.put(*block(0, 1), reason="late")
 
 
-@pytest.mark.parametrize("where", ["open", "write", "convert"])
+@pytest.mark.parametrize("where", ["open", "write", "close"])
 def test_a_full_disk_degrades_the_recording_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
@@ -125,16 +126,16 @@ def test_a_full_disk_degrades_the_recording_and_nothing_else(
 
         return call
 
-    if where == "convert":
-        monkeypatch.setattr(recorder_files, "convert", failing(recorder_files.convert))
+    if where == "close":
+        monkeypatch.setattr(recorder_files.Closer, "__init__", failing(recorder_files.Closer.__init__))
     else:
         name = {"open": "__init__", "write": "write"}[where]
-        monkeypatch.setattr(recorder_files.OpenSegment, name, failing(getattr(recorder_files.OpenSegment, name)))
+        monkeypatch.setattr(Journal, name, failing(getattr(Journal, name)))
     with Recorder(config(tmp_path, segment_rows=200)) as recorder:
         recorder.put(*block(0, 300), reason="learnt")
         wait_for(lambda: recorder.counters()["written"] == 300)
         full.set()
-        recorder.put(*block(300, 300), reason="learnt")
+        recorder.put(*block(300, 250), reason="learnt")
         wait_for(lambda: recorder.counters()["degraded"])
         assert "No space left" in recorder.counters()["error"]
         assert recorder.put(*block(600, 100), reason="learnt")
@@ -200,22 +201,85 @@ def test_a_killed_process_leaves_a_stream_that_the_next_start_closes(tmp_path: P
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_stream_cut_anywhere_keeps_its_whole_batches(tmp_path: Path) -> None:
-    stream = recorder_files.OpenSegment(tmp_path / "segment-000001.arrows")
-    ends = []
+def test_a_journal_cut_anywhere_keeps_its_whole_rows(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "segment-000001.journal")
     for k in range(3):
         seq, t_s, u_V, y_um = block(50 * k, 50)
-        stream.write(recorder_files.Rows(seq, t_s, u_V, y_um, ["learnt"] * 50))
-        ends.append(stream.path.stat().st_size)
-    stream.abandon()
-    whole = stream.path.read_bytes()
-    for cut in (*ends, ends[0] + 9, ends[1] - 1, ends[2] - 40, 20, 0):
-        path = tmp_path / f"segment-{100 + cut:06d}.arrows"
-        path.write_bytes(whole[:cut])
-        expected = 50 * sum(end <= cut for end in ends)
+        journal.write(Rows(seq, t_s, u_V, y_um, ["learnt", f"word-{k}"] * 25), seq)
+    journal.close()
+    whole = journal.path.read_bytes()
+    for cut in (len(whole), len(whole) - 1, len(whole) - 39, 16 + 40 * 30 + 7, 17, 16, 3, 0):
+        path = tmp_path / f"segment-{100 + cut:06d}.journal"
+        path.write_bytes(whole[:cut] + bytes(400))  # the disk may have been given more than was written
+        rows, index = read_journal(path)
+        assert len(rows) <= max(0, cut - 16) // 40
+        assert len(rows) >= max(0, cut - 16) // 40 - 4  # and those that define words
+        assert index.tolist() == rows.seq.tolist() == list(range(len(rows)))
+        assert rows.reason == [("learnt", f"word-{k // 50}")[k % 2] for k in range(len(rows))]
         made = recorder_files.convert(path)
-        assert (0 if made is None else len(read(made, None))) == expected
+        assert (0 if made is None else len(read(made, None))) == len(rows)
         assert not path.exists()
+
+
+def test_a_restart_finds_what_came_behind_its_checkpoint_across_segments(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path, segment_rows=500), index=7) as recorder:
+        for start in range(0, 1200, 100):
+            recorder.put(*block(start, 100), reason="learnt")
+            time.sleep(0.03)
+    behind = recorder_files.rows_behind(tmp_path, 7 + 1100)
+    assert behind is not None
+    assert behind.seq.tolist() == list(range(1100, 1200))
+    assert recorder_files.rows_behind(tmp_path, 7 + 1200) is None
+    assert recorder_files.rows_behind(tmp_path, 3) is None
+    # An instance that took over an older state handles some samples again, and what follows is of its count.
+    with Recorder(config(tmp_path), index=1150) as recorder:
+        recorder.put(*block(5000, 50), reason="learnt")
+        wait_for(lambda: recorder.counters()["written"] == 50)
+        again = recorder_files.rows_behind(tmp_path, 1100)
+    assert again is not None
+    assert again.seq.tolist()[-1] == 5049
+
+
+def test_a_file_size_limit_is_a_full_disk(tmp_path: Path) -> None:
+    """A real one, from the operating system, in the middle of a row."""
+    program = (
+        "import resource, sys, time, numpy as np\n"
+        "from pathlib import Path\n"
+        "from service.recorder import Recorder, RecorderConfig\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_001, resource.RLIM_INFINITY))\n"
+        "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.005, retry_s=0.05))\n"
+        "k = 0\n"
+        "def feed(until):\n"
+        "    global k\n"
+        "    end = time.monotonic() + 20.0\n"
+        "    while not until(r.counters()) and time.monotonic() < end:\n"
+        "        r.put(np.arange(k, k + 10), 1e-3 * np.arange(k, k + 10), np.ones(10), np.ones(10), 'learnt')\n"
+        "        k += 10\n"
+        "        time.sleep(0.0005)\n"
+        "feed(lambda c: c['lost'] and c['degraded'])\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))\n"
+        "feed(lambda c: not c['degraded'])\n"
+        "r.close()\n"
+        "c = r.counters()\n"
+        "assert c['offered'] == k == c['written'] + c['lost'], c\n"
+        "print(c['written'], c['errors'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    written, errors = map(int, done.stdout.split())
+    assert errors >= 1
+    recording = read(tmp_path)
+    assert recording.seq is not None
+    assert len(recording) == written
+    assert recording.seq[0] == 0
+    assert np.all(np.diff(recording.seq) >= 1)
 
 
 def test_bad_configuration_and_bad_rows(tmp_path: Path) -> None:

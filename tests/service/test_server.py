@@ -51,7 +51,7 @@ def eventually(condition: Callable[[], Any], within_s: float = 30.0) -> Any:
 
 def test_it_serves_learns_publishes_and_goes(serve: Callable[..., Any], tmp_path: Path) -> None:
     process = serve(extra=f'recorder = "{tmp_path / "rec"}"')
-    assert process.ready["axes"] == {"x": ["linear", "lssvm_adaptive"]}
+    assert process.ready["axes"] == {"x": ["linear", "lssvm_adaptive", "auto"]}
     statuses: list[dict[str, Any]] = []
     diagnostics: list[dict[str, Any]] = []
     with Client.connect(process.endpoint, timeout_s=5.0) as client, open_client(process.endpoint) as stage:
@@ -61,7 +61,7 @@ def test_it_serves_learns_publishes_and_goes(serve: Callable[..., Any], tmp_path
         tokens = [reply.ok.key_expr for reply in stage.liveliness().get(client.keys.alive_any) if reply.ok]
         assert [str(key) for key in tokens] == [client.keys.alive(process.ready["instance"])]
         before = client.point(40.0)
-        assert (before.snapshot_seq, before.model, before.tracked_memory) == (-1, "lssvm_adaptive", True)
+        assert (before.snapshot_seq, before.model, before.tracked_memory) == (-1, "auto", True)
         for first in range(0, 3000, 20):
             stage.put(client.keys.sample, samples(first, 20), congestion_control=zenoh.CongestionControl.BLOCK)
         eventually(lambda: client.status()["seq"] == 2999)

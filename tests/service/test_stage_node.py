@@ -22,6 +22,7 @@ from service.commands.stage import parse_change
 from service.keys import Keys
 from service.session import open_client
 from service.stage_commands import CommandBuffer
+from service.stage_faults import fault_key
 from service.stage_node import NodeConfig, status_key
 from service.stage_sender import MOST, RING, SampleRing, Sender
 from sim.presets import preset
@@ -165,6 +166,44 @@ def test_free_run_holds_missing_commands_and_stops_cleanly_on_interrupt() -> Non
     assert summary["state"] == "stopped"
 
 
+@pytest.mark.e2e
+def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told() -> None:
+    first, n, limit_V = 5_000_000, 1500, 0.02
+    voltages = {"x": np.full(n, 3.0), "y": 1.5 - 1.5 * np.cos(0.012 * np.arange(n))}
+    options = ("--axis2", "y", "--first", str(first), "--slew", str(limit_V / 1e-3), "--inject", "--duration", "1.5")
+    with stage_process(*options, "--seed", "5", "--batch", "5") as (process, endpoint):
+        session = open_client(endpoint, wait_s=5.0)
+        try:
+            collectors = {axis: Collector(session, axis) for axis in voltages}
+            time.sleep(0.3)
+            session.put(fault_key("t", "y"), b'{"fault": "gap", "duration_s": 0.1}')
+            session.put(fault_key("t", "y"), b'{"fault": "fire"}')
+            time.sleep(0.1)
+            for axis, values in voltages.items():
+                session.put(Keys("t", axis).command, wire.encode_command(first, values))
+            summary = summary_of(process)
+            received = {axis: collector.columns() for axis, collector in collectors.items()}
+        finally:
+            session.close()
+    numbers = np.arange(first, first + n)
+    np.testing.assert_array_equal(received["x"][0], numbers)
+    np.testing.assert_array_equal(received["y"][0], numbers[100:])
+    # 3 V are reached in steps of the slew limit; the second axis stays below it.
+    expected = np.minimum(3.0, limit_V * np.arange(1, n + 1))
+    np.testing.assert_allclose(received["x"][2], expected, rtol=1e-6)
+    np.testing.assert_array_equal(received["y"][2], voltages["y"][100:])
+    stage = Stage(preset("rich", seed=5))
+    y_um, y2_um = stage.run(stage.initial_state(), received["x"][2], voltages["y"])
+    np.testing.assert_array_equal(received["x"][3], y_um)
+    np.testing.assert_array_equal(received["y"][3], y2_um[100:])
+    units = summary["units"]
+    assert isinstance(units, dict)
+    assert units["x"]["slew_limited"] == 149
+    assert units["y"]["slew_limited"] == 0
+    assert units["y"]["published"] == n - 100
+    assert (units["y"]["faults"]["gap"], units["y"]["faults"]["refused"]) == (100, 1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -176,6 +215,10 @@ def test_free_run_holds_missing_commands_and_stops_cleanly_on_interrupt() -> Non
         (("--change", "soon"), "--change: got 'soon'"),
         (("--change", "1:gain_drift.nothing=1"), "nothing"),
         (("--duration", "-1"), "--duration: got -1"),
+        (("--axis2", "x"), "second: got x"),
+        (("--preset", "bouc_wen", "--axis2", "y"), "has one axis"),
+        (("--slew", "0"), "slew_V_per_s: got 0"),
+        (("--first", "-4"), "first: got -4"),
         (("--endpoint", "tcp/127.0.0.1:1", "--wait", "0"), "nobody listens"),
     ],
 )

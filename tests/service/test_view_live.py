@@ -108,6 +108,8 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
             feed.say("status", b"[" * 100_000)
             wait_for(lambda: consumer.counts["malformed"] == 5)
             feed.send(BATCH)
+            # Its last message is the diagnostics; what is under way at the close is not promised.
+            wait_for(lambda: len(basket.of(Diagnostics)) == 51)
         finally:
             consumer.close()
             consumer.close()

@@ -1,0 +1,1 @@
+"""Who may reach a service, and for what: zenoh's TLS, passwords and access control, written, checked and counted."""

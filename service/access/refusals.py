@@ -1,0 +1,114 @@
+"""Counts what zenoh refuses: its log is the only place where a refusal shows.
+
+Access control drops a message without a word to either end. The log line of each drop, of each wrong password and of
+each wrong certificate is all there is, and zenoh writes its log to the standard output. So the standard output is
+turned into a pipe that a thread reads and counts; what is not counted goes on to the standard error, and Python's own
+prints to where the standard output was before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import sys
+import threading
+from typing import Any, Final
+
+import zenoh
+
+#: Log filter of zenoh: one line a refusal, none for what is allowed (those would cost microseconds a message).
+_LOG: Final = ",".join(
+    (
+        "warn",
+        "zenoh::net::routing::interceptor=trace",
+        "zenoh::net::routing::interceptor::access_control=info",
+        "zenoh_transport::unicast::establishment::accept=debug",
+    )
+)
+_PIPE_BYTES: Final = 1 << 20
+_COLOUR: Final = re.compile(rb"\x1b\[[0-9;]*m")
+#: What a line must hold -> the counter it adds to. In this order: the first that fits takes it.
+_PATTERNS: Final = (
+    (re.compile(rb"interceptor: +Msg intercepted"), "messages"),
+    (re.compile(rb"did not match any configured ACL subject"), "identities"),
+    (re.compile(rb"establishment::accept: +(UsrPwd|.*authenti)"), "passwords"),
+    (re.compile(rb"zenoh_link_(tls|quic)\S*: .*"), "certificates"),
+)
+#: Lines of the modules asked for that are no refusals and need not be shown.
+_NOISE: Final = re.compile(rb" (TRACE|DEBUG|INFO) ")
+
+_installed: Refusals | None = None
+
+
+class Refusals:
+    """Counters of refusals since :func:`count_refusals`.
+
+    ``certificates``: connections without a valid one. ``passwords``: connections with a wrong one or none.
+    ``identities``: connections with a valid certificate and a valid password that do not belong together, or to
+    nobody who is known. ``messages``: publications, queries and declarations that access control dropped.
+    """
+
+    def __init__(self) -> None:
+        self._counts = {name: 0 for _, name in _PATTERNS}
+        self._rest = b""
+
+    def counters(self) -> dict[str, int]:
+        """A copy of the counters."""
+        return dict(self._counts)
+
+    def feed(self, chunk: bytes) -> bytes:
+        """Count the lines in a piece of log; returns those that are to be shown."""
+        *lines, self._rest = (self._rest + chunk).split(b"\n")
+        shown = []
+        for line in lines:
+            plain = _COLOUR.sub(b"", line)
+            for pattern, name in _PATTERNS:
+                if pattern.search(plain):
+                    self._counts[name] += 1
+                    break
+            else:
+                if plain.strip() and not _NOISE.search(plain):
+                    shown.append(plain + b"\n")
+        if len(self._rest) > _PIPE_BYTES:
+            self._rest = b""
+        return b"".join(shown)
+
+
+def count_refusals() -> Refusals:
+    """Begin to count, once a process; to be called before the first session is opened. Later calls return the same.
+
+    The environment variable RUST_LOG, where set, is added to the filter and its lines go to the standard error.
+    """
+    global _installed
+    if _installed is not None:
+        return _installed
+    asked = os.environ.get("RUST_LOG")
+    os.environ["RUST_LOG"] = f"{_LOG},{asked}" if asked else _LOG
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
+    refusals = Refusals()
+    sys.stdout.flush()
+    output = os.dup(1)
+    reading, writing = os.pipe()
+    # A flood of refusals must not hold up zenoh's threads while the reader waits for its turn.
+    with contextlib.suppress(OSError, AttributeError):
+        fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+    os.dup2(writing, 1)
+    os.close(writing)
+    sys.stdout = os.fdopen(output, "w", encoding="utf-8", buffering=1, closefd=False)
+    threading.Thread(target=_read, args=(reading, refusals), name="refusals", daemon=True).start()
+    _installed = refusals
+    return refusals
+
+
+def refusal_counters() -> dict[str, Any] | None:
+    """For the status: the counters, or None where nothing is counted."""
+    return None if _installed is None else _installed.counters()
+
+
+def _read(reading: int, refusals: Refusals) -> None:
+    while chunk := os.read(reading, _PIPE_BYTES):
+        if shown := refusals.feed(chunk):
+            with contextlib.suppress(OSError):
+                os.write(2, shown)

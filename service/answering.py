@@ -1,0 +1,126 @@
+"""The answer to a query: which snapshot, which model, from which memory; then by the rules of ``service.fallback``."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from operator import attrgetter
+
+from adaptive.types import FloatArray, InverseModel
+from service.config import AxisConfig
+from service.errors import FieldError
+from service.fallback import Rules, StandIn, answer_safely
+from service.guard import Limits, check_domain
+from service.keys import AUTO
+from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """What queries read: immutable, and replaced whole.
+
+    Attributes
+    ----------
+    seq : the last sample handled before this snapshot, -1 before any. t_s : its time, s; u_V : its voltage, V.
+    models : by name. memories : by name, (m,) each, tracked from the samples up to ``seq``.
+    default : name of the model that answers where a query names none.
+    stand_in : name of the baseline that stands in for it; empty for none.
+    trust : weight of the learning model inside its domain, 0 to 1.
+    trouble : name of what is wrong with the samples or the learner, empty while nothing is.
+    """
+
+    seq: int
+    t_s: float
+    u_V: float
+    models: dict[str, InverseModel]
+    memories: dict[str, FloatArray]
+    default: str = ""
+    stand_in: str = ""
+    trust: float = 1.0
+    trouble: str = ""
+
+    def standing_in_for(self, name: str) -> StandIn | None:
+        """The model that stands in for the one called ``name``; None where there is no other."""
+        if self.stand_in in ("", name) or self.stand_in not in self.models:
+            return None
+        return StandIn(self.stand_in, self.models[self.stand_in], self.memories[self.stand_in])
+
+
+def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[float, bool]:
+    """(weight, stale) of a model whose newest sample is ``age_s`` old, s, where samples are expected.
+
+    Stale from ``stale_s`` on (0: never); from ``last_good_s`` on the stand-in takes over within a second.
+    """
+    if stale_s == 0.0 or age_s <= stale_s:
+        return 1.0, False
+    return 1.0 - min(1.0, max(0.0, age_s - last_good_s)), True
+
+
+def answer(
+    query: FeedforwardQuery, ring: tuple[Served, ...], handled: int, config: AxisConfig, limits: Limits, age_s: float
+) -> FeedforwardReply:
+    """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
+
+    ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
+    ``age_s``: time since the last sample, s, 0 where none is expected. An ``as_of`` names its snapshot: age does not
+    change what it answers, or a replay could not repeat it.
+    """
+    served, behind, trust, stale = ring[-1], False, 1.0, False
+    if query.as_of == NEWEST:
+        trust, stale = trust_by_age(age_s, config.stale_s, config.last_good_s)
+    else:
+        served, behind = _as_of(ring, query.as_of, handled, config.snapshot_every)
+    default = served.default or config.served
+    name = query.model or default
+    model = served.models.get(name)
+    if model is None:
+        raise FieldError("model", repr(name), f"one of {', '.join(served.models)}, or empty for the default")
+    check_domain(query.y_um, limits)
+    memory = served.memories[name] if query.memory is None else query.memory
+    if memory.size != model.memory_size:
+        raise FieldError(
+            "memory",
+            f"{memory.size} values",
+            f"{model.memory_size} for model {name!r}",
+            "bring back the memory of this model's last reply, or none",
+        )
+    got = answer_safely(
+        model,
+        memory,
+        (query.y_um, query.v_um_per_s, query.a_um_per_s2),
+        query.u_before_V,
+        # What does not learn is as good as ever, whatever the samples are.
+        Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
+        served.standing_in_for(name),
+        blends(name, default, config),
+    )
+    return FeedforwardReply(
+        got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
+        got.stand_in,
+    )  # fmt: skip
+
+
+def learns(name: str, config: AxisConfig) -> bool:
+    """Whether the samples change the model called ``name``."""
+    return bool(config.learn) and name in (config.learn, AUTO)
+
+
+def blends(name: str, default: str, config: AxisConfig) -> bool:
+    """Whether a model gives way to the stand-in outside its domain: the default and the one that learns do.
+
+    The others are asked by name to be compared, and answer as themselves.
+    """
+    return name == default or learns(name, config)
+
+
+def _as_of(ring: tuple[Served, ...], as_of: int, handled: int, every: int) -> tuple[Served, bool]:
+    at = bisect_right(ring, as_of, key=attrgetter("seq")) - 1
+    if at < 0:
+        raise FieldError(
+            "as_of",
+            as_of,
+            f"{ring[0].seq} or later",
+            "older snapshots are gone: ask sooner, or keep more of them (snapshots_kept)",
+        )
+    following = (ring[at].seq // every + 1) * every
+    return ring[at], following <= as_of and handled < following

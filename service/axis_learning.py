@@ -1,0 +1,107 @@
+"""What an axis makes of its learner: samples in, a model that is fit to be served out, and what happens when it is not.
+
+All of it is for the thread that handles samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from adaptive.errors import DehystError
+from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
+from service.answering import Served
+from service.axis_operations import AxisOperations
+from service.axis_state import restored_learner
+from service.competing import champion_of
+from service.sequence import SequenceTracker
+from service.watch import LEARNER_FAILED, POISON
+
+#: How often the learner's state is marked while all is well, s of samples.
+MARK_S: Final = 1.0
+
+
+class AxisLearning(AxisOperations):
+    """The learner of an axis; see :class:`service.axis.Axis`, which is the only one to be of this class."""
+
+    dt_s: float
+    sequence: SequenceTracker
+    _revive: Callable[[InverseModel], OnlineModel] | None
+    #: States of the learner, the older one first, and the count of samples at the newer one.
+    _marks: tuple[StateDict, StateDict]
+    _marked: int
+
+    def _learn(self, sample: Sample) -> str:
+        if self.learner is None or self._learner_dead:
+            return "not_learning"
+        try:
+            return self.learner.handle(sample)
+        except Exception as error:
+            # A learner never raises on data. If it does, its state is in doubt: what it last gave stays served.
+            self._failed(f"{type(error).__name__}: {error}")
+            return "not_learning"
+
+    def _failed(self, why: str) -> None:
+        self._learner_dead = True
+        self.note("learner_failed", f"{why}; the last good model stays in service")
+
+    def _judged(self, last: Served) -> dict[str, InverseModel]:
+        """What of the learner is served now: its newest model, or the last good one."""
+        assert self.learner is not None
+        candidate: InverseModel | None = None
+        if self._learner_dead and self._revive is not None and self.watch.failed_long():
+            self._begin_anew(last.models[self.config.learn])
+        if not self._learner_dead:
+            try:
+                candidate = self.learner.snapshot()
+            except (DehystError, ValueError, ArithmeticError) as error:
+                self._failed(f"snapshot: {error}")
+        before = self.watch.trouble
+        good = self.watch.judge(candidate, last.models.get(last.stand_in))
+        now = self.watch.trouble
+        if not now and not before:
+            self._mark()
+        if now != before:
+            if before in POISON and not now:
+                self._go_back()
+            self.set_teaching()
+            detail = f"{now}: the last good model is served, then {last.stand_in or 'nothing else'}" if now else before
+            if now != LEARNER_FAILED:  # which has told of itself
+                self.note("trouble" if now else "recovered", detail)
+        for event in getattr(self.learner, "take_events", list)():
+            self.note(*event)
+        if good is None:
+            return {}
+        # While samples are poisoned the champion stays as it was; a learner that is bad it can do without.
+        auto = {} if now in POISON or self._learner_dead else champion_of(self.learner)
+        return {self.config.learn: good, **auto}
+
+    def _mark(self) -> None:
+        """Keep what the learner is now and then, to go back to: the older of two is from before any trouble."""
+        assert self.learner is not None
+        if not self._learner_dead and self.sequence.received - self._marked >= MARK_S / self.dt_s:
+            self._marks, self._marked = (self._marks[-1], self.learner.state_dict()), self.sequence.received
+
+    def _go_back(self) -> None:
+        """The samples are good again: go on from before they were bad, whose first ones the learner may have believed.
+
+        Its place is taken anew too: what a frozen sensor shows when it comes to itself is no jump of the stage.
+        """
+        assert self.learner is not None
+        if self._marks[0]:
+            try:
+                self.learner = restored_learner(self._marks[0], self.learner)
+                self.note("learner_went_back", "to before the samples went wrong")
+            except DehystError as error:
+                self.note("internal_error", f"going back: {error}")
+        getattr(self.learner, "resync", lambda: None)()
+
+    def _begin_anew(self, model: InverseModel) -> None:
+        assert self._revive is not None
+        try:
+            self.learner, self._learner_dead = self._revive(model), False
+        except Exception as error:
+            self.note("learner_failed", f"beginning anew: {type(error).__name__}: {error}")
+        else:
+            self.set_teaching()
+            self.note("learner_begun_anew", "from the last good model")

@@ -1,0 +1,101 @@
+"""The process that diagnoses: ``python -m service.diagnosing.worker FOLDER``, of the lowest priority.
+
+Reads ``job.json`` and ``samples.npz`` in the folder, writes ``result.json`` there, whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import DehystError
+from adaptive.types import BoolArray, FloatArray
+
+
+def main(arguments: list[str]) -> int:
+    """Diagnose one job. Returns 0; what goes wrong is in the result."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(19)
+    folder = Path(arguments[0])
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    with np.load(folder / "samples.npz", allow_pickle=False) as samples:
+        reference, recent = samples["reference"], samples["recent"]
+    try:
+        result = diagnose(job, reference, recent)
+    except DehystError as error:
+        result = {"error": str(error)}
+    part = folder / "result.part"
+    part.write_text(json.dumps(result), encoding="utf-8")
+    os.replace(part, folder / "result.json")
+    return 0
+
+
+def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> dict[str, Any]:
+    """The verdict on (4, n) samples ``recent`` (seq, t_s, u_V, y_um) against ``reference``.
+
+    ``job``: ``model`` (bundle file), ``name`` (in it), ``from_seq`` (what is recent of the recent samples), ``report``
+    (folder for the engine's full report, or empty). Raises InputError and ModelFileError.
+    """
+    from service.modelfile import read_bundle
+    from sim.changes.compare import compare
+
+    bundle = read_bundle(job["model"])
+    model = bundle.models[job["name"]]
+    result = compare(
+        model, stretch_of(reference, model.dt_s, -1), stretch_of(recent, model.dt_s, int(job["from_seq"]))
+    ).as_dict()
+    if job.get("report"):
+        result["report"] = full_report(Path(job["report"]), recent, model.dt_s)
+    return result
+
+
+def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
+    """Samples (4, n) as a stretch for the comparison; what is before ``from_seq`` only settles the memory."""
+    from adaptive.smoothing import SmootherConfig, smooth_recording
+    from sim.changes.columns import Stretch
+
+    whole, valid = _repaired(samples, dt_s)
+    scored = valid & (whole.t_s + 0.5 * dt_s > _time_of(samples, from_seq))
+    config = SmootherConfig.for_rate(dt_s)
+    # Past its ends the smoother makes up what it has not seen.
+    scored[: config.lag] = scored[-config.lag :] = False
+    motion = smooth_recording(whole.y_um, config)
+    return Stretch(dt_s, whole.t_s, np.ascontiguousarray(whole.u_V), motion, scored)
+
+
+def _time_of(samples: FloatArray, seq: int) -> float:
+    later = np.flatnonzero(samples[0] >= seq)
+    return float(samples[1, later[0]]) if later.size else float("inf")
+
+
+def _repaired(samples: FloatArray, dt_s: float) -> tuple[Any, BoolArray]:
+    from sim.recordings import Recording, repaired
+
+    recording = Recording(
+        t_s=samples[1], u_V=samples[2], y_um=samples[3], dt_s=dt_s, source="recent samples",
+        seq=samples[0].astype(np.int64),
+    )  # fmt: skip
+    fixed = repaired(recording)
+    return fixed.recording, fixed.valid
+
+
+def full_report(out: Path, samples: FloatArray, dt_s: float) -> dict[str, Any]:
+    """What the diagnosis of measured data finds in the recent samples, against the chapter's stage; with its report."""
+    from service.diagnosis_report import Source, write_report
+    from sim.diagnosis.diagnose import diagnose_prepared
+    from sim.diagnosis.prepare import prepare
+
+    recording, _ = _repaired(samples, dt_s)
+    prepared = prepare(recording)
+    source = Source("recent samples", (*(f.message for f in prepared.findings), *prepared.notes))
+    return {"folder": str(out), **write_report(out, diagnose_prepared(prepared), source)}
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,159 @@
+"""Takes the requests of operators from the wire, one after the other, and answers each."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from adaptive.errors import DehystError
+from service.errors import FieldError, ServiceError, error_to_json
+from service.keys import Keys
+from service.operating.journal import Journal
+from service.operating.request import MAX_BYTES, Request, decode_request
+from service.operating.verbs import Verbs
+
+SCHEMA: Final = 1
+JSON: Final = "application/json"
+#: Requests that may wait; what comes on top is refused.
+_WAITING: Final = 32
+_STOP: Final = None
+
+
+class OperationsServer:
+    """The queryable ``.../operate`` of one axis and the thread behind it.
+
+    A thread of its own, because a verb waits for the learner to come to the end of its batch, and a callback of zenoh
+    that waits holds up every query.
+
+    Parameters
+    ----------
+    keys, instance : of the axis. verbs : what can be asked. journal : where it is written down.
+    note : tells an event: name, detail. role : what this instance is now; only a primary takes commands.
+    """
+
+    def __init__(
+        self,
+        keys: Keys,
+        instance: str,
+        verbs: Verbs,
+        journal: Journal,
+        note: Callable[[str, str], None],
+        role: Callable[[], str] = lambda: "primary",
+    ) -> None:
+        self._keys = keys
+        self._instance = instance
+        self._verbs = verbs
+        self._journal = journal
+        self._note = note
+        self._role = role
+        self._counts = {"done": 0, "refused": 0}
+        self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
+        self._thread: threading.Thread | None = None
+
+    def counters(self) -> dict[str, int]:
+        """For the status: requests done and refused, and operations that the journal lost."""
+        return {**self._counts, "unlogged": self._journal.lost}
+
+    def declare(self, session: zenoh.Session) -> list[Any]:
+        """Begin to take requests; returns what is to be undeclared, in this order."""
+        self._queue = queue.Queue(_WAITING)
+        self._thread = threading.Thread(
+            target=self._run, args=(self._queue,), name=f"operate-{self._keys.axis}", daemon=True
+        )
+        self._thread.start()
+        return [session.declare_queryable(self._keys.operate, self._on_query), self]
+
+    def undeclare(self) -> None:
+        """End the thread after the requests that wait; the queryable is to be gone by then."""
+        if self._thread is not None:
+            self._queue.put(_STOP)
+            self._thread.join()
+            self._thread = None
+
+    def handle(self, payload: bytes | None) -> bytes:
+        """Do what a payload asks, write it down, and return the answer. Raises DehystError where it is refused."""
+        request: Request | None = None
+        try:
+            request = decode_request(payload)
+            if self._role() != "primary":
+                raise ServiceError(f"instance {self._instance} is a {self._role()}: only a primary takes commands")
+            seq, result = self._verbs.apply(request)
+        except Exception as error:
+            self._counts["refused"] += 1
+            if request is not None:
+                self._write(request, error=str(error))
+            if not isinstance(error, DehystError):
+                self._note("internal_error", f"{self._keys.operate}: {type(error).__name__}: {error}")
+            raise
+        self._counts["done"] += 1
+        self._write(request, seq=seq)
+        answer = {
+            "schema": SCHEMA,
+            "ok": True,
+            "verb": request.verb,
+            "who": request.who,
+            "stage": self._keys.stage,
+            "axis": self._keys.axis,
+            "instance": self._instance,
+            "seq": seq,
+            "result": result,
+        }
+        return json.dumps(answer, default=_plain).encode()
+
+    def _write(self, request: Request, seq: int | None = None, error: str = "") -> None:
+        """Into the journal; and an event where the verb itself tells none."""
+        entry: dict[str, Any] = {
+            "who": request.who,
+            "verb": request.verb,
+            "arguments": dict(request.arguments),
+            "instance": self._instance,
+            "ok": not error,
+        }
+        entry |= {"error": error} if error else {"seq": seq}
+        lost = self._journal.lost
+        if not self._journal.write(entry) and not lost:
+            self._note("journal_failed", f"{self._journal.path} cannot be written; operations go on, see the status")
+        if error:
+            self._note("operation_refused", f"{request.who}: {request.verb[:32]}: {error}"[:300])
+        elif request.verb in self._verbs.background:
+            self._note("operation", f"{request.who}: {request.verb} {json.dumps(dict(request.arguments))}"[:300])
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        # Refused before its bytes are copied.
+        if query.payload is not None and len(query.payload) > MAX_BYTES:
+            self._refuse(query, FieldError("payload", f"{len(query.payload)} bytes", f"at most {MAX_BYTES} bytes"))
+            return
+        try:
+            payload = None if query.payload is None else query.payload.to_bytes()
+            self._queue.put_nowait((query, payload))
+        except queue.Full:
+            self._refuse(query, ServiceError(f"{_WAITING} requests wait already: ask again later"))
+        except Exception as error:
+            self._refuse(query, error)
+
+    def _refuse(self, query: zenoh.Query, error: BaseException) -> None:
+        self._counts["refused"] += 1
+        with query:
+            query.reply_err(error_to_json(error), encoding=JSON)
+
+    def _run(self, waiting: queue.Queue[tuple[zenoh.Query, bytes | None] | None]) -> None:
+        while (item := waiting.get()) is not _STOP:
+            query, payload = item
+            # Leaving the context finishes the query; without that the caller waits until its time is over.
+            with query:
+                try:
+                    query.reply(self._keys.operate, self.handle(payload), encoding=JSON)
+                except zenoh.ZError:
+                    continue  # who asked is gone
+                except Exception as error:
+                    query.reply_err(error_to_json(error), encoding=JSON)
+
+
+def _plain(value: Any) -> Any:
+    """numpy's numbers and arrays for JSON."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -1,0 +1,42 @@
+"""How a recorder writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.errors import FieldError
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderConfig:
+    """How a recorder writes.
+
+    Attributes
+    ----------
+    directory : where the segments go; made if missing. One axis has one directory.
+    segment_rows : samples a segment holds before it is closed (600,000 are ten minutes at 1 kHz, some 15 MB).
+    max_bytes : all closed segments together, bytes; the oldest are removed beyond that. The journals of the newest two
+    segments, 40 bytes a sample, come on top.
+    queue_samples : samples that may wait for the disk.
+    flush_s : longest time that a sample waits in memory, s: what a killed process loses.
+    sync_s : longest time that a sample waits for the disk itself, s: what a cut of the power loses.
+    retry_s : pause after a failure of the disk, s.
+    """
+
+    directory: Path
+    segment_rows: int = 600_000
+    max_bytes: int = 2_000_000_000
+    queue_samples: int = 100_000
+    flush_s: float = 0.03
+    sync_s: float = 5.0
+    retry_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("segment_rows", 1), ("max_bytes", 1), ("queue_samples", 1)):
+            value = getattr(self, name)
+            if value < least:
+                raise FieldError(name, value, f"a whole number of at least {least}")
+        for name in ("flush_s", "sync_s", "retry_s"):
+            if not getattr(self, name) > 0.0:
+                raise FieldError(name, getattr(self, name), "a positive time in s")

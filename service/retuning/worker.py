@@ -1,0 +1,81 @@
+"""The process that tunes: ``python -m service.retuning.worker FOLDER``, of the lowest priority.
+
+Reads ``order.json`` and ``data.npz`` in the folder, writes ``result.json`` there, whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+
+def main(arguments: list[str]) -> int:
+    """Do one order. Returns 0; what goes wrong is in the result."""
+    # Before anything heavy is imported: whoever answers queries goes first, always.
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(19)
+    folder = Path(arguments[0])
+    order = json.loads((folder / "order.json").read_text(encoding="utf-8"))
+    result = work(order, folder)
+    part = folder / "result.part"
+    part.write_text(json.dumps(result), encoding="utf-8")
+    os.replace(part, folder / "result.json")
+    return 0
+
+
+def work(order: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` in data.npz, or
+    ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
+    import numpy as np
+
+    from adaptive.errors import DehystError
+    from adaptive.residual import Hyperparameters
+    from adaptive.retune import RetuneConfig, compare, propose
+    from service.retuning.job import unpack
+
+    with np.load(folder / "data.npz", allow_pickle=False) as arrays:
+        data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays.files}
+    ranges = {name: tuple(order["search"][name]) for name in ("gamma_range", "width_range")}
+    config = RetuneConfig(**{**order["search"], **ranges})
+    try:
+        if order["kind"] == "compare":
+            hyper = Hyperparameters(float(order["gamma"]), tuple(float(width) for width in order["widths"]))
+            trial = compare(data["before"], data["after"], hyper, config)
+            return asdict(trial)
+        search, by = _search(bool(order["torch"]))
+        found = propose(data["before"], config, search)
+    except DehystError as error:
+        return {"error": str(error)}
+    return {
+        "gamma": found.hyper.gamma,
+        "widths": list(found.hyper.widths),
+        "changed": found.hyper != data["before"].hyper,
+        "J2": found.J2,
+        "J2_before": found.J2_before,
+        "evaluations": found.evaluations,
+        "search": by,
+    }
+
+
+def _search(wanted: bool) -> tuple[Any, str]:
+    """(what finds starts, its name): torch's batch where it is wanted and installed."""
+    if wanted:
+        from baselines.evidence_swarm import EvidenceSearch
+        from baselines.swarm import MissingTorchError, torch_module
+
+        try:
+            torch_module().set_num_threads(1)
+            search = EvidenceSearch()
+        except MissingTorchError:
+            return None, "starts around the present (torch is not installed)"
+        return search, f"torch on {search.device}"
+    return None, "starts around the present"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

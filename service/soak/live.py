@@ -1,0 +1,208 @@
+"""A soak in real time: the processes, the plan of faults, and those who watch."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+
+from service.errors import ServiceError
+from service.soak.actions import Actions
+from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
+from service.soak.monitor import Monitor
+from service.soak.plan import SoakPlan
+from service.soak.processor import Others
+from service.soak.settling import WELL_PCT
+from service.soak.setup import Control
+from service.soak.world import World
+from sim.stage import StageConfig
+
+Say = Callable[[str], None]
+_TICK_S = 0.02
+_PROGRESS_S = 5.0
+_FIRST_SAMPLES_S = 20.0
+#: So long memory and processor of every process are kept each second.
+_DENSE_S = 3600
+#: Processes that are to live all the time but where a fault ends them.
+LASTING = ("router", "a", "b", "stage", "controller", "prober", "echo", "viewer", "bare")
+
+
+def run_live(
+    out: Path, stage: StageConfig, control: Control, model: Path, plan: SoakPlan, stopped: Callable[[], bool], say: Say
+) -> tuple[Ledger, Monitor]:
+    """Run the plan; ``stopped`` ends it early. Raises ServiceError where the processes do not come up."""
+    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, "real_time")
+    with World(out, stage, control, model) as world:
+        say("      starting router, services, stage, controller, prober, echo, viewer")
+        world.start()
+        monitor = Monitor(world.endpoint, control, time.monotonic())
+        try:
+            _wait_for_samples(monitor)
+            watch = _Watch(world, monitor, ledger, say)
+            try:
+                watch.run(plan, stopped)
+            finally:
+                watch.close()
+        finally:
+            say("  stopping all")
+            world.stop()
+            monitor.close()
+    ledger.seconds = monitor.track.seconds[:-1] or monitor.track.seconds
+    ledger.events = monitor.events
+    return ledger, monitor
+
+
+def _wait_for_samples(monitor: Monitor) -> None:
+    until = time.monotonic() + _FIRST_SAMPLES_S
+    while monitor.track.received < 100:
+        if time.monotonic() > until:
+            raise ServiceError("soak: the stage sends no samples: see the logs of stage and controller")
+        time.sleep(0.05)
+
+
+class _Watch:
+    """The loop of a run, and the thread that looks at processes and statuses once a second."""
+
+    def __init__(self, world: World, monitor: Monitor, ledger: Ledger, say: Say) -> None:
+        self._world, self._monitor, self._ledger, self._say = world, monitor, ledger, say
+        self._actions = Actions(world, monitor)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._observe, name="soak-observe")
+        self._told_s = 0.0
+        self._others = Others()
+
+    def run(self, plan: SoakPlan, stopped: Callable[[], bool]) -> None:
+        monitor, ledger = self._monitor, self._ledger
+        monitor.start_s = time.monotonic()
+        monitor.track.seconds.clear()
+        self._thread.start()
+        waiting = list(enumerate(plan.faults))
+        under_way: list[tuple[int, float, Happened]] = []
+        waited_s = 0.0
+        while monitor.now() < plan.duration_s and not stopped():
+            now = monitor.now()
+            if waiting and waiting[0][1].at_s + waited_s <= now and not under_way:
+                fault = waiting[0][1]
+                if fault.window_s[1] + waited_s > plan.duration_s:
+                    # What came before took longer than planned: there is no time left to recover from this one.
+                    self._actions.notes.append(f"{fault.kind} at {fault.at_s:.0f} s: left out, no time to recover")
+                    waiting.pop(0)
+                elif not self._actions.possible(fault):
+                    waited_s += _TICK_S
+                else:
+                    index, _ = waiting.pop(0)
+                    happened = Happened(fault.kind, now, value=fault.value)
+                    self._actions.begin(index, fault)
+                    ledger.faults.append(happened)
+                    under_way.append((index, monitor.now() + fault.duration_s, happened))
+            for index, end_s, happened in list(under_way):
+                if end_s <= monitor.now():
+                    self._actions.end(index)
+                    happened.end_s = monitor.now()
+                    under_way.remove((index, end_s, happened))
+            self._actions.tick()
+            self._progress(plan)
+            time.sleep(_TICK_S)
+        for _, fault in waiting:
+            # Such as one that waited to the end for the standby to be synced, and those behind it.
+            self._actions.notes.append(f"{fault.kind} at {fault.at_s:.0f} s: left out, it did not come to it")
+        for index, _, happened in under_way:
+            self._actions.end(index)
+            happened.end_s = monitor.now()
+        ledger.duration_s = monitor.now()
+
+    def close(self) -> None:
+        """Take back what is under way, and end the thread."""
+        self._actions.finish()
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._ledger.notes += self._actions.notes
+
+    def _observe(self) -> None:
+        missing: dict[int, str] = {}
+        seconds = 0
+        while not self._closing.wait(1.0):
+            for told in self._monitor.ask():
+                name = self._world.by_pid(str(told["instance"]))
+                if name and told.get("role", "primary") == "primary":
+                    self._actions.primary = name
+            for instance, (t_s, told) in list(self._monitor.statuses.items()):
+                if self._monitor.now() - t_s < 1.5:
+                    self._ledger.counters.append((t_s, instance, Row(flat(told))))
+            self._take_probes()
+            self._take_controller()
+            self._take_bare()
+            self._look_at_others()
+            # In a run of days a point every ten seconds shows as much.
+            seconds += 1
+            if seconds > _DENSE_S and seconds % 10:
+                continue
+            for name, child in list(self._world.children.items()):
+                if name not in LASTING:
+                    continue
+                if not child.running:
+                    if child.pid not in self._actions.killed and child.pid not in missing:
+                        missing[child.pid] = name
+                        self._ledger.ended.append((self._monitor.now(), name))
+                    continue
+                try:
+                    process = psutil.Process(child.pid)
+                    now = self._monitor.now()
+                    memory, cpu = process.memory_info().rss / 1024.0, sum(process.cpu_times()[:2])
+                except psutil.Error:
+                    continue
+                self._ledger.memory.setdefault(name, []).append((now, memory, child.pid))
+                self._ledger.cpu.setdefault(name, []).append((now, cpu, child.pid))
+
+    def _take_probes(self) -> None:
+        for line in self._world.children["prober"].take_lines():
+            if not line.startswith('{"t_s"'):
+                continue
+            told = json.loads(line)
+            self._ledger.probes.append(probe_of(told, told["t_s"] - self._monitor.start_s))
+
+    def _take_controller(self) -> None:
+        for line in self._world.children["controller"].take_lines():
+            if line.startswith('{"blocks"'):
+                told = json.loads(line)
+                self._ledger.unsafe_blocks = max(self._ledger.unsafe_blocks, int(told["unsafe"]))
+
+    def _take_bare(self) -> None:
+        for line in self._world.children["bare"].take_lines():
+            if line.startswith('{"t_s"'):
+                told = json.loads(line)
+                self._ledger.bare.append((told["t_s"] - self._monitor.start_s, told["late_s"]))
+
+    def _look_at_others(self) -> None:
+        own_s = {os.getpid(): sum(psutil.Process().cpu_times()[:2])}
+        for name, child in list(self._world.children.items()):
+            # What is to take the processor away is not the soak's own.
+            with contextlib.suppress(psutil.Error):
+                if not name.startswith("busy"):
+                    own_s[child.pid] = sum(psutil.Process(child.pid).cpu_times()[:4])
+        share = self._others.share(own_s)
+        if share is not None:
+            self._ledger.others.append((self._monitor.now(), share))
+
+    def _progress(self, plan: SoakPlan) -> None:
+        now = self._monitor.now()
+        if now - self._told_s < _PROGRESS_S:
+            return
+        self._told_s = now
+        second, _ = self._monitor.latest()
+        mae = math.nan if second is None else 100.0 * second.mae_um / self._ledger.range_um
+        filled = round(20.0 * min(1.0, now / plan.duration_s))
+        last = self._ledger.faults[-1].kind if self._ledger.faults else "none yet"
+        well = "" if not mae > WELL_PCT else " (!)"
+        self._say(
+            f"  [{'#' * filled:<20}] {now:6.0f} of {plan.duration_s:g} s  error {mae:.3f} % of range{well}, "
+            f"{len(self._ledger.faults)} of {len(plan.faults)} faults, last {last}, {self._actions.primary} serves"
+        )

@@ -1,0 +1,91 @@
+"""For every fault of a soak: when all was well again, for how long nobody answered, and who told of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from service.soak.catalogue import KINDS
+from service.soak.ledger import Happened, Ledger
+from service.soak.machine import Machine
+
+#: Mean |error| in a second that counts as well again, in percent of the commanded range.
+WELL_PCT: Final = 0.3
+
+#: What tells of a fault: counters of the status of which one grows, ``event`` for any event, ``instance`` for another
+#: instance that answers. Kinds that are missing are nobody's business.
+TELLERS: Final[dict[str, tuple[str, ...]]] = {
+    "kill_primary": ("instance", "event"),
+    "stop_primary": ("instance", "event", "samples.lost"),
+    "kill_standby": ("instance", "event"),
+    "restart_stage": ("samples.restarts",),
+    "restart_router": ("samples.lost", "event"),
+    "disk_full": ("recorder.errors", "recorder.lost", "event"),
+    "bad_queries": ("queries.errors", "samples.malformed"),
+    "gap": ("samples.lost",),
+    "duplicate": ("samples.late",),
+    "reorder": ("samples.late",),
+    "nan": ("samples.gates.not_finite",),
+    "spike": ("samples.gates.glitch", "samples.gates.outlier"),
+    "freeze": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.unexcited", "learner.jumps", "event"),
+    "saturate": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.saturated", "learner.jumps", "event"),
+    "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
+    "dwell": ("samples.gates.unexcited",),
+}
+
+
+def settle(ledger: Ledger) -> None:
+    """Fill in for every fault when all was well again, for how long nobody answered, and who told of it."""
+    mae = {round(s.t_s): 100.0 * s.mae_um / ledger.range_um for s in ledger.seconds if s.judged}
+    machine = Machine(ledger.bare, ledger.others)
+    begins = [fault.begin_s for fault in ledger.faults[1:]]
+    for fault, next_s in zip(ledger.faults, [*begins, math.inf], strict=False):
+        end = fault.end_s if math.isfinite(fault.end_s) else fault.begin_s
+        last = fault.window_s[1] + 2.0
+        # On a machine that is busy all takes longer: as many seconds as it was are looked at on top.
+        last += machine.busy_s(end, last)
+        within = [p for p in ledger.probes if fault.begin_s <= p.t_s <= last + 1.0]
+        fault.silent_s = max((p.silent_s for p in within if p.t_s <= next_s), default=0.0)
+        for p in within:
+            second = round(math.floor(p.t_s))
+            good = [mae.get(second + i, math.inf) <= WELL_PCT for i in (0, 1)]
+            if p.t_s - 1.0 >= end and not p.failed and len(p.service_us) and all(good):
+                fault.recovered_s = p.t_s - 1.0
+                break
+        fault.busy_s = machine.busy_s(end, min(fault.recovered_s, last) if math.isfinite(fault.recovered_s) else last)
+        if ledger.mode == "fast":
+            for second in sorted(s for s in mae if end <= s <= last):
+                if mae[second] <= WELL_PCT:
+                    fault.recovered_s = float(second)
+                    break
+        fault.told = _told(ledger, fault)
+
+
+def _told(ledger: Ledger, fault: Happened) -> str:
+    """Which counter or event told of a fault; "" for none, "-" where none is asked for."""
+    tellers = TELLERS.get(fault.kind)
+    if tellers is None:
+        return "-"
+    begin, end = fault.begin_s, fault.window_s[1] + 2.0
+    counters = ledger.counters_between(begin - 30.0, end)
+    for teller in tellers:
+        if teller == "event":
+            # Who comes and goes is of no interest but for those who were killed.
+            alive = ("came", "gone") if not KINDS[fault.kind].ends_service else ()
+            said = [e for e in ledger.events if begin <= e["t_s"] <= end and e.get("event") not in alive]
+            if said:
+                return f"event {said[0].get('event')}"
+        elif teller == "instance":
+            before = {name for t, name, _ in counters if begin - 5.0 <= t <= begin}
+            new = {name for t, name, _ in counters if begin < t <= end} - before
+            gone = before - {name for t, name, _ in counters if begin + 1.5 < t <= end}
+            if new or gone:
+                return "another instance"
+        else:
+            for name in {name for _, name, _ in counters}:
+                rows = [(t, c.get(teller, 0.0)) for t, who, c in counters if who == name]
+                was = [value for t, value in rows if t <= begin]
+                now = [value for t, value in rows if begin < t <= end]
+                if now and max(now) > (was[-1] if was else 0.0):
+                    return teller
+    return ""

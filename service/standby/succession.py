@@ -1,0 +1,209 @@
+"""Decides, for one axis of one instance, whether it serves or stands by, and brings it about.
+
+A thread of its own, woken by the claims of others: nothing is decided in a callback of the wire.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import Any, Final
+
+import zenoh
+
+from adaptive.errors import DehystError, ModelFileError
+from service.axis_server import PRIMARY, STANDBY, AxisServer
+from service.standby.claims import Claims
+from service.standby.estate import Estate, inherit
+from service.standby.shadow import Shadow
+
+#: Events of the serving instance after which its model is another than the samples alone would make it.
+OPERATIONS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
+#: Longest wait for the state of the serving instance, and pause before it is asked for again, s.
+_STATE_S: Final = 3.0
+_AGAIN_S: Final = 0.3
+
+
+class Succession:
+    """One axis' place in the line.
+
+    Parameters
+    ----------
+    server : listens already. patience_s : how long to look for one that serves before serving oneself, s.
+    estate : where the other instance of a pair keeps its checkpoints and recordings, if that is on this host.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, server: AxisServer, patience_s: float, estate: Estate | None = None
+    ) -> None:
+        self.server = server
+        self.claims = Claims(server.keys, server.instance)
+        self.shadow = Shadow(server.axis, server.intake, changed=server.keeper.at_once, torn=self._differs)
+        self._estate = estate or Estate()
+        self._refused = ""
+        self._session = session
+        self._patience_s = patience_s
+        self._stopping = False
+        self._stale = True
+        self._token: Any = None
+        self._mine = 0
+        self._subscribers: list[Any] = []
+        self._thread = threading.Thread(target=self._run, name=f"succession-{server.keys.axis}", daemon=True)
+        #: Set once it is known whether this instance serves.
+        self.settled = threading.Event()
+        #: Set once it serves, or holds the model of the one that serves, or was refused it.
+        self.ready = threading.Event()
+        server.synced = False
+        server.intake.gate = self.shadow.gate
+
+    def start(self) -> None:
+        """Look for others, and find one's place."""
+        keys = self.server.keys
+        self._subscribers = [
+            self._session.liveliness().declare_subscriber(keys.claim_any, self._on_claim, history=True),
+            self._session.declare_subscriber(keys.event, self._on_event),
+            self._session.declare_subscriber(keys.status, self._on_status),
+        ]
+        self._thread.start()
+
+    def close(self) -> None:
+        """Give up one's claim and end the thread; the server is closed by whoever opened it."""
+        self._stopping = True
+        self.claims.changed.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._subscribers = []
+        self._drop_claim()
+
+    def _on_claim(self, sample: zenoh.Sample) -> None:
+        self.claims.hear(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    def _on_event(self, sample: zenoh.Sample) -> None:
+        told = _json(sample)
+        if told.get("instance") != self.server.instance and told.get("event") in OPERATIONS:
+            self._differs()
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        """Once a second the serving instance tells a digest of its model: ours of the same sample must be the same."""
+        told = _json(sample)
+        server = self.server
+        if server.role == PRIMARY or not server.synced or told.get("instance") == server.instance:
+            return
+        seq, theirs = told.get("snapshot_seq"), told.get("fingerprint")
+        if isinstance(seq, int) and isinstance(theirs, str) and server.axis.differs(seq, theirs):
+            server.axis.note("standby_differed", f"at sample {seq}; the state is taken over anew")
+            self._differs()
+
+    def _differs(self) -> None:
+        self._stale = True
+        self.claims.changed.set()
+
+    def _run(self) -> None:
+        until = time.monotonic() + self._patience_s
+        while not self._stopping:
+            self.claims.changed.clear()
+            try:
+                self._decide(until)
+            except Exception as error:
+                self.server.axis.note("internal_error", f"standby: {type(error).__name__}: {error}")
+            first = self.claims.first()
+            if self.server.role == STANDBY and first is None:
+                wait_s = max(0.01, until - time.monotonic())
+            else:
+                wait_s = _AGAIN_S if self.server.role == STANDBY and self._stale else 1.0
+            self.claims.changed.wait(wait_s)
+
+    def _decide(self, until: float) -> None:
+        first = self.claims.first()
+        if self.server.role == PRIMARY:
+            if first is not None and (first.epoch, first.instance) > (self._mine, self.server.instance):
+                self._yield_to(first.instance)
+            return
+        if first is None:
+            # Who has stood by knows that the one that served is gone; who has just begun looks around first.
+            if self.settled.is_set() or time.monotonic() >= until:
+                self._take_over()
+            return
+        self.settled.set()
+        if self._stale:
+            self._take_state()
+
+    def _take_over(self) -> None:
+        server = self.server
+        server.epoch = self._mine = self.claims.next_epoch()
+        self._token = self._session.liveliness().declare_token(server.keys.claim(self._mine, server.instance))
+        server.serve()
+        server.intake.call(self._release, 60.0)
+        self._stale = False
+        server.synced = True
+        self.settled.set()
+        self.ready.set()
+
+    def _yield_to(self, other: str) -> None:
+        server = self.server
+        server.axis.note("stood_down", f"{other} serves: it took over while this instance was not heard")
+        # First, so that nobody takes what it has for the model of the one that serves.
+        server.synced = False
+        server.stand_down()
+        self._drop_claim()
+        server.intake.call(self._hold, 60.0)
+        self._stale = True
+        self._take_state()
+
+    def _release(self) -> None:
+        axis = self.server.axis
+        # The first of a line takes over from nobody: what it began from is what it has.
+        began = self.shadow.give_up(self._inherit if self._mine > 1 else lambda _: "")
+        self.server.intake.gate = None
+        if self._mine > 1:
+            model = f"not synced: it goes on from {began}" if began else "with the model of the one before"
+            axis.note("took_over", f"as number {self._mine}, {model}", synced=not began)
+
+    def _inherit(self, newest_seq: int) -> str:
+        return inherit(self.server.axis, self._estate, self.server.keys.stage, newest_seq)
+
+    def _hold(self) -> None:
+        self.shadow.hold()
+        self.server.intake.gate = self.shadow.gate
+
+    def _take_state(self) -> None:
+        """Take over the state of the one that serves; where it does not come, once more after a while."""
+        self._stale = False  # what makes it stale again may happen while it is taken
+        self._stale = not self._taken() or self._stale
+
+    def _taken(self) -> bool:
+        for reply in self._session.get(self.server.keys.state, timeout=_STATE_S):
+            if reply.ok is None:
+                continue
+            data = reply.ok.payload.to_bytes()
+            try:
+                self.server.intake.call(lambda data=data: self.shadow.take_state(data), 10.0)  # type: ignore[misc]
+            except DehystError as error:
+                if str(error) != self._refused:
+                    self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
+                self._refused = str(error)
+                if isinstance(error, ModelFileError):
+                    # Another configuration: it stays without, and says so, but records all the same.
+                    self.ready.set()
+                return False
+            self._refused = ""
+            self.server.synced = True
+            self.ready.set()
+            return True
+        return False
+
+    def _drop_claim(self) -> None:
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
+
+
+def _json(sample: zenoh.Sample) -> dict[str, Any]:
+    try:
+        told = json.loads(sample.payload.to_bytes())
+    except (ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}

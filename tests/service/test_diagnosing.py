@@ -1,0 +1,347 @@
+"""The diagnosis in the background: buffer, alarm, job, watcher, and a real service whose stage changes its gain."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from adaptive.types import Sample
+from service import wire
+from service.axis import Axis
+from service.client import Client
+from service.config import AxisConfig, parse_config
+from service.diagnosing.alarm import Alarm, Levels
+from service.diagnosing.buffer import SampleBuffer
+from service.diagnosing.job import Job
+from service.diagnosing.settings import WatchConfig
+from service.diagnosing.watcher import Watcher
+from service.errors import FieldError
+from service.guard import Limits
+from service.identifying import identify_one
+from service.modelfile import BundleMeta, read_bundle, write_bundle
+from service.session import open_client
+from service.wire import SampleBatch
+from sim.presets import preset
+from sim.reference import demo_reference
+from sim.signals import training_input
+from sim.stage import Stage
+
+DT_S = 1e-3
+QUICK = WatchConfig(history_s=8.0, reference_s=4.0, recent_s=3.0, collect_s=2.0, cooldown_s=5.0, timeout_s=60.0)
+
+
+def batch(first: int, n: int, y_um: float = 1.0) -> SampleBatch:
+    k = np.arange(first, first + n)
+    return SampleBatch(k, k * DT_S, 0.1 * k, np.full(n, y_um))
+
+
+def eventually(condition: Callable[[], Any], within_s: float) -> Any:
+    until = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < until, "did not come true in time"
+        time.sleep(0.05)
+    return value
+
+
+# ---- buffer
+
+
+@pytest.mark.parametrize("sizes", [(3, 4, 5), (1,) * 20, (50,), (9, 10, 11)])
+def test_the_buffer_keeps_the_newest_in_order(sizes: tuple[int, ...]) -> None:
+    buffer, first = SampleBuffer(10), 0
+    for n in sizes:
+        assert buffer.add(batch(first, n))
+        first += n
+    kept = buffer.copy()
+    assert kept[0].tolist() == list(range(max(0, first - 10), first))
+    assert kept[2].tolist() == pytest.approx((0.1 * kept[0]).tolist())
+    assert buffer.copy(4)[0].tolist() == kept[0, -4:].tolist()
+    assert (buffer.size, buffer.last_seq) == (min(10, first), first - 1)
+
+
+def test_doubles_are_left_out_and_a_restart_begins_anew() -> None:
+    buffer = SampleBuffer(1000)
+    buffer.add(batch(0, 500))
+    assert buffer.add(batch(490, 20))
+    assert buffer.copy()[0].tolist() == list(range(510))
+    assert buffer.add(batch(0, 150))
+    assert buffer.size == 510
+    assert not buffer.add(batch(150, 150))
+    assert buffer.copy()[0].tolist() == list(range(150, 300))
+
+
+# ---- alarm
+
+NORMAL = Levels(1.0, 0.0, 0.05, True)
+
+
+@pytest.mark.parametrize(
+    ("now", "word"),
+    [
+        (replace(NORMAL, gain=0.985), "gain"),
+        (replace(NORMAL, offset_V=0.3), "offset"),
+        (replace(NORMAL, error_pct=1.0), "error"),
+        (replace(NORMAL, valid=False), "validity"),
+    ],
+)
+def test_an_alarm_needs_to_last(now: Levels, word: str) -> None:
+    alarm = Alarm(WatchConfig(), 10.0)
+    assert alarm.check(0.0, now) == ""
+    alarm.arm(NORMAL)
+    assert alarm.check(1.0, now) == ""
+    assert alarm.check(1.4, NORMAL) == ""
+    assert alarm.check(1.6, now) == ""
+    assert word in alarm.check(2.1, now)
+
+
+def test_what_stays_within_its_bounds_raises_none() -> None:
+    alarm = Alarm(WatchConfig(), 10.0)
+    alarm.arm(NORMAL)
+    assert all(alarm.check(0.1 * k, Levels(1.009, 0.19, 0.19, True)) == "" for k in range(100))
+    assert Levels.of({"gain": float("nan"), "offset_V": 0.0, "recent_rms_error_pct": 1.0}) is None
+    assert Levels.of({"gain": 1.0}) is None
+
+
+# ---- configuration
+
+
+def test_the_configuration_is_read_strictly() -> None:
+    text = 'stage = "demo"\n[[axis]]\nname = "x"\nmodel = "x.npz"\nu_min_V = 0\nu_max_V = 9\nslew_V_per_s = 1\n'
+    read = parse_config(text + '[axis.diagnosis]\ncollect_s = 3\nreports = "r"\n', "here", Path("/a"))
+    assert read.axes[0].diagnosis.collect_s == 3.0
+    assert read.axes[0].diagnosis.reports == "/a/r"
+    assert parse_config(text, "here", Path()).axes[0].diagnosis == WatchConfig()
+    for line, word in (("colect_s = 3", "colect_s"), ("timeout_s = 0", "timeout_s"), ("history_s = 3", "history_s")):
+        with pytest.raises(FieldError, match=word):
+            parse_config(text + f"[axis.diagnosis]\n{line}\n", "here", Path())
+
+
+# ---- jobs and the watcher, on the stage that stands in for hardware
+
+
+@pytest.fixture(scope="module")
+def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    stage = Stage(preset("rich", dt_s=DT_S, seed=20))
+    u_V = training_input(DT_S, 10.0)[1]
+    y_um = stage.run(stage.initial_state(), u_V)[0]
+    path = tmp_path_factory.mktemp("model") / "x.npz"
+    models = {name: identify_one(name, u_V, y_um, DT_S, 200) for name in ("linear", "lssvm_adaptive")}
+    meta = BundleMeta("demo", "x", DT_S, y_min_um=float(y_um.min()), y_max_um=float(y_um.max()))
+    write_bundle(path, models, meta)
+    return path
+
+
+def voltages(model_file: Path, seconds: float) -> Any:
+    """What the identified model gives for a reference with large and small swings."""
+    model = read_bundle(model_file).models["lssvm_adaptive"]
+    wanted = demo_reference(seconds, DT_S, (6.0, 78.0), 20)
+    swing = 30.0 * (1.0 - np.cos(2.0 * np.pi * 0.5 * wanted.t_s)) + 10.0
+    v, a = np.gradient(swing, DT_S), np.gradient(np.gradient(swing, DT_S), DT_S)
+    return np.clip(model.feedforward(swing, v, a, model.rest_memory(0.0)).u_V, -2.0, 10.0)
+
+
+def recorded(model_file: Path, seconds: float, change_s: float, **change: float) -> Any:
+    """Samples (4, n) of the stage, changed at ``change_s``."""
+    u_V = voltages(model_file, seconds)
+    values = {name.replace("__", "."): value for name, value in change.items()}
+    config = preset("rich", dt_s=DT_S, seed=21)
+    stage = Stage(replace(config, changes=((change_s, values),)) if values else config)
+    y_um = stage.run(stage.initial_state(), u_V)[0]
+    seq = np.arange(u_V.size)
+    return np.stack([seq, seq * DT_S, u_V, y_um])
+
+
+def order(model_file: Path, from_seq: int) -> dict[str, Any]:
+    return {"model": str(model_file), "name": "lssvm_adaptive", "from_seq": from_seq, "report": ""}
+
+
+def test_a_job_names_the_change_in_a_process_of_its_own(model_file: Path) -> None:
+    samples = recorded(model_file, 14.0, 7.0, gain_drift__gain=-0.019)
+    told: list[dict[str, Any]] = []
+    job = Job(order(model_file, 7000), samples[:, :6500], samples[:, 2000:], 60.0, told.append)
+    job.start()
+    eventually(lambda: not job.running, 60.0)
+    assert told[0]["verdict"] == "changed"
+    assert told[0]["effects"][0]["name"] == "gain_drift"
+    assert told[0]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.003)
+    assert "gain drift, -1." in told[0]["text"] or "gain drift, -2." in told[0]["text"]
+
+
+def test_a_job_that_cannot_be_done_says_why(model_file: Path, tmp_path: Path) -> None:
+    samples = recorded(model_file, 3.0, 0.0)
+    told: list[dict[str, Any]] = []
+    jobs = (
+        Job(order(tmp_path / "none.npz", 0), samples, samples, 60.0, told.append),
+        Job(order(model_file, 2900), samples, samples, 60.0, told.append),
+        Job(order(model_file, 0), samples, samples, 0.05, told.append),
+    )
+    for job in jobs:
+        job.start()
+    eventually(lambda: not any(job.running for job in jobs), 60.0)
+    assert all(sum(word in t["error"] for t in told) == 1 for word in ("none.npz", "usable samples", "timeout_s"))
+
+
+def test_a_cancelled_job_tells_nothing_and_leaves_no_process(model_file: Path) -> None:
+    samples = recorded(model_file, 3.0, 0.0)
+    told: list[dict[str, Any]] = []
+    job = Job(order(model_file, 0), samples, samples, 60.0, told.append)
+    job.start()
+    eventually(lambda: job._process is not None, 10.0)
+    job.cancel()
+    assert not job.running
+    assert job._process is not None
+    assert job._process.poll() is not None
+    assert told == []
+
+
+class StandIn:
+    """A learner that tells a gain; nothing is learnt."""
+
+    def __init__(self, model: Any) -> None:
+        self.model, self.gain, self.seq = model, 1.0, -1
+
+    def handle(self, sample: Sample) -> str:
+        self.seq = sample.seq
+        return "learnt"
+
+    def snapshot(self) -> Any:
+        return self.model
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"gain": self.gain, "offset_V": 0.0, "recent_rms_error_pct": 0.05, "valid": 1.0}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+
+def watched(model_file: Path, config: WatchConfig = QUICK) -> tuple[Watcher, Axis, StandIn]:
+    models = dict(read_bundle(model_file).models)
+    limits = Limits(-2.0, 10.0, 4000.0, 0.0, 90.0)
+    learner = StandIn(models["lssvm_adaptive"])
+    axis = Axis(AxisConfig("x", model_file, limits, diagnosis=config), models, learner, limits)
+    return Watcher(axis, config), axis, learner
+
+
+def feed(watcher: Watcher, samples: Any, first: int, last: int) -> None:
+    for k in range(first, last, 20):
+        part = samples[:, k : min(last, k + 20)]
+        watcher.take(SampleBatch(part[0].astype(np.int64), *(np.ascontiguousarray(row) for row in part[1:])))
+        watcher.tick(k * DT_S)
+
+
+def test_an_alarm_leads_to_a_verdict_and_a_new_reference(model_file: Path) -> None:
+    samples = recorded(model_file, 18.0, 6.0, gain_drift__gain=-0.03)
+    watcher, axis, learner = watched(model_file)
+    feed(watcher, samples, 0, 6000)
+    assert watcher.status()["armed"]
+    learner.gain = 0.972
+    feed(watcher, samples, 6000, 7500)
+    assert [e["event"] for e in axis.take_events()] == ["diagnosis_alarm"]
+    feed(watcher, samples, 7500, 11000)
+    eventually(lambda: not watcher.status()["running"], 60.0)
+    (event,) = axis.take_events()
+    assert event["event"] == "diagnosis"
+    assert event["detail"].startswith("the model's error grew: gain drift, -")
+    status = watcher.status()
+    json.dumps(status)
+    assert (status["alarms"], status["started"], status["finished"], status["armed"]) == (1, 1, 1, False)
+    assert status["last"]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.03, abs=0.004)
+    feed(watcher, samples, 11000, 17000)
+    assert watcher.status()["armed"]
+    assert watcher.status()["alarms"] == 1
+    watcher.close()
+
+
+def test_requests_are_answered_at_once_and_one_runs_at_a_time(model_file: Path) -> None:
+    samples = recorded(model_file, 13.0, 0.0)
+    watcher, axis, _ = watched(model_file)
+    assert not watcher.request({})["started"]
+    # From a stage that has been moving for a while: creep since its first move is a change, and would be told.
+    feed(watcher, samples, 4000, 13000)
+    begin = time.perf_counter()
+    assert watcher.request({"recent_s": 3.0}) == {"started": True, "job": 1}
+    assert watcher.request({})["why"] == "one is running"
+    assert time.perf_counter() - begin < 0.2
+    for bad in ({"recent": 3.0}, {"recent_s": "3"}, {"recent_s": True}, {"recent_s": 0.1}, {"report": 1}):
+        with pytest.raises(InputError):
+            watcher.request(bad)
+    with pytest.raises(InputError, match="reports"):
+        watcher.request({"report": True})
+    eventually(lambda: not watcher.status()["running"], 60.0)
+    assert watcher.status()["last"]["verdict"] == "unchanged"
+    assert axis.take_events()[-1]["event"] == "diagnosis"
+    watcher.close()
+    assert not watcher.request({})["started"]
+
+
+def test_a_stage_that_rests_gives_no_reference(model_file: Path) -> None:
+    watcher, _, _ = watched(model_file)
+    for first in range(0, 9000, 100):
+        watcher.take(batch(first, 100, y_um=40.0))
+    assert not watcher.status()["reference"]
+    assert not watcher.request({})["started"]
+
+
+def test_watching_brings_neither_torch_nor_plots_into_the_service() -> None:
+    code = (
+        "import sys, service.server, service.diagnosing.watcher;"
+        "print([m for m in ('torch', 'matplotlib', 'rerun', 'sim.diagnosis', 'sim.changes') if m in sys.modules])"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert ended.stdout.strip() == "[]"
+
+
+@pytest.mark.e2e
+def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tmp_path: Path, free_port: int) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    config = tmp_path / "serve.toml"
+    config.write_text(
+        f'stage = "demo"\nlisten = ["{endpoint}"]\n[[axis]]\nname = "x"\nmodel = {json.dumps(str(model_file))}\n'
+        "u_min_V = -2.0\nu_max_V = 10.0\nslew_V_per_s = 4000.0\n"
+        "[axis.diagnosis]\nhistory_s = 8\nreference_s = 4\nrecent_s = 3\ncollect_s = 2.5\n"
+    )
+    u_V = voltages(model_file, 20.0)
+    cli = [sys.executable, "-m", "service.cli"]
+    serve = subprocess.Popen([*cli, "serve", "--config", str(config), "--json"], stdout=subprocess.PIPE, text=True)
+    stage = None
+    try:
+        assert serve.stdout is not None
+        assert json.loads(serve.stdout.readline())["ready"]
+        stage = subprocess.Popen(
+            [
+                *cli, "stage", "--endpoint", endpoint, "--duration", "20", "--batch", "20", "--seed", "21",
+                "--change", "6:gain_drift.gain=-0.019", "--json",
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        assert stage.stdout is not None
+        assert json.loads(stage.stdout.readline())["ready"]
+        with Client.connect(endpoint, timeout_s=5.0) as client, open_client(endpoint) as session:
+            events: list[dict[str, Any]] = []
+            session.declare_subscriber(client.keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+            for first in range(0, u_V.size, 500):
+                session.put(client.keys.command, wire.encode_command(first, u_V[first : first + 500]))
+            said = eventually(lambda: [e for e in events if e["event"] == "diagnosis"], 100.0)
+            assert said[0]["detail"].startswith("the model's error grew: gain drift, -")
+            last = client.status()["diagnosis"]["last"]
+            assert last["effects"][0]["name"] == "gain_drift"
+            assert last["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.004)
+    finally:
+        for process in (stage, serve):
+            if process is not None:
+                process.terminate()
+                process.communicate(timeout=30)

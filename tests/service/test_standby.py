@@ -1,0 +1,225 @@
+"""Two real instances on one stage: the model is the same in both, and one of them answers whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.client import Client
+from service.keys import Keys
+from service.session import open_client
+from service.standby.claims import Claim, Claims, parse_claim
+from sim.recordings import read
+from tests.service.conftest import unused_port, write_config
+from tests.service.living import Asker, Process, Stage, eventually
+
+pytestmark = pytest.mark.e2e
+SLEW_V_PER_S = 2000.0
+
+
+@pytest.fixture
+def processes() -> Iterator[list[Process]]:
+    started: list[Process] = []
+    yield started
+    for process in started:
+        process.send(signal.SIGCONT)
+        process.kill()
+
+
+def pair_config(folder: Path) -> tuple[Path, list[str]]:
+    """A configuration of an instance and its standby, and where clients find them."""
+    ports = [unused_port(), unused_port()]
+    extra = 'recorder = "rec"\ncheckpoints = "kept"\nserved = "lssvm_adaptive"\n'
+    config = write_config(folder, ports[0], extra=extra)
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
+    config.write_text(f'standby_listen = ["{endpoints[1]}"]\nlease_s = 0.6\n' + config.read_text())
+    return config, endpoints
+
+
+def test_the_standby_takes_over_and_the_one_that_comes_back_stands_by(tmp_path: Path, processes: list[Process]) -> None:
+    config, endpoints = pair_config(tmp_path)
+    serve = ("serve", "--config", str(config))
+    processes.append(Process(*serve))
+    assert processes[0].ready["role"] == "primary"
+    standing: dict[str, dict[str, Any]] = {}
+
+    def on_standby(sample: Any) -> None:
+        status = json.loads(sample.payload.to_bytes())
+        standing[status["instance"]] = status
+
+    with (
+        open_client(endpoints, 20.0) as session,
+        Client.connect(endpoints, timeout_s=0.3, wait_s=20.0, retry_s=10.0) as client,
+        Stage(endpoints) as stage,
+    ):
+        session.declare_subscriber(f"{client.keys.base}/standby/*", on_standby)
+        eventually(lambda: client.status()["samples"]["learnt"] > 300)
+        # It comes late, and holds the same model to the last bit nevertheless.
+        processes.append(Process(*serve, "--standby"))
+        assert (processes[1].ready["role"], processes[1].ready["synced"]) == ("standby", True)
+        second = processes[1].ready["instance"]
+        learnt = eventually(lambda: standing.get(second, {}).get("samples", {}).get("learnt", 0))
+        assert learnt > 300
+        assert is_the_same(client, standing, second)
+
+        # The one that serves is killed.
+        asker = Asker(client)
+        asker.ask_for(0.5)
+        # Half a dozen threads have to be woken one after the other; on a machine with ten others for each that waits.
+        limit_s = 0.2 if os.getloadavg()[0] < 2.0 * (os.cpu_count() or 1) else 1.0
+        processes[0].process.kill()
+        asker.ask_for(1.5)
+        assert asker.silence_s < limit_s, f"no answer for {1e3 * asker.silence_s:.0f} ms"
+        assert asker.step_V <= SLEW_V_PER_S * asker.silence_s
+        assert asker.step_V < 0.1
+        status = client.status()
+        assert (status["role"], status["epoch"], status["instance"]) == ("primary", 2, second)
+        assert status["samples"]["lost"] <= 100
+
+        # It comes back, meets the one that serves, and stands by, with the model of that one.
+        processes.append(Process(*serve))
+        third = processes[2].ready["instance"]
+        assert (processes[2].ready["role"], processes[2].ready["synced"]) == ("standby", True)
+        eventually(lambda: standing.get(third, {}).get("samples", {}).get("learnt", 0) > learnt)
+        assert is_the_same(client, standing, third)
+
+        # The one that serves is stopped for a while: to the others that is as good as dead, until it comes back.
+        processes[1].send(signal.SIGSTOP)
+        asker.ask_for(3.0)
+        assert asker.silence_s < 2.5
+        assert asker.step_V < 0.1
+        assert (client.status()["instance"], client.status()["epoch"]) == (third, 3)
+        standing.pop(second, None)
+        processes[1].send(signal.SIGCONT)
+        eventually(lambda: standing.get(second, {}).get("role") == "standby")
+        eventually(lambda: {client.status()["instance"] for _ in range(20)} == {third})
+        assert is_the_same(client, standing, second)
+        sent = stage.sent
+    # Both wrote what they saw, each into its own folder.
+    for process in processes[1:]:
+        process.send(signal.SIGTERM)
+        assert process.process.wait(30) == 0
+    for name in ("rec", "rec-standby"):
+        recorded = read(tmp_path / name)
+        assert recorded.seq is not None
+        assert len(recorded) > 1000
+    assert sent > 5000
+
+
+def is_the_same(client: Client, standing: dict[str, dict[str, Any]], instance: str) -> bool:
+    """Whether a standby tells, of two samples, the digest that the serving instance tells of them.
+
+    Fails where one that says it is synced tells another one.
+    """
+    serving: dict[int, str] = {}
+    beside: dict[int, str] = {}
+    until = time.monotonic() + 25.0
+    while time.monotonic() < until:
+        status = client.status()
+        serving[status["snapshot_seq"]] = status["fingerprint"]
+        told = standing.get(instance)
+        if told and told["synced"]:
+            beside[told["snapshot_seq"]] = told["fingerprint"]
+        common = serving.keys() & beside.keys()
+        assert not [seq for seq in common if serving[seq] != beside[seq]]
+        if len(common) >= 2:
+            return True
+        time.sleep(0.004)
+    return False
+
+
+def test_a_router_that_is_started_again_is_found_again(tmp_path: Path, processes: list[Process]) -> None:
+    endpoint = f"tcp/127.0.0.1:{unused_port()}"
+    config = write_config(tmp_path, 1)
+    config.write_text(
+        config.read_text().replace('listen = ["tcp/127.0.0.1:1"]', f'listen = []\nconnect = ["{endpoint}"]')
+    )
+    router = ("router", "--listen", endpoint)
+    processes.append(Process(*router))
+    processes.append(Process("serve", "--config", str(config)))
+    with Client.connect(endpoint, timeout_s=0.5, wait_s=20.0, retry_s=20.0) as client, Stage([endpoint]):
+        eventually(lambda: client.status()["samples"]["learnt"] > 100)
+        processes[0].process.kill()
+        time.sleep(0.3)
+        processes.append(Process(*router))
+        asker = Asker(client)
+        asker.ask_for(0.5)
+        before = client.status()
+        eventually(lambda: client.status()["seq"] > before["seq"] + 100)
+        assert client.status()["epoch"] == 1
+
+
+def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processes: list[Process]) -> None:
+    config = write_config(tmp_path, port := unused_port())
+    endpoint = f"tcp/127.0.0.1:{port}"
+    processes.append(Process("serve", "--config", str(config)))
+    program = (
+        "import sys, time\n"
+        "from service.session import open_client\n"
+        "s = open_client(sys.argv[1])\n"
+        "sub = s.declare_subscriber('dehyst/v1/demo/x/**', lambda _: None)\n"
+        "print('watching', flush=True)\n"
+        "time.sleep(100)\n"
+    )
+    viewers = [
+        subprocess.Popen([sys.executable, "-c", program, endpoint], stdout=subprocess.PIPE, text=True) for _ in range(3)
+    ]
+    try:
+        for viewer in viewers:
+            assert viewer.stdout is not None
+            assert viewer.stdout.readline() == "watching\n"
+        with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0) as client, Stage([endpoint]):
+            eventually(lambda: client.status()["samples"]["learnt"] > 100)
+            asker = Asker(client)
+            viewers[0].kill()
+            for viewer in viewers[1:]:
+                viewer.send_signal(signal.SIGSTOP)
+            asker.ask_for(2.5)
+            assert asker.silence_s < 0.5
+            assert client.retries == 0
+            assert client.status()["samples"]["lost"] == 0
+    finally:
+        for viewer in viewers:
+            viewer.send_signal(signal.SIGCONT)
+            viewer.kill()
+            viewer.communicate(timeout=20)
+
+
+def test_the_greatest_claim_serves() -> None:
+    keys = Keys("demo", "x")
+    claims = Claims(keys, "i-me")
+    assert (claims.first(), claims.next_epoch()) == (None, 1)
+    claims.hear(keys.claim(3, "i-me"), True)  # one's own is no news
+    assert claims.first() is None
+    claims.hear(keys.claim(1, "i-b"), True)
+    claims.hear(keys.claim(2, "i-a"), True)
+    claims.hear(keys.claim(2, "i-c"), True)
+    assert claims.first() == Claim(2, "i-c")
+    claims.hear(keys.claim(2, "i-c"), False)
+    assert claims.first() == Claim(2, "i-a")
+    claims.hear(keys.claim(2, "i-a"), False)
+    claims.hear(keys.claim(1, "i-b"), False)
+    assert (claims.first(), claims.next_epoch()) == (None, 3)
+    claims.hear("dehyst/v1/demo/x/alive/i-b", True)
+    assert claims.first() is None
+    assert parse_claim("x") is None
+    assert np.all([Claim(2, "a") > Claim(1, "z"), Claim(2, "b") > Claim(2, "a")])
+
+
+def test_a_standby_needs_ears_of_its_own(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "service.cli", "serve", "--config", str(write_config(tmp_path, 1)), "--standby"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "standby_listen" in done.stderr
