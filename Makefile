@@ -10,7 +10,7 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test check bench blind requirements clean
+.PHONY: help setup setup-test demo test check bench fuzz blind requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -48,7 +48,10 @@ check: setup-test ## ruff, mypy --strict, the import contract
 bench: setup-test ## the solver beside its yardsticks and its peers
 	$(BIN)/dehyst bench
 
-blind: setup-test ## score the diagnosis on 200 recordings with hidden effects (an hour or more)
+fuzz: setup-test ## a million malformed payloads, by coverage, and a live service under fire (minutes)
+	$(BIN)/python -m benchmarks.fuzz --out out/fuzz
+
+blind: setup-test ## score the diagnosis on 218 recordings with hidden effects (about half an hour)
 	$(BIN)/python -m tests.hidden.blind
 
 requirements: ## pin both requirement files anew (needs uv)

@@ -1,0 +1,178 @@
+"""A live service under fire: bad payloads from one process, an honest client in another, and what the fire costs it.
+
+The honest client asks for one point at a steady pace throughout. What is compared is its round trip under malformed
+payloads against the same under as many honest ones from the same place: the fire's content may cost nothing, its rate
+costs what any traffic does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import psutil
+
+from benchmarks.fuzz_targets import models, seeds
+from benchmarks.mutations import mutated
+from service.client import Client
+from service.keys import Keys
+from service.modelfile import BundleMeta, write_bundle
+from service.session import open_client
+
+_STAGE, _AXIS = "fuzz", "x"
+_PACE_HZ: Final = 200.0
+#: How much slower the honest client's p99 may get under malformed payloads than under honest ones, and in absolute
+#: terms where both are within the machine's own noise, µs.
+_P99_RATIO: Final = 1.5
+_P99_NOISE_US: Final = 300.0
+_GROWTH_MB: Final = 16.0
+_OVERSIZED_EVERY: Final = 997
+
+
+def bombard(out: Path, duration_s: float, rate_hz: float, seed: int) -> dict[str, Any]:
+    """Fire at a service of our own on loopback for about ``duration_s``; returns the verdict and its numbers."""
+    out.mkdir(parents=True, exist_ok=True)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    endpoint = f"tcp/127.0.0.1:{port}"
+    write_bundle(out / "x.npz", models(), BundleMeta(_STAGE, _AXIS, 1e-3, y_min_um=0.0, y_max_um=90.0))
+    (out / "serve.toml").write_text(
+        f'stage = "{_STAGE}"\nlisten = ["{endpoint}"]\n[[axis]]\nname = "{_AXIS}"\nmodel = "x.npz"\n'
+        "u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n",
+        encoding="utf-8",
+    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    serving = subprocess.Popen(
+        [sys.executable, "-m", "service.cli", "serve", "--config", str(out / "serve.toml"), "--json"],
+        stdout=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    assert serving.stdout is not None
+    if not serving.stdout.readline():
+        return {"held": False, "why": "the service did not come up"}
+    try:
+        with Client.connect(endpoint, _STAGE, _AXIS, timeout_s=5.0) as client:
+            told = _phases(client, endpoint, duration_s, rate_hz, seed, psutil.Process(serving.pid), environment)
+    finally:
+        serving.terminate()
+        serving.communicate(timeout=30)
+    told["exit"] = serving.returncode
+    limit_us = max(_P99_RATIO * told["honest_fire"]["p99_us"], told["honest_fire"]["p99_us"] + _P99_NOISE_US)
+    told["held"] = (
+        told["exit"] == 0
+        and told["unanswered"] == 0
+        and told["growth_MB"] <= _GROWTH_MB
+        and told["malformed_fire"]["p99_us"] <= limit_us
+        and told["malformed_fire"]["failed"] == 0
+    )
+    print(
+        f"live       {told['fired']} payloads, {told['unanswered']} unanswered, {told['growth_MB']:+.1f} MB; honest "
+        f"client's p50/p99: quiet {_pair(told['quiet'])}, under honest fire {_pair(told['honest_fire'])}, under "
+        f"malformed fire {_pair(told['malformed_fire'])} us{'' if told['held'] else '  NOT held'}",
+        flush=True,
+    )
+    return told
+
+
+def _phases(
+    client: Client, endpoint: str, duration_s: float, rate_hz: float, seed: int,
+    service: psutil.Process, environment: dict[str, str],
+) -> dict[str, Any]:  # fmt: skip
+    share_s = duration_s / 4
+    _pace(client, min(2.0, share_s))  # until everything that is made at first use is made
+    told: dict[str, Any] = {"quiet": _pace(client, share_s)}
+    fired = unanswered = 0
+    settled = 0
+    for phase in ("honest_fire", "malformed_fire"):
+        bad = phase == "malformed_fire"
+        length_s = 2 * share_s if bad else share_s
+        firing = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.fuzz_live", endpoint, str(length_s + 1.0), str(rate_hz), str(seed),
+             "bad" if bad else "honest"],
+            stdout=subprocess.PIPE, text=True, env=environment,
+        )  # fmt: skip
+        assert firing.stdout is not None
+        firing.stdout.readline()
+        if bad:  # the first oversized payloads leave their buffers behind, once
+            _pace(client, 0.3 * length_s)
+            settled = service.memory_info().rss
+        told[phase] = _pace(client, 0.7 * length_s if bad else length_s)
+        counts = json.loads(firing.communicate(timeout=120)[0].splitlines()[-1])
+        if bad:
+            fired, unanswered = counts["fired"], counts["unanswered"]
+            told["refused"] = counts["refused"]
+    status = client.status()
+    return told | {
+        "fired": fired,
+        "unanswered": unanswered,
+        "growth_MB": (service.memory_info().rss - settled) / 1e6,
+        "malformed_samples": status["samples"]["malformed"],
+        "query_errors": status["queries"]["errors"],
+    }
+
+
+def _pace(client: Client, duration_s: float) -> dict[str, float]:
+    """The honest client: one point at a time, at a steady pace."""
+    taken_us = []
+    failed = 0
+    start = time.perf_counter()
+    for k in range(max(1, int(duration_s * _PACE_HZ))):
+        due = start + k / _PACE_HZ
+        if (rest := due - time.perf_counter()) > 0.0:
+            time.sleep(rest)
+        begin = time.perf_counter()
+        try:
+            client.point(20.0 + (k % 50), model="linear")
+        except Exception:
+            failed += 1
+        taken_us.append(1e6 * (time.perf_counter() - begin))
+    p50, p99 = np.percentile(taken_us, [50.0, 99.0])
+    return {"count": len(taken_us), "failed": failed, "p50_us": float(p50), "p99_us": float(p99)}
+
+
+def _pair(told: dict[str, float]) -> str:
+    return f"{told['p50_us']:.0f}/{told['p99_us']:.0f}"
+
+
+def fire(endpoint: str, duration_s: float, rate_hz: float, seed: int, bad: bool) -> int:
+    """Fire queries, commands and samples in turn at ``rate_hz``; every query is waited for."""
+    rng = np.random.default_rng(seed)
+    keys = Keys(_STAGE, _AXIS)
+    aims = [("feedforward", "query"), ("operate", "operate"), ("sample", "samples"), ("feedforward", "query")]
+    honest = {name: seeds(name) for name in ("query", "operate", "samples")}
+    fired = refused = unanswered = 0
+    with open_client(endpoint, 10.0) as session:
+        time.sleep(0.5)
+        print("ready", flush=True)
+        start = time.perf_counter()
+        while (due := start + fired / rate_hz) < start + duration_s:
+            if (rest := due - time.perf_counter()) > 0.0:
+                time.sleep(rest)
+            elif time.perf_counter() - start > duration_s:
+                break
+            what, target = aims[fired % len(aims)] if bad else ("feedforward", "query")
+            payload = honest[target][fired % len(honest[target])] if bad else honest["query"][0]
+            if bad:
+                payload = mutated(payload, rng)
+                if fired % _OVERSIZED_EVERY == 0:
+                    payload = payload[:8] + bytes(2**20)
+            fired += 1
+            if what == "sample":
+                session.put(keys.sample, payload)
+                continue
+            replies = list(session.get(f"{keys.base}/{what}", payload=payload, timeout=10.0))
+            unanswered += len(replies) != 1
+            refused += sum(reply.err is not None for reply in replies)
+    print(json.dumps({"fired": fired, "refused": refused, "unanswered": unanswered}), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(fire(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]), sys.argv[5] == "bad"))

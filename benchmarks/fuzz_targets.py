@@ -1,0 +1,153 @@
+"""What is fuzzed: everything that reads bytes from others, and honest payloads to begin with.
+
+A target takes any bytes. It may raise what the project documents for malformed input, and nothing else; and it may not
+take long, nor keep memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.features import FeatureMap
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import InverseModel
+from baselines.linear import LinearInverse, LinearParameters
+from baselines.points import Domain
+from service import checkpoint, wire, wire_model, wire_query
+from service.errors import error_from_json, error_to_json
+from service.operating.request import Request, decode_request, encode_request
+from service.stage_faults import decode_fault
+
+Target = Callable[[bytes], None]
+#: What a decoder may raise on malformed bytes.
+EXPECTED = (InputError, ModelFileError)
+
+
+def models() -> dict[str, InverseModel]:
+    """A line and a small LSSVM with memory, of a stage of 11 µm/V that moves 90 µm."""
+    features = FeatureMap(
+        1e-3, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
+        kernel_plays=(0,), asymmetric=True,
+    )  # fmt: skip
+    rng = np.random.default_rng(5)
+    beta = np.zeros(features.basis_size)
+    beta[:2] = 4.0, 4.09
+    lssvm = LssvmInverse(
+        "lssvm_adaptive", features, beta, rng.uniform(-1.0, 1.0, (20, features.kernel_size)),
+        0.01 * rng.normal(size=20), np.ones(features.kernel_size), 1e4,
+        domain=np.array([0.0, 90.0, -2e4, 2e4, -1e7, 1e7]), noise_variance=1e-6, kernel_variance=1e-4,
+    )  # fmt: skip
+    line = LinearInverse(LinearParameters(11.0, 1.0), 1e-3, Domain(0.0, 90.0, 1e4), 0.05)
+    return {"linear": line, "lssvm_adaptive": lssvm}
+
+
+def _refusing(decode: Callable[[bytes], object]) -> Target:
+    def target(data: bytes) -> None:
+        with contextlib.suppress(*EXPECTED):
+            decode(data)
+
+    return target
+
+
+def _answering() -> Target:
+    """A query all the way: decoded, answered by a model, guarded, encoded, and decoded by the client."""
+    lssvm = models()["lssvm_adaptive"]
+    memory = lssvm.rest_memory(0.0)
+
+    def target(data: bytes) -> None:
+        try:
+            query = wire_query.decode_query(data)
+        except EXPECTED:
+            return
+        n = min(query.y_um.size, 64)
+        carried = memory if query.memory is None or query.memory.size != memory.size else query.memory
+        with np.errstate(all="ignore"):
+            lssvm.feedforward(query.y_um[:n], query.v_um_per_s[:n], query.a_um_per_s2[:n], carried)
+
+    return target
+
+
+def _framed_model(data: bytes) -> None:
+    """A model of any JSON and any body, under a header that fits them: past the lengths, into what they are about."""
+    size = int.from_bytes(data[:2], "little")
+    text, body = data[2 : 2 + size], data[2 + size :]
+    count = 1
+    with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
+        count = max(1, len(json.loads(text)["arrays"]))
+    head = struct.pack("<BBHIqII", wire.VERSION, wire.MODEL, 0, count, 5, len(text), len(body))
+    with contextlib.suppress(*EXPECTED):
+        wire_model.decode_model(head + text + body)
+
+
+def _framed_checkpoint(data: bytes) -> None:
+    """A checkpoint of any JSON and any body, under a head whose digest fits: a standby reads what a service sends."""
+    size = int.from_bytes(data[:2], "little")
+    digest = hashlib.blake2b(data[2:], digest_size=16).digest()
+    head = struct.pack("<8sQ16s", checkpoint.MAGIC, min(size, len(data[2:])), digest)
+    with contextlib.suppress(*EXPECTED):
+        checkpoint.decode_checkpoint(head + data[2:])
+
+
+#: Words that a mutation may put in: what the JSON of a payload is made of.
+WORDS = (
+    '"name"', '"kind"', '"dt_s"', '"values"', '"arrays"', '"/memory"', '"lssvm"', '"linear"', '"<f8"', '"<i8"', '"|u1"',
+    '"|b1"', "[]", "{}", "null", "true", "1e999", "-1", "NaN", '"verb"', '"who"', '"arguments"', '"freeze"', '"select"',
+    '"rollback"', '"checkpoint"', '"model"', '"error"', '"message"', '"field"', "Timeout", "[[[[[[", '{"a":{"a":{"a":',
+)  # fmt: skip
+
+TARGETS: dict[str, Callable[[], Target]] = {
+    "samples": lambda: _refusing(wire.decode_samples),
+    "command": lambda: _refusing(wire.decode_command),
+    "reference": lambda: _refusing(wire.decode_reference),
+    "query": lambda: _refusing(wire_query.decode_query),
+    "reply": lambda: _refusing(wire_query.decode_reply),
+    "answer": _answering,
+    "model": lambda: _refusing(wire_model.decode_model),
+    "framed": lambda: _framed_model,
+    "checkpoint": lambda: _framed_checkpoint,
+    "fault": lambda: _refusing(decode_fault),
+    "operate": lambda: _refusing(decode_request),
+    "error": lambda: _refusing(error_from_json),
+}
+
+
+def seeds(target: str) -> list[bytes]:
+    """Honest payloads of a target."""
+    y, v, a = np.linspace(1.0, 80.0, 12).reshape(3, 4)
+    query = [
+        wire_query.encode_query(40.0, 0.0),
+        wire_query.encode_query(y, v, a, [1.0, 2.0], "lssvm_adaptive", 7, 1.5),
+        wire_query.encode_query(y, v, a, models()["lssvm_adaptive"].rest_memory(3.0)),
+    ]
+    sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in models().items()]
+    framed = []
+    for payload in sent:
+        size = struct.unpack_from("<I", payload, 16)[0]
+        framed.append(size.to_bytes(2, "little") + payload[24:])
+    meta = checkpoint.CheckpointMeta("demo", "x", 1e-3, 41, 40)
+    kept = b"".join(checkpoint.encode_checkpoint(meta, {"a": np.arange(3.0), "name": "x", "n": 2, "b": np.eye(2)}))
+    reply = wire_query.FeedforwardReply(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
+    return {
+        "samples": [wire.encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, np.nan, 2.0], [3.0, 4.0, np.inf])],
+        "command": [wire.encode_command(9, y)],
+        "reference": [wire.encode_reference(9, y)],
+        "query": query,
+        "answer": query,
+        "reply": [wire_query.encode_reply(reply)],
+        "model": sent,
+        "framed": framed,
+        "checkpoint": [kept[8:10] + kept[32:], b""],
+        "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],
+        "operate": [
+            encode_request(Request("rollback", "alice", {"checkpoint": 3})),
+            encode_request(Request("select", "bob", {"model": "linear"})),
+        ],
+        "error": [error_to_json(InputError("y_um[0]: got nan")), json.dumps({"error": "x"}).encode(), b"Timeout"],
+    }[target]
