@@ -6,8 +6,11 @@ only where they are called: by the tests, the benchmarks, and whoever builds on 
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
+from adaptive.drift import DriftConfig, DriftFilter
 from adaptive.features import FeatureMap
 from adaptive.finite import all_finite
 from adaptive.learner import Learner, LearnerConfig
@@ -37,3 +40,9 @@ def warm() -> None:
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
     all_finite(still)
+    algebras: tuple[Literal["filterpy", "compiled"], ...] = ("filterpy", "compiled")
+    for algebra in algebras:
+        drift = DriftFilter(DriftConfig(algebra=algebra), np.zeros(p), np.eye(p), 1e-3, 1.0)
+        for moving in (True, False):
+            drift.update(np.ones(p), 0.0, moving)
+        drift.expect_change()

@@ -12,9 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-PACKAGES = ("adaptive", "baselines", "sim")
-#: What is compiled side by side, in a process each.
-GROUPS = (("adaptive",), ("baselines", "sim"))
+PACKAGES = ("adaptive", "baselines", "sim", "service")
+#: What is compiled side by side, in a process each: modules with a ``warm()``.
+GROUPS = (("adaptive.warm",), ("baselines.warm", "sim.warm", "service.guard"))
 
 
 def digest(root: Path) -> str:
@@ -35,7 +35,7 @@ def forget(root: Path) -> None:
 
 
 def main() -> int:
-    """Call each package's ``warm.warm()``, unless nothing has changed since the last time."""
+    """Call each ``warm()``, unless nothing has changed since the last time."""
     root = Path(__file__).resolve().parents[1]
     stamp = root / "service" / "__pycache__" / "compiled.sha256"
     now = digest(root)
@@ -45,7 +45,7 @@ def main() -> int:
     start = time.perf_counter()
     print("compiling the loops, once (half a minute) ...", flush=True)
     children = [
-        subprocess.Popen([sys.executable, "-c", "".join(f"import {p}.warm; {p}.warm.warm();" for p in group)], cwd=root)
+        subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
         for group in GROUPS
     ]
     failed = [child.args for child in children if child.wait() != 0]
