@@ -6,6 +6,8 @@ allocates, nothing raises, and no step leaves the window non-finite.
 
 from __future__ import annotations
 
+import numpy as np
+
 from adaptive import window_cholesky as cholesky
 from adaptive import window_inverse as inverse
 from adaptive.compiled import compiled_reassociating
@@ -32,6 +34,7 @@ from adaptive.window_state import (
     ILL_CONDITIONED,
     ILL_STEPS,
     INVERSE_FORM,
+    NEGLIGIBLE,
     NO_SLOT,
     NOTHING_TO_UNDO,
     REFINEMENTS,
@@ -69,7 +72,9 @@ def _refined(A: WindowArrays) -> bool:
         row = A.C[COUNT] - 1
     before = A.F[RESIDUAL]
     good = refine(A)
-    return good and abs(row_residual(A, row)) <= CONTRACTION * before
+    n = A.C[COUNT]
+    size = abs(A.V[Y, row]) + abs(A.beta[0]) + np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
+    return good and abs(row_residual(A, row)) <= max(CONTRACTION * before, NEGLIGIBLE * size)
 
 
 @compiled_reassociating

@@ -171,7 +171,8 @@ def _conclude(A: WindowArrays) -> int:
     if not residual <= allowed + _ROUND_OFF * (abs(A.V[ws.Y, i]) + abs(A.beta[0]) + length):
         A.C[ws.RESIDUALS_EXCEEDED] += 1
         # As in the core: a refinement that does not contract shows an inverse gone wrong.
-        if not (refine(A) and _row_residual(A, i) <= ws.CONTRACTION * residual):
+        size = abs(A.V[ws.Y, i]) + abs(A.beta[0]) + length
+        if not (refine(A) and _row_residual(A, i) <= max(ws.CONTRACTION * residual, ws.NEGLIGIBLE * size)):
             _take_back(A)
             A.C[ws.ILL_STEPS] += 1
             return ws.ILL_CONDITIONED

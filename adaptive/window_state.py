@@ -79,6 +79,9 @@ COUNTERS = 14
 
 #: A refinement that leaves more than this share of the residual that asked for it shows an inverse gone wrong.
 CONTRACTION = 0.5
+#: ... unless it is this small beside target and weights: where hardly more samples than linear terms are held, alpha is
+#: nearly nothing, and what is left is rounding.
+NEGLIGIBLE = 1e-13
 
 # Values of C[UNDO].
 UNDO_NOTHING, UNDO_REPLACE, UNDO_APPEND = range(3)
