@@ -127,7 +127,6 @@ def domain_of(model: InverseModel) -> list[tuple[float, float]] | None:
     """Bounds of y (µm), v (µm/s) and a (µm/s²) inside which ``model`` says "inside"; None where it has no bounds."""
     if isinstance(model, ChampionInverse):
         model = model.served
-    model = getattr(model, "served", model)  # of a champion, that of the contestant that answers
     if not isinstance(model, LssvmInverse):
         return None
     lows, highs = model.domain[::2].tolist(), model.domain[1::2].tolist()
@@ -146,18 +145,11 @@ def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArr
         return Feedforward(nothing, nothing, np.zeros(points[0].size, dtype=np.bool_), memory)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a memory out of this world gives voltages out of it: guarded later
+@np.errstate(all="ignore")  # a memory out of this world gives voltages out of it, which are guarded later
 def _mix(
     forward: Feedforward, weight: FloatArray, finite: NDArray[np.bool_], other: Feedforward
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
     """(voltages, deviations, flags) of the mixture; a stand-in that is not finite gets no weight."""
-    with np.errstate(all="ignore"):  # what overflows is not finite, and goes the way of what is not
-        return _mixed(forward, weight, finite, other)
-
-
-def _mixed(
-    forward: Feedforward, weight: FloatArray, finite: NDArray[np.bool_], other: Feedforward
-) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
     usable = np.isfinite(other.u_V)
     w = np.where(finite, weight, 0.0)
     w = np.where(usable, w, 1.0)

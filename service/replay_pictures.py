@@ -3,36 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from service.replay import Replayed, covered
+from service.traces import envelope, traces
 
 ADAPTIVE_COLOUR, FROZEN_COLOUR, STATED_COLOUR = "#004d40", "#e69f00", "#56b4e9"
 #: Points beyond which a line is drawn by the extremes of what it leaves out.
-MOST_POINTS = 4000
 #: What the learner's diagnostics show, in this order, where it has them.
 SHOWN = (("gain", "gain"), ("frame_offset_um", "offset of the frame, µm"), ("offset_V", "offset, V"))
-
-
-def _figure(width: float, height: float, rows: int, **options: Any) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, 1, **options)
-
-
-def _envelope(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    stride = max(1, 2 * len(values) // MOST_POINTS)
-    if stride < 3:
-        return t_s, values
-    n = len(values) // stride * stride
-    rows = values[:n].reshape(-1, stride)
-    return np.repeat(t_s[:n:stride], 2), np.stack([rows.min(axis=1), rows.max(axis=1)], axis=1).ravel()
 
 
 def _moving(values: FloatArray, span: int) -> FloatArray:
@@ -49,19 +30,19 @@ def draw_errors(path: Path, title: str, replayed: Replayed, span_V: float, windo
     r, percent = replayed, 100.0 / span_V
     dt = float(np.median(np.diff(r.t_s)))
     shown = [(key, label) for key, label in SHOWN if key in r.notes]
-    figure, grid = _figure(
+    figure, grid = traces(
         11.0, 8.0 + 1.3 * len(shown), 3 + len(shown), sharex=True, height_ratios=(0.8, 1.4, 1.4, *[0.6] * len(shown))
     )
     top, middle, bottom = grid[:3]
     figure.suptitle(title, fontsize=11)
-    top.plot(*_envelope(r.t_s, r.y_um), color="black", lw=0.6)
+    top.plot(*envelope(r.t_s, r.y_um), color="black", lw=0.6)
     top.set_ylabel("reading, µm")
-    middle.plot(*_envelope(r.t_s, r.frozen_V * percent), color=FROZEN_COLOUR, lw=0.6, label="not adapting")
-    t_std, std = _envelope(r.t_s, r.std_V * percent)
+    middle.plot(*envelope(r.t_s, r.frozen_V * percent), color=FROZEN_COLOUR, lw=0.6, label="not adapting")
+    t_std, std = envelope(r.t_s, r.std_V * percent)
     middle.fill_between(
         t_std, -2.0 * std, 2.0 * std, color=STATED_COLOUR, alpha=0.4, lw=0, label="± 2 stated deviations"
     )
-    middle.plot(*_envelope(r.t_s, r.adaptive_V * percent), color=ADAPTIVE_COLOUR, lw=0.6, label="adapting")
+    middle.plot(*envelope(r.t_s, r.adaptive_V * percent), color=ADAPTIVE_COLOUR, lw=0.6, label="adapting")
     shares = covered(r)
     middle.set_title(
         f"errors within one stated deviation: {100 * shares['one_std']:.0f} % (68 stated), "
@@ -76,7 +57,7 @@ def draw_errors(path: Path, title: str, replayed: Replayed, span_V: float, windo
         (r.adaptive_V, ADAPTIVE_COLOUR, "adapting"),
     ):
         running = np.maximum(_moving(np.abs(values), span) * percent, 1e-5)
-        bottom.semilogy(*_envelope(r.t_s, running), color=colour, lw=1.3, label=label)
+        bottom.semilogy(*envelope(r.t_s, running), color=colour, lw=1.3, label=label)
     bottom.set_ylabel(f"mean |error| of the last {window_s:g} s,\n% of voltage span")
     bottom.legend(fontsize=8, loc="upper right")
     for axes, (key, label) in zip(grid[3:], shown, strict=True):
@@ -100,7 +81,7 @@ def draw_gates(path: Path, title: str, replayed: Replayed, bins: int = 300) -> N
     total = np.histogram(t_s[finite], edges)[0]
     counts = np.bincount(r.gate, minlength=len(r.gates))
     order = sorted(range(len(r.gates)), key=lambda i: (r.gates[i] in ("learnt", "passed"), counts[i]), reverse=True)
-    figure, grid = _figure(11.0, 1.2 + 0.75 * len(order), len(order), sharex=True, sharey=True, squeeze=False)
+    figure, grid = traces(11.0, 1.2 + 0.75 * len(order), len(order), sharex=True, sharey=True, squeeze=False)
     figure.suptitle(f"{title}: what the learner said of the samples", fontsize=11)
     for axes, index in zip(grid[:, 0], order, strict=True):
         seen = np.histogram(t_s[finite & (r.gate == index)], edges)[0]

@@ -9,31 +9,10 @@ import numpy as np
 
 from service.scenarios import FACTOR, FLOORS, WINDOW_S, Verdict, windows
 from service.scenarios_run import ADAPTIVE, FROZEN, Course
+from service.traces import MOST_POINTS, envelope, traces
 
 #: Colour-blind safe; the adaptive model is the dark one.
 ADAPTIVE_COLOUR, FROZEN_COLOUR, ALLOWED_COLOUR, EVENT_COLOUR = "#004d40", "#e69f00", "#999999", "#d55e00"
-#: Points beyond which a line is drawn as its extremes only.
-MOST_POINTS = 4000
-
-
-def _figure(width: float, height: float, rows: int, **options: Any) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, 1, **options)
-
-
-def _envelope(t_s: Any, values: Any) -> tuple[Any, Any]:
-    """A line that keeps the extremes of what it leaves out."""
-    stride = max(1, 2 * len(values) // MOST_POINTS)
-    if stride < 3:
-        return t_s, values
-    n = len(values) // stride * stride
-    rows = values[:n].reshape(-1, stride)
-    pairs = np.stack([rows.min(axis=1), rows.max(axis=1)], axis=1).ravel()
-    return np.repeat(t_s[:n:stride], 2), pairs
 
 
 def draw_course(path: Path, course: Course, verdict: Verdict) -> None:
@@ -41,12 +20,12 @@ def draw_course(path: Path, course: Course, verdict: Verdict) -> None:
     s = course.scenario
     dt, percent = s.stage.dt_s, 100.0 / s.range_um
     t_s = np.arange(course.wanted_um.size) * dt
-    figure, (top, middle, bottom, gates) = _figure(11.0, 9.5, 4, sharex=True, height_ratios=(0.8, 1.2, 1.4, 0.8))
+    figure, (top, middle, bottom, gates) = traces(11.0, 9.5, 4, sharex=True, height_ratios=(0.8, 1.2, 1.4, 0.8))
     figure.suptitle(f"{s.name}: {s.text}; {'held' if verdict.held else 'NOT held'}", fontsize=11)
-    top.plot(*_envelope(t_s, course.wanted_um), color="black", lw=0.6)
+    top.plot(*envelope(t_s, course.wanted_um), color="black", lw=0.6)
     top.set_ylabel("reference, µm")
     for name, colour, front in ((FROZEN, FROZEN_COLOUR, 2), (ADAPTIVE, ADAPTIVE_COLOUR, 3)):
-        middle.plot(*_envelope(t_s, course.error_um[name] * percent), color=colour, lw=0.6, zorder=front)
+        middle.plot(*envelope(t_s, course.error_um[name] * percent), color=colour, lw=0.6, zorder=front)
     middle.set_ylabel("error, % of range")
     w = windows(course)
     lines = (
@@ -55,7 +34,7 @@ def draw_course(path: Path, course: Course, verdict: Verdict) -> None:
         (w.adaptive_um, ADAPTIVE_COLOUR, "-", "adapting"),
     )
     for values, colour, style, label in lines:
-        bottom.semilogy(*_envelope(w.t_s, np.maximum(values * percent, 1e-4)), style, color=colour, lw=1.2, label=label)
+        bottom.semilogy(*envelope(w.t_s, np.maximum(values * percent, 1e-4)), style, color=colour, lw=1.2, label=label)
     bottom.plot(verdict.worst_s, verdict.worst_pct, "v", color=EVENT_COLOUR, ms=6, label="closest to the limit")
     bottom.set_ylabel(f"mean |error| over {WINDOW_S:g} s,\n% of range")
     bottom.legend(fontsize=8, ncols=2)
@@ -86,7 +65,7 @@ def draw_gates(axes: Any, gate: Any, names: tuple[str, ...], t_s: Any) -> None:
 
 def draw_overview(path: Path, verdicts: list[Verdict]) -> None:
     """A bar a scenario: its worst window over what that window allows."""
-    figure, axes = _figure(9.0, 1.2 + 0.28 * len(verdicts), 1)
+    figure, axes = traces(9.0, 1.2 + 0.28 * len(verdicts), 1)
     ratios = [v.worst_ratio for v in verdicts]
     colours = [ADAPTIVE_COLOUR if v.held else EVENT_COLOUR for v in verdicts]
     bars = axes.barh(range(len(verdicts)), ratios, color=colours)

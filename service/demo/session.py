@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from service.demo.run import Run
 from service.identifying import NAMES, Stretch, identify_all
 from service.modelfile import BundleMeta, write_bundle
 from service.models import load_axis
+from service.output_folder import clear_output
 from service.recorder import Recorder, RecorderConfig
 from service.view.feed import Event, Record, SceneConfig, Tracking
 from service.view.offline import write_recording
@@ -51,7 +51,7 @@ def run(
     Raises InputError on a folder that cannot be used, ServiceError where a process failed.
     """
     own = stage.resolve() if stage is not None else None
-    _make_room(out)
+    clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
     plan = Plan(run_s=duration_s, seed=seed) if own is None else plan_for(own, logs, duration_s, seed)
@@ -98,19 +98,6 @@ class _Bar:
         self._next_s = (done_s // 5.0 + 1.0) * 5.0
         filled = round(20.0 * min(1.0, done_s / self._total_s))
         self._say(f"  [{'#' * filled:<20}] {done_s:4.0f} of {self._total_s:g} s  {detail}".rstrip())
-
-
-def _make_room(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name in OURS:
-            path = out / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error
 
 
 def _record(plan: Plan, folder: Path, logs: Path, fast: bool, bar: _Bar) -> None:

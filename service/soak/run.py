@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adaptive.errors import InputError
+from service.output_folder import clear_output
 from service.soak.intervals import Intervals
 from service.soak.judge import judge
 from service.soak.ledger import Ledger
@@ -43,7 +42,7 @@ def run(
 
     Raises InputError on a folder or a stage that cannot be used, ServiceError where a process does not come up.
     """
-    _make_room(out)
+    clear_output(out, OURS)
     (out / "logs").mkdir()
     stage = stage_of(stage_file, plan.seed)
     say(f"[1/3] identifying stage {stage.name!r} from 10 s of the chapter's signal")
@@ -158,16 +157,3 @@ def _draw(out: Path, ledger: Ledger) -> list[str]:
             draw(out / name, ledger)
             drawn.append(name)
     return drawn
-
-
-def _make_room(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name in OURS:
-            path = out / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error

@@ -38,11 +38,20 @@ def _branch(g: float, length: float, push: float, rate_up: float, rate_down: flo
 
 
 @compiled
+def _followed(h: float, du: float, push: float, beta: float, gamma: float) -> float:
+    """h after a step du of the voltage, V. By the symmetry of (2.2) a falling step of h is a rising one of -h."""
+    if du > 0.0:
+        return _branch(h, du, push, beta + gamma, beta - gamma)
+    if du < 0.0:
+        return -_branch(-h, -du, push, beta + gamma, beta - gamma)
+    return h
+
+
+@compiled
 def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: float) -> FloatArray:
     """h of (2.2) with n = 1, exactly, for a voltage that is monotone between two samples.
 
-    ``slope`` = alpha d in µm/V; beta, gamma in 1/V; h in µm. By the symmetry of (2.2) a falling step of h is a rising
-    one of -h.
+    ``slope`` = alpha d in µm/V; beta, gamma in 1/V; h in µm.
     """
     n = u_V.shape[0]
     out = np.empty(n)
@@ -50,10 +59,7 @@ def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: 
     out[0] = h
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
-        if du > 0.0:
-            h = _branch(h, du, slope, beta + gamma, beta - gamma)
-        elif du < 0.0:
-            h = -_branch(-h, -du, slope, beta + gamma, beta - gamma)
+        h = _followed(h, du, slope, beta, gamma)
         out[k] = h
     return out
 
@@ -70,10 +76,7 @@ def bouc_wen_paced(
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
         push = max(slope * (1.0 + gain * pace[k]), 1e-12)
-        if du > 0.0:
-            h = _branch(h, du, push, beta + gamma, beta - gamma)
-        elif du < 0.0:
-            h = -_branch(-h, -du, push, beta + gamma, beta - gamma)
+        h = _followed(h, du, push, beta, gamma)
         out[k] = h
     return out
 

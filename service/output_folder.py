@@ -1,0 +1,26 @@
+"""The folder that a command writes into: there, writable, and without what an earlier run left."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from adaptive.errors import InputError
+
+
+def clear_output(out: Path, names: Iterable[str]) -> None:
+    """Make ``out`` and remove what stands there under ``names``, files or folders; the rest stays.
+
+    Raises InputError where the folder cannot be written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            path = out / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error
