@@ -216,6 +216,11 @@ class Front:
         self.gates.since_jump += 1
         return self.track.advance(step)
 
+    def creep(self, by_um: float) -> None:
+        """The stage has crept by so much, µm, that no voltage made. Not while a jump of the frame is under way."""
+        if self.track is not None and not self.on_probation:
+            self.track.creep(by_um)
+
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0

@@ -31,6 +31,7 @@ class LearnerConfig:
     for its model again and above which it no longer does.
     fallback_floor : share of the voltage span by which the learner may be worse than the model it started from before
     that one is served in its stead.
+    creep_s : time within which what the constant takes up at rest goes over to the frame, s; 0: it stays (``rest``).
     weights : how much doubtful and old samples count.
     """
 
@@ -44,6 +45,7 @@ class LearnerConfig:
     valid_enter: float = 0.004
     valid_leave: float = 0.012
     fallback_floor: float = 0.002
+    creep_s: float = 0.1
     admission: AdmissionConfig = field(default_factory=AdmissionConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
     weights: WeightConfig = field(default_factory=WeightConfig)
@@ -59,6 +61,8 @@ class LearnerConfig:
             raise InputError(f"eviction: got {self.eviction!r}, expected 'nearest' or 'fifo'")
         if not 0.0 <= self.serving_age_s <= 10.0:
             raise InputError(f"serving_age_s: got {self.serving_age_s}, expected 0 to 10 s")
+        if not 0.0 <= self.creep_s <= 1e6:
+            raise InputError(f"creep_s: got {self.creep_s}, expected a time in s, or 0 to leave the frame where it is")
         if not 0.0 < self.valid_enter <= self.valid_leave:
             raise InputError(
                 f"valid_enter, valid_leave: got {self.valid_enter}, {self.valid_leave}, expected 0 < enter <= leave"

@@ -11,6 +11,7 @@ from adaptive.front import Front
 from adaptive.judgement import Delay, Judgement
 from adaptive.learner_config import LearnerConfig, part_of
 from adaptive.residual import ResidualWindow
+from adaptive.rest import Rest
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, StateDict
 
@@ -30,7 +31,8 @@ class Parts:
     Attributes
     ----------
     front : gates, smoother, frame and hysteresis memory. filter : of the linear part. window : the kernel part.
-    judgement, delay : errors at the age of serving. domain : (6,) learnt range, as of the snapshot.
+    rest : what a rest has taught. judgement, delay : errors at the age of serving.
+    domain : (6,) learnt range, as of the snapshot.
     point : (d,) kernel inputs of the last instant that was due to teach, NaN before any.
     mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
     some of what went wrong. counters : samples by outcome. events : by name.
@@ -51,6 +53,7 @@ class Parts:
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
         self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
+        self.rest = Rest()
         self.delay = Delay(round(config.serving_age_s / step_s))
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
@@ -58,6 +61,18 @@ class Parts:
     def voltage(self, basis: FloatArray, kernel: FloatArray) -> float:
         """What the learnt model asks for, V, at basis (p,) and kernel inputs (d,)."""
         return float(basis @ self.filter.beta) + self.window.mean(kernel)
+
+    def take_rest(self, moving: bool) -> None:
+        """After a step of the filter: at rest, let what the constant has gained go over to the frame."""
+        front, span_V = self.front, self.filter.span_V
+        if moving:
+            self.rest.leave()
+            return
+        shift_um = self.rest.shift_um(
+            float(self.filter.beta[0]), front.range_um / span_V, front.range_um, self.filter.step_s, self.config.creep_s
+        )
+        if shift_um:
+            front.creep(shift_um)
 
     def judge(self, error_V: float, frozen_error_V: float) -> None:
         """Take the errors at one instant: of the linear part as it was served for it, and of the frozen model."""
@@ -91,6 +106,7 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "front": parts.front.state_dict(),
         "filter": parts.filter.state_dict(),
         "window": parts.window.state_dict(),
+        "rest": parts.rest.state_dict(),
         "judgement": parts.judgement.state_dict(),
         "counters": dict(parts.counters),
         "events": dict(parts.events),
@@ -116,6 +132,7 @@ def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool
         parts.front.restore(part_of(state, "front"))
         parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, part_of(state, "filter"))
         parts.window.restore(part_of(state, "window"))
+        parts.rest = Rest.from_state(part_of(state, "rest"))
         parts.judgement = Judgement.from_state(part_of(state, "judgement"))
         parts.counters |= {key: int(value) for key, value in part_of(state, "counters").items()}
         parts.events |= {key: int(value) for key, value in part_of(state, "events").items()}

@@ -19,6 +19,7 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from adaptive.window_state import IntArray
 
 #: Share of the learnt range by which a point may lie outside and still count as inside.
 DOMAIN_MARGIN = 0.05
@@ -74,6 +75,47 @@ def evaluate(
         u[i] = mean
         std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
         inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def evaluate_packed(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    constants: FloatArray,
+    counts: IntArray,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """`evaluate` with all that a model is made of in two arrays, as `LssvmInverse` packs it.
+
+    Twenty arrays cost more to hand over than one point costs to work out, and are twenty places in memory to fetch.
+    """
+    K, A, M, p, d, n, c = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5], counts[6]
+    frame, scalars, domain, scale = constants[0:3], constants[3:6], constants[6:12], constants[12:16]
+    at = 16
+    thresholds = constants[at : at + K]
+    at += K
+    arcs = constants[at : at + A]
+    at += A
+    retain = constants[at : at + M]
+    at += M
+    beta = constants[at : at + p]
+    at += p
+    inverse_widths = constants[at : at + d]
+    at += d
+    alpha = constants[at : at + n]
+    at += n
+    scaled = constants[at : at + d * n].reshape(d, n)
+    at += d * n
+    covariance = constants[at : at + c * c].reshape(c, c)
+    m = FeatureArrays(thresholds, arcs, retain, scale, counts[9:], counts[7:9], frame)
+    evaluate(
+        y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
+        u, std, inside,
+    )  # fmt: skip
 
 
 @compiled
@@ -140,7 +182,9 @@ class LssvmInverse:
     valid: bool = True
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
     _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
-    _margins: FloatArray = field(init=False, repr=False, compare=False)
+    #: All that `evaluate_packed` needs.
+    _constants: FloatArray = field(init=False, repr=False, compare=False)
+    _counts: IntArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         p, d, n = self.features.basis_size, self.features.kernel_size, self.support.shape[0]
@@ -161,7 +205,14 @@ class LssvmInverse:
         object.__setattr__(self, "_scaled", scaled)
         object.__setattr__(self, "_inverse_widths", 1.0 / self.widths)
         spans = np.repeat(self.domain[1::2] - self.domain[::2], 2) * DOMAIN_MARGIN
-        object.__setattr__(self, "_margins", self.domain + spans * np.array([-1.0, 1.0] * 3))
+        margins = self.domain + spans * np.array([-1.0, 1.0] * 3)
+        m = self.features.arrays
+        scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma))
+        parts = (m.frame, scalars, margins, m.scale, m.thresholds, m.arcs, m.retain, self.beta, 1.0 / self.widths,
+                 self.alpha, scaled.ravel(), covariance.ravel())  # fmt: skip
+        object.__setattr__(self, "_constants", np.concatenate(parts))
+        sizes = [m.thresholds.size, m.arcs.size, m.retain.size, p, d, n, covariance.shape[0]]
+        object.__setattr__(self, "_counts", np.array([*sizes, *m.flags, *m.kernel_plays], dtype=np.int64))
 
     @property
     def dt_s(self) -> float:
@@ -181,7 +232,7 @@ class LssvmInverse:
         """Voltages for (n,) desired points; pure. Raises InputError on shapes that do not fit together."""
         y, v, a = self._points(y_um, v_um_per_s, a_um_per_s2)
         after = self._memory(memory)
-        n = y.shape[0]
+        n = y.size
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
         self.evaluate_into(y, v, a, after, u, std, inside)
         return Feedforward(u, std, inside, after)
@@ -194,11 +245,7 @@ class LssvmInverse:
 
         ``memory`` (m,) is advanced in place. For callers that ask point by point at the rate of a controller.
         """
-        evaluate(
-            y_um, v_um_per_s, a_um_per_s2, memory, self.features.arrays, self.beta, self.beta_covariance, self._scaled,
-            self.alpha, self._inverse_widths, self.noise_variance, self.kernel_variance,
-            1.0 / (1.0 + 1.0 / self.gamma), self._margins, u_V, std_V, inside,
-        )  # fmt: skip
+        evaluate_packed(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts, u_V, std_V, inside)
 
     def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
@@ -212,6 +259,10 @@ class LssvmInverse:
         after = self._memory(memory)
         track_memory(y, after, self.features.arrays)
         return after
+
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without its checks: (n,) contiguous displacements, µm; the voltages are not used."""
+        track_memory(y_um, memory, self.features.arrays)
 
     def _points(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray

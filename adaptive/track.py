@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -119,6 +119,11 @@ class Track:
         self.state.x *= ratio
         self.state.x[0] += (1.0 - ratio) * self.served.offset_um + shift_um
         self.served, self.switch = served, self.state.count + self.lag
+
+    def creep(self, by_um: float) -> None:
+        """The frame's offset moves, µm, under a motion that stays. Nothing where the frame is about to jump."""
+        if self.features is self.served:
+            self.features = self.served = replace(self.served, offset_um=self.served.offset_um + by_um)
 
     def advance(self, step: Step) -> tuple[Pair | None, bool]:
         """One step: the pair of ``lag`` samples ago, None before there is one; whether it is the first after a jump."""

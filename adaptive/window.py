@@ -202,9 +202,9 @@ class Window:
 
     def predict_with_variance(self, x: FloatArray, include_noise: bool = False) -> tuple[float, float]:
         """Mean and variance at one point, of the function or of a sample of weight 1, in squared target units."""
-        mean, latent = self._core.predict_with_variance(self.arrays, self._point(x))
+        mean, latent, scale = self._core.predict_with_variance(self.arrays, self._point(x))
         noise = 1.0 / self.config.gamma if include_noise else 0.0
-        return float(mean), float((latent + noise) * self.scale)
+        return float(mean), float((latent + noise) * scale)
 
     @property
     def scale(self) -> float:

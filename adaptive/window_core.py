@@ -223,21 +223,6 @@ def predict(A: WindowArrays, x: FloatArray) -> float:
 
 
 @compiled_reassociating
-def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float]:
-    """Mean, and variance of the function in units of `scale`, at one point. O(N²)."""
-    k, p = A.V[K], A.beta.shape[0]
-    kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
-    u = A.small[1, :p]
-    for c in range(p):
-        u[c] = design_value(A, x, c)
-        mean += A.beta[c] * u[c]
-    if A.C[FORM] == INVERSE_FORM:
-        return mean, inverse.variance(A, k, u)
-    return mean, cholesky.variance(A, k, u)
-
-
-@compiled_reassociating
 def scale(A: WindowArrays) -> float:
     """Variance of the kernel process by its likelihood, y'alpha/(N - p): the unit of variances; 0 while N <= p."""
     n, p = A.C[COUNT], A.beta.shape[0]
@@ -246,6 +231,21 @@ def scale(A: WindowArrays) -> float:
     total: float = max(dot(A.V[Y], A.V[ALPHA], n), 0.0)
     degrees: float = n - p
     return total / degrees
+
+
+@compiled_reassociating
+def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float, float]:
+    """Mean, variance of the function in units of `scale`, and `scale`, at one point: one call for all. O(N²)."""
+    k, p = A.V[K], A.beta.shape[0]
+    kernel_column(A, x, k)
+    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
+    u = A.small[1, :p]
+    for c in range(p):
+        u[c] = design_value(A, x, c)
+        mean += A.beta[c] * u[c]
+    if A.C[FORM] == INVERSE_FORM:
+        return mean, inverse.variance(A, k, u), scale(A)
+    return mean, cholesky.variance(A, k, u), scale(A)
 
 
 @compiled_reassociating

@@ -119,23 +119,33 @@ def product(P: FloatArray, n: int, b: FloatArray, z: FloatArray) -> None:
 
 @compiled_reassociating
 def quadratic(P: FloatArray, n: int, k: FloatArray) -> float:
-    """k' P k from the lower triangle of P[:n, :n]; half the arithmetic of a product, and P is only read."""
+    """k' P k from the lower triangle of P[:n, :n]; half the arithmetic of a product, and P is only read.
+
+    Nothing but the reading of P costs time: eight rows at a time are as many streams as the processor fetches ahead.
+    """
     total, i = 0.0, 0
-    while i + 3 < n:
-        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    while i + 7 < n:
+        s0, s1, s2, s3, s4, s5, s6, s7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         r0, r1, r2, r3 = P[i], P[i + 1], P[i + 2], P[i + 3]
+        r4, r5, r6, r7 = P[i + 4], P[i + 5], P[i + 6], P[i + 7]
         for j in range(i):
             kj = k[j]
             s0 += r0[j] * kj
             s1 += r1[j] * kj
             s2 += r2[j] * kj
             s3 += r3[j] * kj
+            s4 += r4[j] * kj
+            s5 += r5[j] * kj
+            s6 += r6[j] * kj
+            s7 += r7[j] * kj
         total += 2.0 * (s0 * k[i] + s1 * k[i + 1] + s2 * k[i + 2] + s3 * k[i + 3])
-        for r in range(i, i + 4):
+        total += 2.0 * (s4 * k[i + 4] + s5 * k[i + 5] + s6 * k[i + 6] + s7 * k[i + 7])
+        for r in range(i, i + 8):
+            s0 = 0.0
             for j in range(i, r):
-                total += 2.0 * P[r, j] * k[r] * k[j]
-            total += P[r, r] * k[r] * k[r]
-        i += 4
+                s0 += P[r, j] * k[j]
+            total += (2.0 * s0 + P[r, r] * k[r]) * k[r]
+        i += 8
     while i < n:
         s0 = 0.0
         r0 = P[i]

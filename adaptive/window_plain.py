@@ -339,12 +339,12 @@ def predict(A: WindowArrays, x: FloatArray) -> float:
     return float(_kernel(A, x) @ A.V[ws.ALPHA] + _design(A, x) @ A.beta)
 
 
-def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float]:
+def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float, float]:
     """As `window_core.predict_with_variance`."""
     k, h = _kernel(A, x), _design(A, x)
     half = _half_small(A, h - A.S @ k)
     latent = 1.0 - k @ _multiply(A, k) + half @ half
-    return float(k @ A.V[ws.ALPHA] + h @ A.beta), max(float(latent), 0.0)
+    return float(k @ A.V[ws.ALPHA] + h @ A.beta), max(float(latent), 0.0), scale(A)
 
 
 def scale(A: WindowArrays) -> float:

@@ -173,6 +173,10 @@ class BoucWenInverse:
         _track(same_length("u_V", u_V, y.size), self.parameters.shape, after)
         return after
 
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without its checks: (n,) contiguous voltages, V, that somebody else answered."""
+        _track(u_V, self.parameters.shape, memory)
+
     def state_dict(self) -> StateDict:
         """Flat numbers by name."""
         state = model_state(self.dt_s, self.voltage_std_V, self.domain)

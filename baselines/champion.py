@@ -3,10 +3,15 @@
 The caller's memory holds one share a contestant and then every contestant's own memory. Point by point the shares move
 to the champion, at a rate of one over ``blend_s``: after a change of champion every caller goes over in its own
 stream, without a jump, and a call is still a pure function of its arguments.
+
+The memory of a contestant that has no share follows the motion and the voltages that are answered (``carry``), as it
+would follow those of the stage: that costs next to nothing, where its own answer, which nobody asks for, would not.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -27,6 +32,23 @@ KINDS: Final[dict[str, Any]] = {
     "bouc_wen": BoucWenInverse,
     "mpi": MpiInverse,
 }
+
+
+#: Takes (n,) motion, µm, the voltages answered for it, V, and a memory that it advances in place.
+Carry = Callable[[FloatArray, FloatArray, FloatArray], None]
+
+
+def _carry_of(model: InverseModel) -> Carry:
+    """How the memory of a contestant follows what others answer."""
+    carry: Carry | None = getattr(model, "carry", None)
+    if carry is not None:
+        return carry
+
+    def track(y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        still = np.zeros(np.asarray(y_um).size)
+        memory[:] = model.track(y_um, still, still, u_V, memory)
+
+    return track
 
 
 def kind_of(model: InverseModel) -> str:
@@ -56,6 +78,9 @@ class ChampionInverse:
     blend_s: float = 0.05
     name: str = "auto"
     _cuts: tuple[int, ...] = field(init=False, repr=False, compare=False)
+    #: The shares of a stream that is wholly the champion's, as bytes; and of the others what carries their memories.
+    _alone: bytes = field(init=False, repr=False, compare=False)
+    _others: tuple[tuple[Carry, int, int], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.models or len(self.names) != len(self.models) or not 0 <= self.champion < len(self.models):
@@ -66,7 +91,16 @@ class ChampionInverse:
         if len({model.dt_s for model in self.models}) != 1 or not self.blend_s >= 0.0:
             raise InputError("models, blend_s: expected models of one sample time, and a time of at least 0 s")
         sizes = [len(self.models), *(model.memory_size for model in self.models)]
-        object.__setattr__(self, "_cuts", tuple(int(cut) for cut in np.cumsum(sizes)))
+        cuts = tuple(int(cut) for cut in np.cumsum(sizes))
+        object.__setattr__(self, "_cuts", cuts)
+        object.__setattr__(self, "_alone", self._settled().tobytes())
+        spans = zip(self.models, cuts, cuts[1:], strict=False)
+        others = [
+            (_carry_of(model), begin, end)
+            for i, (model, begin, end) in enumerate(spans)
+            if end > begin and i != self.champion
+        ]
+        object.__setattr__(self, "_others", tuple(others))
 
     @property
     def dt_s(self) -> float:
@@ -98,29 +132,32 @@ class ChampionInverse:
         if self._is_settled(memory):
             return self._champions(y_um, v_um_per_s, a_um_per_s2, memory)
         shares, parts = self._parts(memory)
-        answers = [
-            model.feedforward(y_um, v_um_per_s, a_um_per_s2, part)
-            for model, part in zip(self.models, parts, strict=True)
-        ]
-        champion = answers[self.champion]
-        ends = [
-            answer.memory if np.isfinite(answer.memory).all() else part
-            for answer, part in zip(answers, parts, strict=True)
-        ]
-        if shares[self.champion] >= 1.0:
-            return Feedforward(champion.u_V, champion.std_V, champion.inside, np.concatenate([self._settled(), *ends]))
-        weights = self._weights(shares, champion.u_V.size)
-        u, variance = np.zeros(champion.u_V.size), np.zeros(champion.u_V.size)
-        inside = champion.inside.copy()
-        blended = [(weights[:, i], answer) for i, answer in enumerate(answers) if shares[i] > 0.0 or i == self.champion]
-        for weight, answer in blended:
-            # A contestant that has nothing finite to say leaves its share to the champion.
-            u += weight * np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V)
-        for weight, answer in blended:
-            apart = np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V) - u
-            variance += np.where(weight > 0.0, weight * (answer.std_V**2 + apart**2), 0.0)
-            inside &= answer.inside | (weight <= 0.0)
-        return Feedforward(u, np.sqrt(variance), inside, np.concatenate([weights[-1], *ends]))
+        champion = self.served.feedforward(y_um, v_um_per_s, a_um_per_s2, parts[self.champion])
+        n = champion.u_V.size
+        weights = self._weights(shares, n)
+        answers = {
+            i: champion if i == self.champion else model.feedforward(y_um, v_um_per_s, a_um_per_s2, parts[i])
+            for i, model in enumerate(self.models)
+            if i == self.champion or shares[i] > 0.0
+        }
+        u, std, inside = champion.u_V, champion.std_V, champion.inside
+        if len(answers) > 1:
+            u, variance, inside = np.zeros(n), np.zeros(n), inside.copy()
+            for i, answer in answers.items():
+                # A contestant that has nothing finite to say leaves its share to the champion.
+                u += weights[:, i] * np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V)
+            for i, answer in answers.items():
+                apart = np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V) - u
+                variance += np.where(weights[:, i] > 0.0, weights[:, i] * (answer.std_V**2 + apart**2), 0.0)
+                inside &= answer.inside | (weights[:, i] <= 0.0)
+            std = np.sqrt(variance)
+        ends = []
+        for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
+            end = answers[i].memory if i in answers else part.copy()
+            if i not in answers and part.size:
+                _carry_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+            ends.append(end if np.isfinite(end).all() else part)
+        return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 
     def track(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
@@ -136,29 +173,27 @@ class ChampionInverse:
 
     def _is_settled(self, memory: FloatArray) -> bool:
         """Whether a caller's stream of points is wholly the champion's: almost always."""
-        if not isinstance(memory, np.ndarray) or memory.shape != (self.memory_size,) or memory.dtype != np.float64:
+        if type(memory) is not np.ndarray or memory.shape != (self._cuts[-1],) or memory.dtype != np.float64:
             return False
-        shares = memory[: len(self.models)].tolist()
         # As it leaves this class; anything else goes the long way, where it is judged.
-        return bool(shares[self.champion] == 1.0 and shares.count(0.0) == len(shares) - 1)
+        return memory[: len(self.models)].tobytes() == self._alone
 
     def _champions(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """The champion's answer, and all memories after it: what a contestant without one would say nobody asks."""
-        champion: Feedforward | None = None
+        """The champion's answer, and all memories after it."""
+        begin, end = self._cuts[self.champion], self._cuts[self.champion + 1]
+        answer = self.models[self.champion].feedforward(y_um, v_um_per_s, a_um_per_s2, memory[begin:end])
         after = memory.copy()
-        begin = len(self.models)
-        for i, (model, end) in enumerate(zip(self.models, self._cuts[1:], strict=True)):
-            if end > begin or i == self.champion:
-                answer = model.feedforward(y_um, v_um_per_s, a_um_per_s2, memory[begin:end])
-                if i == self.champion:
-                    champion = answer
-                if end > begin and all_finite(answer.memory):
-                    after[begin:end] = answer.memory
-            begin = end
-        assert champion is not None
-        return Feedforward(champion.u_V, champion.std_V, champion.inside, after)
+        after[begin:end] = answer.memory
+        for carry, first, stop in self._others:
+            carry(y_um, answer.u_V, after[first:stop])
+        if not all_finite(after):
+            # One that cannot go on stays where it was; it is no reason for the others to.
+            for first, stop in itertools.pairwise(self._cuts):
+                if not np.isfinite(after[first:stop]).all():
+                    after[first:stop] = memory[first:stop]
+        return Feedforward(answer.u_V, answer.std_V, answer.inside, after)
 
     def _settled(self) -> FloatArray:
         shares = np.zeros(len(self.models))

@@ -132,6 +132,10 @@ class MpiInverse:
         _track(same_length("u_V", u_V, y.size), self.parameters.r_, after)
         return after
 
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without its checks: (n,) contiguous voltages, V, that somebody else answered."""
+        _track(u_V, self.parameters.r_, memory)
+
     def state_dict(self) -> StateDict:
         """Flat numbers and vectors by name."""
         state = model_state(self.dt_s, self.voltage_std_V, self.domain)

@@ -24,6 +24,7 @@ from service.errors import FieldError, SessionError
 from service.intake import SampleSink, SampleWatcher
 from service.keeper import learn_again, restore_newest
 from service.keys import Keys
+from service.memory import TRIM_S, give_back, keep_little
 from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
 from service.standby.estate import Estate, of_standby
@@ -208,9 +209,13 @@ class Service:
         }
 
     def _publish(self) -> None:
+        trimmed_at = time.monotonic()
         while not self._stopping.is_set():
             self._wake.wait(_TICK_S)
             self._wake.clear()
+            if time.monotonic() - trimmed_at >= TRIM_S:
+                trimmed_at = time.monotonic()
+                give_back()
             for axis in self.axes:
                 try:
                     axis.tick(time.monotonic())
@@ -221,7 +226,8 @@ class Service:
 
 
 def tune_process() -> None:
-    """One BLAS thread (two stall for tens of ms now and then), and quick changes between Python's threads."""
+    """One BLAS thread (two stall for tens of ms now and then), quick changes between Python's threads, few heaps."""
+    keep_little()
     threadpool_limits(1)
     sys.setswitchinterval(_SWITCH_S)
 

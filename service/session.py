@@ -41,8 +41,9 @@ LEASE_S: Final = 1.0
 _OPEN_S: Final = 1.0
 #: Longest time that a receiver may take nothing at all, s.
 _STUCK_S: Final = 0.3
-#: By mode, s. A client has one other end only: nobody waits behind it. At a router the lease decides before.
-_PATIENCE_S: Final = {"peer": _STUCK_S, "router": 1.5, "client": 5.0}
+#: By mode, s. A client has one other end only: nobody waits behind it. At a router it must be shorter than the lease,
+#: because everybody's signs of life wait behind one slow subscriber when another one comes or goes.
+_PATIENCE_S: Final = {"peer": _STUCK_S, "router": _STUCK_S, "client": 5.0}
 #: The longest message that is put together from its parts, bytes: the largest model, and some. Zenoh's own default of
 #: 1 GiB would let any sender ask for that much memory.
 MAX_MESSAGE_BYTES: Final = 72 * 2**20

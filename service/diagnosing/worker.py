@@ -1,13 +1,10 @@
 """The process that diagnoses: ``python -m service.diagnosing.worker FOLDER``, of the lowest priority.
 
-Reads ``job.json`` and ``samples.npz`` in the folder, writes ``result.json`` there, whole or not at all.
+See ``service.background`` for what it finds in the folder and leaves there.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,24 +13,19 @@ import numpy as np
 
 from adaptive.errors import DehystError
 from adaptive.types import BoolArray, FloatArray
+from service.background import work
 
 
 def main(arguments: list[str]) -> int:
     """Diagnose one job. Returns 0; what goes wrong is in the result."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
-    folder = Path(arguments[0])
-    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    with np.load(folder / "samples.npz", allow_pickle=False) as samples:
-        reference, recent = samples["reference"], samples["recent"]
+    return work(Path(arguments[0]), _diagnosed)
+
+
+def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
     try:
-        result = diagnose(job, reference, recent)
+        return diagnose(job, arrays["reference"], arrays["recent"])
     except DehystError as error:
-        result = {"error": str(error)}
-    part = folder / "result.part"
-    part.write_text(json.dumps(result), encoding="utf-8")
-    os.replace(part, folder / "result.json")
-    return 0
+        return {"error": str(error)}
 
 
 def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> dict[str, Any]:

@@ -1,45 +1,33 @@
 """The process that tunes: ``python -m service.retuning.worker FOLDER``, of the lowest priority.
 
-Reads ``order.json`` and ``data.npz`` in the folder, writes ``result.json`` there, whole or not at all.
+See ``service.background`` for what it finds in the folder and leaves there.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from adaptive.types import FloatArray
+from service.background import work
+
 
 def main(arguments: list[str]) -> int:
     """Do one order. Returns 0; what goes wrong is in the result."""
-    # Before anything heavy is imported: whoever answers queries goes first, always.
-    with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
-    folder = Path(arguments[0])
-    order = json.loads((folder / "order.json").read_text(encoding="utf-8"))
-    result = work(order, folder)
-    part = folder / "result.part"
-    part.write_text(json.dumps(result), encoding="utf-8")
-    os.replace(part, folder / "result.json")
-    return 0
+    return work(Path(arguments[0]), tuned)
 
 
-def work(order: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` in data.npz, or
+def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
+    """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` of the arrays, or
     ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
-    import numpy as np
-
     from adaptive.errors import DehystError
     from adaptive.residual import Hyperparameters
     from adaptive.retune import RetuneConfig, compare, propose
     from service.retuning.job import unpack
 
-    with np.load(folder / "data.npz", allow_pickle=False) as arrays:
-        data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays.files}
+    data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}
     ranges = {name: tuple(order["search"][name]) for name in ("gamma_range", "width_range")}
     config = RetuneConfig(**{**order["search"], **ranges})
     try:

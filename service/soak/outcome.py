@@ -15,6 +15,7 @@ from service.soak.ledger import Happened, Ledger
 #: Before this the memory of a process is not judged, and a process that lived shorter after it neither, s.
 MEMORY_WARM_S: Final = 180.0
 MEMORY_LEAST_S: Final = 300.0
+_FLOOR_S: Final = 60.0
 
 
 def memory_slope(ledger: Ledger) -> float | None:
@@ -30,8 +31,16 @@ def memory_slope(ledger: Ledger) -> float | None:
                 continue
             lived = float(np.ptp(t[after]))
             if best is None or lived > best[0]:
-                best = lived, 3600.0 * _slope(t[after], kb[after])
+                best = lived, 3600.0 * _slope(*_floor(t[after], kb[after]))
     return None if best is None else best[1]
+
+
+def _floor(t_s: FloatArray, kb: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least of every minute, and when it was: what is in use for a moment (a state that is handed over, a
+    checkpoint) is given back within a minute, and is no growth."""
+    minute = ((t_s - t_s[0]) // _FLOOR_S).astype(np.int64)
+    at = [int(np.argmin(np.where(minute == m, kb, np.inf))) for m in range(int(minute[-1]) + 1) if np.any(minute == m)]
+    return t_s[at], kb[at]
 
 
 def _slope(t_s: FloatArray, values: FloatArray) -> float:

@@ -52,6 +52,9 @@ def recovers(ledger: Ledger) -> Invariant:
         end = fault.window_s[1]
         if math.isfinite(fault.recovered_s):
             over.append(fault.recovered_s - end - fault.busy_s)
+        elif end + RECOVERED_S > ledger.duration_s:
+            # It lasted longer than planned, and the run was over before its time was.
+            continue
         elif fault.busy_s <= _EXCUSED_SHARE * KINDS[fault.kind].recover_s:
             over.append(math.inf)
     return _judged(over, len(ledger.faults), RECOVERED_S, "longest beyond its time until all was well", "faults")
@@ -62,7 +65,8 @@ def _judged(over: list[float], of: int, limit_s: float, text: str, what: str) ->
     worst = max(over, default=0.0)
     left = of - len(over)
     if left:
-        text += f"; {left} of {of} {what} not judged: a bare loop was late by {STALLED_S:g} s, or others had the cores"
+        why = f"a bare loop was late by {STALLED_S:g} s, others had the cores, or the run was over"
+        text += f"; {left} of {of} {what} not judged: {why}"
     if worst <= limit_s and len(over) < _LEAST_SHARE * of:
         return Invariant(None, worst, limit_s, "s", text)
     return Invariant(bool(worst <= limit_s), worst, limit_s, "s", text)

@@ -8,10 +8,14 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.diagnosis.forms import Form, Trial
-from sim.diagnosis.loops import bouc_wen_paced, felt_rate, grown_plays, plays_nested, plays_sum
+from sim.diagnosis.loops import asymmetric, bouc_wen_paced, felt_rate, grown_plays, plays_nested
 from sim.diagnosis.nominal import loop_numbers
 from sim.diagnosis.restoring import Restoring, Stops
 from sim.diagnosis.setting import At, Setting, Slot
+
+#: Knees of the dead zones: of the displacement, and of a wide play, over half the stroke from its middle.
+_NEAR = np.array([-0.6, -0.2, 0.2, 0.6])
+_WIDE = np.array([-0.4, 0.0, 0.4])
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class Asymmetry(Form):
     form_error: float = 0.12
 
     def plausible(self, p: FloatArray, setting: Setting) -> bool:
-        return 1e-4 <= abs(self.physical(p, setting)["bend"][0]) + 0.02 * float(np.max(np.abs(p[7:]))) <= 0.1
+        return 1e-5 <= abs(self.physical(p, setting)["bend"][0]) + 0.02 * float(np.max(np.abs(p[7:]))) <= 0.1
 
     def slots(self, setting: Setting) -> tuple[Slot, ...]:
         near = tuple(Slot(f"dead_zone{j}", "1", 0.0, -0.2, 0.2, 0.01, At.STATIC, True) for j in (1, 2, 3, 4))
@@ -95,30 +99,18 @@ class Asymmetry(Form):
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, setting: Setting
     ) -> FloatArray | None:
-        half = 0.5 * setting.range_um
         low = float(np.min(w_um)) if setting.fitted_low_um is None else setting.fitted_low_um
-        x = (w_um - low) / half - 1.0
-        out = np.zeros_like(w_um)
-        for weight, knee in zip(p[:4], (-0.6, -0.2, 0.2, 0.6), strict=True):
-            if weight != 0.0:
-                out += weight * half * np.maximum(x - knee, 0.0)
-        if np.any(p[4:7]):
-            z = plays_sum(u_V, np.array([0.15 * setting.swing_V]), np.ones(1))
-            z = (z - setting.u_low_V) / (0.5 * setting.swing_V) - 1.0
-            for weight, knee in zip(p[4:7], (-0.4, 0.0, 0.4), strict=True):
-                out += weight * half * np.maximum(z - knee, 0.0)
-        if p[7] != 0.0:
-            out += p[7] * h_um * x
-        if p[8] != 0.0:
-            loop = float(np.max(np.abs(h_um))) if setting.fitted_loop_um is None else setting.fitted_loop_um
-            out += p[8] * h_um * h_um / max(loop, 1e-12)
-        return out
+        loop = float(np.max(np.abs(h_um))) if setting.fitted_loop_um is None else setting.fitted_loop_um
+        x_scale = np.array([low, 0.5 * setting.range_um])
+        z_scale = np.array([0.15 * setting.swing_V, setting.u_low_V, 0.5 * setting.swing_V])
+        q = np.ascontiguousarray(p)
+        return np.asarray(asymmetric(u_V, h_um, w_um, q, _NEAR, _WIDE, x_scale, z_scale, max(loop, 1e-12)))
 
     def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
         """The bend over the whole stroke, and the two products."""
         row = np.zeros(p.size)
-        row[:4] = 0.5 * (1.0 - np.array([-0.6, -0.2, 0.2, 0.6])) / 2.0
-        row[4:7] = 0.5 * (1.0 - np.array([-0.4, 0.0, 0.4])) / 2.0
+        row[:4] = 0.5 * (1.0 - _NEAR) / 2.0
+        row[4:7] = 0.5 * (1.0 - _WIDE) / 2.0
         one, two = np.zeros(p.size), np.zeros(p.size)
         one[7], two[8] = 1.0, 1.0
         return {"bend": (float(row @ p), row), "branch": (float(p[7]), one), "width": (float(p[8]), two)}
@@ -135,8 +127,9 @@ class RateDependence(Form):
     name: str = "rate_dependence"
     form_error: float = 0.3
     variant: str = "width"
-    #: Time over which the rate is felt, s.
+    #: Time over which the rate is felt, s; ``felt_free``: only where its fit begins.
     felt_s: float = 0.004
+    felt_free: bool = False
 
     def plausible(self, p: FloatArray, setting: Setting) -> bool:
         return 0.003 <= self.physical(p, setting)["growth_per_decade"][0] <= 0.6
@@ -148,11 +141,19 @@ class RateDependence(Form):
             g = setting.range_um / max(v, 1e-9)
             w = tuple(Slot(f"weight{j}_um_per_V", "µm/V", 0.0, -g, g, 0.1 * g, At.STATIC) for j in (1, 2, 3))
             return (*w, pace)
-        return (
+        own = (
             Slot("width_per_decade", "1", 0.0, -1.0, 1.0, 0.02, At.STATIC),
             Slot("slope_per_decade", "1", 0.0, -1.0, 1.0, 0.02, At.STATIC),
             pace,
         )
+        felt = Slot("log_felt_s", "1", float(np.log(self.felt_s)), float(np.log(2e-4)), 0.0, 0.2, At.STATIC)
+        return (*own, felt) if self.felt_free else own
+
+    def _paced(self, p: FloatArray) -> tuple[float, float]:
+        """Rate above which the loop grows (V/s), and the time over which it is felt (s)."""
+        if self.felt_free:
+            return float(np.exp(p[-2])), float(np.exp(p[-1]))
+        return float(np.exp(p[-1])), self.felt_s
 
     def trials(self, setting: Setting, residual_um: FloatArray) -> list[Trial]:
         slots = self.slots(setting)
@@ -176,10 +177,11 @@ class RateDependence(Form):
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, setting: Setting
     ) -> FloatArray | None:
-        if not np.any(p[:-1]):
+        if not np.any(p[: 2 if self.variant == "width" else 3]):
             return None
-        rate = felt_rate(u_V, float(np.exp(-setting.dt_s / self.felt_s)) if self.felt_s > 0.0 else 0.0, setting.dt_s)
-        pace = np.log10(1.0 + rate / np.exp(p[-1]))
+        corner_V_per_s, felt_s = self._paced(p)
+        rate = felt_rate(u_V, float(np.exp(-setting.dt_s / felt_s)) if felt_s > 0.0 else 0.0, setting.dt_s)
+        pace = np.log10(1.0 + rate / corner_V_per_s)
         if self.variant != "width":
             radii, factor, added = self._growth(setting)
             return np.asarray(grown_plays(u_V, radii, np.ascontiguousarray(p[:3]), 1.0 + factor * pace, added * pace))
@@ -192,9 +194,9 @@ class RateDependence(Form):
         return np.asarray(out)
 
     def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
-        v0 = float(np.exp(p[-1]))
+        v0, _ = self._paced(p)
         row, corner = np.zeros(p.size), np.zeros(p.size)
-        corner[-1] = v0
+        corner[-2 if self.felt_free else -1] = v0
         if self.variant != "width":
             # Growth of the loop's height, relative to the stroke.
             radii, factor, added = self._growth(setting)

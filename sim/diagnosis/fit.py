@@ -44,6 +44,12 @@ class Fit:
         slots = tuple(s if s < less.start else s - width for s in (self.row_slots[i] for i in keep))
         return Columns(self.rows[keep], slots)
 
+    def slim(self) -> Fit:
+        """The fit to be kept for later: of what was simulated the drive and the reading are left."""
+        none = np.empty(0)
+        signals = replace(self.signals, h_um=none, w_um=none, static_um=none, moved_um=none, motion_um=none)
+        return replace(self, signals=signals, rows=None, row_slots=())
+
 
 def refreshed(fit: Fit, mask: BoolArray) -> Fit:
     """The fit with columns computed where it stands, for everything that is asked of them later."""

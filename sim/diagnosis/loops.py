@@ -118,6 +118,46 @@ def grown_plays(
 
 
 @compiled
+def asymmetric(
+    u_V: FloatArray,
+    h_um: FloatArray,
+    w_um: FloatArray,
+    p: FloatArray,
+    near: FloatArray,
+    wide: FloatArray,
+    x_scale: FloatArray,
+    z_scale: FloatArray,
+    loop_um: float,
+) -> FloatArray:
+    """Dead zones (2.8) on the static displacement and on a wide play, and products of loop and displacement, µm.
+
+    ``p``: weights at the knees ``near`` of x, at the knees ``wide`` of z, of h x and of h². x = (w - low)/half - 1 with
+    ``x_scale`` (low, half) in µm; z the same of a play of the voltage with ``z_scale`` (radius, low, half) in V.
+    """
+    n = u_V.shape[0]
+    out = np.empty(n)
+    low_um, half_um = x_scale[0], x_scale[1]
+    radius_V, low_V, half_V = z_scale[0], z_scale[1], z_scale[2]
+    a, b = near.shape[0], wide.shape[0]
+    branch, width = p[a + b], p[a + b + 1] / loop_um
+    held = 0.0
+    for k in range(n):
+        x = (w_um[k] - low_um) / half_um - 1.0
+        held = min(max(held, u_V[k] - radius_V), u_V[k] + radius_V)
+        z = (held - low_V) / half_V - 1.0
+        total = 0.0
+        for j in range(a):
+            if x > near[j]:
+                total += p[j] * (x - near[j])
+        for j in range(b):
+            if z > wide[j]:
+                total += p[a + j] * (z - wide[j])
+        h = h_um[k]
+        out[k] = half_um * total + branch * h * x + width * h * h
+    return out
+
+
+@compiled
 def plays_sum(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> FloatArray:
     """Sum of weighted plays (2.4), (2.7) that start relaxed at zero volts."""
     n = u_V.shape[0]

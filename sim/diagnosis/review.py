@@ -57,7 +57,7 @@ def review(search: Search, fit: Fit, held: HeldOut, steps: dict[str, Step]) -> t
         # Where the voltage was monitored, a rival must agree with that as well.
         rivals = [r for r in rivals if r.cost - r.held.sse_um2 <= 1.2 * (cost - held.sse_um2) + 0.05 * gain]
         names = _rivals(search, rivals, held, gain, held_less)
-        found.append(Found(steps[form.name], less, held_less, names))
+        found.append(Found(steps[form.name], less.slim(), held_less, names))
         index += 1
     return fit, held, found
 

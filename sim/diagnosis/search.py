@@ -12,12 +12,15 @@ from sim.diagnosis.catalogue import FORMS, same_set
 from sim.diagnosis.causes_modal import Modes
 from sim.diagnosis.causes_restoring import RestoringLoop
 from sim.diagnosis.evidence import HeldOut, Screen, Screened, Split, held_out, p_value
+from sim.diagnosis.finer import finer
 from sim.diagnosis.first_fits import first_fits
 from sim.diagnosis.fit import Fit, calibrate, refreshed
 from sim.diagnosis.forms import Form
 from sim.diagnosis.lines import line_is_there
 from sim.diagnosis.monitor import monitor_misfit
-from sim.diagnosis.slips import Slips, slips_of
+from sim.diagnosis.side_by_side import side_by_side
+from sim.diagnosis.slip_dates import slips_of
+from sim.diagnosis.slips import Slips, redated
 
 Progress = Callable[[str, float], None]
 
@@ -35,6 +38,8 @@ class Rules:
     #: Least share of what stands above the noise floor that the first, and a further, cause must remove.
     least_excess_first: float = 0.1
     least_excess_next: float = 0.25
+    #: A further cause that removes so much of it is accepted whatever the forms before it may have left behind.
+    nearly_all: float = 0.85
     #: Cost of a number, as a share of the squared error: of two causes that do as well, the simpler.
     cost_per_number: float = 0.002
     #: How many of the linearised guesses are fitted in full.
@@ -94,15 +99,10 @@ class Search:
     def looks(self, fit: Fit, skip: set[str]) -> tuple[list[Screened], list[Form]]:
         """The best linearised guess of every form that could show, largest gain first."""
         screen = Screen(fit, self.mask, self.parts)
-        found: list[Screened] = []
         self._refresh(fit)
-        for i, form in enumerate(self.forms):
-            if form.name in skip or form.applies(fit.model.setting):
-                continue
-            look = screen.look(i, fit.model.plus(form))
-            if look is not None:
-                found.append(look)
-        found.sort(key=lambda s: -s.gain_um2)
+        shown = [i for i, f in enumerate(self.forms) if f.name not in skip and not f.applies(fit.model.setting)]
+        seen = side_by_side(lambda i: screen.look(i, fit.model.plus(self.forms[i])), shown)
+        found = sorted((look for look in seen if look is not None), key=lambda s: -s.gain_um2)
         return found, [self.forms[s.index] for s in found]
 
     def _refresh(self, fit: Fit) -> None:
@@ -115,22 +115,26 @@ class Search:
 
     def refit(self, base: Fit, looks: list[Screened], count: int, least_um2: float) -> list[Candidate]:
         """The most promising guesses fitted jointly, the cheapest in held-out error first."""
-        out: list[Candidate] = []
         if not looks:
-            return out
+            return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
+        timing = bool(chosen) and self.forms[chosen[0].index].name == "timing"
         for look in looks:
             form = self.forms[look.index]
-            # A line at the mains is small but has its own mark; a loop in the force shows once the mode gives way.
+            # A line at the mains is small but has its own mark; a loop in the force shows once the mode gives way;
+            # slips show to a model that knows of the others, and until then a clock stands for them.
             line = form.name == "mains_hum" and self.is_line(look, base)
-            if (line or isinstance(form, RestoringLoop)) and all(look is not c for c in chosen):
+            own = line or isinstance(form, RestoringLoop) or (timing and isinstance(form, Slips))
+            if own and all(look is not c for c in chosen):
                 chosen.append(look)
-        for look in chosen:
+
+        def fitted(look: Screened) -> Candidate:
             form, fits = first_fits(self.forms[look.index], look.start, base, self.mask)
             quick = min(fits, key=lambda f: f.sse_um2)
             held = self.held(quick)
-            out.append(Candidate(form, replace(quick, rows=None), held, self.cost(quick, held, base)))
-        return sorted(out, key=lambda c: c.cost)
+            return Candidate(form, quick.slim(), held, self.cost(quick, held, base))
+
+        return sorted(side_by_side(fitted, chosen), key=lambda c: c.cost)
 
     def is_line(self, look: Screened, base: Fit) -> bool:
         return line_is_there(base.residual_um, base.model.setting, float(look.start[0]))
@@ -175,6 +179,9 @@ class Search:
         least = max(
             rules.least_gain * float(now.sum()), (0.5 if self.coarse else rules.least_of_floor) * float(floor.sum())
         )
+        # What a form leaves behind is no other cause to the last: what explains nearly all of it, and much, is there.
+        if not first and whole > rules.nearly_all and float(now.sum()) > 2.0 * float(floor.sum()):
+            return True
         return gain > least and gain > need * excess and whole > 0.5 * need
 
     def run(self, nominal: Fit) -> tuple[Fit, HeldOut, list[Step]]:
@@ -202,14 +209,7 @@ class Search:
                     break
             if accepted is None:
                 break
-            left = accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))
-            if (
-                accepted.form.name == "hysteresis_shape"
-                and not accepted.form.variant
-                and left > (1.5 * self.sigma_um) ** 2
-            ):
-                accepted = self._finer(accepted, current)
-            accepted = self._other_hold(accepted, current)
+            accepted = self._other_hold(self._finer(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.form.form_error**2 * gone
@@ -230,14 +230,28 @@ class Search:
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 
     def _finer(self, accepted: Candidate, base: Fit) -> Candidate:
-        """More thresholds where a loop shape is the cause: what it leaves must not be taken for something else."""
-        form = replace(accepted.form, variant="fine")
+        """The same cause in a form with more numbers, where it has one and that does better."""
+        left = np.sqrt(accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
+        own = accepted.fit.p[len(base.p) :]
+        found = finer(accepted.form, own, float(left), base.model.setting)
+        if found is None:
+            return accepted
+        form, starts = found
         model = base.model.plus(form)
-        start = np.concatenate([accepted.fit.p[: len(base.p)], np.zeros(len(form.slots(model.setting)))])
-        fit = refreshed(calibrate(model, start, self.mask, 8, 1e-3), self.mask)
+        beside = accepted.fit.p[: len(base.p)]
+        fits = [calibrate(model, np.concatenate([beside, start]), self.mask, 10, 1e-3) for start in starts]
+        fit = refreshed(min(fits, key=lambda f: f.sse_um2), self.mask)
         held = self.held(fit)
         cost = self.cost(fit, held, base)
         return Candidate(form, fit, held, cost) if cost < accepted.cost else accepted
+
+    def redated(self, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
+        """The fit with its slips, if it has any, dated beside everything that was found since."""
+        better = redated(fit, self.mask)
+        if better is fit:
+            return fit, held
+        better = refreshed(better, self.mask)
+        return better, self.held(better)
 
     def without(self, fit: Fit, index: int) -> Fit:
         """The model less one cause, calibrated anew."""

@@ -6,75 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adaptive.compiled import compiled
 from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.causes_reading import Timing
 from sim.diagnosis.chain import Model
-from sim.diagnosis.fit import Fit, calibrate
+from sim.diagnosis.fit import Fit, calibrate, evaluate
 from sim.diagnosis.forms import Form, Trial
 from sim.diagnosis.loops_linear import resample_by
 from sim.diagnosis.setting import At, Setting, Slot
+from sim.diagnosis.slip_dates import MOST, MOST_SLIPS, Found, dated, moved, pruned, slips_of
 
-#: Samples by which a column may come to run ahead or late.
-MOST = 12
-#: Slips beyond this number are no slips but another cause that looks like them.
-MOST_SLIPS = 16
-_BLOCK = 8
-
-
-@compiled
-def _path(cost: FloatArray, price: float) -> FloatArray:
-    """The cheapest way through ``cost`` (blocks, shifts) where each step of one shift costs ``price`` (Viterbi)."""
-    n, m = cost.shape
-    back = np.zeros((n, m), dtype=np.int8)
-    total = cost[0].copy()
-    for b in range(1, n):
-        for j in range(1, m):  # a change by more steps pays for each
-            if total[j - 1] + price < total[j]:
-                total[j] = total[j - 1] + price
-                back[b, j] = back[b, j - 1] - 1
-        for j in range(m - 2, -1, -1):
-            if total[j + 1] + price < total[j]:
-                total[j] = total[j + 1] + price
-                back[b, j] = back[b, j + 1] + 1
-        for j in range(m):
-            total[j] += cost[b, j]
-    out = np.empty(n)
-    j = int(np.argmin(total))
-    for b in range(n - 1, -1, -1):
-        out[b] = j
-        j += int(back[b, j])
-    return out
-
-
-def slips_of(y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> tuple[tuple[int, int], ...]:
-    """Where the readings slip against the model, and by how many samples: ``((index, size), ...)``; positive is lost.
-
-    Asked of first differences, so that slow errors of the model do not matter, in blocks of eight samples. A slip has
-    to save far more than the typical error of a block.
-    """
-    n = y_um.size // _BLOCK * _BLOCK
-    moved = np.diff(y_um, prepend=y_um[:1])
-    there = np.diff(model_um, prepend=model_um[:1])
-    inside = mask & np.append(mask[:1], mask[:-1])
-    cost = np.empty((n // _BLOCK, 2 * MOST + 1))
-    for j in range(2 * MOST + 1):
-        shift = j - MOST
-        ahead = np.roll(there, -shift)
-        error = np.square(np.where(inside, moved - ahead, 0.0))
-        cost[:, j] = np.add.reduceat(error[:n], np.arange(0, n, _BLOCK))
-    least = cost.min(axis=1)
-    if not np.all(np.isfinite(least)):
-        return ()
-    cost -= least[:, None]
-    # A model that is still wrong pays for that in many blocks: the price rises until few slips are left.
-    price = 12.0 * max(float(np.quantile(least, 0.9)), 1e-18)
-    for _ in range(12):
-        path = _path(np.ascontiguousarray(cost), price)
-        at = np.flatnonzero(np.diff(path)) + 1
-        if at.size <= MOST_SLIPS:
-            return tuple((int(b * _BLOCK), int(path[b] - path[b - 1])) for b in at)
-        price *= 3.0
-    return ()
+#: Least share of the squared error that a slip must take off.
+_LEAST_GAIN = 0.002
+#: Share of the squared error that the first guess may leave: more, and something else is the cause.
+_PROMISING = 0.6
 
 
 @dataclass(frozen=True)
@@ -85,7 +29,7 @@ class Slips(Form):
     variant: str = "slips"
     of_one_recording: bool = True
     #: Where, as first samples, and by how many samples; found anew in every residual.
-    found: tuple[tuple[int, int], ...] = ()
+    found: Found = ()
 
     def applies(self, setting: Setting) -> str:
         return "" if self.found else "a lasting jump of the timing"
@@ -122,16 +66,62 @@ class Slips(Form):
         }
 
 
-def placed(form: Slips, bare: Model, base: Fit, mask: BoolArray) -> Fit:
-    """Slips of whole samples, looked for again beside a model that knows most of them, until they stay."""
-    setting = base.model.setting
-    p = base.p
-    for _ in range(6):
-        model = bare.plus(form)
-        start = np.concatenate([p[: base.p.size], form.trials(setting, base.residual_um)[0][0]])
-        fit = calibrate(model, start, mask, 8, 1e-3, frozenset(range(base.p.size)))
-        found = slips_of(setting.y_um, fit.signals.motion_um, mask)
-        if not found or found == form.found:
+def without_slips(fit: Fit, index: int) -> FloatArray:
+    """The reading (n,) that the model would give had ``forms[index]`` lost no sample."""
+    p = fit.p.copy()
+    p[fit.model.where(index)] = 0.0
+    return fit.model.simulate(p, At.READING, fit.signals).reading_um
+
+
+def placed(form: Slips, bare: Model, base: Fit, mask: BoolArray, known: Found = ()) -> Fit:
+    """Slips of whole samples beside everything else; a model that knows of some sees the others.
+
+    ``known`` are those to begin with. Otherwise they are looked for beside ``base``, and beside a model that was
+    fitted with a clock that runs wrong: many slips of one sign look like one, and bend the other numbers less so.
+    """
+    y_um, own, index = base.model.setting.y_um, base.p.size, len(bare.forms)
+
+    def fitted(p: FloatArray, found: Found, iterations: int, sizes_too: bool = False) -> Fit:
+        sizes = [float(size) for _, size in found]
+        only = None if sizes_too else frozenset(range(own))
+        model = bare.plus(replace(form, found=found))
+        return calibrate(model, np.concatenate([p[:own], sizes]), mask, iterations, 1e-3, only)
+
+    starts = [base.p]
+    if not known:
+        clock = calibrate(bare.plus(Timing()), np.append(base.p, 0.0), mask, 6, 1e-2)
+        starts.append(clock.p[:own])
+    fits: list[tuple[Fit, Found]] = []
+    for p in starts:
+        there = bare.simulate(p).reading_um
+        found = dated(pruned(dated(known or slips_of(y_um, there, mask), y_um, there, mask)), y_um, there, mask)
+        if found:
+            fits.append((fitted(p, found, 4), found))
+    fit, found = min(fits, key=lambda pair: pair[0].sse_um2, default=(base, ()))
+    promising = bool(known) or fit.sse_um2 < _PROMISING * base.sse_um2
+    for _ in range(2 * MOST_SLIPS if promising else 0):
+        there = without_slips(fit, index) if found else fit.signals.reading_um
+        after, gain = moved(found, y_um, there, mask)
+        if gain < _LEAST_GAIN * fit.sse_um2 or len(after) > MOST_SLIPS:
             break
-        form, p = replace(form, found=found), fit.p
-    return calibrate(fit.model, fit.p, mask, 6, 1e-3)
+        found = pruned(dated(after, y_um, there, mask))
+        fit = fitted(fit.p, found, 4)
+    # That their sizes, let free, come out whole tells slips from what looks like them.
+    return fitted(fit.p, found or form.found, 8, sizes_too=not known)
+
+
+def redated(fit: Fit, mask: BoolArray) -> Fit:
+    """The fit with its slips looked for anew beside all its causes: an earlier model that lacked some dated them
+    worse, or overlooked one. The fit as it is where it has no slips or they stay."""
+    index = next((i for i, form in enumerate(fit.model.forms) if isinstance(form, Slips)), -1)
+    if index < 0:
+        return fit
+    form, y_um = fit.model.forms[index], fit.model.setting.y_um
+    assert isinstance(form, Slips)
+    bare = fit.model.less(index)
+    where = fit.model.where(index)
+    # To the end of the chain, where `placed` has them.
+    base = evaluate(bare, np.concatenate([fit.p[: where.start], fit.p[where.stop :]]), mask)
+    there = without_slips(fit, index)
+    tried = placed(form, bare, base, mask, dated(form.found, y_um, there, mask))
+    return tried if tried.sse_um2 < (1.0 - 1e-4) * fit.sse_um2 else fit

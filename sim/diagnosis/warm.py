@@ -7,7 +7,7 @@ import numpy as np
 from sim.diagnosis import loops, loops_linear
 from sim.diagnosis.dynamics import Dynamics, respond
 from sim.diagnosis.restoring import Loop, Stops
-from sim.diagnosis.slips import slips_of
+from sim.diagnosis.slip_dates import dated, moved, slips_of
 
 
 def warm() -> None:
@@ -19,6 +19,7 @@ def warm() -> None:
     loops.felt_rate(u, 0.5, 1.0)
     loops.grown_plays(u, two, two, u, u)
     loops.plays_sum(u, two, two)
+    loops.asymmetric(u, u, u, np.zeros(6), two, two, two, np.ones(3), 1.0)
     loops.plays_nested(u, two, two)
     loops.plays_matrix(u, two)
     loops_linear.lag_ends(u, 0.5, True)
@@ -26,7 +27,9 @@ def warm() -> None:
     loops_linear.slow_poles(u, two)
     loops_linear.friction(u, 0.1, 0.5)
     loops_linear.resample(u, 0.0, 0.5)
-    slips_of(u, u, np.ones(u.size, dtype=np.bool_))
+    there = np.ones(u.size, dtype=np.bool_)
+    slips_of(u, u, there)
+    moved(dated(((4, 1),), u, u, there), u, u, there)
     system = Dynamics((2e-3,), ((300.0, 0.02),))
     respond(u, system, 5e-4)
     respond(u, system, 5e-4, Stops(two, two))

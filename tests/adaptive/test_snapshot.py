@@ -10,7 +10,7 @@ import pytest
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.kernels import gram
-from adaptive.snapshot import LssvmInverse
+from adaptive.snapshot import DOMAIN_MARGIN, LssvmInverse, evaluate
 from adaptive.types import InverseModel
 
 
@@ -33,6 +33,28 @@ def test_equals_its_formula(model: LssvmInverse) -> None:
     np.testing.assert_allclose(answer.u_V, expected, atol=1e-10)
     np.testing.assert_array_equal(answer.memory, after)
     assert model.mean(basis[7], kernel[7]) == pytest.approx(expected[7], abs=1e-10)
+
+
+def test_the_packed_model_is_the_model(model: LssvmInverse) -> None:
+    y, v, a = points()
+    p = model.features.basis_size
+    spread = 1e-4 * np.eye(p) + 1e-5
+    for one in (
+        model,
+        replace(model, beta_covariance=spread),
+        replace(model, support=model.support[:0], alpha=model.alpha[:0]),
+    ):
+        memory, n = model.rest_memory(40.0), y.size
+        u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+        margin = DOMAIN_MARGIN * np.repeat(one.domain[1::2] - one.domain[::2], 2) * np.array([-1.0, 1.0] * 3)
+        evaluate(
+            y, v, a, memory, one.features.arrays, one.beta, one.beta_covariance,
+            np.ascontiguousarray((one.support / one.widths).T), one.alpha, 1.0 / one.widths, one.noise_variance,
+            one.kernel_variance, 1.0 / (1.0 + 1.0 / one.gamma), one.domain + margin, u, std, inside,
+        )  # fmt: skip
+        answer = one.feedforward(y, v, a, model.rest_memory(40.0))
+        for got, expected in ((answer.u_V, u), (answer.std_V, std), (answer.inside, inside), (answer.memory, memory)):
+            np.testing.assert_array_equal(got, expected)
 
 
 def test_a_trajectory_in_pieces_is_the_same_to_the_last_bit(model: LssvmInverse) -> None:

@@ -10,6 +10,8 @@ import pytest
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import FloatArray, InverseModel, Sample, StateDict
+from baselines.bouc_wen import BoucWenParameters
+from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.champion import ChampionInverse
 from baselines.competition import Competition, CompetitionConfig
 from baselines.linear import LinearInverse, LinearParameters
@@ -21,6 +23,15 @@ from baselines.succession import FAILED, WINS, Succession
 
 DT, GAIN, SPAN_V, RANGE_UM = 1e-3, 11.0, 7.0, 77.0
 SEEN = Domain(0.0, 80.0, 2000.0)
+BOUC_WEN = BoucWenParameters(
+    m_kg=0.015,
+    b_N_s_per_m=4.8e4,
+    k_N_per_m=1.9e7,
+    d_um_per_V=11.35,
+    alpha=0.4754,
+    beta_per_V=0.8649,
+    gamma_per_V=0.9630,
+)
 MPI = MpiParameters((0.0, 0.6, 1.2), (8.0, 2.0, 1.0), (0.0, 30.0), (1.0, -0.1))
 
 
@@ -317,3 +328,37 @@ def test_a_champion_model_is_stored_and_refuses_what_does_not_fit() -> None:
 def test_bad_settings_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(InputError):
         CompetitionConfig(**bad)  # type: ignore[arg-type]
+
+
+def test_who_has_no_share_follows_what_is_answered_and_who_has_one_answers_itself() -> None:
+    mpi = MpiInverse(MPI, DT, SEEN, 0.1)
+    bouc_wen = BoucWenInverse(BOUC_WEN, DT, SEEN, 0.1)
+    auto = ChampionInverse(("line", "mpi", "bouc_wen"), (line(), mpi, bouc_wen), 0)
+    y = 40.0 + 20.0 * np.sin(np.arange(60) * 0.1)
+    still = np.zeros(y.size)
+    memory = auto.rest_memory(40.0)
+    whole = auto.feedforward(y, still, still, memory)
+    np.testing.assert_array_equal(whole.u_V, line().feedforward(y, still, still, np.zeros(0)).u_V)
+    parts = np.split(whole.memory, np.cumsum([3, 0, mpi.memory_size])[:3])
+    for model, part in ((mpi, parts[2]), (bouc_wen, parts[3])):
+        np.testing.assert_array_equal(part, model.track(y, still, still, whole.u_V, model.rest_memory(40.0)))
+    # The long way, by shares that are the champion's but for what rounding left of another, comes to the same.
+    almost = memory.copy()
+    almost[:3] = (1.0, -0.0, 0.0)
+    for name in ("u_V", "std_V", "inside", "memory"):
+        np.testing.assert_array_equal(getattr(auto.feedforward(y, still, still, almost), name), getattr(whole, name))
+    shared = memory.copy()
+    shared[:3] = (0.5, 0.5, 0.0)
+    blended = auto.feedforward(y, still, still, shared)
+    own = mpi.feedforward(y, still, still, mpi.rest_memory(40.0)).memory
+    np.testing.assert_array_equal(np.split(blended.memory, np.cumsum([3, 0, mpi.memory_size])[:3])[2], own)
+
+
+def test_a_memory_that_is_not_finite_stays_its_owners() -> None:
+    mpi = MpiInverse(MPI, DT, SEEN, 0.1)
+    auto = ChampionInverse(("line", "mpi"), (line(), mpi), 0)
+    memory = auto.rest_memory(40.0)
+    memory[3] = math.inf
+    answer = auto.feedforward(np.array([41.0]), np.zeros(1), np.zeros(1), memory)
+    assert np.isfinite(answer.u_V).all()
+    assert answer.memory[:2].tolist() == [1.0, 0.0]

@@ -312,6 +312,7 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
         f'stage = "demo"\nlisten = ["{endpoint}"]\n[[axis]]\nname = "x"\nmodel = {json.dumps(str(model_file))}\n'
         "u_min_V = -2.0\nu_max_V = 10.0\nslew_V_per_s = 4000.0\n"
         "[axis.diagnosis]\nhistory_s = 8\nreference_s = 4\nrecent_s = 3\ncollect_s = 2.5\n"
+        f"reports = {json.dumps(str(tmp_path / 'reports'))}\n"
     )
     u_V = voltages(model_file, 20.0)
     cli = [sys.executable, "-m", "service.cli"]
@@ -340,6 +341,14 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
             last = client.status()["diagnosis"]["last"]
             assert last["effects"][0]["name"] == "gain_drift"
             assert last["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.004)
+            ask = [*cli, "ask-diagnosis", "--report", "--recent", "4", "--endpoint", endpoint, "--json"]
+            asked = subprocess.run(ask, capture_output=True, text=True, timeout=60, check=True)
+            assert json.loads(asked.stdout)["result"] == {"started": True, "job": 2}
+            eventually(lambda: client.status()["diagnosis"]["finished"] == 2, 120.0)
+            folder = Path(client.status()["diagnosis"]["last"]["report"]["folder"])
+            assert folder.parent == tmp_path / "reports"
+            assert {"report.md", "report.json", "residual.png", "stage.toml"} <= {f.name for f in folder.iterdir()}
+            assert "Noise floor" in (folder / "report.md").read_text() or (folder / "report.md").stat().st_size > 500
     finally:
         for process in (stage, serve):
             if process is not None:

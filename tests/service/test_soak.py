@@ -354,6 +354,30 @@ def test_what_a_machine_that_stood_still_shows_is_not_judged(late_s: float, othe
     assert verdict(ledger)["verdict"] == "broken"
 
 
+def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
+    ledger = healthy()
+    for second in ledger.seconds[36:]:
+        second.error_sum_um = 1000.0
+    ledger.faults.append(Happened("gap", 36.0, 38.5))
+    found = verdict(ledger)
+    assert found["invariants"]["recovers_by_itself"]["held"] is True
+    assert "1 of 2 faults not judged" in found["invariants"]["recovers_by_itself"]["text"]
+    ledger = healthy()
+    for second in ledger.seconds[32:]:
+        second.error_sum_um = 1000.0
+    ledger.faults.append(Happened("gap", 32.0, 33.0))
+    assert "recovers_by_itself" in broken(verdict(ledger))
+
+
+def test_memory_that_is_used_for_a_moment_is_no_growth() -> None:
+    ledger = healthy()
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 1500.0, 1.0)
+    held = np.where(rng.random(t.size) < 0.5, rng.uniform(0.0, 20_000.0, t.size), 0.0)
+    ledger.memory["a"] = [(float(s), 200_000.0 + 0.1 * s + more, 17) for s, more in zip(t, held, strict=True)]
+    assert memory_slope(ledger) == pytest.approx(360.0, rel=0.05)
+
+
 def test_a_silence_belongs_to_the_fault_that_made_it() -> None:
     ledger = healthy()
     ledger.faults.append(Happened("restart_router", 16.0, 16.3))

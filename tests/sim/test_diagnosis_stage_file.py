@@ -14,7 +14,7 @@ from sim.diagnosis.diagnose import diagnose_prepared
 from sim.diagnosis.modal import peaks
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.result import TEST, Diagnosis
-from sim.diagnosis.slips import slips_of
+from sim.diagnosis.slip_dates import slips_of
 from sim.effects import Chain, effect
 from sim.recordings import Recording, read
 from sim.stage import Stage, StageConfig
