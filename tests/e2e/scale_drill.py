@@ -51,12 +51,15 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
         serving = [
             (one, "left", ()), (two, "right", ()), (two, "left", ("--standby",)), (one, "right", ("--standby",)),
         ]  # fmt: skip
-        services = {}
-        for host, stage, options in serving:
-            config = _config(folder / f"{host.name}-{stage}", folder / f"{host.name}.json5", stage, router)
-            services[host.name, stage] = host.start(*cli, "serve", "--config", str(config), "--json", *options)
+        roles = {}
+        # First those that serve: a standby that finds nobody within three seconds serves itself.
+        for group in (serving[:2], serving[2:]):
+            services = {}
+            for host, stage, options in group:
+                config = _config(folder / f"{host.name}-{stage}", folder / f"{host.name}.json5", stage, router)
+                services[host.name, stage] = host.start(*cli, "serve", "--config", str(config), "--json", *options)
+            roles |= {key: _line(process)["role"] for key, process in services.items()}
         _say("services started")
-        roles = {key: _line(process)["role"] for key, process in services.items()}
         for stage in STAGES:
             lab.start(
                 *cli, "stage", "--free-run", "--name", stage, "--axis", "x", "--twins", "y", "--rate", str(RATE_HZ),
