@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ BoolArray = NDArray[np.bool_]
 StateDict = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Feedforward:
+class Feedforward(NamedTuple):
     """The answer of an inverse model to a trajectory of n points, ``dt_s`` apart.
 
     Attributes

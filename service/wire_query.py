@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,8 +67,7 @@ _ONE_POINT: Final = struct.Struct("<3d")
 _REPLY: Final = struct.Struct("<BBHIqII")
 
 
-@dataclass(frozen=True, slots=True)
-class FeedforwardQuery:
+class FeedforwardQuery(NamedTuple):
     """n desired points, one sample time apart.
 
     Attributes
@@ -90,8 +88,7 @@ class FeedforwardQuery:
     u_before_V: float = float("nan")
 
 
-@dataclass(frozen=True, slots=True)
-class FeedforwardReply:
+class FeedforwardReply(NamedTuple):
     """Voltages for n desired points.
 
     Attributes

@@ -16,7 +16,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answering import trust_by_age
 from service.axis import Axis
 from service.config import AxisConfig
-from service.fallback import Rules, StandIn, answer_safely, domain_weight
+from service.fallback import Rules, StandIn, answer_quickly, answer_safely, domain_weight
 from service.guard import Limits
 from service.wire_model import decode_model, encode_model
 from service.wire_query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, FeedforwardQuery
@@ -70,6 +70,22 @@ def test_inside_the_domain_the_model_answers_alone() -> None:
     np.testing.assert_array_equal(got.std_V, alone.std_V)
     assert not got.flags.any()
     assert (got.stand_in, got.fallback) == ("", False)
+
+
+def test_the_quick_answer_is_the_safe_one_or_none() -> None:
+    y, memory = np.linspace(20.0, 30.0, 5), np.zeros(1)
+    quick = answer_quickly(Says((1.0, 1.1, 1.2, 1.3, 9.9)), memory, points(y), 1.0, LIMITS)
+    assert quick is not None
+    safe = answer_safely(Says((1.0, 1.1, 1.2, 1.3, 9.9)), memory, points(y), 1.0, Rules(LIMITS), LINE)
+    for one, other in zip(quick, safe, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert quick.flags[-1], "limited along the trajectory as ever"
+    for odd in (Says((math.nan,) * 5), Says((1.0,) * 5, inside=False), Says((), raises=True)):
+        assert answer_quickly(odd, memory, points(y), 1.0, LIMITS) is None
+    assert answer_quickly(Says((1.0,) * 5), np.full(1, math.inf), points(y), 1.0, LIMITS) is None
+    alone = answer_quickly(Says((1.0,) * 5, inside=False), memory, points(y), 1.0, LIMITS, blends=False)
+    assert alone is not None
+    assert (alone.flags == OUTSIDE_DOMAIN).all()
 
 
 def test_outside_it_passes_smoothly_to_the_baseline_and_says_so() -> None:
