@@ -18,7 +18,8 @@ from sim.diagnosis.nominal_fit import begins_at_rest, calibrated, nominal_settin
 from sim.diagnosis.prepare import Prepared
 from sim.diagnosis.result import FOLDS, TEST, Diagnosis
 from sim.diagnosis.review import review
-from sim.diagnosis.search import Progress, Rules, Search
+from sim.diagnosis.rules import Rules
+from sim.diagnosis.search import Progress, Search
 from sim.diagnosis.second import second_error
 from sim.diagnosis.setting import Setting
 from sim.stage import StageConfig

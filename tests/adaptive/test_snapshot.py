@@ -10,7 +10,8 @@ import pytest
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.kernels import gram
-from adaptive.snapshot import DOMAIN_MARGIN, LssvmInverse, evaluate
+from adaptive.snapshot import DOMAIN_MARGIN, LssvmInverse
+from adaptive.snapshot_loops import evaluate
 from adaptive.types import InverseModel
 
 

@@ -1,0 +1,133 @@
+"""The compiled loops of a served inverse LSSVM: voltages and deviations of a trajectory, and its memory carried on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.features import FeatureArrays, advance, fill
+from adaptive.kernels import rbf_column, weigh
+from adaptive.types import BoolArray, FloatArray
+from adaptive.window_state import IntArray
+
+
+@compiled
+def evaluate(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    m: FeatureArrays,
+    beta: FloatArray,
+    beta_covariance: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+    noise_variance: float,
+    kernel_variance: float,
+    shrink: float,
+    domain: FloatArray,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """Voltages, deviations and domain flags of n points; ``memory`` advances in place."""
+    n = y.shape[0]
+    d, count = scaled.shape
+    p = beta.shape[0]
+    basis = np.empty(p)
+    x = np.empty(d)
+    k = np.empty(count)
+    bits = np.empty(count)
+    for i in range(n):
+        advance(y[i], memory, m)
+        fill(y[i], v[i], a[i], memory, m, basis, x)
+        mean = 0.0
+        variance = noise_variance
+        for j in range(p):
+            mean += beta[j] * basis[j]
+        for j in range(beta_covariance.shape[0]):
+            s = 0.0
+            for i2 in range(beta_covariance.shape[0]):
+                s += beta_covariance[j, i2] * basis[i2]
+            variance += s * basis[j]
+        nearest = 0.0
+        if count > 0:
+            for j in range(d):
+                x[j] *= inverse_widths[j]
+            rbf_column(scaled, count, x, k, bits)
+            kernel_part, nearest = weigh(k, alpha)
+            mean += kernel_part
+        u[i] = mean
+        std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
+        inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def evaluate_packed(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    constants: FloatArray,
+    counts: IntArray,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """`evaluate` with all that a model is made of in two arrays, as `LssvmInverse` packs it.
+
+    Twenty arrays cost more to hand over than one point costs to work out, and are twenty places in memory to fetch.
+    """
+    K, A, M, p, d, n, c = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5], counts[6]
+    frame, scalars, domain, scale = constants[0:3], constants[3:6], constants[6:12], constants[12:16]
+    at = 16
+    thresholds = constants[at : at + K]
+    at += K
+    arcs = constants[at : at + A]
+    at += A
+    retain = constants[at : at + M]
+    at += M
+    beta = constants[at : at + p]
+    at += p
+    inverse_widths = constants[at : at + d]
+    at += d
+    alpha = constants[at : at + n]
+    at += n
+    scaled = constants[at : at + d * n].reshape(d, n)
+    at += d * n
+    covariance = constants[at : at + c * c].reshape(c, c)
+    m = FeatureArrays(thresholds, arcs, retain, scale, counts[9:], counts[7:9], frame)
+    evaluate(
+        y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
+        u, std, inside,
+    )  # fmt: skip
+
+
+@compiled
+def track_memory(y: FloatArray, memory: FloatArray, m: FeatureArrays) -> None:  # pragma: no cover - compiled
+    """Advance ``memory`` (m,) in place by (n,) measured displacements."""
+    for i in range(y.shape[0]):
+        advance(y[i], memory, m)
+
+
+@compiled
+def mean_of(
+    basis: FloatArray,
+    kernel: FloatArray,
+    beta: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Mean at one point whose inputs are known."""
+    count = alpha.shape[0]
+    mean = 0.0
+    for j in range(beta.shape[0]):
+        mean += beta[j] * basis[j]
+    if count > 0:
+        k = np.empty(count)
+        rbf_column(scaled, count, kernel * inverse_widths, k, np.empty(count))
+        for j in range(count):
+            mean += alpha[j] * k[j]
+    return mean
