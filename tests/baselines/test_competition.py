@@ -77,7 +77,7 @@ class Broken:
 
     def feedforward(self, y: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray) -> object:
         said = self.inner.feedforward(y, v, a, memory)
-        return replace(said, u_V=np.full(y.size, np.nan))
+        return said._replace(u_V=np.full(y.size, np.nan))
 
 
 def motion(n: int, first: int = 0) -> tuple[FloatArray, FloatArray]:
