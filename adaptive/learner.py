@@ -126,7 +126,7 @@ class Learner:
                 return admission.FROZEN
             if parts.filter.update(self._basis, target, not rest, weight) == "outlier":
                 return admission.OUTLIER
-            parts.take_rest(moving=not rest)
+            parts.take_rest(pair.u_V, moving=not rest)
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis @ parts.filter.beta), weight)

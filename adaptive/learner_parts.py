@@ -62,15 +62,14 @@ class Parts:
         """What the learnt model asks for, V, at basis (p,) and kernel inputs (d,)."""
         return float(basis @ self.filter.beta) + self.window.mean(kernel)
 
-    def take_rest(self, moving: bool) -> None:
+    def take_rest(self, u_V: float, moving: bool) -> None:
         """After a step of the filter: at rest, let what the constant has gained go over to the frame."""
-        front, span_V = self.front, self.filter.span_V
+        front, f = self.front, self.filter
         if moving:
             self.rest.leave()
             return
-        shift_um = self.rest.shift_um(
-            float(self.filter.beta[0]), front.range_um / span_V, front.range_um, self.filter.step_s, self.config.creep_s
-        )
+        constant_V, creep_s = float(f.beta[0]), self.config.creep_s
+        shift_um = self.rest.shift_um(constant_V, u_V, f.span_V, front.range_um, f.step_s, creep_s)
         if shift_um:
             front.creep(shift_um)
 

@@ -28,7 +28,15 @@ TELLERS: Final[dict[str, tuple[str, ...]]] = {
     "nan": ("samples.gates.not_finite",),
     "spike": ("samples.gates.glitch", "samples.gates.outlier"),
     "freeze": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.unexcited", "learner.jumps", "event"),
-    "saturate": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.saturated", "learner.jumps", "event"),
+    # A reading that stays at its end looks like a stage at rest.
+    "saturate": (
+        "samples.gates.glitch",
+        "samples.gates.outlier",
+        "samples.gates.saturated",
+        "learner.jumps",
+        "samples.gates.unexcited",
+        "event",
+    ),
     "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
     "dwell": ("samples.gates.unexcited",),
 }

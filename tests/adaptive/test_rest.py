@@ -23,8 +23,8 @@ STEP_S = 2e-3
 
 def after(rest: Rest, steps: int, gained_V: float, creep_s: float = 0.1) -> float:
     """By how much the frame has moved, µm, after so many steps with a constant that has gained so much."""
-    rest.shift_um(1.0, 10.0, 80.0, STEP_S, creep_s)
-    return sum(rest.shift_um(1.0 + gained_V, 10.0, 80.0, STEP_S, creep_s) for _ in range(steps))
+    rest.shift_um(1.0, 5.0, 8.0, 80.0, STEP_S, creep_s)
+    return sum(rest.shift_um(1.0 + gained_V, 5.0, 8.0, 80.0, STEP_S, creep_s) for _ in range(steps))
 
 
 def test_a_stage_that_needs_more_voltage_has_crept_back() -> None:
@@ -43,24 +43,33 @@ def test_nothing_moves_where_it_is_switched_off_or_before_anything_was_gained() 
     assert after(Rest(), 100, 0.0) == 0.0
 
 
+def test_a_voltage_that_goes_on_holds_no_stage_in_place() -> None:
+    stuck, still = Rest(), Rest()
+    # 8 V in 4 s under a reading that does not change, and a hundredth of that.
+    moved = [sum(r.shift_um(1.0 + 0.01 * k, 2.0 + v * k, 8.0, 80.0, STEP_S, 0.1) for k in range(400))
+             for r, v in ((stuck, 4e-3), (still, 4e-5))]  # fmt: skip
+    assert moved[0] == 0.0
+    assert moved[1] < -0.5
+
+
 def test_a_new_rest_begins_from_the_constant_that_it_finds() -> None:
     rest = Rest()
     after(rest, 50, 1e-3)
     rest.leave()
     assert isnan(rest.constant_V)
-    assert [rest.shift_um(7.0, 10.0, 80.0, STEP_S, 0.1) for _ in range(40)] == [0.0] * 40
+    assert [rest.shift_um(7.0, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(40)] == [0.0] * 40
 
 
 def test_its_state_goes_on_and_damage_is_named() -> None:
     rest = Rest()
     after(rest, 13, 1e-3)
     again = Rest.from_state(rest.state_dict())
-    one, other = ([r.shift_um(1.002, 10.0, 80.0, STEP_S, 0.1) for _ in range(20)] for r in (rest, again))
+    one, other = ([r.shift_um(1.002, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(20)] for r in (rest, again))
     assert one == other
     assert sum(one) < 0.0
     assert isnan(Rest.from_state({}).constant_V), "a state from before there was any"
     with pytest.raises(ModelFileError, match="rest"):
-        Rest.from_state({"constant_V": 1.0})
+        Rest.from_state({"constant_V": 1.0, "steps": 3})
 
 
 def rested(model: LssvmInverse, config: LearnerConfig, hold_s: float) -> tuple[float, Learner]:
