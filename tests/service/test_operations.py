@@ -252,7 +252,8 @@ def test_more_than_can_wait_is_refused_at_once(
     replies = [reply for handler in waiting for reply in handler]
     refused = [json.loads(reply.err.payload.to_bytes()) for reply in replies if reply.err is not None]
     assert len(replies) == 40
-    assert len(refused) == 40 - 33  # 32 wait and one is being done
+    # 32 wait, and one is being done if it was taken before the last of them came.
+    assert 40 - 33 <= len(refused) <= 40 - 32
     assert all("wait already" in error["message"] for error in refused)
 
 
