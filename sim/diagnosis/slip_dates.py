@@ -142,8 +142,8 @@ def _best_stretch(before_um: FloatArray, after_um: FloatArray, ends: IntArray, f
 def moved(found: Found, y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> tuple[Found, float]:
     """The slips with one more, or one taken in two, and what that takes off the squared error, µm².
 
-    A stretch from some sample on, up to a later slip or to the end, is shifted by another few samples. Asked of the
-    readings themselves: a slip shifts all that follows, which a model's error does not.
+    A stretch from some sample on, up to a later slip or to the end, or from a slip on up to some sample, is shifted by
+    another few samples. Asked of the readings themselves: a slip shifts all that follows, a model's error does not.
     """
     n = y_um.size
     index = np.arange(n)
@@ -151,17 +151,27 @@ def moved(found: Found, y_um: FloatArray, model_um: FloatArray, mask: BoolArray)
     for at, size in found:
         shifts[at:] += size
     ends = np.array([*(at for at, _ in found), n], dtype=np.int64)
+    # Seen from the end, where a stretch begins is where it ends.
+    begins = np.array([n - at for at, _ in reversed(found)], dtype=np.int64)
 
     def error(extra: int) -> FloatArray:
         return np.where(mask, y_um - model_um[np.clip(index + shifts + extra, 0, n - 1)], 0.0)
 
     now = error(0)
-    others = [d for d in range(-MOST, MOST + 1) if d]
-    gain, begin, end, extra = max((*_best_stretch(now, error(d), ends, _FIRST), d) for d in others)
+    back = np.ascontiguousarray(now[::-1])
+    best = (0.0, 0, n, 0)
+    for extra in (d for d in range(-MOST, MOST + 1) if d):
+        other = error(extra)
+        gain, begin, end = _best_stretch(now, other, ends, _FIRST)
+        best = max(best, (gain, begin, end, extra))
+        if begins.size:
+            gain, late, early = _best_stretch(back, np.ascontiguousarray(other[::-1]), begins, 0)
+            best = max(best, (gain, n - early, n - late, extra))
+    gain, begin, end, extra = best
     sizes = dict(found)
-    sizes[begin] = sizes.get(begin, 0) + extra
-    if end < n:
-        sizes[end] -= extra
+    for at, by in ((begin, extra), (end, -extra)):
+        if at < n:
+            sizes[at] = sizes.get(at, 0) + by
     return tuple((at, size) for at, size in sorted(sizes.items()) if size), gain
 
 

@@ -49,6 +49,13 @@ def test_from_nothing_one_move_after_the_other_finds_them_all() -> None:
     assert found == truth
 
 
+def test_two_that_were_taken_for_one_come_apart() -> None:
+    truth: Found = ((900, 1), (2500, 1), (4100, 1))
+    y_um, there, model = slipped(truth, np.random.default_rng(6)), np.ones(N, dtype=np.bool_), motion()[:N]
+    after, _ = moved(((900, 1), (2500, 2)), y_um, model, there)
+    assert dated(after, y_um, model, there) == truth
+
+
 def test_a_gain_is_the_squared_error_that_a_move_takes_off() -> None:
     truth: Found = ((1500, 1), (3000, 1))
     y_um, there, model = slipped(truth, np.random.default_rng(3)), np.ones(N, dtype=np.bool_), motion()[:N]
