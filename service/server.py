@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
 import secrets
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from types import FrameType
 from typing import Any, Final
 
 import zenoh
@@ -29,6 +26,9 @@ from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
 from service.standby.estate import Estate, of_standby
 from service.standby.succession import Succession
+from service.stopping import StopSignal
+
+__all__ = ["Service", "StopSignal", "tune_process"]
 
 #: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
 #: would be the latency of a query that meets the learner.
@@ -230,26 +230,3 @@ def tune_process() -> None:
     keep_little()
     threadpool_limits(1)
     sys.setswitchinterval(_SWITCH_S)
-
-
-class StopSignal:
-    """Ctrl-C and SIGTERM, caught from its making on; make it in the main thread before anything slow."""
-
-    def __init__(self) -> None:
-        self.reason = ""
-        self._event = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def wait(self, duration_s: float | None = None) -> str:
-        """Wait for a signal or for ``duration_s``; returns the signal's name, or that the time is over."""
-        until = math.inf if duration_s is None else time.monotonic() + duration_s
-        # In steps, because a wait without end keeps some platforms from delivering the signal.
-        while not self._event.wait(min(0.5, max(0.0, until - time.monotonic()))):
-            if time.monotonic() >= until:
-                return "time is over"
-        return self.reason
-
-    def _on_signal(self, number: int, _: FrameType | None) -> None:
-        self.reason = signal.Signals(number).name
-        self._event.set()

@@ -17,6 +17,7 @@ from service.keys import ROOT, check_name
 from service.operating.remote import Standbys, in_order, statuses
 from service.operating.table import screen, table
 from service.session import DEFAULT_ENDPOINT, open_client
+from service.stopping import StopSignal
 
 #: A standby tells of itself this often, and a little more, s.
 _STANDBY_PERIOD_S = 1.2
@@ -69,22 +70,24 @@ def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) 
     )
     alone = sys.stdout.isatty() and not args.json
     until = None if args.duration is None else time.monotonic() + args.duration
+    # Not an exception in the middle of anything: one that is raised where an object is cleaned up is lost.
+    stop = StopSignal()
     try:
         if alone:
             print("\x1b[?1049h\x1b[?25l", end="")  # a screen of its own, without a cursor
         found = in_order([*_settled(session, args), *standbys.statuses()])
-        while until is None or time.monotonic() < until:
+        while not stop.reason and (until is None or time.monotonic() < until):
             if args.json:
                 print(json.dumps({"schema": 1, "time_unix_s": time.time(), "axes": found}), flush=True)
             elif alone:
                 print(screen(found, args.endpoint, list(events)), end="", flush=True)
             else:
                 print(f"{table(found)}\n", flush=True)
-            time.sleep(args.period)
+            stop.wait(args.period)
+            if stop.reason:
+                break
             answers = statuses(session, args.stage, args.axis, args.timeout)
             found = in_order([*answers, *standbys.statuses()])
-    except KeyboardInterrupt:
-        pass
     except BrokenPipeError:
         sys.stdout = None  # whoever read has gone; nothing is left to be flushed to
     finally:
