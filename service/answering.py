@@ -9,7 +9,7 @@ from operator import attrgetter
 from adaptive.types import FloatArray, InverseModel
 from service.config import AxisConfig
 from service.errors import FieldError
-from service.fallback import Answer, Rules, StandIn, answer_quickly, answer_safely
+from service.fallback import Rules, StandIn, answer_safely
 from service.guard import Limits, check_domain
 from service.keys import AUTO
 from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply
@@ -84,16 +84,16 @@ def answer(
             f"{model.memory_size} for model {name!r}",
             "bring back the memory of this model's last reply, or none",
         )
-    points = (query.y_um, query.v_um_per_s, query.a_um_per_s2)
-    # What does not learn is as good as ever, whatever the samples are.
-    trust = trust * served.trust if learns(name, config) else 1.0
-    gives_way = blends(name, default, config)
-    got: Answer | None = None
-    if not stale and (trust >= 1.0 or not gives_way):
-        got = answer_quickly(model, memory, points, query.u_before_V, limits, gives_way)
-    if got is None:
-        rules = Rules(limits, config.blend_share, trust, stale)
-        got = answer_safely(model, memory, points, query.u_before_V, rules, served.standing_in_for(name), gives_way)
+    got = answer_safely(
+        model,
+        memory,
+        (query.y_um, query.v_um_per_s, query.a_um_per_s2),
+        query.u_before_V,
+        # What does not learn is as good as ever, whatever the samples are.
+        Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
+        served.standing_in_for(name),
+        blends(name, default, config),
+    )
     return FeedforwardReply(
         got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
         got.stand_in,

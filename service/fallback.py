@@ -58,30 +58,6 @@ class Answer(NamedTuple):
     stand_in: str
 
 
-def answer_quickly(
-    model: InverseModel,
-    memory: FloatArray,
-    points: tuple[FloatArray, FloatArray, FloatArray],
-    u_before_V: float,
-    limits: Limits,
-    blends: bool = True,
-) -> Answer | None:
-    """What ``answer_safely`` says of a model in full trust, with fresh samples, where nothing speaks against it.
-
-    Almost every answer. None for any other, and where the model raises: ``answer_safely`` knows what to say then.
-    """
-    try:
-        forward = model.feedforward(*points, memory)
-    except Exception:
-        return None
-    if not all_finite(forward.memory):
-        return None
-    safe, flags, found = guarded(forward.u_V, forward.inside, model.dt_s, limits, u_before_V)
-    if found & (NOT_FINITE_REPLACED | (OUTSIDE_DOMAIN if blends else 0)):
-        return None
-    return Answer(safe, forward.std_V, flags, forward.memory, False, "")
-
-
 def answer_safely(
     model: InverseModel,
     memory: FloatArray,
@@ -96,14 +72,15 @@ def answer_safely(
     ``blends``: whether ``model`` is one that gives way to ``stand_in`` outside its domain and by its trust; where not,
     the stand-in serves for what is not finite alone.
     """
-    trusted = not blends or rules.trust >= 1.0
-    if trusted and not rules.stale:
-        quick = answer_quickly(model, memory, points, u_before_V, rules.limits, blends)
-        if quick is not None:
-            return quick
     forward = _forward(model, points, memory)
     u, std = forward.u_V, forward.std_V
     after_ok = all_finite(forward.memory)
+    trusted = not blends or rules.trust >= 1.0
+    if trusted and after_ok and not rules.stale:
+        # Almost every answer: nothing speaks against what the model says.
+        safe, flags, found = guarded(u, forward.inside, model.dt_s, rules.limits, u_before_V)
+        if not found & (NOT_FINITE_REPLACED | (OUTSIDE_DOMAIN if blends else 0)):
+            return Answer(safe, std, flags, forward.memory, False, "")
     finite = np.isfinite(u)
     ok = bool(finite.all())
     marks: NDArray[np.uint8] | None = None

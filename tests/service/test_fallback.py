@@ -16,7 +16,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answering import trust_by_age
 from service.axis import Axis
 from service.config import AxisConfig
-from service.fallback import Rules, StandIn, answer_quickly, answer_safely, domain_weight
+from service.fallback import Answer, Rules, StandIn, answer_safely, domain_weight
 from service.guard import Limits
 from service.wire_model import decode_model, encode_model
 from service.wire_query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, FeedforwardQuery
@@ -57,6 +57,20 @@ class Says:
         return {}
 
 
+class Counted(Says):
+    """Says what another says, and counts how often it was asked."""
+
+    def __init__(self, inner: Says) -> None:
+        super().__init__(inner.u_V, inner.std_V, inner.inside, inner.raises)
+        object.__setattr__(self, "asked", 0)
+
+    asked: int
+
+    def feedforward(self, y: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray) -> Feedforward:
+        object.__setattr__(self, "asked", self.asked + 1)
+        return super().feedforward(y, v, a, memory)
+
+
 def points(y: FloatArray, v: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     return y, np.full(y.size, v), np.zeros(y.size)
 
@@ -72,19 +86,27 @@ def test_inside_the_domain_the_model_answers_alone() -> None:
     assert (got.stand_in, got.fallback) == ("", False)
 
 
-def test_the_quick_answer_is_the_safe_one_or_none() -> None:
-    y, memory = np.linspace(20.0, 30.0, 5), np.zeros(1)
-    quick = answer_quickly(Says((1.0, 1.1, 1.2, 1.3, 9.9)), memory, points(y), 1.0, LIMITS)
-    assert quick is not None
-    safe = answer_safely(Says((1.0, 1.1, 1.2, 1.3, 9.9)), memory, points(y), 1.0, Rules(LIMITS), LINE)
-    for one, other in zip(quick, safe, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert quick.flags[-1], "limited along the trajectory as ever"
-    for odd in (Says((math.nan,) * 5), Says((1.0,) * 5, inside=False), Says((), raises=True)):
-        assert answer_quickly(odd, memory, points(y), 1.0, LIMITS) is None
-    assert answer_quickly(Says((1.0,) * 5), np.full(1, math.inf), points(y), 1.0, LIMITS) is None
-    alone = answer_quickly(Says((1.0,) * 5, inside=False), memory, points(y), 1.0, LIMITS, blends=False)
-    assert alone is not None
+def test_a_model_is_asked_once_and_its_answer_stands_where_nothing_speaks_against_it() -> None:
+    y, memory, rules = np.linspace(20.0, 30.0, 5), np.zeros(1), Rules(LIMITS)
+
+    def asked(model: Says, memory: FloatArray = memory, blends: bool = True) -> Answer:
+        counted = Counted(model)
+        got = answer_safely(counted, memory, points(y), 1.0, rules, LINE, blends)
+        assert counted.asked == 1
+        return got
+
+    good = asked(Says((1.0, 1.1, 1.2, 1.3, 9.9)))
+    assert (good.fallback, good.stand_in) == (False, "")
+    np.testing.assert_array_equal(good.u_V[:4], (1.0, 1.1, 1.2, 1.3))
+    assert good.flags[-1], "limited along the trajectory as ever"
+    for odd in (Says((math.nan,) * 5), Says((), raises=True)):
+        got = asked(odd)
+        assert got.fallback
+        assert (got.flags & NOT_FINITE_REPLACED).all()
+    # A model without bounds of its own answers outside its domain too, and says so.
+    assert (asked(Says((1.0,) * 5, inside=False)).flags & OUTSIDE_DOMAIN).all()
+    assert asked(Says((1.0,) * 5), np.full(1, math.inf)).fallback
+    alone = asked(Says((1.0,) * 5, inside=False), blends=False)
     assert (alone.flags == OUTSIDE_DOMAIN).all()
 
 
