@@ -11,6 +11,15 @@ from adaptive.types import FloatArray
 
 
 @compiled
+def _around(w: FloatArray, i: int) -> tuple[float, float, float]:
+    """w[i-1], w[i], w[i+1] less the first value; the record goes on as it begins and ends."""
+    top = w.shape[0] - 1
+    w0 = w[0]
+    a, b, c = w[min(max(i - 1, 0), top)], w[min(max(i, 0), top)], w[min(max(i + 1, 0), top)]
+    return a - w0, b - w0, c - w0
+
+
+@compiled
 def modes(
     w: FloatArray,
     shift: int,
@@ -39,9 +48,7 @@ def modes(
         last = max(min(n - 1 + shift, n - 1), first)
         for k in range(first):
             i = k - shift
-            a = w[i - 1] - w0 if 0 <= i - 1 < n else (0.0 if i < 1 else w[n - 1] - w0)
-            b = w[i] - w0 if 0 <= i < n else (0.0 if i < 0 else w[n - 1] - w0)
-            c = w[i + 1] - w0 if 0 <= i + 1 < n else (0.0 if i < -1 else w[n - 1] - w0)
+            a, b, c = _around(w, i)
             nr = ar * xr - ai * xi + (g0r * a + g1r * b + g2r * c)
             xi = ar * xi + ai * xr + (g0i * a + g1i * b + g2i * c)
             xr = nr
@@ -61,9 +68,7 @@ def modes(
                 out[k + 1] += xr
         for k in range(last, n - 1):
             i = k - shift
-            a = w[i - 1] - w0 if 0 <= i - 1 < n else (0.0 if i < 1 else w[n - 1] - w0)
-            b = w[i] - w0 if 0 <= i < n else (0.0 if i < 0 else w[n - 1] - w0)
-            c = w[i + 1] - w0 if 0 <= i + 1 < n else (0.0 if i < -1 else w[n - 1] - w0)
+            a, b, c = _around(w, i)
             nr = ar * xr - ai * xi + (g0r * a + g1r * b + g2r * c)
             xi = ar * xi + ai * xr + (g0i * a + g1i * b + g2i * c)
             xr = nr
@@ -105,9 +110,7 @@ def modes_with_plays(
             play[j] = min(max(play[j], y - radii_um[j]), y + radii_um[j])
             force += weights[j] * (y - play[j])
         i = k - shift
-        a = w[i - 1] - w0 if 0 <= i - 1 < n else (0.0 if i < 1 else w[n - 1] - w0)
-        b = w[i] - w0 if 0 <= i < n else (0.0 if i < 0 else w[n - 1] - w0)
-        c = w[i + 1] - w0 if 0 <= i + 1 < n else (0.0 if i < -1 else w[n - 1] - w0)
+        a, b, c = _around(w, i)
         y = 0.0
         for j in range(m):
             nr = poles_re[j] * xr[j] - poles_im[j] * xi[j]
