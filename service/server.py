@@ -26,9 +26,6 @@ from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
 from service.standby.estate import Estate, of_standby
 from service.standby.succession import Succession
-from service.stopping import StopSignal
-
-__all__ = ["Service", "StopSignal", "tune_process"]
 
 #: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
 #: would be the latency of a query that meets the learner.

@@ -14,7 +14,6 @@ import contextlib
 import gc
 import json
 import math
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -60,7 +59,7 @@ class StageNode:
 
     def __init__(self, config: NodeConfig, session: zenoh.Session) -> None:
         self.config = config
-        self._stop = threading.Event()
+        self._stop = False
         stage = Stage(config.stage)
         self._units = [
             _Unit(config, stage, axis, config.second if axis == config.units[0] else "", session)
@@ -74,7 +73,7 @@ class StageNode:
 
     def stop(self) -> None:
         """End the run at the next tick; from any thread or signal handler."""
-        self._stop.set()
+        self._stop = True
 
     def summary(self) -> dict[str, Any]:
         """What happened so far: ticks, late ones, and per unit samples published and commands counted."""
@@ -120,7 +119,7 @@ class StageNode:
     def _wait_for_commands(self) -> bool:
         said = -math.inf
         while not all(port.commands.first.is_set() for port in self._ports):
-            if self._stop.is_set():
+            if self._stop:
                 return False
             if time.monotonic() - said >= STATUS_S:
                 said = time.monotonic()
@@ -137,9 +136,9 @@ class StageNode:
         status_ticks = max(1, round(STATUS_S / dt_s))
         k, late = first, 0
         worst_s = 0.0
-        now, stopped, wake = time.perf_counter, self._stop.is_set, self._sender.wake
+        now, wake = time.perf_counter, self._sender.wake
         start = now()
-        while k < stop and not stopped():
+        while k < stop and not self._stop:
             due = start + (k - first) * dt_s
             rest = due - now()
             if rest > 0.0:

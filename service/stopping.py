@@ -2,31 +2,88 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import select
 import signal
 import threading
 import time
+import weakref
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 
 class StopSignal:
-    """Ctrl-C and SIGTERM, caught from its making on; make it in the main thread before anything slow."""
+    """Ctrl-C and SIGTERM, caught from its making on; make it in the main thread before anything slow.
 
-    def __init__(self) -> None:
+    ``raising`` is for work that does not look: it is broken off by a KeyboardInterrupt. Where that is raised into
+    something that swallows it (an object that is being cleaned up), :meth:`look` raises it once more.
+    """
+
+    def __init__(self, *, raising: bool = False) -> None:
         self.reason = ""
-        self._event = threading.Event()
+        self._raising = raising
+        self._then: Callable[[], None] = lambda: None
+        # A pipe and no threading.Event: setting one takes a lock, which the code that the signal interrupts may hold.
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        weakref.finalize(self, _close, self._read, self._write)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
     def wait(self, duration_s: float | None = None) -> str:
         """Wait for a signal or for ``duration_s``; returns the signal's name, or that the time is over."""
         until = math.inf if duration_s is None else time.monotonic() + duration_s
-        # In steps, because a wait without end keeps some platforms from delivering the signal.
-        while not self._event.wait(min(0.5, max(0.0, until - time.monotonic()))):
-            if time.monotonic() >= until:
-                return "time is over"
-        return self.reason
+        while not self.reason and (rest_s := until - time.monotonic()) > 0.0:
+            # In steps, because a wait without end keeps some platforms from delivering the signal.
+            select.select([self._read], [], [], min(0.5, rest_s))
+        return self.reason or "time is over"
+
+    def look(self) -> None:
+        """Raises KeyboardInterrupt if a signal has come."""
+        if self.reason:
+            raise KeyboardInterrupt
+
+    def then(self, action: Callable[[], None]) -> None:
+        """From now on a signal does ``action``, which takes no lock, in place of raising; at once if one has come."""
+        self._then = action
+        self._raising = False
+        if self.reason:
+            action()
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
         self.reason = signal.Signals(number).name
-        self._event.set()
+        with contextlib.suppress(OSError):
+            os.write(self._write, b".")
+        self._then()
+        if self._raising:
+            raise KeyboardInterrupt
+
+
+def _close(*descriptors: int) -> None:
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def unbroken() -> Iterator[None]:
+    """Ctrl-C and SIGTERM that come in this block act at its end: a child process that was started is also noted down.
+
+    In another thread than the main one it does nothing, because no signal is handled there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    held = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in held:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in held.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptive.errors import InputError
+from service.stopping import StopSignal
 
 EPILOG = """\
 What runs in real time: a simulated stage (five twins of one seed, one for each model), the service that learns from
@@ -55,8 +56,14 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
+    stop = StopSignal(raising=True)
+
+    def say(text: str) -> None:
+        stop.look()
+        print(text, file=sys.stderr, flush=True)
+
     done = session.run(
-        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=_say, stage=args.stage
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage
     )
     if args.json:
         print(json.dumps(done.summary))
@@ -66,10 +73,6 @@ def run(args: argparse.Namespace) -> int:
     if lost:
         print(f"dehyst demo: {lost} samples were lost between stage and service", file=sys.stderr)
     return 1 if lost else 0
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:

@@ -26,8 +26,8 @@ def run(args: argparse.Namespace) -> int:
     """Route until interrupted. Returns 0; endpoints that cannot be had or may not be used are raised."""
     from service.access.check import check_reach, has_access_control
     from service.access.refusals import count_refusals, refusal_counters
-    from service.server import StopSignal
     from service.session import DEFAULT_ENDPOINT, check_endpoint, open_router
+    from service.stopping import StopSignal
 
     listen = [check_endpoint("--listen", endpoint) for endpoint in args.listen or [DEFAULT_ENDPOINT]]
     connect = [check_endpoint("--connect", endpoint) for endpoint in args.connect]

@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
     config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
     # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from service.server import Service, StopSignal, tune_process
+    from service.server import Service, tune_process
+    from service.stopping import StopSignal
 
     tune_process()
     stop = StopSignal()

@@ -42,9 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the soak. Returns 0 where every invariant held, 1 where one did not, 130 where it was interrupted."""
-    from service.server import StopSignal
     from service.soak.catalogue import KINDS
     from service.soak.plan import known_kinds, make_plan
+    from service.stopping import StopSignal
 
     if args.list:
         for name, kind in KINDS.items():

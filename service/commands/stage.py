@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 
 from service.errors import FieldError
 from service.session import DEFAULT_ENDPOINT, check_endpoint
+from service.stopping import StopSignal
 from sim.stage import Change, StageConfig
 
 EPILOG = """\
@@ -112,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     from service.session import open_client, open_service
     from service.stage_node import NodeConfig, StageNode
 
+    stop = StopSignal(raising=True)
     config = stage_config(args)
     if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0.0):
         raise FieldError("--duration", args.duration, "a positive time in s")
@@ -140,21 +140,15 @@ def run(args: argparse.Namespace) -> int:
         session = open_client(endpoint, args.wait, args.zenoh_config)
     try:
         node = StageNode(node_config, session)
-
-        def stop(_signal: int, _frame: FrameType | None) -> None:
-            node.stop()
-
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            names = [name for name in (*node_config.units, args.axis2) if name]
-            ready = {"ready": True, "stage": args.name, "axes": names, "endpoint": endpoint}
-            begins = "running" if args.free_run else "waiting for commands"
-            text = f"ready: stage {args.name}, axes {', '.join(names)}, {1 / config.dt_s:g} Hz, {begins}"
-            print(json.dumps(ready) if args.json else f"{text} at {endpoint}", flush=True)
-            summary = node.run()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        # Before it is said to be ready, nothing has been moved: the run ends without its words.
+        stop.look()
+        stop.then(node.stop)
+        names = [name for name in (*node_config.units, args.axis2) if name]
+        ready = {"ready": True, "stage": args.name, "axes": names, "endpoint": endpoint}
+        begins = "running" if args.free_run else "waiting for commands"
+        text = f"ready: stage {args.name}, axes {', '.join(names)}, {1 / config.dt_s:g} Hz, {begins}"
+        print(json.dumps(ready) if args.json else f"{text} at {endpoint}", flush=True)
+        summary = node.run()
     finally:
         session.close()  # type: ignore[no-untyped-call]
     print(json.dumps(summary), flush=True)

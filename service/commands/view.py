@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import subprocess
 import sys
-import threading
 import time
 import uuid
 from pathlib import Path
@@ -15,6 +13,7 @@ from pathlib import Path
 from adaptive.errors import InputError
 from service.errors import ServiceError
 from service.session import DEFAULT_ENDPOINT, open_client
+from service.stopping import StopSignal
 from service.view.consumer import Consumer, ConsumerConfig
 from service.view.feed import SceneConfig
 from service.view.output import Output, OutputConfig
@@ -88,9 +87,7 @@ def run(args: argparse.Namespace) -> int:
         args.stage, args.axis, args.model, twins(args.twin), changes_s=tuple(args.change_at), batch_s=args.batch
     )
     # Before anything slow: whoever starts us may end us at once.
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = StopSignal()
     outputs: list[Output] = []
     viewer: subprocess.Popen[bytes] | None = None
     try:
@@ -149,10 +146,11 @@ def _scene(args: argparse.Namespace, config: ConsumerConfig, history_s: float | 
     return SceneConfig(f"{args.stage}/{args.axis}", config.models, range_um=args.range_um, history_s=history_s)
 
 
-def _wait(stop: threading.Event, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
+def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
     """Until asked to stop, the time is over, or the viewer that we started has been closed and was ``alone``."""
     until = time.monotonic() + duration_s if duration_s is not None else float("inf")
-    while not stop.wait(0.1) and time.monotonic() < until:
+    while not stop.reason and time.monotonic() < until:
+        stop.wait(0.1)
         if viewer is not None and viewer.poll() is not None:
             if viewer.returncode != 0:
                 raise ServiceError(

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from service.errors import ServiceError
+from service.stopping import unbroken
 
 
 def free_port() -> int:
@@ -48,10 +49,11 @@ class Child:
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            with self._changed:
-                self.lines.append(line.rstrip("\n"))
-                self._changed.notify_all()
+        with self._process.stdout as said:
+            for line in said:
+                with self._changed:
+                    self.lines.append(line.rstrip("\n"))
+                    self._changed.notify_all()
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -135,9 +137,10 @@ class Children:
 
     def start(self, name: str, arguments: list[str]) -> Child:
         """Start ``python ARGUMENTS``."""
-        child = Child(name, arguments, self._logs / f"{name}.log")
-        self._children = [other for other in self._children if other.running]
-        self._children.append(child)
+        with unbroken():
+            child = Child(name, arguments, self._logs / f"{name}.log")
+            self._children = [other for other in self._children if other.running]
+            self._children.append(child)
         return child
 
     def __enter__(self) -> Children:
@@ -146,5 +149,7 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for child in reversed(self._children):
-            child.stop()
+        # Who presses Ctrl-C twice is not to be left with what was not stopped yet.
+        with unbroken():
+            for child in reversed(self._children):
+                child.stop()

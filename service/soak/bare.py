@@ -9,7 +9,7 @@ import json
 import sys
 import time
 
-from service.server import StopSignal
+from service.stopping import StopSignal
 
 #: Distance of the ticks, s.
 STEP_S = 2e-3

@@ -22,10 +22,10 @@ from service import wire
 from service.client import Client, Trajectory
 from service.errors import ServiceError
 from service.keys import Keys
-from service.server import StopSignal
 from service.soak.reference import SoakReference
 from service.soak.setup import AXIS, STAGE, Control
 from service.stage_node import status_key
+from service.stopping import StopSignal
 
 #: Time-out of a query, s: a controller that has 60 ms ahead does not wait for a second.
 TIMEOUT_S = 0.1

@@ -13,9 +13,10 @@ import numpy as np
 import zenoh
 
 from service.keys import Keys
-from service.server import StopSignal, tune_process
+from service.server import tune_process
 from service.session import open_client
 from service.soak.setup import AXIS, STAGE
+from service.stopping import StopSignal
 from service.wire_query import encode_query
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.

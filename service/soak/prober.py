@@ -18,10 +18,10 @@ import numpy as np
 from adaptive.errors import DehystError, InputError
 from service.client import Client, Point
 from service.errors import ServiceError
-from service.server import StopSignal
 from service.session import open_client
 from service.soak.extras import ECHO_KEY
 from service.soak.setup import AXIS, STAGE, Control
+from service.stopping import StopSignal
 from service.wire_query import FeedforwardReply, encode_query, encode_reply
 
 #: Pause between two rounds of one query and one echo, s; and the time-out of both.
