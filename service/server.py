@@ -197,6 +197,7 @@ class Service:
             "ready": True,
             "instance": self.instance,
             "role": PRIMARY if any(axis.role == PRIMARY for axis in self.axes) else STANDBY,
+            "epoch": max(axis.epoch for axis in self.axes),
             "synced": all(axis.synced for axis in self.axes),
             "listen": list(self.config.listen),
             "connect": list(self.config.connect),

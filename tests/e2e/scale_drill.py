@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,29 @@ USERS = {
 }  # fmt: skip
 
 
+class Stall(threading.Thread):
+    """How long this machine stood still at most: who cannot say for a lease that it lives is taken for dead."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.worst_s = 0.0
+        self._ended = False
+        self.start()
+
+    def run(self) -> None:
+        before = time.monotonic()
+        while not self._ended:
+            time.sleep(0.01)
+            now = time.monotonic()
+            self.worst_s, before = max(self.worst_s, now - before - 0.01), now
+
+    def end(self) -> float:
+        """The longest so far, s; it is watched no longer."""
+        self._ended = True
+        self.join()
+        return self.worst_s
+
+
 def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
     """Do it; returns what was seen."""
     make_hub(namespaces)
@@ -51,14 +75,14 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
         serving = [
             (one, "left", ()), (two, "right", ()), (two, "left", ("--standby",)), (one, "right", ("--standby",)),
         ]  # fmt: skip
-        roles = {}
+        roles, stall = {}, Stall()
         # First those that serve: a standby that finds nobody within three seconds serves itself.
         for group in (serving[:2], serving[2:]):
             services = {}
             for host, stage, options in group:
                 config = _config(folder / f"{host.name}-{stage}", folder / f"{host.name}.json5", stage, router)
                 services[host.name, stage] = host.start(*cli, "serve", "--config", str(config), "--json", *options)
-            roles |= {key: _line(process)["role"] for key, process in services.items()}
+            roles |= {key: _line(process) for key, process in services.items()}
         _say("services started")
         for stage in STAGES:
             lab.start(
@@ -68,7 +92,13 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
         client = lab.start("-m", "tests.e2e.scale_drill", str(folder), "--ask", router)
         _line(client)
         _say("the client is answered by every axis")
-        seen: dict[str, Any] = {"namespaces": namespaces, "roles": {f"{h}/{s}": r for (h, s), r in roles.items()}}
+        told = {f"{h}/{s}": ready for (h, s), ready in roles.items()}
+        seen: dict[str, Any] = {
+            "namespaces": namespaces,
+            "roles": {key: ready["role"] for key, ready in told.items()},
+            "epochs": {key: ready["epoch"] for key, ready in told.items()},
+            "stalled_s": stall.end(),
+        }
         time.sleep(_BEFORE_S)
         lost_at = time.monotonic()
         _say("host one is lost")

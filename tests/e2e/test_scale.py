@@ -21,6 +21,8 @@ from tests.service.conftest import unused_port
 pytestmark = pytest.mark.e2e
 #: Longest time without an answer while the standby takes over from a host that vanished: its lease is 1 s.
 _TAKEN_OVER_S = 6.0
+#: Signs of life come every quarter of a lease of 1 s: a machine that stands still for so long makes services look dead.
+_STALL_S = 0.7
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the openssl command is not installed")
@@ -37,9 +39,12 @@ def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path, record_prop
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     seen = json.loads(done.stdout.splitlines()[-1])
-    assert seen["roles"] == {
-        "one/left": "primary", "two/right": "primary", "two/left": "standby", "one/right": "standby",
-    }  # fmt: skip
+    planned = {"one/left": "primary", "two/right": "primary", "two/left": "standby", "one/right": "standby"}
+    if seen["roles"] != planned and seen["stalled_s"] > _STALL_S:
+        pytest.skip(
+            f"the machine stood still for {seen['stalled_s']:.1f} s: a standby rightly took over before the loss"
+        )
+    assert seen["roles"] == planned, (seen["epochs"], seen["stalled_s"], done.stderr[-3000:])
     client = seen["client"]
     before, after = (
         {f"{status['stage']}/{status['axis']}": status for status in client[when]} for when in ("before", "after")
