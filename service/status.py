@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import psutil
-
 from service.access.refusals import refusal_counters
 from service.axis import Axis
 from service.intake import Intake
 from service.keys import Keys
 from service.latency import LatencyMeter
+from service.memory import in_use
 from service.registry import kind_of
 from service.wire import VERSION
 
@@ -19,7 +18,6 @@ SCHEMA: Final = 1
 _QUALITY: Final = (
     "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
 )  # fmt: skip
-_PROCESS: Final = psutil.Process()
 
 
 def axis_status(
@@ -61,5 +59,5 @@ def axis_status(
         "queries": latency.summary(),
         "diagnosis": None if intake.watcher is None else intake.watcher.status(),
         "refused": refusal_counters(),
-        "memory_bytes": _PROCESS.memory_info().rss,
+        "memory": in_use(),
     }

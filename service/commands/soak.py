@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=1, metavar="N", help="of the plan, the reference and the stage's noise (1)")
     add("--out", type=Path, default=Path("out/soak"), metavar="DIR", help="where the results go (default: %(default)s)")
     add("--fast", action="store_true", help="one process, as fast as possible; faults of processes are left out")
-    add("--faults", default="", metavar="A,B", help="only these kinds of faults (default: all; --list names them)")
+    add("--faults", default="", metavar="A,B", help="only these kinds (default: all; --list names them), or none")
     add("--stage", type=Path, metavar="FILE", help="a stage file in place of the one that stands in for hardware")
     add("--list", action="store_true", help="list the kinds of faults, and end")
     add("--json", action="store_true", help="print soak.json in place of the report")

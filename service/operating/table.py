@@ -71,7 +71,7 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
     ("queries", 9, lambda s: str(_get(s, "queries", "count"))),
     ("p50 us", 7, lambda s: _number(_get(s, "queries", "p50_us"), ".0f")),
     ("p99 us", 7, lambda s: _number(_get(s, "queries", "p99_us"), ".0f")),
-    ("MB", 5, lambda s: _number(s.get("memory_bytes"), ".0f", 1e-6)),
+    ("MB", 5, lambda s: _number((s.get("memory") or {}).get("resident_bytes"), ".0f", 1e-6)),
     ("refused", 8, lambda s: str(sum((s.get("refused") or {}).values())) if s.get("refused") else "-"),
     ("not learnt", 24, _gates),
 )

@@ -8,12 +8,14 @@ from typing import Final
 from service.soak.invariant import Invariant, most
 from service.soak.ledger import Ledger
 from service.soak.machine import Machine
-from service.soak.outcome import memory_slope
+from service.soak.outcome import Trend, memory_slope, resident_growth
 from service.soak.timing import answered_again, queries_answered, recovers
 
 #: Mean |error| outside fault windows, in percent of the commanded range.
 TRACKING_PCT: Final = 0.1
 MEMORY_KB_PER_HOUR: Final = 1024.0
+#: What lies free between other things goes up and down by so much, of some 300 MB.
+RESIDENT_MB: Final = 30.0
 #: A message or two may be between two counters when they are read.
 UNDER_WAY = 64
 
@@ -67,13 +69,30 @@ def judge(ledger: Ledger, missing: int | None, tracking_pct: float = TRACKING_PC
         f"mean |error| outside fault windows, over {len(quiet)} s in which every voltage came in time"
         + ("" if quiet else ": not judged"),
     )  # fmt: skip
-    slope = memory_slope(ledger)
-    found["memory"] = Invariant(
-        slope is None or slope <= MEMORY_KB_PER_HOUR, slope, MEMORY_KB_PER_HOUR, "kB/hour",
-        "growth of the longest-lived serving process after warm-up"
-        + ("" if slope is not None else ": too short a run to judge"),
+    found["memory"] = _memory(memory_slope(ledger))
+    grown = resident_growth(ledger)
+    found["memory_resident"] = Invariant(
+        grown is None or grown <= RESIDENT_MB, grown, RESIDENT_MB, "MB",
+        "resident memory of that process in its last five minutes above that of the first five after warm-up"
+        + ("" if grown is not None else ": too short a run to judge"),
     )  # fmt: skip
     return found
+
+
+def _memory(trend: Trend | None) -> Invariant:
+    """Broken where it grows beyond doubt, held where it does not; else this run cannot tell, and says so."""
+    text = "growth of what the longest-lived serving process has in use, after warm-up"
+    if trend is None:
+        return Invariant(True, None, MEMORY_KB_PER_HOUR, "kB/hour", f"{text}: too short a run to judge")
+    held: bool | None = None
+    if trend.slope <= MEMORY_KB_PER_HOUR and trend.doubt <= MEMORY_KB_PER_HOUR:
+        held = True
+    elif trend.slope - trend.doubt > MEMORY_KB_PER_HOUR:
+        held = False
+    told = f"{text}, ± {trend.doubt:.0f}"
+    if held is None:
+        told += ": not judged, a run without faults (--faults none) or one of hours tells"
+    return Invariant(held, trend.slope, MEMORY_KB_PER_HOUR, "kB/hour", told)
 
 
 def _accounted(ledger: Ledger) -> Invariant:

@@ -139,7 +139,7 @@ def flat(status: dict[str, Any]) -> dict[str, float]:
         elif isinstance(value, (bool, int, float)):
             found[prefix] = float(value)
 
-    for part in ("samples", "learner", "recorder", "queries", "seq", "checkpoints", "fallback"):
+    for part in ("samples", "learner", "recorder", "queries", "seq", "checkpoints", "fallback", "memory"):
         walk(part, status.get(part))
     found["serves"] = float(status.get("role", "primary") == "primary")
     return found

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -12,27 +13,78 @@ from adaptive.types import FloatArray
 from service.soak.invariant import Invariant
 from service.soak.ledger import Happened, Ledger
 
+T = TypeVar("T")
+
 #: Before this the memory of a process is not judged, and a process that lived shorter after it neither, s.
 MEMORY_WARM_S: Final = 180.0
 MEMORY_LEAST_S: Final = 300.0
 _FLOOR_S: Final = 60.0
+#: Of a small object of Python's on average: its allocator's pools over their blocks, as measured in a service.
+_BLOCK_BYTES: Final = 100.0
 
 
-def memory_slope(ledger: Ledger) -> float | None:
-    """kB per hour of the serving process that lived longest after its warm-up; None where none lived long enough."""
-    best: tuple[float, float] | None = None
-    for name in ("a", "b", "service"):
-        rows = ledger.memory.get(name, [])
-        for pid in {row[2] for row in rows}:
-            t = np.array([row[0] for row in rows if row[2] == pid])
-            kb = np.array([row[1] for row in rows if row[2] == pid])
-            after = t >= t[0] + MEMORY_WARM_S
-            if not after.any() or np.ptp(t[after]) < MEMORY_LEAST_S:
-                continue
-            lived = float(np.ptp(t[after]))
-            if best is None or lived > best[0]:
-                best = lived, 3600.0 * _slope(*_floor(t[after], kb[after]))
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """A slope and twice its standard error, both kB per hour."""
+
+    slope: float
+    doubt: float
+
+
+def memory_slope(ledger: Ledger) -> Trend | None:
+    """What the serving process that lived longest after its warm-up has in use; None where none lived long enough.
+    Where the allocator cannot tell what is in use, its resident memory.
+
+    What is in use is what the learner, its snapshots and its marks hold: it goes up and down by megabytes when faults
+    take samples from the window, change the model or the role. A slope of 1 MB an hour shows in half an hour without
+    faults, and in hours with them; the doubt says so.
+    """
+    return _longest(_in_use(ledger) or _resident(ledger), lambda t, kb: _trend(*_floor(t, kb)))
+
+
+def resident_growth(ledger: Ledger) -> float | None:
+    """MB by which the resident memory of that process ended above where it was after its warm-up: the least of the
+    last five minutes less the least of the first five. None where none lived for ten."""
+
+    def growth(t_s: FloatArray, kb: FloatArray) -> float:
+        first, last = t_s <= t_s[0] + MEMORY_LEAST_S, t_s >= t_s[-1] - MEMORY_LEAST_S
+        return float(kb[last].min() - kb[first].min()) / 1024.0
+
+    return _longest(_resident(ledger), growth, 2.0 * MEMORY_LEAST_S)
+
+
+def _longest(
+    rows: Mapping[str, list[tuple[float, float]]],
+    what: Callable[[FloatArray, FloatArray], T],
+    least_s: float = MEMORY_LEAST_S,
+) -> T | None:
+    best: tuple[float, T] | None = None
+    for taken in rows.values():
+        t, kb = (np.array(column) for column in zip(*taken, strict=True))
+        after = t >= t[0] + MEMORY_WARM_S
+        lived = float(np.ptp(t[after])) if after.any() else 0.0
+        if lived >= least_s and (best is None or lived > best[0]):
+            best = lived, what(t[after], kb[after])
     return None if best is None else best[1]
+
+
+def _resident(ledger: Ledger) -> dict[str, list[tuple[float, float]]]:
+    """By serving process, (t_s, kB)."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for name in ("a", "b", "service"):
+        for t_s, kb, number in ledger.memory.get(name, []):
+            found.setdefault(f"{name}-{number}", []).append((t_s, kb))
+    return found
+
+
+def _in_use(ledger: Ledger) -> dict[str, list[tuple[float, float]]]:
+    """By instance, (t_s, kB): of the C library's allocator and of Python's."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for t_s, name, now in ledger.counters:
+        if "memory.malloc_bytes" in now:
+            kb = (now["memory.malloc_bytes"] + _BLOCK_BYTES * now["memory.python_blocks"]) / 1024.0
+            found.setdefault(name, []).append((t_s, kb))
+    return found
 
 
 def _floor(t_s: FloatArray, kb: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -43,10 +95,19 @@ def _floor(t_s: FloatArray, kb: FloatArray) -> tuple[FloatArray, FloatArray]:
     return t_s[at], kb[at]
 
 
-def _slope(t_s: FloatArray, values: FloatArray) -> float:
+def _trend(t_s: FloatArray, kb: FloatArray) -> Trend:
     """Median of the slopes between the two halves (Theil and Sen's, each point with the one half a run later)."""
     half = len(t_s) // 2
-    return float(np.median((values[half : 2 * half] - values[:half]) / (t_s[half : 2 * half] - t_s[:half])))
+    slope = float(np.median((kb[half : 2 * half] - kb[:half]) / (t_s[half : 2 * half] - t_s[:half])))
+    left = kb - slope * t_s
+    left -= left.mean()
+    square = float(left @ left)
+    # What is above the line in one minute is so in the next: so many minutes count as one.
+    alike = min(max(float(left[1:] @ left[:-1]) / square, 0.0), 0.9) if square > 0.0 else 0.0
+    error = math.sqrt(
+        square * (1.0 + alike) / (1.0 - alike) / max(len(kb) - 2, 1) / float(np.sum((t_s - t_s.mean()) ** 2))
+    )
+    return Trend(3600.0 * slope, 2.0 * 3600.0 * error)
 
 
 def summary(ledger: Ledger, invariants: Mapping[str, Invariant], samples: dict[str, int]) -> dict[str, Any]:
@@ -56,7 +117,7 @@ def summary(ledger: Ledger, invariants: Mapping[str, Invariant], samples: dict[s
     def at(values: FloatArray, percent: float) -> float | None:
         return round(float(np.percentile(values, percent)), 1) if values.size else None
 
-    slope = memory_slope(ledger)
+    trend = memory_slope(ledger)
     return {
         "verdict": "broken" if any(i.held is False for i in invariants.values()) else "held",
         "duration_s": round(ledger.duration_s, 1),
@@ -69,7 +130,7 @@ def summary(ledger: Ledger, invariants: Mapping[str, Invariant], samples: dict[s
             "echo_p50_us": at(echo, 50),
             "echo_p99_us": at(echo, 99),
         },
-        "memory_slope_kb_per_hour": None if slope is None else round(slope, 1),
+        "memory_slope_kb_per_hour": None if trend is None else round(trend.slope, 1),
         "samples": samples,
     }
 

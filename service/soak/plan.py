@@ -49,10 +49,12 @@ class SoakPlan:
 
 
 def known_kinds(names: list[str]) -> tuple[str, ...]:
-    """The kinds named, or all of them where none is. Raises InputError on an unknown one."""
+    """The kinds named, or all of them where none is; none of them for ``none``. Raises InputError on an unknown one."""
+    if names == ["none"]:
+        return ()
     for name in names:
         if name not in KINDS:
-            raise InputError(f"--faults: got {name!r}, expected some of: {', '.join(KINDS)}")
+            raise InputError(f"--faults: got {name!r}, expected none, or some of: {', '.join(KINDS)}")
     return tuple(dict.fromkeys(names)) or tuple(KINDS)
 
 

@@ -370,7 +370,7 @@ def test_the_commands_against_a_real_service(
         "axes"
     ]
     assert [(status["axis"], status["role"]) for status in axes] == [("y", "primary")]
-    assert axes[0]["memory_bytes"] > 5e7
+    assert axes[0]["memory"]["resident_bytes"] > 5e7
     assert axes[0]["checkpoints"]["age_s"] is not None
     assert dehyst("status", "--endpoint", process.endpoint, "--once", "--stage", "none").returncode == 1
 
