@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled
+from adaptive.compiled import compiled, compiled_reassociating
 from adaptive.features import FeatureArrays, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, FloatArray
 from adaptive.window_state import IntArray
+
+
+@compiled_reassociating
+def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
+    """basis' covariance basis, V², (p, p) and (p,); 0 for a covariance of no size. Half of a point's time, in order."""
+    total = 0.0
+    for j in range(covariance.shape[0]):
+        row = covariance[j]
+        s = 0.0
+        for i in range(row.shape[0]):
+            s += row[i] * basis[i]
+        total += s * basis[j]
+    return total
 
 
 @compiled
@@ -46,11 +59,7 @@ def evaluate(
         variance = noise_variance
         for j in range(p):
             mean += beta[j] * basis[j]
-        for j in range(beta_covariance.shape[0]):
-            s = 0.0
-            for i2 in range(beta_covariance.shape[0]):
-                s += beta_covariance[j, i2] * basis[i2]
-            variance += s * basis[j]
+        variance += spread(beta_covariance, basis)
         nearest = 0.0
         if count > 0:
             for j in range(d):
