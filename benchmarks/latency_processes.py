@@ -15,8 +15,9 @@ import zenoh
 
 from service import wire
 from service.keys import Keys
-from service.server import StopSignal, tune_process
+from service.server import tune_process
 from service.session import open_client, open_service
+from service.stopping import StopSignal
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.
 ECHO_KEY = "echo"

@@ -8,6 +8,7 @@ with an :class:`InputError` that names the field, what was got and what was expe
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -56,6 +57,13 @@ class SampleBatch:
 
     def __len__(self) -> int:
         return int(self.seq.size)
+
+
+def joined(batches: Sequence[SampleBatch]) -> SampleBatch:
+    """The samples of several messages, in their order, as those of one."""
+    return SampleBatch(
+        *(np.concatenate([getattr(batch, name) for batch in batches]) for name in ("seq", "t_s", "u_V", "y_um"))
+    )
 
 
 @dataclass(frozen=True, slots=True)
