@@ -1,9 +1,9 @@
-"""Gain and offset of a displacement against a model's, by a Kalman filter: the frame in which a slower fit is made."""
+"""Gain and offset of a displacement against a model's, by filterpy's Kalman filter: the frame of a slower fit."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +27,14 @@ class GainFilter:
     covariance: FloatArray
     gain: float = 1.0
     offset_um: float = 0.0
+    _library: Any = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # Here, because it takes a while to import, which who only evaluates models need not wait for.
+        from filterpy.kalman import KalmanFilter
+
+        self._library = KalmanFilter(dim_x=2, dim_z=1)
+        self._library.Q = np.diag(self.walk)
 
     @classmethod
     def start(cls, gain_walk: float, offset_walk_um: float, step_s: float) -> GainFilter:
@@ -36,24 +44,14 @@ class GainFilter:
 
     def update(self, y_um: float, model_um: float, noise_um2: float) -> None:
         """One pair; ``noise_um2`` is the variance of the model's error. What would not stay finite changes nothing."""
-        # Two by two, written out in plain numbers: as arrays the same takes ten times as long.
-        (p00, p01), (_, p11) = self.covariance.tolist()
-        w0, w1 = self.walk.tolist()
-        p00, p11 = p00 + w0, p11 + w1
-        along0, along1 = p00 * model_um + p01, p01 * model_um + p11
-        variance = model_um * along0 + along1 + noise_um2
-        gain0, gain1 = along0 / variance, along1 / variance
-        innovation = y_um - self.gain * model_um - self.offset_um
-        # Joseph's form, (I - K h') P (I - K h')' + r K K', stays positive.
-        k00, k01, k10, k11 = 1.0 - gain0 * model_um, -gain0, -gain1 * model_um, 1.0 - gain1
-        a00, a01 = k00 * p00 + k01 * p01, k00 * p01 + k01 * p11
-        a10, a11 = k10 * p00 + k11 * p01, k10 * p01 + k11 * p11
-        new00 = a00 * k00 + a01 * k01 + noise_um2 * gain0 * gain0
-        new01 = a00 * k10 + a01 * k11 + noise_um2 * gain0 * gain1
-        new11 = a10 * k10 + a11 * k11 + noise_um2 * gain1 * gain1
-        gain, offset_um = self.gain + gain0 * innovation, self.offset_um + gain1 * innovation
-        if all(map(math.isfinite, (new00, new01, new11, gain, offset_um))):
-            self.covariance = np.array([[new00, new01], [new01, new11]])
+        kf = self._library
+        kf.x, kf.P = np.array([[self.gain], [self.offset_um]]), self.covariance
+        kf.predict()
+        kf.update(np.array([[y_um]]), R=noise_um2, H=np.array([[model_um, 1.0]]))
+        if np.isfinite(kf.x).all() and np.isfinite(kf.P).all():
+            # Rounding leaves a little asymmetry, which the recursion would keep.
+            self.covariance = 0.5 * (kf.P + kf.P.T)
+            gain, offset_um = kf.x[:, 0].tolist()
             # A stage whose gain has changed its sign or by more than this is another stage.
             self.gain, self.offset_um = min(max(gain, 0.2), 5.0), offset_um
 

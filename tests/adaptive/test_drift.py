@@ -105,7 +105,7 @@ def test_bad_configuration_is_named() -> None:
 
 
 def test_the_librarys_algebra_and_the_compiled_one_agree_through_changes_and_rests() -> None:
-    library, compiled = made(), made(DriftConfig(algebra="compiled"))
+    library, compiled = made(DriftConfig(algebra="filterpy")), made(DriftConfig(algebra="compiled"))
     basis = rows(900)
     outcomes = set()
     for k, row in enumerate(basis):
@@ -120,15 +120,15 @@ def test_the_librarys_algebra_and_the_compiled_one_agree_through_changes_and_res
     np.testing.assert_allclose(library.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
 
 
-def test_the_default_algebra_is_filterpys(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_library_is_called_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     from filterpy.kalman import KalmanFilter
 
     calls = []
     update = KalmanFilter.update
     monkeypatch.setattr(KalmanFilter, "update", lambda self, z, **more: (calls.append(1), update(self, z, **more)))
-    feed(made(), rows(5), TRUE)
+    feed(made(DriftConfig(algebra="filterpy")), rows(5), TRUE)
     assert len(calls) == 5
-    feed(made(DriftConfig(algebra="compiled")), rows(5), TRUE)
+    feed(made(), rows(5), TRUE)
     assert len(calls) == 5
 
 
