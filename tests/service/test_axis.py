@@ -20,7 +20,7 @@ from service.intake import Intake
 from service.modelfile import Bundle, BundleMeta
 from service.models import load_axis, make_learner
 from service.sequence import RESTART_AFTER
-from service.wire import SampleBatch, decode_samples, encode_samples
+from service.wire import SampleBatch, decode_samples, encode_samples, joined
 from service.wire_query import NOT_FINITE_REPLACED, FeedforwardQuery, FeedforwardReply
 
 DT_S = 1e-3
@@ -324,6 +324,55 @@ def test_queries_are_answered_while_samples_are_handled(models: dict[str, Invers
         intake.close()
     assert axis.handled_seq == 5999
     assert count > 20
+
+
+def test_messages_that_wait_are_handled_together_and_work_in_its_place(models: dict[str, InverseModel]) -> None:
+    """Forty messages of a sample each, and something to be done behind the twentieth."""
+    axis = make_axis(models)
+    intake = Intake(axis, lambda: None)
+    sizes: list[int] = []
+
+    class Watcher:
+        def take(self, batch: SampleBatch) -> None:
+            sizes.append(len(batch))
+
+        def tick(self, now_s: float) -> None: ...
+        def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
+            return {}
+
+        def status(self) -> dict[str, Any]:
+            return {}
+
+        def close(self) -> None: ...
+
+    intake.watcher = Watcher()
+    messages = parts(recording(40), 1)
+    for part in messages[:20]:
+        assert intake.offer(part)
+    intake.start()
+    try:
+        seen = intake.call(lambda: axis.handled_seq)
+        for part in messages[20:]:
+            assert intake.offer(part)
+    finally:
+        intake.close()
+    assert seen == 19, "what came before the work was handled before it"
+    assert axis.handled_seq == 39
+    assert sum(sizes) == 40
+    assert len(sizes) < 20, "several messages at a time"
+    assert intake.waiting == 0
+
+
+def test_the_model_does_not_depend_on_how_samples_were_gathered(models: dict[str, InverseModel]) -> None:
+    one, many = make_axis(models), make_axis(models)
+    whole = recording(600)
+    for part in parts(whole, 1):
+        one.handle(part)
+    for first in range(0, 600, 50):
+        many.handle(joined(parts(whole, 1)[first : first + 50]))
+    assert one.newest.seq == many.newest.seq
+    assert one.gates == many.gates
+    np.testing.assert_array_equal(ask(one, n=5).u_V, ask(many, n=5).u_V)
 
 
 def test_a_full_queue_drops_and_counts(models: dict[str, InverseModel]) -> None:
