@@ -158,31 +158,9 @@ def asymmetric(
 
 
 @compiled
-def plays_sum(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> FloatArray:
-    """Sum of weighted plays (2.4), (2.7) that start relaxed at zero volts."""
-    n = u_V.shape[0]
-    m = radii_V.shape[0]
-    state = np.zeros(m)
-    out = np.empty(n)
-    for k in range(n):
-        total = 0.0
-        for j in range(m):
-            s = state[j]
-            low = u_V[k] - radii_V[j]
-            high = u_V[k] + radii_V[j]
-            if s < low:
-                s = low
-            elif s > high:
-                s = high
-            state[j] = s
-            total += weights[j] * s
-        out[k] = total
-    return out
-
-
-@compiled
 def plays_nested(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> FloatArray:
-    """`plays_sum` for radii in rising order, in a few operations a sample however many plays there are.
+    """Sum of weighted plays (2.4), (2.7) that start relaxed at zero volts, with radii in rising order.
+    A few operations a sample, however many plays there are.
 
     Plays that start relaxed stay nested: those that an input drags along are always the narrowest so many. Only a
     reversal touches the others, and the held part of the sum is taken anew there, so that no error builds up.
@@ -217,24 +195,4 @@ def plays_nested(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> F
                 dragged += 1
             before = u
         out[k] = held + slope[dragged] * u - way * lead[dragged]
-    return out
-
-
-@compiled
-def plays_matrix(u_V: FloatArray, radii_V: FloatArray) -> FloatArray:
-    """Every play on its own, (m, n)."""
-    m = radii_V.shape[0]
-    n = u_V.shape[0]
-    out = np.empty((m, n))
-    for j in range(m):
-        s = 0.0
-        r = radii_V[j]
-        for k in range(n):
-            low = u_V[k] - r
-            high = u_V[k] + r
-            if s < low:
-                s = low
-            elif s > high:
-                s = high
-            out[j, k] = s
     return out

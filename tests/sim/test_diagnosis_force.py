@@ -10,11 +10,12 @@ from baselines.mechanical_bouc_wen import MechanicalBoucWen
 from sim.diagnosis.diagnose import diagnose_prepared
 from sim.diagnosis.dynamics import Dynamics, respond
 from sim.diagnosis.export import export
-from sim.diagnosis.loops import plays_nested, plays_sum
+from sim.diagnosis.loops import plays_nested
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.restoring import Loop
 from sim.effects import effect, simulate
 from sim.recordings import Recording
+from tests.sim.plays import plays
 
 DT = 1.0 / 750.0
 #: A mode of 32 Hz and, at small motion, half as much stiffness again in its loop. In µm for m, which changes nothing.
@@ -91,4 +92,4 @@ def test_nested_plays_are_plays(seed: int) -> None:
     u = np.cumsum(rng.standard_normal(3000))
     u[700:800] = u[700]
     radii, weights = np.sort(rng.random(20)) * 30.0, rng.standard_normal(20)
-    np.testing.assert_allclose(plays_nested(u, radii, weights), plays_sum(u, radii, weights), atol=1e-11)
+    np.testing.assert_allclose(plays_nested(u, radii, weights), weights @ plays(u, radii), atol=1e-11)

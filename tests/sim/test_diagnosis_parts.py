@@ -17,7 +17,7 @@ from sim.diagnosis.dynamics import Dynamics, respond
 from sim.diagnosis.evidence import split
 from sim.diagnosis.fit import calibrate
 from sim.diagnosis.lines import line_is_there
-from sim.diagnosis.loops import bouc_wen_loop, bouc_wen_paced, plays_matrix, plays_sum
+from sim.diagnosis.loops import bouc_wen_loop, bouc_wen_paced
 from sim.diagnosis.loops_linear import friction, resample
 from sim.diagnosis.noise import noise_floor, repeated_period
 from sim.diagnosis.nominal import BoucWen
@@ -25,6 +25,7 @@ from sim.diagnosis.prepare import prepare
 from sim.diagnosis.setting import Setting
 from sim.effects import effect, simulate
 from sim.recordings import Recording
+from tests.sim.plays import plays
 
 DT = 5e-4
 
@@ -89,11 +90,9 @@ def test_first_order_hold_is_exact_on_a_ramp() -> None:
     np.testing.assert_allclose(got[:-1], (t - 2e-3 * (1.0 - np.exp(-t / 2e-3)))[:-1], atol=1e-9)
 
 
-def test_plays_agree_and_friction_with_full_share_is_a_play() -> None:
+def test_friction_with_full_share_is_a_play() -> None:
     u = np.cumsum(np.random.default_rng(0).normal(size=500)) * 0.1
-    radii, weights = np.array([0.1, 0.5, 1.0]), np.array([0.3, 0.2, -0.1])
-    np.testing.assert_allclose(plays_sum(u, radii, weights), weights @ plays_matrix(u, radii), atol=1e-12)
-    play = plays_matrix(u - u[0], np.array([0.4]))[0] + u[0]
+    play = plays(u - u[0], np.array([0.4]))[0] + u[0]
     assert np.max(np.abs(friction(u, 0.4, 1.0) - play)) <= 0.4 + 1e-12
     assert np.all(np.abs(friction(u, 0.4, 0.3) - u) <= 0.4 + 1e-12)
 
