@@ -14,13 +14,19 @@ from adaptive.window_state import IntArray
 @compiled_reassociating
 def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
     """basis' covariance basis, V², (p, p) and (p,); 0 for a covariance of no size. Half of a point's time, in order."""
-    total = 0.0
-    for j in range(covariance.shape[0]):
-        row = covariance[j]
-        s = 0.0
-        for i in range(row.shape[0]):
-            s += row[i] * basis[i]
-        total += s * basis[j]
+    p, total, j = covariance.shape[0], 0.0, 0
+    # Four rows at a time: each sum that ends costs as much as the row.
+    while j + 3 < p:
+        r0, r1, r2, r3 = covariance[j], covariance[j + 1], covariance[j + 2], covariance[j + 3]
+        b0, b1, b2, b3 = basis[j], basis[j + 1], basis[j + 2], basis[j + 3]
+        for i in range(p):
+            total += (r0[i] * b0 + r1[i] * b1 + r2[i] * b2 + r3[i] * b3) * basis[i]
+        j += 4
+    while j < p:
+        row, bj = covariance[j], basis[j]
+        for i in range(p):
+            total += row[i] * bj * basis[i]
+        j += 1
     return total
 
 

@@ -51,6 +51,10 @@ def page(report: dict[str, Any]) -> str:
     lines.append(f"{'N':>6}" + "".join(f"{title:>10}" for _, title in columns))
     for n, row in report["window"].items():
         lines.append(f"{n:>6}" + "".join(f"{row[key]:>10.2f}" for key, _ in columns))
+    if "500" in report["window"]:
+        row = report["window"]["500"]
+        spread = ((name, row[f"{name}_p99_over_median"]) for name in ("update", "dsymv", "memory_pass"))
+        lines += ["", "p99 over the median at N = 500: " + ", ".join(f"{name} {value:.2f}" for name, value in spread)]
     lines += ["", "The same stream, N = 500: learning one sample, and the error of predicting it before", ""]
     for name, row in report["peers"].items():
         lines.append(f"{name:>14} {row['update_us']:>12.1f} µs {row['over_dehyst']:>8.1f} x   RMSE {row['rmse']:.5f}")

@@ -139,6 +139,31 @@ def test_while_learning_a_stage_that_changes(identified: tuple[int, LssvmInverse
     assert_calibrated(error_V[8000:], std_V[8000:])
 
 
+@pytest.mark.parametrize("learning", [False, True])
+def test_outside_the_learnt_range(identified: tuple[int, LssvmInverse], learning: bool) -> None:
+    """Strokes that grow to a fifth of the range beyond it: what is stated there grows with what is wrong."""
+    seed, model = identified
+    from sim.signals import training_input
+
+    u_V = training_input(DT_S, 10.0)[1]
+    middle_V, half_V = 0.5 * (u_V.max() + u_V.min()), 0.5 * (u_V.max() - u_V.min())
+    t = np.arange(0.0, 20.0, DT_S)
+    swing = np.sin(2.0 * np.pi * 1.3 * t) * (0.6 + 0.4 * np.sin(2.0 * np.pi * 0.11 * t))
+    grown_V = (middle_V + half_V * np.linspace(0.6, 1.5, t.size) * swing) * np.minimum(1.0, t / 0.5)
+    y_um = rich(seed, grown_V)
+    error_V, std_V = (foretold if learning else free_run)(model, grown_V, y_um)
+    low, high = model.domain[0], model.domain[1]
+    outside = np.maximum(low - y_um, y_um - high) / (high - low)
+    inside = (outside <= 0.0) & (t > 1.0)
+    for least, most in ((0.0, 0.1), (0.1, 0.2)):
+        there = (outside > least) & (outside <= most)
+        assert np.count_nonzero(there) > 200
+        rms_V, stated_V = (float(np.sqrt(np.mean(x[there] ** 2))) for x in (error_V, std_V))
+        assert rms_V < 1.4 * stated_V, (least, rms_V, stated_V)
+        assert shares(error_V[there], std_V[there])[1] >= 0.85
+        assert stated_V > 1.05 * float(np.sqrt(np.mean(std_V[inside] ** 2)))
+
+
 def measured(name: str) -> tuple[FloatArray, FloatArray]:
     path = DATA / "picma_stack" / name
     if not path.exists():
