@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from adaptive import condition, kernels, lapack, lssvm, window_core, window_plain
+from adaptive import condition, kernels, lapack, lssvm, window_core, window_handle, window_plain
 from adaptive import window_state as ws
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray, StateDict
@@ -85,6 +85,23 @@ class Window:
         self.arrays = arrays or ws.allocate(
             config.capacity, np.array(config.widths), config.gamma, config.linear, 0.25 * config.accuracy, form
         )
+
+    @property
+    def arrays(self) -> WindowArrays:
+        """The state; its arrays are written in place."""
+        return self._arrays
+
+    @arrays.setter
+    def arrays(self, arrays: WindowArrays) -> None:
+        self._arrays = arrays
+        # What answers, and what it is given: compiled code a handle, numpy the arrays.
+        compiled = self.config.backend == "compiled"
+        self._answers: ModuleType = window_handle if compiled else window_plain
+        self._given: Any = window_handle.handle_of(arrays) if compiled else arrays
+
+    def __reduce__(self) -> tuple[type[Window], tuple[WindowConfig, WindowArrays]]:
+        # A handle is of one process, and of these arrays.
+        return Window, (self.config, self._arrays)
 
     @classmethod
     def from_samples(
@@ -198,11 +215,11 @@ class Window:
 
     def predict(self, x: FloatArray) -> float:
         """Mean at one point ``x`` (d,); 0 while the window is empty."""
-        return float(self._core.predict(self.arrays, self._point(x)))
+        return float(self._answers.predict(self._given, self._point(x)))
 
     def predict_with_variance(self, x: FloatArray, include_noise: bool = False) -> tuple[float, float]:
         """Mean and variance at one point, of the function or of a sample of weight 1, in squared target units."""
-        mean, latent, scale = self._core.predict_with_variance(self.arrays, self._point(x))
+        mean, latent, scale = self._answers.predict_with_variance(self._given, self._point(x))
         noise = 1.0 / self.config.gamma if include_noise else 0.0
         return float(mean), float((latent + noise) * scale)
 
