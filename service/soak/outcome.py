@@ -15,10 +15,11 @@ from service.soak.ledger import Happened, Ledger
 
 T = TypeVar("T")
 
-#: Before this the memory of a process is not judged, and a process that lived shorter after it neither, s.
-MEMORY_WARM_S: Final = 180.0
+#: Warm-up: half of a process' life, within these, s. Rings fill and kinds of work are done for the first time for a
+#: quarter of an hour. What has lived shorter than the last of them after it is not judged.
+MEMORY_WARM_S: Final = (180.0, 900.0)
 MEMORY_LEAST_S: Final = 300.0
-_FLOOR_S: Final = 60.0
+_MINUTE_S: Final = 60.0
 #: Of a small object of Python's on average: its allocator's pools over their blocks, as measured in a service.
 _BLOCK_BYTES: Final = 100.0
 
@@ -39,7 +40,10 @@ def memory_slope(ledger: Ledger) -> Trend | None:
     take samples from the window, change the model or the role. A slope of 1 MB an hour shows in half an hour without
     faults, and in hours with them; the doubt says so.
     """
-    return _longest(_in_use(ledger) or _resident(ledger), lambda t, kb: _trend(*_floor(t, kb)))
+    used = _in_use(ledger)
+    if used:
+        return _longest(used, lambda t, kb: _trend(*_minutes(t, kb, np.median)))
+    return _longest(_resident(ledger), lambda t, kb: _trend(*_minutes(t, kb, np.min)))
 
 
 def resident_growth(ledger: Ledger) -> float | None:
@@ -61,7 +65,7 @@ def _longest(
     best: tuple[float, T] | None = None
     for taken in rows.values():
         t, kb = (np.array(column) for column in zip(*taken, strict=True))
-        after = t >= t[0] + MEMORY_WARM_S
+        after = t >= t[0] + warm_up_s(float(np.ptp(t)))
         lived = float(np.ptp(t[after])) if after.any() else 0.0
         if lived >= least_s and (best is None or lived > best[0]):
             best = lived, what(t[after], kb[after])
@@ -87,12 +91,18 @@ def _in_use(ledger: Ledger) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
-def _floor(t_s: FloatArray, kb: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The least of every minute, and when it was: what is in use for a moment (a state that is handed over, a
-    checkpoint) is given back within a minute, and is no growth."""
-    minute = ((t_s - t_s[0]) // _FLOOR_S).astype(np.int64)
-    at = [int(np.argmin(np.where(minute == m, kb, np.inf))) for m in range(int(minute[-1]) + 1) if np.any(minute == m)]
-    return t_s[at], kb[at]
+def warm_up_s(lived_s: float) -> float:
+    """How much of the life of a process is its warm-up, s."""
+    least_s, most_s = MEMORY_WARM_S
+    return min(most_s, max(least_s, 0.5 * lived_s))
+
+
+def _minutes(t_s: FloatArray, kb: FloatArray, of: Callable[[FloatArray], Any]) -> tuple[FloatArray, FloatArray]:
+    """One value a minute, and its middle: what is in use for a moment (a state that is handed over, a checkpoint) is
+    given back within a minute, and is no growth."""
+    minute = ((t_s - t_s[0]) // _MINUTE_S).astype(np.int64)
+    there = np.unique(minute)
+    return t_s[0] + _MINUTE_S * (there + 0.5), np.array([float(of(kb[minute == m])) for m in there])
 
 
 def _trend(t_s: FloatArray, kb: FloatArray) -> Trend:

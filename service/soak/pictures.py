@@ -15,7 +15,7 @@ import numpy as np
 from service.soak.catalogue import KINDS, MACHINE, PROCESS, STAGE
 from service.soak.judge import TRACKING_PCT
 from service.soak.ledger import Ledger
-from service.soak.outcome import MEMORY_WARM_S
+from service.soak.outcome import warm_up_s
 
 #: Colour-blind safe: where a fault happens.
 COLOURS = {PROCESS: "#d55e00", STAGE: "#0072b2", MACHINE: "#cc79a7"}
@@ -73,7 +73,7 @@ def draw_memory(path: Path, ledger: Ledger) -> None:
         used = np.diff([r[1] for r in cpu]) / np.maximum(np.diff([r[0] for r in cpu]), 1e-3)
         same = np.diff([r[2] for r in cpu]) == 0
         bottom.plot(np.array([r[0] for r in cpu])[1:], np.where(same, 100.0 * used, np.nan), color=colours(i), lw=0.8)
-    top.axvline(MEMORY_WARM_S, color="black", lw=0.6, ls=":")
+    top.axvline(warm_up_s(ledger.duration_s), color="black", lw=0.6, ls=":")
     top.set_ylabel("resident memory, MB")
     bottom.set_ylabel("processor, % of a core")
     _finish(figure, path, ledger, (top, bottom))

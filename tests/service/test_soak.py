@@ -471,7 +471,7 @@ def test_a_growth_that_half_an_hour_cannot_tell_is_not_judged() -> None:
 
 def test_resident_memory_is_judged_by_what_it_ends_at() -> None:
     ledger = healthy()
-    t = np.arange(0.0, 1200.0, 1.0)
+    t = np.arange(0.0, 1300.0, 1.0)
     ledger.memory["a"] = [(float(s), 200_000.0 + 1024.0 * (40.0 if s > 850.0 else 0.0), 17) for s in t]
     assert resident_growth(ledger) == pytest.approx(40.0)
     assert "memory_resident" in broken(verdict(ledger))
