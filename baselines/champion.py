@@ -20,7 +20,7 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.finite import all_finite
 from adaptive.snapshot import LssvmInverse
-from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
+from adaptive.types import BoolArray, Feedforward, FloatArray, InverseModel, StateDict
 from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.linear import LinearInverse
 from baselines.mpi_inverse import MpiInverse
@@ -194,6 +194,25 @@ class ChampionInverse:
                 if not np.isfinite(after[first:stop]).all():
                     after[first:stop] = memory[first:stop]
         return Feedforward(answer.u_V, answer.std_V, answer.inside, after)
+
+    def evaluate_into(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
+        std_V: FloatArray, inside: BoolArray,
+    ) -> bool:  # fmt: skip
+        """As ``feedforward``, without its checks and its new arrays: (n,) contiguous doubles in, (n,) results out.
+
+        ``memory`` (m,) is advanced in place. False where this is not for the quick way (another kind of champion, a
+        stream that is not wholly its own, a memory that does not stay finite): ask ``feedforward`` with the memory
+        from before. For callers that ask point by point at the rate of a controller.
+        """
+        champion = self.models[self.champion]
+        if type(champion) is not LssvmInverse or not self._is_settled(memory):
+            return False
+        begin, end = self._cuts[self.champion], self._cuts[self.champion + 1]
+        champion.evaluate_into(y_um, v_um_per_s, a_um_per_s2, memory[begin:end], u_V, std_V, inside)
+        for carry, first, stop in self._others:
+            carry(y_um, u_V, memory[first:stop])
+        return bool(all_finite(memory))
 
     def _settled(self) -> FloatArray:
         shares = np.zeros(len(self.models))

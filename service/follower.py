@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from adaptive.errors import DehystError
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
+from baselines.champion import ChampionInverse
 from service.answering import trust_by_age
 from service.errors import FieldError
 from service.fallback import Answer, Rules, answer_safely
@@ -95,11 +96,11 @@ class Follower:
         model = message.model
         y, v, a = self._one
         y[0], v[0], a[0] = y_um, v_um_per_s, a_um_per_s2
-        if type(model) is LssvmInverse and self.memory.size == model.memory_size:
-            after = self.memory.copy()
-            u_V, std_V, within = self._result
+        after = self.memory.copy()
+        u_V, std_V, within = self._result
+        if type(model) is LssvmInverse and after.size == model.memory_size:
             model.evaluate_into(y, v, a, after, u_V, std_V, within)
-        else:
+        elif not (type(model) is ChampionInverse and model.evaluate_into(y, v, a, after, u_V, std_V, within)):
             forward = model.feedforward(y, v, a, self.memory)
             u_V, within, after = forward.u_V, forward.inside, forward.memory
         u = u_V.item(0)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError, ModelFileError
+from adaptive.features import FeatureMap
+from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, Sample, StateDict
 from baselines.bouc_wen import BoucWenParameters
 from baselines.bouc_wen_inverse import BoucWenInverse
@@ -361,3 +363,44 @@ def test_a_memory_that_is_not_finite_stays_its_owners() -> None:
     answer = auto.feedforward(np.array([41.0]), np.zeros(1), np.zeros(1), memory)
     assert np.isfinite(answer.u_V).all()
     assert answer.memory[:2].tolist() == [1.0, 0.0]
+
+
+def lssvm(gain: float = GAIN) -> LssvmInverse:
+    """The inverse of a straight line, as a window without samples makes it."""
+    features = FeatureMap(DT, 0.0, 80.0, 2000.0, 1e5, (2.0, 8.0), (), (), (0,))
+    beta = np.zeros(features.basis_size)
+    beta[:2] = 40.0 / gain, 40.0 / gain
+    count = features.kernel_size
+    return LssvmInverse(
+        "lssvm", features, beta, np.zeros((4, count)), np.zeros(4), np.ones(count), 10.0,
+        np.array([0.0, 80.0, -2e3, 2e3, -1e9, 1e9]),
+    )  # fmt: skip
+
+
+def test_the_quick_way_of_one_point_is_the_long_one() -> None:
+    mpi, bouc_wen = MpiInverse(MPI, DT, SEEN, 0.01), BoucWenInverse(BOUC_WEN, DT, SEEN, 0.01)
+    auto = ChampionInverse(("lssvm", "mpi", "bouc_wen"), (lssvm(), mpi, bouc_wen), 0)
+    long = quick = auto.rest_memory(5.0)
+    out = np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_)
+    for y_um in 20.0 + 15.0 * np.sin(np.arange(80) * 0.2):
+        point = np.array([y_um]), np.array([30.0]), np.zeros(1)
+        slow = auto.feedforward(*point, long)
+        after = quick.copy()
+        assert auto.evaluate_into(*point, after, *out)
+        assert (slow.u_V[0], slow.std_V[0], slow.inside[0]) == tuple(values[0] for values in out)
+        np.testing.assert_array_equal(after, slow.memory)
+        long, quick = slow.memory, after
+
+
+def test_the_quick_way_is_refused_where_it_is_not_the_champions_alone() -> None:
+    mpi = MpiInverse(MPI, DT, SEEN, 0.01)
+    out = np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_)
+    point = np.array([20.0]), np.zeros(1), np.zeros(1)
+    by_mpi = ChampionInverse(("lssvm", "mpi"), (lssvm(), mpi), 1)
+    assert not by_mpi.evaluate_into(*point, by_mpi.rest_memory(5.0), *out), "another kind of champion"
+    auto = ChampionInverse(("lssvm", "mpi"), (lssvm(), mpi), 0)
+    assert not auto.evaluate_into(*point, by_mpi.rest_memory(5.0), *out), "a stream that goes over from another"
+    auto = ChampionInverse(("lssvm", "bouc_wen"), (lssvm(), BoucWenInverse(BOUC_WEN, DT, SEEN, 0.01)), 0)
+    broken = auto.rest_memory(5.0)
+    broken[2 + lssvm().memory_size :] = np.nan
+    assert not auto.evaluate_into(*point, broken, *out), "a memory that is not finite"
