@@ -46,8 +46,9 @@ class GainFilter:
         """One pair; ``noise_um2`` is the variance of the model's error. What would not stay finite changes nothing."""
         kf = self._library
         kf.x, kf.P = np.array([[self.gain], [self.offset_um]]), self.covariance
-        kf.predict()
-        kf.update(np.array([[y_um]]), R=noise_um2, H=np.array([[model_um, 1.0]]))
+        with np.errstate(all="ignore"):
+            kf.predict()
+            kf.update(np.array([[y_um]]), R=noise_um2, H=np.array([[model_um, 1.0]]))
         if np.isfinite(kf.x).all() and np.isfinite(kf.P).all():
             # Rounding leaves a little asymmetry, which the recursion would keep.
             self.covariance = 0.5 * (kf.P + kf.P.T)
