@@ -86,7 +86,7 @@ class Parts:
             j.fallen_s = 0.0
             self.filter.go_back(self.mark)
             self.events["rollbacks"] += 1
-        elif j.judged % round(MARK_S / step_s) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
+        elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
 
     def shift_constant(self, by_V: float) -> None:

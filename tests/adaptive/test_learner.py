@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from adaptive.errors import InputError, ModelFileError
+from adaptive.features import FeatureMap
 from adaptive.learner import Learner, LearnerConfig
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, Sample
@@ -224,3 +226,21 @@ def test_bad_configuration_is_named() -> None:
         LearnerConfig(eviction="random")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="valid_enter"):
         LearnerConfig(valid_enter=0.5)
+
+
+@pytest.mark.parametrize("dt_s", [0.5, 2.0, 5.0])
+def test_a_stage_that_is_read_every_few_seconds_is_learnt_too(dt_s: float) -> None:
+    """A second, or half of one, of which something is done every so often may be less than a step."""
+    features = FeatureMap(dt_s, 0.0, 1.0, 1.0, 1.0, (0.1, 0.2), (0.3,), (0.1,), (0,), asymmetric=True)
+    p, d = features.basis_size, features.kernel_size
+    model = LssvmInverse(
+        "slow", features, np.zeros(p), np.linspace(0.0, 1.0, 12 * d).reshape(12, d), np.zeros(12), np.ones(d), 10.0,
+        np.array([0.0, 1.0] * 3),
+    )  # fmt: skip
+    learner = Learner(model, LearnerConfig(window=10))
+    said = [
+        learner.handle(Sample(k, k * dt_s, 0.1 + 0.1 * math.sin(0.3 * k), 0.2 + 0.1 * math.sin(0.3 * k)))
+        for k in range(400)
+    ]
+    assert said.count("learnt") > 100
+    assert np.isfinite(learner.snapshot().feedforward(*np.full((3, 1), 0.2), learner.memory()).u_V).all()
