@@ -313,6 +313,8 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
         "u_min_V = -2.0\nu_max_V = 10.0\nslew_V_per_s = 4000.0\n"
         "[axis.diagnosis]\nhistory_s = 8\nreference_s = 4\nrecent_s = 3\ncollect_s = 2.5\n"
         f"reports = {json.dumps(str(tmp_path / 'reports'))}\n"
+        "[axis.retuning]\nperiod_s = 0.0\nfresh = 60\ntorch = false\n"
+        "search = {starts = 2, rows = 100, iterations = 15}\n"
     )
     u_V = voltages(model_file, 20.0)
     cli = [sys.executable, "-m", "service.cli"]
@@ -336,11 +338,18 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
             session.declare_subscriber(client.keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
             for first in range(0, u_V.size, 500):
                 session.put(client.keys.command, wire.encode_command(first, u_V[first : first + 500]))
+            # Beside it an operator has the model tuned, by the same real wire.
+            eventually(lambda: client.status()["seq"] > 1000, 30.0)
+            tune = [*cli, "retune", "--endpoint", endpoint, "--who", "alice", "--json"]
+            tuned = subprocess.run(tune, capture_output=True, text=True, timeout=60, check=True)
+            assert json.loads(tuned.stdout)["result"] == {"started": True, "job": 1}
             said = eventually(lambda: [e for e in events if e["event"] == "diagnosis"], 100.0)
             assert said[0]["detail"].startswith("the model's error grew: gain drift, -")
             last = client.status()["diagnosis"]["last"]
             assert last["effects"][0]["name"] == "gain_drift"
             assert last["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.004)
+            last = eventually(lambda: client.status()["retuning"]["last"], 60.0)
+            assert last["outcome"] in ("better", "worse", "unchanged"), last
             ask = [*cli, "ask-diagnosis", "--report", "--recent", "4", "--endpoint", endpoint, "--json"]
             asked = subprocess.run(ask, capture_output=True, text=True, timeout=60, check=True)
             assert json.loads(asked.stdout)["result"] == {"started": True, "job": 2}
