@@ -179,12 +179,14 @@ class Learner:
         return self.parts.front.served
 
     def warm_window(self) -> None:
-        """Load (or compile) the window's steps on a copy: the first sample that teaches must not wait for them."""
+        """Load (or compile) the window's steps on a copy: neither the first sample that teaches nor the first other
+        hyper-parameters must wait for them."""
         capacity = self.config.window
         window = ResidualWindow.from_model(self.base, capacity, self.config.eviction)
         if len(window) < capacity:
             window.learn(10.0 + np.zeros(self.base.features.kernel_size), 0.0)
         window.learn(window.arrays()[0][0], 0.0)
+        window.with_hyperparameters(window.hyper).newest_error_V(1)
 
     def freeze(self) -> None:
         """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""

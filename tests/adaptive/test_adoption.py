@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -109,3 +111,43 @@ def test_window_data_is_a_copy_that_travels(state: dict[str, object]) -> None:
     assert data.age.min() == 0.0
     learner.window_data().targets_V[:] = 0.0
     assert np.any(learner.window_data().targets_V != 0.0)
+
+
+_ADOPT = """
+import sys
+import numpy as np
+from numba.core import event
+from adaptive.features import FeatureMap
+from adaptive.learner import Hyperparameters, Learner, LearnerConfig
+from adaptive.snapshot import LssvmInverse
+from adaptive.types import Sample
+
+compiled = []
+
+class Listener(event.Listener):
+    def on_start(self, what):
+        compiled.append(what.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, what):
+        pass
+
+features = FeatureMap(1e-3, 0.0, 1.0, 1.0, 1.0, (0.1, 0.2), (0.3,), (0.1,), (0,), asymmetric=True)
+p, d = features.basis_size, features.kernel_size
+model = LssvmInverse(
+    "m", features, np.zeros(p), np.linspace(0.0, 1.0, 12 * d).reshape(12, d), np.zeros(12), np.ones(d), 10.0,
+    np.array([0.0, 1.0] * 3),
+)
+learner = Learner(model, LearnerConfig(window=10))
+for k in range(200):
+    learner.handle(Sample(k, k * 1e-3, 0.1 * np.sin(0.1 * k), 0.1 * np.sin(0.1 * k)))
+learner.warm_window()
+event.register("numba:compile", Listener())
+print(learner.adopt(Hyperparameters(20.0, (1.2,) * d)))
+print("compiled", *compiled)
+"""
+
+
+def test_nothing_is_compiled_when_other_hyper_parameters_come() -> None:
+    """A learner that compiles for seconds while samples come is what an adoption looked like in a soak."""
+    run = subprocess.run([sys.executable, "-c", _ADOPT], capture_output=True, text=True, timeout=300, check=True)
+    assert run.stdout.splitlines()[-1].strip() == "compiled"
