@@ -48,17 +48,17 @@ _pointer: Any = intrinsic(_to_pointer)
 
 @compiled
 def _matrix(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[16 + 2 * i], h[17 + 2 * i]), np.float64)
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i], h[_FIELDS + 2 * i + 1]), np.float64)
 
 
 @compiled
 def _vector(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[16 + 2 * i],), np.float64)
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.float64)
 
 
 @compiled
 def _integers(h: IntArray, i: int) -> IntArray:  # pragma: no cover - compiled
-    return carray(_pointer(h[i]), (h[16 + 2 * i],), np.int64)
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.int64)
 
 
 @compiled

@@ -41,6 +41,7 @@ def give_back() -> bool:
     return False
 
 
+_PROCESS: Final = psutil.Process()
 _MALLINFO2: Final = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost"
 
 
@@ -58,7 +59,7 @@ def in_use() -> dict[str, int | None]:
     tell a leak early.
     """
     return {
-        "resident_bytes": psutil.Process().memory_info().rss,
+        "resident_bytes": _PROCESS.memory_info().rss,
         "malloc_bytes": _malloc_bytes(),
         "python_blocks": sys.getallocatedblocks(),
     }
