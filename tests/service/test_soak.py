@@ -18,10 +18,9 @@ from adaptive.errors import InputError
 from service.commands.soak import seconds
 from service.soak.catalogue import KINDS
 from service.soak.intervals import Intervals
-from service.soak.judge import TRACKING_PCT, judge
-from service.soak.ledger import Happened, Ledger, Probe, Row, flat, probe_of
-from service.soak.monitor import Second, Track
-from service.soak.outcome import memory_slope, resident_growth, summary
+from service.soak.judge import TRACKING_PCT
+from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
+from service.soak.monitor import Track
 from service.soak.plan import TAIL_S, WARM_S, known_kinds, make_plan
 from service.soak.processor import Others
 from service.soak.reference import PERIOD_S, SoakReference
@@ -29,6 +28,7 @@ from service.soak.settling import settle
 from service.soak.setup import Control
 from service.stage_faults import Fault, Injector, decode_fault
 from service.wire import SampleBatch
+from tests.service.soaked import broken, healthy, verdict
 
 CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 
@@ -229,36 +229,6 @@ def test_track_measures_errors_steps_and_holds() -> None:
     assert track.seen.spans == [(0, 4), (6, 8)]
 
 
-def healthy(duration_s: int = 40) -> Ledger:
-    """A run in which a sample stream broke off for a second, and all was as it should be."""
-    ledger = Ledger(float(duration_s), 76.0, 4.0, "real_time")
-    ledger.faults = [Happened("gap", 10.0, 11.0)]
-    lost = 0
-    for k in range(duration_s):
-        bad = 10 <= k < 12
-        ledger.seconds.append(Second(float(k), 1000 * k, 1000, 1000, 1000 * (2.0 if bad else 0.03), 2.0, 0.2))
-        ledger.probes.append(Probe(k + 0.9, [200.0, 220.0], [150.0, 160.0], 0, 0, 0.02, 0.02))
-        lost += 1000 if k == 10 else 0
-        ledger.counters.append(
-            (
-                k + 0.5, "i1-a",
-                {"seq": 1000.0 * k, "samples.received": 1000.0 * k - lost, "samples.late": 0.0,
-                 "samples.lost": float(lost), "samples.restarts": 0.0, "samples.dropped": 0.0,
-                 "samples.gates.learnt": 1000.0 * k - lost},
-            )
-        )  # fmt: skip
-    return ledger
-
-
-def verdict(ledger: Ledger, missing: int = 0) -> dict[str, Any]:
-    settle(ledger)
-    return summary(ledger, judge(ledger, missing), {"seen": 1})
-
-
-def broken(found: dict[str, Any]) -> set[str]:
-    return {name for name, row in found["invariants"].items() if not row["held"]}
-
-
 def test_a_healthy_run_holds_and_has_the_promised_form() -> None:
     found = verdict(healthy())
     assert broken(found) == set()
@@ -369,21 +339,6 @@ def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
     assert "recovers_by_itself" in broken(verdict(ledger))
 
 
-def slope_of(ledger: Ledger) -> float:
-    trend = memory_slope(ledger)
-    assert trend is not None
-    return trend.slope
-
-
-def test_memory_that_is_used_for_a_moment_is_no_growth() -> None:
-    ledger = healthy()
-    rng = np.random.default_rng(1)
-    t = np.arange(0.0, 1500.0, 1.0)
-    held = np.where(rng.random(t.size) < 0.5, rng.uniform(0.0, 20_000.0, t.size), 0.0)
-    ledger.memory["a"] = [(float(s), 200_000.0 + 0.1 * s + more, 17) for s, more in zip(t, held, strict=True)]
-    assert slope_of(ledger) == pytest.approx(360.0, rel=0.05)
-
-
 def test_a_silence_belongs_to_the_fault_that_made_it() -> None:
     ledger = healthy()
     ledger.faults.append(Happened("restart_router", 16.0, 16.3))
@@ -416,69 +371,6 @@ def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> Non
 
 def test_a_lost_record_breaks_the_run() -> None:
     assert broken(verdict(healthy(), missing=1)) == {"no_record_lost"}
-
-
-def test_memory_is_that_of_one_process_after_its_warm_up() -> None:
-    ledger = healthy()
-    assert memory_slope(ledger) is None
-    t = np.arange(0.0, 1000.0, 1.0)
-    # Start-up grows, then it is flat; a second life of the same service begins lower.
-    ledger.memory["a"] = [(float(s), 200_000.0 + min(s, 150.0) * 50.0, 17) for s in t]
-    ledger.memory["b"] = [(float(s), 150_000.0 + 0.1 * s, 18) for s in t[:600]]
-    assert slope_of(ledger) == pytest.approx(0.0, abs=1e-6)
-    ledger.memory["b"] = [(float(s), 150_000.0 + 0.1 * s, 18) for s in np.arange(0.0, 1200.0)]
-    assert slope_of(ledger) == pytest.approx(360.0)
-
-
-def in_use(t_s: float, malloc_kb: float, blocks: float = 0.0) -> tuple[float, str, Row]:
-    return (
-        t_s,
-        "i17-ab",
-        Row({"serves": 1.0, "memory.malloc_bytes": 1024.0 * malloc_kb, "memory.python_blocks": blocks}),
-    )
-
-
-def test_what_is_in_use_tells_the_slope_where_the_allocator_can_say() -> None:
-    ledger = healthy()
-    t = np.arange(0.0, 1200.0, 1.0)
-    # What lies free comes and goes; what is in use grows by 0.1 kB a second.
-    rng = np.random.default_rng(2)
-    ledger.memory["a"] = [(float(s), 200_000.0 + rng.uniform(0.0, 20_000.0), 17) for s in t]
-    ledger.counters = [in_use(float(s), 90_000.0 + 0.1 * s) for s in t]
-    assert slope_of(ledger) == pytest.approx(360.0)
-    # So do small objects of Python's.
-    ledger.counters = [in_use(float(s), 90_000.0, 200_000.0 + 1.024 * s) for s in t]
-    assert slope_of(ledger) == pytest.approx(360.0)
-    ledger.counters = [in_use(float(s), 90_000.0 + 5.0 * np.sin(s)) for s in t]
-    assert slope_of(ledger) == pytest.approx(0.0, abs=30.0)
-
-
-def test_a_growth_that_half_an_hour_cannot_tell_is_not_judged() -> None:
-    ledger = healthy()
-    t = np.arange(0.0, 1800.0, 1.0)
-    level = np.repeat(np.random.default_rng(3).uniform(0.0, 10_000.0, 30), 60)
-    ledger.counters = [in_use(float(s), 90_000.0 + float(up)) for s, up in zip(t, level, strict=True)]
-    found = verdict(ledger)["invariants"]["memory"]
-    assert found["held"] is None
-    assert "not judged" in found["text"]
-    # A leak that stands out is one all the same.
-    ledger.counters = [in_use(float(s), 90_000.0 + 40.0 * s + float(up)) for s, up in zip(t, level, strict=True)]
-    assert "memory" in broken(verdict(ledger))
-    # Without faults nothing but a sum of small things is left, and half an hour tells.
-    ledger.counters = [in_use(float(s), 90_000.0 + 0.001 * float(up)) for s, up in zip(t, level, strict=True)]
-    assert verdict(ledger)["invariants"]["memory"]["held"] is True
-
-
-def test_resident_memory_is_judged_by_what_it_ends_at() -> None:
-    ledger = healthy()
-    t = np.arange(0.0, 1300.0, 1.0)
-    ledger.memory["a"] = [(float(s), 200_000.0 + 1024.0 * (40.0 if s > 850.0 else 0.0), 17) for s in t]
-    assert resident_growth(ledger) == pytest.approx(40.0)
-    assert "memory_resident" in broken(verdict(ledger))
-    ledger.memory["a"] = [(float(s), 200_000.0 + 1024.0 * (40.0 if 400.0 < s < 900.0 else 0.0), 17) for s in t]
-    assert resident_growth(ledger) == pytest.approx(0.0)
-    ledger.memory["a"] = ledger.memory["a"][:700]
-    assert resident_growth(ledger) is None
 
 
 def test_status_is_flattened() -> None:
