@@ -19,6 +19,9 @@ ABSURD = 1e9
 KINK_DECAY, KINK_SHARE = 0.9, 2.0
 #: Samples over which the smoother's prediction errors are averaged; one counts as this many rms at most.
 INNOVATION_SAMPLES, FAR_RMS = 500, 2.0
+#: Readings that stay equal while the voltage moves by this share of its span, and by this many times the usual error of
+#: the smoother's predictions, are those of a sensor that is stuck, or at its end; so many of them at least.
+STUCK_SHARE, STUCK_SIGMA, REPEATED = 0.002, 8.0, 4
 #: Sample time up to which ``glitch_share`` holds as it is, s.
 GLITCH_DT_S = 1e-3
 
@@ -112,6 +115,7 @@ class AdmissionState:
     moved, anchor_um : the smoother's count when the stage last left a place, and where it then was.
     u_V, u_before_V : the last two voltages. kink_V : the largest kink of the voltage of late, fading.
     innovation2 : mean square error of the smoother's predictions, in ranges².
+    y_um, same : the last reading, and how many in a row are equal to it; low_V, high_V : the voltages meanwhile.
     """
 
     seq: int = -1
@@ -126,6 +130,10 @@ class AdmissionState:
     u_before_V: float = 0.0
     kink_V: float = 0.0
     innovation2: float = 0.0
+    y_um: float = 0.0
+    same: int = 0
+    low_V: float = 0.0
+    high_V: float = 0.0
 
     def state_dict(self) -> StateDict:
         return asdict(self)
@@ -193,6 +201,21 @@ def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation:
     most = max(FAR_RMS * state.innovation2**0.5, config.surprise_share / config.surprise_sigma)
     error = min(abs(innovation), most)
     state.innovation2 += (error * error - state.innovation2) / INNOVATION_SAMPLES
+
+
+def stuck_share(state: AdmissionState) -> float:
+    """How far the stage must have gone, in ranges, before readings that stay equal are no chance of the sensor's."""
+    return max(STUCK_SHARE, STUCK_SIGMA * float(state.innovation2**0.5))
+
+
+def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float) -> bool:
+    """Whether the sensor repeats itself while the voltage moves on; to be told every reading with its voltage."""
+    if y_um != state.y_um:
+        state.y_um, state.same, state.low_V, state.high_V = y_um, 1, u_V, u_V
+        return False
+    state.same += 1
+    state.low_V, state.high_V = min(state.low_V, u_V), max(state.high_V, u_V)
+    return state.same >= REPEATED and state.high_V - state.low_V > stuck_share(state) * span_V
 
 
 def settling(config: AdmissionConfig, state: AdmissionState) -> bool:

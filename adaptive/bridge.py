@@ -22,6 +22,8 @@ Voltage = Callable[[FloatArray, FloatArray], float]
 STEPS, SLOPE_SHARE = 2, 1e-5
 #: A slope outside these shares of the mean one is the model's error, not the stage's.
 SLOPES = (0.4, 2.5)
+#: A place further from the middle of the range than this many ranges is none; NaN is not either.
+FAR_RANGES = 1.5
 #: Readings before the doubtful one from which the model's error is taken.
 ANCHORS = 4
 
@@ -73,17 +75,18 @@ class Bridging:
     def begin(
         self, motion: tuple[float, float, float], u_V: FloatArray, y_um: FloatArray, memory: FloatArray
     ) -> Bridge:
-        """From the last smoothed instant over the (n,) samples after it, with their voltages and readings.
+        """From the last smoothed instant over the (n,) samples after it, with their voltages and (k,) first readings.
 
         ``motion`` (µm, µm/s, µm/s²) and ``memory`` (m,) are of that instant.
         """
         y, v, a = motion
         dt = self.features.dt_s
         bridge = Bridge(y, y - v * dt + 0.5 * a * dt * dt, a, memory.copy())
-        off = np.empty(u_V.size)
+        off = np.empty(y_um.size)
         for i in range(u_V.size):
             self.advance(bridge, float(u_V[i]))
-            off[i] = y_um[i] - bridge.last_um
+            if i < y_um.size:
+                off[i] = y_um[i] - bridge.last_um
         bridge.offset_um = float(np.mean(off[-ANCHORS:])) if off.size else 0.0
         bridge.path_um = 0.0
         return bridge
@@ -93,13 +96,14 @@ class Bridging:
         m, before = self.features, bridge.last_um
         low, high = (share * self.slope_V_per_um for share in SLOPES)
         h = SLOPE_SHARE * (m.y_max_um - m.y_min_um)
+        middle_um = m.offset_um + m.gain * 0.5 * (m.y_max_um + m.y_min_um)
         y = 2.0 * bridge.last_um - bridge.before_um
         for _ in range(STEPS):
             there = self._voltage(bridge, y)
             slope = (self._voltage(bridge, y + h) - there) / h
             y -= (there - u_V) / min(max(slope, low), high)
-        if not np.isfinite(y):
-            y = before
+        if not abs(y - middle_um) <= FAR_RANGES * (m.y_max_um - m.y_min_um):
+            y = before  # the model has lost its way: no stage goes there
         m.advance(y, bridge.memory)
         bridge.before_um, bridge.last_um = before, y
         bridge.path_um += abs(y - before)

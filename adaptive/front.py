@@ -16,12 +16,15 @@ import numpy as np
 
 from adaptive import admission
 from adaptive.admission import (
+    REPEATED,
     AdmissionState,
     at_rest,
     check_sample,
     settling,
+    stuck_share,
     surprise,
     watch_innovation,
+    watch_reading,
     watch_voltage,
 )
 from adaptive.bridge import Bridging, Voltage
@@ -29,16 +32,26 @@ from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig, part_of
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.snapshot import LssvmInverse
-from adaptive.surprise import PROBATION, Hold, Verdict, bridged, frame_after, judge, jump_of, steps_of
+from adaptive.surprise import (
+    MOST_BRIDGED,
+    PROBATION,
+    Hold,
+    Verdict,
+    bridged,
+    frame_after,
+    judge,
+    jump_of,
+    steps_of,
+)
 from adaptive.track import Pair, Step, Taken, Track
-from adaptive.types import Sample, StateDict
+from adaptive.types import FloatArray, Sample, StateDict
 
 #: A reading further from the middle of the identified range than this many ranges is none, however long it lasts.
 FAR_OUT = 1.5
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
 #: Samples without a reading whose voltages are kept.
-MOST_HEARD = 64
+MOST_HEARD = MOST_BRIDGED
 
 
 class Front:
@@ -109,10 +122,12 @@ class Front:
             return self._restart(sample, admission.GAP if missing else admission.SETTLING)
         for u in between:
             self._keep(track, u, nan)
+        stuck = watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and not settling(c, gates)
         limit = surprise(c, gates, self.base.span_V)
-        if self._hold is None and not (known and abs(innovation) > limit):
+        doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
+        if self._hold is None and not doubtful:
             watch_innovation(c, gates, innovation)
             return Taken("", (Step(sample.y_um, sample.u_V),))
         return self._decide(sample, track, self._keep(track, sample.u_V, sample.y_um), limit, innovation)
@@ -144,7 +159,15 @@ class Front:
         """Hold a sample back; begins a hold where there is none."""
         hold, made = self._hold, Bridging(track.served, self._voltage, self.base.span_V / self.range_um)
         if hold is None:
-            hold = self._hold = Hold(made.begin(*track.since_motion(), track.memory), track.copy())
+            motion, past_V, past_um = track.since_motion()
+            # Readings that were repeated before that was noticed are none, nor are they an anchor.
+            repeated = self.gates.same - 1 if self.gates.same >= REPEATED else 0
+            track.doubt(repeated)
+            bridge = made.begin(motion, past_V, past_um[: max(past_um.size - repeated, 0)], track.memory)
+            hold = self._hold = Hold(bridge, track.copy())
+            if self.gates.same > 1:
+                hold.last_um, hold.same = self.gates.y_um, self.gates.same - 1
+                hold.low_um = hold.high_um = self.gates.y_um
         old = replace(made, features=hold.track.served)
         hold.put(u_V, y_um, old.advance(hold.bridge, u_V))
         return hold
@@ -166,10 +189,14 @@ class Front:
             self.undone += 1
         tolerance = limit + min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
         trusted = gates.since_glitch * self.dt_s > c.doubt_s
-        verdict = judge(c, hold, tolerance * self.range_um, self.range_um, trusted)
+        stuck_um = stuck_share(gates) * self.range_um
+        verdict = judge(c, hold, tolerance * self.range_um, stuck_um, self.range_um, trusted)
         if verdict is Verdict.WAIT:
             return Taken(admission.GLITCH, undone=undone)
         if verdict is Verdict.LOST:
+            # Where the stage is is open, where it has turned the bridge knows best.
+            assert self.track is not None
+            self.track.remember(hold.bridge.memory)
             return replace(self._restart(sample, admission.GAP), undone=undone)
         if verdict is Verdict.JUMP:
             return self._take_jump(track, hold, undone)
@@ -207,6 +234,22 @@ class Front:
         y_um[bad] = f.offset_um + ratio * (np.array(hold.old_um)[bad] - f.offset_um) + shift_um
         return Taken("", steps_of(hold, y_um, bad), away_um, undone)
 
+    @property
+    def holds(self) -> bool:
+        """Whether readings are held back."""
+        return self._hold is not None and not self._hold.taken
+
+    def memory_now(self, frozen: bool = False) -> FloatArray:
+        """(m,) hysteresis memory of a stage that is where the last sample saw it, or must be by its voltage.
+
+        ``frozen`` : for a model in the frame that learning began with.
+        """
+        if self.track is None:
+            return self.base.rest_memory(self.base.features.y_rest_um)
+        if self._hold is not None and not self._hold.taken and not frozen:
+            return self._hold.bridge.memory.copy()
+        return self.track.memory_now(frozen)
+
     # ---- what it teaches
 
     def advance(self, step: Step) -> tuple[Pair | None, bool]:
@@ -215,6 +258,20 @@ class Front:
         self.gates.since_start += 1
         self.gates.since_jump += 1
         return self.track.advance(step)
+
+    def to_base_frame(self) -> bool:
+        """Go back to the frame that learning began with, and the memory tracked in it. False where it is that already.
+
+        For when the model of the beginning is right again: then no jump has moved the sensor for good.
+        """
+        track = self.track
+        if track is None or self.jumps == self.undone or track.served == self.base.features:
+            return False
+        track.features = track.served = self.base.features
+        track.memory, track.switch = track.frozen_memory.copy(), 0
+        self._before, self._hold = None, None
+        self.undone += 1
+        return True
 
     def creep(self, by_um: float) -> None:
         """The stage has crept by so much, µm, that no voltage made. Not while a jump of the frame is under way."""

@@ -71,6 +71,17 @@ class Learner:
         """Forget the sequence: the next sample is taken whatever its number, after the stage itself began anew."""
         self.parts.front.resync()
 
+    def take_place_of(self, other: Learner) -> None:
+        """Go on where ``other`` is, with what this one knows: after samples that ``other`` should not have believed.
+
+        Where the stage is and has been ``other`` knows still, unless it lost it or took a jump that this one has not.
+        """
+        mine, its = self.parts.front, other.parts.front
+        if its.track is None or (its.restarts, its.jumps, its.undone) != (mine.restarts, mine.jumps, mine.undone):
+            self.resync()
+            return
+        mine.restore(its.state_dict())
+
     def _handle(self, sample: Sample) -> str:
         parts, front = self.parts, self.parts.front
         front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
@@ -172,6 +183,22 @@ class Learner:
         """
         track = self.parts.front.track
         return self.base.rest_memory(self.base.features.y_rest_um) if track is None else track.memory.copy()
+
+    def memory_for(self, model: LssvmInverse, smoothed: bool = False) -> FloatArray | None:
+        """(m,) hysteresis memory with which ``model``, a snapshot of this learner, goes on from the last sample.
+
+        What was learnt was learnt with it: one that is tracked otherwise, over readings that were not believed, would
+        make the model wrong until the stage has wiped the difference out. None before the first sample.
+        ``smoothed`` : from the smoother's instant, ``lag`` samples ago; None while readings are held back.
+        """
+        front = self.parts.front
+        # Of two memories in one frame, that of the learner has seen no reading that was not believed.
+        frozen = model.features != front.served and model.features == self.base.features
+        if front.track is None or (smoothed and front.holds):
+            return None
+        if smoothed:
+            return (front.track.frozen_memory if frozen else front.track.memory).copy()
+        return front.memory_now(frozen)
 
     @property
     def features(self) -> FeatureMap:

@@ -82,8 +82,10 @@ class Parts:
         before = j.fallback
         self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
         if j.fallen_s > ROLLBACK_S:
-            # Half a second of losing to the frozen model: what was learnt since all was well is wrong.
+            # Half a second of losing to the frozen model: what was learnt since all was well is wrong, and so is a
+            # jump that the frozen model knows nothing of.
             j.fallen_s = 0.0
+            self.front.to_base_frame()
             self.filter.go_back(self.mark)
             self.events["rollbacks"] += 1
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:

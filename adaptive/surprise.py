@@ -6,16 +6,20 @@ that stay at one new level, by the same distance (the sensor's zero) or the same
 takes depends on what is known of the sensor: few where it has not been wrong lately and the jump is of a size that a
 stage makes; more after a glitch, for larger and for the smallest jumps. A jump that was taken is on probation: readings
 that come back to the old level soon after, or go to a third one, take it back.
+
+Readings that do not change at all while the voltage moves the stage are a sensor that is stuck, or at its end: they are
+no level, however long they last, and the bridge goes on until the sensor shows the stage again.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
 
-from adaptive.admission import AdmissionConfig
+from adaptive.admission import REPEATED, AdmissionConfig
 from adaptive.bridge import Bridge
 from adaptive.features import FeatureMap
 from adaptive.learner_config import part_of
@@ -25,6 +29,11 @@ from adaptive.types import BoolArray, FloatArray, StateDict
 
 #: Samples that are held back undecided at most, and for how many the old level is followed after a jump was taken.
 MOST_HELD, PROBATION = 40, 64
+#: Samples that are bridged at most while there are no readings, or only repeated ones. The hysteresis memory stays true
+#: for as long, and would be wrong after a restart until the stage wipes that out.
+MOST_BRIDGED = 4096
+#: The least slope of displacement over voltage, relative to the mean one, just after a turning point.
+LEAST_SLOPE = 0.4
 #: A jump of place that scales the displacement by less than this, or more than its inverse, is taken for an offset.
 JUMP_RATIO = 0.85
 #: Share of the way that the bridge has gone by which it may be wrong, and of a level by which readings may scatter.
@@ -49,6 +58,8 @@ class Hold:
     u_V, y_um, old_um : by sample: voltage, reading (NaN for none), and where it must be at the old level.
     level : index of the first reading of the present level; -1 for none. worst_um : largest distance from the old one.
     taken : whether a jump to the present level has been taken, on probation.
+    last_um : the last reading, also from before the hold. same : how many in a row are equal to it; low_um, high_um :
+    between what places the stage was meanwhile.
     """
 
     bridge: Bridge
@@ -59,9 +70,18 @@ class Hold:
     level: int = -1
     worst_um: float = 0.0
     taken: bool = False
+    last_um: float = math.nan
+    same: int = 0
+    low_um: float = 0.0
+    high_um: float = 0.0
 
     def put(self, u_V: float, y_um: float, old_um: float) -> None:
         """Keep one sample."""
+        if y_um == self.last_um:
+            self.same += 1
+            self.low_um, self.high_um = min(self.low_um, old_um), max(self.high_um, old_um)
+        elif not math.isnan(y_um):
+            self.last_um, self.same, self.low_um, self.high_um = y_um, 1, old_um, old_um
         self.u_V.append(u_V)
         self.y_um.append(y_um)
         self.old_um.append(old_um)
@@ -72,7 +92,8 @@ class Hold:
         state |= {f"track.{key}": value for key, value in self.track.state_dict().items()}
         for name in ("u_V", "y_um", "old_um"):
             state[name] = np.array(getattr(self, name), dtype=np.float64)
-        return state | {"level": self.level, "worst_um": self.worst_um, "taken": self.taken}
+        names = ("level", "worst_um", "taken", "last_um", "same", "low_um", "high_um")
+        return state | {name: getattr(self, name) for name in names}
 
     @classmethod
     def from_state(cls, smoother: FixedLagSmoother, base: FeatureMap, values: StateDict) -> Hold:
@@ -86,6 +107,10 @@ class Hold:
             level=int(values["level"]),
             worst_um=float(values["worst_um"]),
             taken=bool(values["taken"]),
+            last_um=float(values["last_um"]),
+            same=int(values["same"]),
+            low_um=float(values["low_um"]),
+            high_um=float(values["high_um"]),
         )
 
 
@@ -94,24 +119,36 @@ def near_old(hold: Hold, tolerance_um: float) -> bool:
     return abs(hold.y_um[-1] - hold.old_um[-1]) <= tolerance_um + WAY_SHARE * hold.bridge.path_um
 
 
+def is_stuck(hold: Hold, stuck_um: float) -> bool:
+    """Whether the last readings are equal although the stage has moved: no sensor that works shows that."""
+    return hold.same >= REPEATED and hold.high_um - hold.low_um > LEAST_SLOPE * stuck_um
+
+
 def needed(config: AdmissionConfig, away_um: float, range_um: float, trusted: bool) -> int:
     """Readings at one level beyond which it is a jump."""
     usual = config.glitch_share <= abs(away_um) / range_um <= config.jump_share
     return config.glitch_persistence if trusted and usual else config.doubt_persistence
 
 
-def judge(config: AdmissionConfig, hold: Hold, tolerance_um: float, range_um: float, trusted: bool) -> Verdict:
+def judge(
+    config: AdmissionConfig, hold: Hold, tolerance_um: float, stuck_um: float, range_um: float, trusted: bool
+) -> Verdict:
     """What the last reading of a hold decides, where no jump has been taken yet. Changes ``level``.
 
-    ``tolerance_um`` : how far from the old level a reading may be; ``trusted`` : the sensor has not been wrong lately.
+    ``tolerance_um`` : how far from the old level a reading may be; ``stuck_um`` : how far the stage may have gone under
+    readings that stay equal; ``trusted`` : the sensor has not been wrong lately.
     """
     last = len(hold.y_um) - 1
-    if np.isnan(hold.y_um[last]):
-        return Verdict.WAIT if last + 1 < MOST_HELD else Verdict.LOST
+    away_um = hold.y_um[last] - hold.old_um[last]
+    if np.isnan(away_um):
+        return Verdict.WAIT if last + 1 < MOST_BRIDGED else Verdict.LOST
+    stuck = is_stuck(hold, stuck_um)
+    if stuck or not near_old(hold, tolerance_um):
+        hold.worst_um = max(hold.worst_um, abs(away_um))
+    if stuck:
+        return Verdict.WAIT if last + 1 < MOST_BRIDGED else Verdict.LOST
     if near_old(hold, tolerance_um):
         return Verdict.BACK
-    away_um = hold.y_um[last] - hold.old_um[last]
-    hold.worst_um = max(hold.worst_um, abs(away_um))
     if hold.level < 0 or not _same_level(hold, tolerance_um):
         hold.level = last
     count = int(np.count_nonzero(~np.isnan(hold.y_um[hold.level :])))

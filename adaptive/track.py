@@ -11,6 +11,7 @@ from adaptive.errors import InputError
 from adaptive.features import FeatureMap
 from adaptive.learner_config import part_of
 from adaptive.smoothing import FixedLagSmoother, SmootherState
+from adaptive.snapshot_loops import track_memory
 from adaptive.types import BoolArray, FloatArray, StateDict
 
 Motion = tuple[float, float, float]
@@ -144,6 +145,17 @@ class Track:
         pair = Pair(now, *self.motion, float(self.u_V[at]), float(self.u_V[before]), good, not bool(self.good.all()))
         return pair, switched
 
+    def remember(self, memory: FloatArray) -> None:
+        """Go on with another (m,) hysteresis memory, given in the frame that is served."""
+        self.memory = memory.copy()
+        if self.served == self.base:
+            self.frozen_memory = memory.copy()
+
+    def doubt(self, n: int) -> None:
+        """The last ``n`` readings were none: nothing is taught of them."""
+        slots = self.good.shape[0]
+        self.good[np.arange(self.state.count - min(n, slots), self.state.count) % slots] = False
+
     def since_motion(self) -> tuple[Motion, FloatArray, FloatArray]:
         """The last smoothed motion, in the frame that is served, and (lag,) voltages and readings since then."""
         assert self.motion is not None
@@ -152,6 +164,24 @@ class Track:
         y, v, a = self.motion
         # Just after a jump the smoothed instants are still in the frame from before it.
         return (g.offset_um + g.gain / f.gain * (y - f.offset_um), v, a), self.u_V[past], self.y_um[past]
+
+    def memory_now(self, frozen: bool) -> FloatArray:
+        """(m,) hysteresis memory after the last step: the smoothed one, carried along the readings since.
+
+        ``frozen`` : the one in the frame of ``base``.
+        """
+        end, slots = self.state.count, self.u_V.shape[0]
+        past = np.arange(max(end - self.lag, 0), end)
+        y_um = self.y_um[past % slots]
+        if frozen or self.features is self.served:
+            features, after = (self.base, self.frozen_memory.copy()) if frozen else (self.served, self.memory.copy())
+            track_memory(y_um, after, features.arrays)
+            return after
+        after = self.memory.copy()
+        jumped = int(np.searchsorted(past, self.switch - self.lag))
+        track_memory(y_um[:jumped], after, self.features.arrays)
+        track_memory(y_um[jumped:], after, self.served.arrays)
+        return after
 
     def state_dict(self) -> StateDict:
         """All of it under flat names, but for what it was made with."""
