@@ -171,6 +171,13 @@ class ChampionInverse:
         n = np.asarray(y_um).size
         return np.concatenate([self._weights(shares, n)[-1] if n else shares, *ends])
 
+    def with_memory(self, memory: FloatArray, name: str, own: FloatArray) -> FloatArray:
+        """``memory`` (m,) with that of the contestant called ``name`` replaced by ``own``. Not changed in place."""
+        i = self.names.index(name)
+        after = memory.copy()
+        after[self._cuts[i] : self._cuts[i + 1]] = own
+        return after
+
     def _is_settled(self, memory: FloatArray) -> bool:
         """Whether a caller's stream of points is wholly the champion's: almost always."""
         if type(memory) is not np.ndarray or memory.shape != (self._cuts[-1],) or memory.dtype != np.float64:

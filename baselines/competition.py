@@ -14,7 +14,7 @@ from collections import deque
 from typing import Any
 
 from adaptive.errors import InputError, ModelFileError
-from adaptive.learner import Hyperparameters
+from adaptive.learner import Hyperparameters, Learner
 from adaptive.learner_config import part_of
 from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
 from baselines import competition_report
@@ -143,6 +143,14 @@ class Competition:
         for model in self._models:
             getattr(model, "resync", lambda: None)()
 
+    def take_place_of(self, other: Competition) -> None:
+        """Go on where ``other`` is, with what this one knows; see :meth:`adaptive.learner.Learner.take_place_of`."""
+        for i, (mine, its) in enumerate(zip(self._models, other._models, strict=True)):
+            if isinstance(mine, Learner) and isinstance(its, Learner) and not other._out[i]:
+                mine.take_place_of(its)
+            else:
+                getattr(mine, "resync", lambda: None)()
+
     def _exclude(self, i: int, error: Exception) -> None:
         self._out[i] = True
         if i == 0:
@@ -158,6 +166,11 @@ class Competition:
         self._begin_anew()
         self._newest = tuple(self._snapshot(i) for i in range(len(self._models)))
         bad = self._judging.judge(self._seq, rows, self._out)
+        for model, newest, score in zip(self._models, self._newest, self._judging.scores, strict=True):
+            # Where one knows its own memory it is judged by that: over lost readings ours is a guess.
+            own = getattr(model, "memory_for", lambda *_: None)(newest, True)
+            if own is not None:
+                score.memory = own
         self._judging.remember(self._seq, self._newest)
         if not self._frozen:
             self._choose(bad, float(rows[4].sum()) * self._dt_s)

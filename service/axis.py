@@ -17,6 +17,7 @@ from typing import Any, Final
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answering import Served, answer, blends, learns
 from service.axis_learning import AxisLearning
+from service.clock import SampleClock
 from service.config import LEARN, AxisConfig
 from service.errors import FieldError
 from service.guard import Limits
@@ -79,8 +80,7 @@ class Axis(AxisLearning):
         self._frozen_by = ""
         self._events: deque[dict[str, Any]] = deque(maxlen=_MAX_EVENTS)
         # Time goes on where a restarted stage begins anew; what learns sees one clock and one count.
-        self._t_last_s = self._t_offset_s = 0.0
-        self._number_last = -1
+        self.clock = SampleClock(self.dt_s)
         self._gates: dict[str, int] = {}
         # Newest last. A tuple, replaced at each snapshot, so that a query never waits for the learner.
         self._ring: tuple[Served, ...] = (self._first(dict(models)),)
@@ -134,10 +134,8 @@ class Axis(AxisLearning):
             number = self.sequence.number(seq)
             if order == RESTARTED:
                 self._restart(seq)
-                self._t_offset_s = self._t_last_s + (number - self._number_last) * self.dt_s - t_s
-            t_going_on_s = t_s + self._t_offset_s
-            if order != LATE and math.isfinite(t_going_on_s):
-                self._number_last, self._t_last_s = number, t_going_on_s
+            # One that is late is refused whatever its time.
+            t_going_on_s = t_s if order == LATE else self._time(number, t_s, order == RESTARTED)
             verdict = self._learn(Sample(number, t_going_on_s, u_V, y_um))
             self._gates[verdict] = self._gates.get(verdict, 0) + 1
             verdicts.append(verdict)
@@ -193,12 +191,20 @@ class Axis(AxisLearning):
         models = last.models
         if self.learner is not None:
             models = models | self._judged(last)
-        memories = self.tracker.advance(models, last.memories)
+        memories = self._own_memory(models, self.tracker.advance(models, last.memories))
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
             trust=self.watch.trust, trouble=self.watch.trouble,
         )  # fmt: skip
         self._ring = (*self._ring, served)[-self.config.snapshots_kept :]
+
+    def _time(self, number: int, t_s: float, restarted: bool) -> float:
+        """The time of a sample for what learns."""
+        sets = self.clock.sets
+        t_going_on_s = self.clock.take(number, t_s, restarted)
+        if self.clock.sets != sets:
+            self.note("stage_clock_set", "the stage's clock has been set; time goes on by the numbers of the samples")
+        return t_going_on_s
 
     def _restart(self, seq: int) -> None:
         """The stage counts from the beginning again: snapshots of the old count can no longer be named."""

@@ -8,12 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+
 from adaptive.errors import DehystError
-from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from baselines.champion import ChampionInverse
 from service.answering import Served
 from service.axis_operations import AxisOperations
 from service.axis_state import restored_learner
 from service.competing import champion_of
+from service.keys import AUTO
 from service.sequence import SequenceTracker
 from service.watch import LEARNER_FAILED, POISON
 
@@ -76,6 +80,19 @@ class AxisLearning(AxisOperations):
         auto = {} if now in POISON or self._learner_dead else champion_of(self.learner)
         return {self.config.learn: good, **auto}
 
+    def _own_memory(self, models: dict[str, InverseModel], tracked: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """``tracked`` memories, with the learner's own for its model, alone and as the champion's contestant."""
+        name, memory_for = self.config.learn, getattr(self.learner, "memory_for", None)
+        if memory_for is None or self._learner_dead:
+            return tracked
+        own = memory_for(models[name])
+        if own is None or own.shape != tracked[name].shape or not np.isfinite(own).all():
+            return tracked
+        champion = models.get(AUTO)
+        if not isinstance(champion, ChampionInverse) or name not in champion.names:
+            return tracked | {name: own}
+        return tracked | {name: own, AUTO: champion.with_memory(tracked[AUTO], name, own)}
+
     def _mark(self) -> None:
         """Keep what the learner is now and then, to go back to: the older of two is from before any trouble."""
         assert self.learner is not None
@@ -85,16 +102,22 @@ class AxisLearning(AxisOperations):
     def _go_back(self) -> None:
         """The samples are good again: go on from before they were bad, whose first ones the learner may have believed.
 
-        Its place is taken anew too: what a frozen sensor shows when it comes to itself is no jump of the stage.
+        Where the stage is it has followed by the voltages. If it could not, its place is taken anew: what a frozen
+        sensor shows when it comes to itself is no jump of the stage.
         """
         assert self.learner is not None
+        before, place = self.learner, None
         if self._marks[0]:
             try:
-                self.learner = restored_learner(self._marks[0], self.learner)
+                self.learner = restored_learner(self._marks[0], before)
                 self.note("learner_went_back", "to before the samples went wrong")
+                place = getattr(self.learner, "take_place_of", None)
             except DehystError as error:
                 self.note("internal_error", f"going back: {error}")
-        getattr(self.learner, "resync", lambda: None)()
+        if place is None:
+            getattr(self.learner, "resync", lambda: None)()
+        else:
+            place(before)
 
     def _begin_anew(self, model: InverseModel) -> None:
         assert self._revive is not None

@@ -17,6 +17,7 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import FloatArray, InverseModel, OnlineModel, StateDict
 from service.answering import Served
+from service.clock import SampleClock
 from service.competing import champion_of
 from service.errors import FieldError
 from service.registry import build, kind_of
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from service.axis import Axis
 
 #: Of what is written here; another one is refused.
-STATE_SCHEMA: Final = 1
+STATE_SCHEMA: Final = 2
 #: Parts of a learner's state that tell what it is and not what it has learnt: its settings, and of the model that it
 #: began from what no re-tuning changes. They must be those of the present one.
 _FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")
@@ -49,14 +50,12 @@ def axis_state(axis: Axis) -> StateDict:
         "served.default": served.default,
         "served.trust": served.trust,
         "served.trouble": served.trouble,
-        "clock.t_last_s": axis._t_last_s,
-        "clock.t_offset_s": axis._t_offset_s,
-        "clock.number_last": axis._number_last,
         "frozen_by": axis._frozen_by,
         "dead": axis._learner_dead,
         "adoptions": json.dumps([retuned.to_json() for retuned in axis.adoptions.pending]),
     }
     state |= {f"sequence.{name}": value for name, value in axis.sequence.state_dict().items()}
+    state |= {f"clock.{name}": value for name, value in axis.clock.state_dict().items()}
     state |= {f"tracker.{name}": value for name, value in axis.tracker.state_dict().items()}
     state |= {f"gates.{name}": count for name, count in axis.gates.items()}
     state |= {f"memory.{name}": memory for name, memory in served.memories.items()}
@@ -78,17 +77,18 @@ def restore_axis(axis: Axis, state: StateDict) -> None:
         learner = None if axis.learner is None else restored_learner(under("learner.", state), axis.learner)
         watched = {role: _model(under(f"model.{role}.", state), role) for role in _roles(state)}
         served = _served(axis, state, learner, watched)
-        tracker, sequence, watch = (under(part, state) for part in ("tracker.", "sequence.", "watch."))
-        clock = [float(state["clock.t_last_s"]), float(state["clock.t_offset_s"]), int(state["clock.number_last"])]
+        parts = ("tracker.", "sequence.", "watch.", "clock.")
+        tracker, sequence, watch, clock = (under(part, state) for part in parts)
         seq, frozen_by, dead = int(state["seq"]), str(state["frozen_by"]), bool(state["dead"])
         adoptions = [Retuned.from_json(entry, "adoptions") for entry in json.loads(str(state["adoptions"]))]
-        # From here on nothing is looked up that may be missing but in these three, which check before they change.
+        # From here on nothing is looked up that may be missing but in these, which check before they change.
+        SampleClock(axis.dt_s).restore(clock)
         axis.sequence.restore(sequence)
         axis.tracker.restore(tracker)
         axis.watch.restore(watch, watched)
     except (KeyError, TypeError, ValueError, InputError) as error:
         raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
-    axis._t_last_s, axis._t_offset_s, axis._number_last = clock[0], clock[1], int(clock[2])
+    axis.clock.restore(clock)
     axis._gates = {name: int(count) for name, count in under("gates.", state).items()}
     axis._frozen_by, axis._learner_dead = frozen_by, dead
     axis.adoptions.replace(adoptions)

@@ -49,6 +49,10 @@ class Competing:
         """What answers as ``auto``."""
         return self.competition.snapshot()
 
+    def take_place_of(self, other: Competing) -> None:
+        """Go on where ``other`` is, with what this one has learnt."""
+        self.competition.take_place_of(other.competition)
+
     def counters(self) -> dict[str, int]:
         return self.competition.counters()
 

@@ -49,7 +49,7 @@ class WatchConfig:
     revive_s : time after which a learner that failed is begun anew, s.
     """
 
-    frozen_s: float = 0.25
+    frozen_s: float = 0.1
     frozen_share: float = 0.02
     poisoned_s: float = 0.25
     poisoned_share: float = 0.5
@@ -90,13 +90,14 @@ class Watch:
         """One sample in order, and what the learner said of it."""
         n, c = self._n, self.config
         n["count"] += 1
-        bad = 1.0 if verdict in _BAD_VALUES else 0.0
-        n["bad"] += (bad - n["bad"]) * self._dt_s / c.poisoned_s
         if y_um == n["y"]:
             n["still"] += 1
             n["u_low"], n["u_high"] = min(n["u_low"], u_V), max(n["u_high"], u_V)
         else:
             n["still"], n["y"], n["u_low"], n["u_high"] = 0, y_um, u_V, u_V
+        # A sensor that repeats itself has trouble of its own name.
+        bad = 1.0 if verdict in _BAD_VALUES and not n["still"] else 0.0
+        n["bad"] += (bad - n["bad"]) * self._dt_s / c.poisoned_s
 
     def _samples_say(self) -> str:
         n, c = self._n, self.config

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
+from adaptive.learner import Learner
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, Sample, StateDict
 from baselines.bouc_wen import BoucWenParameters
@@ -290,6 +292,24 @@ def test_glitches_and_gaps_are_not_scored() -> None:
         model.handle(Sample(2000 + k, (2000 + k) * DT, float(u[k]), float(y[k] + spike)))
     assert model.standing()["contestants"]["one"]["rms_V"] < 0.01
     assert model.champion == "one"
+
+
+def test_one_that_knows_its_own_memory_is_judged_by_it() -> None:
+    """Over samples without a reading where the stage has been is a guess; the learner has a better one."""
+    learner = Learner(replace(lssvm(), span_V=SPAN_V))
+    model = Competition({"learner": learner, "line": Fixed(GAIN)}, RANGE_UM, SPAN_V)
+    u = motion(3000)[0]
+    # The strokes become small while nothing is read: what they turned at last stays in the memory for long.
+    u[1500:] = 3.5 + (u[1500:] - 3.5) * np.exp(-np.arange(1500) * DT / 0.15)
+    y = GAIN * u
+    y[1500:1900] = math.nan
+    compared = 0
+    for k in range(3000):
+        model.handle(Sample(k, k * DT, float(u[k]), float(y[k])))
+        if k % model.config.block == 0 and k > 2000 and not learner.parts.front.holds:
+            compared += 1
+            np.testing.assert_array_equal(model._judging.scores[0].memory, learner.memory())
+    assert compared > 20
 
 
 def test_state_of_other_contestants_is_refused() -> None:

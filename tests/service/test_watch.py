@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from adaptive.learner import Learner
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from service.axis import Axis
@@ -98,6 +99,41 @@ def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie:
     bench.run(500)
     assert bench.axis.gates["learnt"] > learnt
     assert bench.u_V == pytest.approx(before, abs=0.05)
+
+
+@pytest.mark.parametrize("lie", [frozen, poisoned, lambda k, y: np.minimum(y, 50.0), lambda k, y: y * math.nan])
+def test_going_back_forgets_what_was_learnt_and_not_where_the_stage_has_been(lie: Any) -> None:
+    """Else the learner would go on with turning points of seconds ago, and every caller with other ones."""
+    bench, twin = Bench(make_axis()), Bench(make_axis())
+    for each in (bench, twin):
+        each.run(3100)
+    bench.run(900, lie)
+    bench.run(1501)  # up to a snapshot
+    twin.run(2401)
+    assert "learner_went_back" in bench.events
+    learner, other = bench.axis.learner, twin.axis.learner
+    assert isinstance(learner, Learner)
+    assert isinstance(other, Learner)
+    assert learner.counters()["restarts"] == other.counters()["restarts"]
+    assert np.max(np.abs(learner.memory() - other.memory())) < 0.5
+    served = bench.axis.newest
+    np.testing.assert_array_equal(served.memories[NAME], learner.memory_for(served.models[NAME]))
+
+
+def test_the_learners_model_is_served_with_the_memory_that_it_was_learnt_with() -> None:
+    """Readings that were not believed are not in it, whether the model is asked alone or as a contestant."""
+    bench = Bench(make_axis(compete=("linear",), served="auto", snapshot_every=20))
+    bench.run(3000)
+    bench.run(41, lambda k, y: y + np.where(k % 10 == 3, 25.0, 0.0))
+    served, learner = bench.axis.newest, bench.axis.learner
+    own = learner.memory_for(served.models[NAME])
+    np.testing.assert_array_equal(served.memories[NAME], own)
+    champion = served.models["auto"]
+    assert own.tobytes() in served.memories["auto"].tobytes()
+    assert served.memories["auto"].size == champion.memory_size
+    # A play is never further from the stage than its threshold.
+    place = 45.0 + 30.0 * math.sin(2 * math.pi * 3.0 * served.seq * DT_S)
+    assert abs(own[0] - place) < 2.0
 
 
 def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
