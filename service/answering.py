@@ -6,13 +6,16 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from operator import attrgetter
 
+import numpy as np
+
+from adaptive.finite import all_finite
 from adaptive.types import FloatArray, InverseModel
 from service.config import AxisConfig
 from service.errors import FieldError
 from service.fallback import Rules, StandIn, answer_safely
 from service.guard import Limits, check_domain
 from service.keys import AUTO
-from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply
+from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply, Pending
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +79,9 @@ def answer(
     if model is None:
         raise FieldError("model", repr(name), f"one of {', '.join(served.models)}, or empty for the default")
     check_domain(query.y_um, limits)
-    memory = served.memories[name] if query.memory is None else query.memory
+    memory = query.memory
+    if memory is None:
+        memory = carried(model, served.memories[name], query.pending, served.seq)
     if memory.size != model.memory_size:
         raise FieldError(
             "memory",
@@ -98,6 +103,19 @@ def answer(
         got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
         got.stand_in,
     )  # fmt: skip
+
+
+def carried(model: InverseModel, memory: FloatArray, pending: Pending | None, seq: int) -> FloatArray:
+    """(m,) memory of ``model`` once what is under way after sample ``seq`` has been done; ``memory`` is not changed."""
+    if pending is None:
+        return memory
+    seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size)
+    y_um, u_V = pending.y_um[seen:], pending.u_V[seen:]
+    if not y_um.size:
+        return memory
+    still = np.zeros(y_um.size)
+    after = model.track(y_um, still, still, u_V, memory)
+    return after if all_finite(after) else memory
 
 
 def learns(name: str, config: AxisConfig) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
-from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued
+from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued, extended
 from service.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.follower import Follower
 from service.guard import Limits, guard
@@ -152,12 +152,15 @@ class Client:
         as_of: int = NEWEST,
         u_before_V: float = math.nan,
         after: Point | Trajectory | None = None,
+        begin: int | None = None,
         wait_s: float = 0.0,
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
-        query = continued(memory, model, u_before_V, after)
+        query = continued(memory, model, u_before_V, after, begin)
         reply = self._ask(lambda: encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
-        return as_point(reply)
+        if begin is None:
+            return as_point(reply)
+        return as_point(reply, extended(query["pending"], begin, np.array([y_um]), reply.u_V))
 
     def trajectory(
         self,
@@ -170,6 +173,7 @@ class Client:
         as_of: int = NEWEST,
         u_before_V: float = math.nan,
         after: Point | Trajectory | None = None,
+        begin: int | None = None,
         wait_s: float = 0.0,
     ) -> Trajectory:
         """Voltages for n desired points, ``dt_s`` apart.
@@ -183,6 +187,10 @@ class Client:
         Other arguments
         ---------------
         after : the answer before this one; brings back its memory and its last voltage.
+        begin : the stage's number of the sample at which the first point is due, for whoever commands the answers. The
+            hysteresis memory is then what the service tracks from the samples, carried along what ``after`` left under
+            way: where the stage has not gone where it was sent, the next answer knows. An answer may begin before the
+            end of the one before, which it then replaces from there on.
         memory, u_before_V : the same by hand. Without any, the service begins with what it tracks from the samples.
         model : name of the model to ask, "" for the service's default.
         as_of : answer from the newest snapshot that has seen no sample after this number.
@@ -190,9 +198,9 @@ class Client:
         """
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
-        query = continued(memory, model, u_before_V, after)
+        query = continued(memory, model, u_before_V, after, begin)
         reply = self._ask(lambda: encode_query(y, v, a, as_of=as_of, **query), wait_s)
-        return as_trajectory(reply)
+        return as_trajectory(reply, None if begin is None else extended(query["pending"], begin, y, reply.u_V))
 
     def follow(self, model: str = "", memory: ArrayLike | None = None) -> Follower:
         """Follow the model into this process; see :class:`service.follower.Follower`. Closed with this client.

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptive.types import FloatArray
-from service.wire_query import FeedforwardReply
+from service.errors import FieldError
+from service.wire_query import FeedforwardReply, Pending
+
+#: Samples under way that are kept: those after the newest snapshot matter, which is some tens of samples old.
+UNDER_WAY: Final = 512
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +28,7 @@ class Trajectory:
     memory : (m,) hysteresis memory after the last point. model : that answered. snapshot_seq : the last sample it
     had seen. fallback : whether something went wrong and a stand-in answered for it. tracked_memory : whether the
     memory was the service's own. stand_in : name of the model that answered, in part or whole, where the flags say so.
+    pending : what is under way once it has been commanded, where ``begin`` was given.
     """
 
     u_V: FloatArray
@@ -35,6 +40,7 @@ class Trajectory:
     fallback: bool
     tracked_memory: bool
     stand_in: str = ""
+    pending: Pending | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,28 +56,63 @@ class Point:
     fallback: bool
     tracked_memory: bool
     stand_in: str = ""
+    pending: Pending | None = None
 
 
-def as_trajectory(reply: FeedforwardReply) -> Trajectory:
+def as_trajectory(reply: FeedforwardReply, pending: Pending | None = None) -> Trajectory:
     """All points of a reply."""
     return Trajectory(
         reply.u_V, reply.std_V, reply.flags, reply.memory, reply.model, reply.snapshot_seq, reply.fallback,
-        reply.tracked_memory, reply.stand_in,
+        reply.tracked_memory, reply.stand_in, pending,
     )  # fmt: skip
 
 
-def as_point(reply: FeedforwardReply) -> Point:
+def as_point(reply: FeedforwardReply, pending: Pending | None = None) -> Point:
     """The one point of a reply."""
     return Point(
         float(reply.u_V[0]), float(reply.std_V[0]), int(reply.flags[0]), reply.memory, reply.model, reply.snapshot_seq,
-        reply.fallback, reply.tracked_memory, reply.stand_in,
+        reply.fallback, reply.tracked_memory, reply.stand_in, pending,
     )  # fmt: skip
 
 
+def under_way(after: Point | Trajectory | None, begin: int) -> Pending | None:
+    """What is under way before sample ``begin``: what ``after`` left, replaced from ``begin`` on; None for nothing.
+
+    Over samples for which nothing was commanded the stage has held its last voltage.
+    """
+    if after is None or after.pending is None or begin <= after.pending.first:
+        return None
+    first, y_um, u_V = after.pending
+    wanted = begin - first
+    if wanted >= y_um.size + UNDER_WAY:
+        return None
+    held = max(wanted - y_um.size, 0)
+    y_um, u_V = np.pad(y_um, (0, held), "edge")[:wanted], np.pad(u_V, (0, held), "edge")[:wanted]
+    return Pending(begin - min(wanted, UNDER_WAY), y_um[-UNDER_WAY:], u_V[-UNDER_WAY:])
+
+
+def extended(before: Pending | None, begin: int, y_um: FloatArray, u_V: FloatArray) -> Pending:
+    """``before`` and the (n,) samples from ``begin`` on."""
+    if before is None:
+        return Pending(begin, y_um, u_V)
+    return Pending(before.first, np.concatenate([before.y_um, y_um]), np.concatenate([before.u_V, u_V]))
+
+
 def continued(
-    memory: ArrayLike | None, model: str, u_before_V: float, after: Point | Trajectory | None
+    memory: ArrayLike | None, model: str, u_before_V: float, after: Point | Trajectory | None, begin: int | None = None
 ) -> dict[str, Any]:
-    """Memory, model and voltage before of a query that goes on from the answer ``after`` where they are not given."""
+    """Memory, model and voltage before of a query that goes on from the answer ``after`` where they are not given.
+
+    With ``begin``, the number of its first sample, what is under way takes the place of the memory.
+    """
+    if begin is not None:
+        if memory is not None:
+            raise FieldError("memory", "one beside begin", "one of the two: with begin the service tracks the memory")
+        under = under_way(after, begin)
+        asked = continued(np.empty(0), model, u_before_V, after)
+        # The voltage before the first point is that of the sample before it, also where the last answer is replaced.
+        before_V = float(under.u_V[-1]) if under is not None and math.isnan(u_before_V) else asked["u_before_V"]
+        return asked | {"memory": None, "pending": under, "u_before_V": before_V}
     if after is not None:
         memory = after.memory if memory is None else memory
         model = model or after.model

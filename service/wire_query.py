@@ -19,13 +19,15 @@ from service.wire import (
     check_finite,
     check_header,
     check_length,
+    check_seq,
     column,
     doubles,
 )
 
-#: The query carries accelerations (options bit 0) and a memory vector (options bit 1).
+#: The query carries accelerations (options bit 0), a memory vector (bit 1), or what is under way (bit 2).
 HAS_ACCELERATION: Final = 1
 HAS_MEMORY: Final = 2
+HAS_PENDING: Final = 4
 #: Reply options: the learner has not yet handled all that ``as_of`` needs, so this answer may differ from a repeated
 #: one; the query brought no memory, so the service's own was used; another model than the one asked for answered in
 #: part or whole because something went wrong; the name of the model that stood in follows that of the one asked.
@@ -53,6 +55,8 @@ FLAG_NAMES: Final = {
 }
 
 MAX_MEMORY: Final = 4096
+#: Samples that may be under way.
+MAX_PENDING: Final = 4096
 MAX_NAME_BYTES: Final = 64
 #: ``as_of`` of a query that takes the newest snapshot.
 NEWEST: Final = -1
@@ -61,10 +65,25 @@ _LEAST_SEQ: Final = -1
 
 # version, kind, options, n, as_of, u_before_V, m, bytes of the name
 _QUERY: Final = struct.Struct("<BBHIqdII")
+# first sample and number of those that are under way
+_PENDING: Final = struct.Struct("<qI")
 # y, v, a of a query for one point
 _ONE_POINT: Final = struct.Struct("<3d")
 # version, kind, options, n, snapshot_seq, m, bytes of the name
 _REPLY: Final = struct.Struct("<BBHIqII")
+
+
+class Pending(NamedTuple):
+    """What is under way: commanded, and not yet seen in the samples.
+
+    Attributes
+    ----------
+    first : the stage's number of the first sample. y_um, u_V : (k,) the motion wanted, µm, and the voltages for it, V.
+    """
+
+    first: int
+    y_um: FloatArray
+    u_V: FloatArray
 
 
 class FeedforwardQuery(NamedTuple):
@@ -73,7 +92,8 @@ class FeedforwardQuery(NamedTuple):
     Attributes
     ----------
     y_um, v_um_per_s, a_um_per_s2 : (n,) each, finite; the motion at the instants of the points.
-    memory : (m,) from the reply before, or None: start from what the service tracks from the samples.
+    memory : (m,) from the reply before, or None: start from what the service tracks from the samples ...
+    pending : ... and from there along this to the first point; None for nothing. Not together with ``memory``.
     model : name of the model to ask; empty for the service's default.
     as_of : answer from the newest snapshot that had seen no sample after this number; NEWEST for the newest.
     u_before_V : voltage just before the first point, V, from where the slew limit counts; NaN where there is none.
@@ -86,6 +106,7 @@ class FeedforwardQuery(NamedTuple):
     model: str = ""
     as_of: int = NEWEST
     u_before_V: float = float("nan")
+    pending: Pending | None = None
 
 
 class FeedforwardReply(NamedTuple):
@@ -129,6 +150,7 @@ def encode_query(
     model: str = "",
     as_of: int = NEWEST,
     u_before_V: float = float("nan"),
+    pending: Pending | None = None,
 ) -> bytes:
     """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError naming what does not fit."""
     options, m, n = 0, 0, 1
@@ -151,13 +173,19 @@ def encode_query(
     name = model.encode()
     if len(name) > MAX_NAME_BYTES:
         raise FieldError("model", f"{len(name)} bytes", f"a name of at most {MAX_NAME_BYTES} bytes")
+    under_way = b""
+    if pending is not None:
+        options |= HAS_PENDING
+        y, u = column("pending.y_um", pending.y_um), _same_length("pending.u_V", pending.u_V, len(pending.y_um))
+        first = _PENDING.pack(check_seq("pending.first", pending.first), y.size)
+        under_way = b"".join((first, y.astype("<f8", copy=False).tobytes(), u.astype("<f8", copy=False).tobytes()))
     head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, u_before_V, m, len(name))
-    return b"".join((head, *parts, name))
+    return b"".join((head, *parts, name, under_way))
 
 
 def decode_query(data: bytes) -> FeedforwardQuery:
     """The query in a payload. Raises InputError where it is malformed, not finite, or out of bounds."""
-    options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY)
+    options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY | HAS_PENDING)
     *_, as_of, u_before_V, m, name_bytes = _QUERY.unpack_from(data)
     _check_sizes(m, name_bytes)
     if m and not options & HAS_MEMORY:
@@ -168,7 +196,9 @@ def decode_query(data: bytes) -> FeedforwardQuery:
         raise FieldError("u_before_V", u_before_V, "a finite voltage in V, or NaN for none")
     columns = 3 if options & HAS_ACCELERATION else 2
     end = _QUERY.size + 8 * (m + columns * n)
-    check_length(data, end + name_bytes)
+    pending = _pending(data, end + name_bytes, options) if options & HAS_PENDING else None
+    if pending is None:
+        check_length(data, end + name_bytes)
     values = doubles(data, _QUERY.size, m + columns * n)
     memory, y, v = values[:m], values[m : m + n], values[m + n : m + 2 * n]
     a = values[m + 2 * n :] if columns == 3 else np.zeros(n)
@@ -176,8 +206,9 @@ def decode_query(data: bytes) -> FeedforwardQuery:
         for name, part in (("memory", memory), ("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
             check_finite(name, part)
     return FeedforwardQuery(
-        y, v, a, memory if options & HAS_MEMORY else None, _name(data[end:]) if name_bytes else "", as_of, u_before_V
-    )
+        y, v, a, memory if options & HAS_MEMORY else None,
+        _name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
+    )  # fmt: skip
 
 
 def encode_reply(reply: FeedforwardReply) -> bytes:
@@ -229,6 +260,23 @@ def decode_reply(data: bytes) -> FeedforwardReply:
         bool(options & FALLBACK),
         stand_in,
     )
+
+
+def _pending(data: bytes, begin: int, options: int) -> Pending:
+    """What is under way, from ``begin`` to the end of a query. Raises InputError where it is malformed."""
+    if options & HAS_MEMORY:
+        raise FieldError("pending", "a memory beside it", "one of the two: a memory is of the instant before y_um[0]")
+    if len(data) < begin + _PENDING.size:
+        raise FieldError("payload", f"{len(data)} bytes", f"at least {begin + _PENDING.size}, for what is under way")
+    first, k = _PENDING.unpack_from(data, begin)
+    if not 1 <= k <= MAX_PENDING:
+        raise FieldError("pending", f"{k} samples", f"1 to {MAX_PENDING}")
+    check_length(data, begin + _PENDING.size + 16 * k)
+    values = doubles(data, begin + _PENDING.size, 2 * k)
+    pending = Pending(check_seq("pending.first", first), values[:k], values[k:])
+    check_finite("pending.y_um", pending.y_um)
+    check_finite("pending.u_V", pending.u_V)
+    return pending
 
 
 def _same_length(field: str, values: ArrayLike, n: int) -> FloatArray:

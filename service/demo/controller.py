@@ -92,7 +92,9 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                 for name in MODELS:
                     begin = time.perf_counter()
                     motion = (wanted[0][part], wanted[1][part], wanted[2][part])
-                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(block))
+                    # The service tracks the teacher's stage; the memory of the others travels.
+                    due = part.start if name == TEACHER else None
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(block), due)
                     late += waited
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
@@ -118,7 +120,12 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
 
 
 def ask(
-    client: Client, motion: tuple[FloatArray, FloatArray, FloatArray], model: str, after: Trajectory | None, as_of: int
+    client: Client,
+    motion: tuple[FloatArray, FloatArray, FloatArray],
+    model: str,
+    after: Trajectory | None,
+    as_of: int,
+    begin: int | None = None,
 ) -> tuple[Trajectory, bool]:
     """The voltages for a block, and whether they had to be asked for more than once.
 
@@ -129,7 +136,8 @@ def ask(
     wanted, waited = as_of, False
     while True:
         try:
-            return client.trajectory(*motion, model=model, after=after, as_of=wanted, wait_s=BEHIND_S), waited
+            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=BEHIND_S)
+            return answer, waited
         except (BehindError, ReplyTimeoutError, RefusedError) as error:
             too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST
             if time.monotonic() >= until or (isinstance(error, RefusedError) and not too_old):

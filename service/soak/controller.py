@@ -1,7 +1,7 @@
 """The controller of a soak as a process: it asks ahead, sends what it gets, and never gives up.
 
 ``python -m service.soak.controller CONTROL.json ENDPOINT``. Where no answer comes before a block is due the stage holds
-its last voltage, and the controller goes on with the next block, from the memory that the service has tracked.
+its last voltage, and the controller goes on with the next block.
 """
 
 from __future__ import annotations
@@ -144,12 +144,12 @@ class Controller:
             self._client.reference(begin, motion[0])
         while clock.first == first and clock.before(begin):
             try:
-                answer = self._client.trajectory(motion[0], motion[1], motion[2], after=after, u_before_V=self._last_V)
+                answer = self._client.trajectory(
+                    motion[0], motion[1], motion[2], after=after, begin=begin, u_before_V=self._last_V
+                )
             except (ServiceError, InputError) as error:
                 self.counts["errors" if isinstance(error, InputError) else "retries"] += 1
                 self._error = str(error)
-                # A memory that no longer fits, or a service that is not there: ask anew, without one.
-                after = None
                 time.sleep(0.002)
                 continue
             if not clock.before(begin):

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.axis import Axis
+from service.client_answers import Trajectory, as_trajectory, extended, under_way
 from service.config import AxisConfig
 from service.guard import Limits
 from service.models import load_axis
@@ -90,7 +90,7 @@ class _Turns:
         self._reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
         self._commands: dict[int, FloatArray] = {}
         self._asked = 0
-        self._memory: FloatArray | None = None
+        self._answer: Trajectory | None = None
         self._last_V = math.nan
         self._told = 0
 
@@ -148,13 +148,12 @@ class _Turns:
     def _ask(self) -> None:
         size = self._control.block
         motion = self._reference.rows(self._asked, size)
-        query = FeedforwardQuery(motion[0], motion[1], motion[2], self._memory, u_before_V=self._last_V)
-        try:
-            reply = self.axis.answer(query)
-        except InputError:
-            # A memory that no longer fits: asked anew without one, as a client would.
-            reply = self.axis.answer(FeedforwardQuery(motion[0], motion[1], motion[2], u_before_V=self._last_V))
-        self._memory, self._last_V = reply.memory, float(reply.u_V[-1])
+        pending = under_way(self._answer, self._asked)
+        reply = self.axis.answer(
+            FeedforwardQuery(motion[0], motion[1], motion[2], u_before_V=self._last_V, pending=pending)
+        )
+        self._answer = as_trajectory(reply, extended(pending, self._asked, motion[0], reply.u_V))
+        self._last_V = float(reply.u_V[-1])
         self._commands[self._asked] = reply.u_V
         self.track.want(self._asked, motion[0])
         self.track.command(self._asked, reply.u_V)

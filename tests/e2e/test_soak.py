@@ -53,6 +53,26 @@ def test_a_killed_primary_and_poisoned_samples_in_real_processes(tmp_path: Path)
 
 
 @pytest.mark.e2e
+def test_after_every_lie_of_the_sensor_the_error_is_soon_what_it_was(tmp_path: Path) -> None:
+    """One after the other, in one process and so the same on any machine: nothing of a lie may stay.
+
+    This plan once ended with an error of 7 % for good: a sensor at its end was taken for a jump by half the range.
+    """
+    lies = "nan,stage_clock,freeze,saturate,gap"
+    done = subprocess.run(
+        command(tmp_path, "--duration", "64s", "--fast", "--faults", lies),
+        capture_output=True, text=True, timeout=170, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    found = read(tmp_path)
+    assert sum(fault["count"] for fault in found["faults"].values()) >= 6
+    assert found["invariants"]["tracking"]["worst"] < 0.05
+    events = [event["event"] for event in json.loads((tmp_path / "plan.json").read_text())["events"]]
+    assert "learner_failed" not in events
+    assert events.count("learner_went_back") == events.count("recovered") > 2
+
+
+@pytest.mark.e2e
 def test_ctrl_c_leaves_a_report_of_what_ran(tmp_path: Path) -> None:
     process = subprocess.Popen(
         command(tmp_path, "--duration", "2h", "--fast", "--faults", "gap"),
