@@ -125,6 +125,7 @@ def seeds(target: str) -> list[bytes]:
         wire_query.encode_query(40.0, 0.0),
         wire_query.encode_query(y, v, a, [1.0, 2.0], "lssvm_adaptive", 7, 1.5),
         wire_query.encode_query(y, v, a, models()["lssvm_adaptive"].rest_memory(3.0)),
+        wire_query.encode_query(y, v, a, pending=wire_query.Pending(3, y, 0.1 * y)),
     ]
     sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in models().items()]
     framed = []

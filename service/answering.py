@@ -13,7 +13,7 @@ from adaptive.types import FloatArray, InverseModel
 from service.config import AxisConfig
 from service.errors import FieldError
 from service.fallback import Rules, StandIn, answer_safely
-from service.guard import Limits, check_domain
+from service.guard import Limits, check_domain, check_voltages
 from service.keys import AUTO
 from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply, Pending
 
@@ -79,6 +79,9 @@ def answer(
     if model is None:
         raise FieldError("model", repr(name), f"one of {', '.join(served.models)}, or empty for the default")
     check_domain(query.y_um, limits)
+    if query.pending is not None:
+        check_domain(query.pending.y_um, limits, "pending.y_um")
+        check_voltages(query.pending.u_V, limits, "pending.u_V")
     memory = query.memory
     if memory is None:
         memory = carried(model, served.memories[name], query.pending, served.seq)

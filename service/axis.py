@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answering import Served, answer, blends, learns
@@ -36,6 +36,14 @@ __all__ = ["Axis", "Served"]
 #: bounds it far from its data, then the one that is always there.
 STAND_INS: Final = ("mpi", "linear", "bouc_wen")
 _MAX_EVENTS: Final = 256
+
+
+class Tally(NamedTuple):
+    """Counts that belong together: of the last sample handled, of what came, and of what was made of it."""
+
+    seq: int
+    samples: dict[str, int]
+    gates: dict[str, int]
 
 
 class Axis(AxisLearning):
@@ -89,6 +97,8 @@ class Axis(AxisLearning):
         self._marked = 0
         #: The last sequence number whose snapshot, if it has one, is in the ring.
         self.handled_seq = -1
+        #: What has been counted up to the last message; replaced whole, for whoever tells of it meanwhile.
+        self.tally = Tally(-1, self.sequence.counters(), {})
         #: Time since the last sample, s, where samples are expected; set by whoever has a clock.
         self.age_s = 0.0
         #: Called once, right after the next snapshot, by the thread that handles samples; then None again.
@@ -151,7 +161,12 @@ class Axis(AxisLearning):
             if self.at_snapshot is not None and self.newest.seq == seq:
                 call, self.at_snapshot = self.at_snapshot, None
                 call()
+        self.count()
         return verdicts
+
+    def count(self) -> None:
+        """Bring the tally up to date; in the thread that handles samples."""
+        self.tally = Tally(self.handled_seq, self.sequence.counters(), self.gates)
 
     def answer(self, query: FeedforwardQuery) -> FeedforwardReply:
         """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for."""

@@ -97,6 +97,7 @@ def restore_axis(axis: Axis, state: StateDict) -> None:
     axis._marks, axis._marked = (under("mark.", state), {}), axis.sequence.received
     axis._ring = (served,)
     axis.handled_seq = seq
+    axis.count()
     axis.set_teaching()
 
 

@@ -61,7 +61,7 @@ class Limits:
             raise FieldError("limits", repr(data)[:200], "the five limits of an axis") from error
 
 
-def check_domain(y_um: FloatArray, limits: Limits) -> None:
+def check_domain(y_um: FloatArray, limits: Limits, field: str = "y_um") -> None:
     """InputError naming the first desired point, (n,) µm, that is not within the displacement limits."""
     if y_um.size == 1 and limits.y_min_um <= y_um.item(0) <= limits.y_max_um:
         return
@@ -70,11 +70,23 @@ def check_domain(y_um: FloatArray, limits: Limits) -> None:
         return
     bad = int(np.flatnonzero(~((y_um >= limits.y_min_um) & (y_um <= limits.y_max_um)))[0])
     raise FieldError(
-        f"y_um[{bad}]",
+        f"{field}[{bad}]",
         f"{y_um[bad]:g} µm",
         f"{limits.y_min_um:g} to {limits.y_max_um:g} µm",
         "keep the trajectory within the range of the stage",
     )
+
+
+def check_voltages(u_V: FloatArray, limits: Limits, field: str) -> None:
+    """InputError naming the first voltage, (n,) V, that the axis could not have answered."""
+    bad = np.flatnonzero(~((u_V >= limits.u_min_V) & (u_V <= limits.u_max_V)))
+    if bad.size:
+        raise FieldError(
+            f"{field}[{bad[0]}]",
+            f"{u_V[bad[0]]:g} V",
+            f"{limits.u_min_V:g} to {limits.u_max_V:g} V",
+            "send the voltages as they were answered",
+        )
 
 
 @compiled

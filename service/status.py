@@ -24,7 +24,7 @@ def axis_status(
     keys: Keys, instance: str, axis: Axis, intake: Intake, latency: LatencyMeter, sample_age_s: float | None
 ) -> dict[str, Any]:
     """All that a client, an operator or a viewer wants to know of an axis; JSON values only."""
-    served = axis.newest
+    served, tally = axis.newest, axis.tally
     return {
         "schema": SCHEMA,
         "wire": VERSION,
@@ -38,18 +38,18 @@ def axis_status(
             name: {"kind": kind_of(model), "memory_size": model.memory_size} for name, model in served.models.items()
         },
         "limits": axis.limits.to_json(),
-        "seq": axis.handled_seq,
+        "seq": tally.seq,
         "snapshot_seq": served.seq,
         "snapshot_every": axis.config.snapshot_every,
         "snapshots_kept": axis.config.snapshots_kept,
         "sample_age_s": sample_age_s,
         "samples": {
-            **axis.sequence.counters(),
+            **tally.samples,
             "dropped": intake.dropped,
             "malformed": intake.malformed,
             "waiting": intake.waiting,
-            "learnt": axis.gates.get("learnt", 0),
-            "gates": axis.gates,
+            "learnt": tally.gates.get("learnt", 0),
+            "gates": tally.gates,
         },
         "learner": intake.counters,
         "quality": {name: intake.diagnostics[name] for name in _QUALITY if name in intake.diagnostics},

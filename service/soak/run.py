@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ OURS = ("soak.json", "report.md", "plan.json", "error.png", "latency.png", "memo
         "a", "b", "logs")  # fmt: skip
 #: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
 OWN_STAGE_RATIO = 2.0
+#: Numbers that go on by more than this are those of another life of the stage.
+_RESTARTED = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,18 +121,10 @@ def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[in
     # One that stands by records too, in a folder of its own.
     folders = [out / name / folder for name in ("a", "b") for folder in ("recording", "recording-standby")]
     found, rows = recorded(folders)
-    # While no file may grow nothing can be kept, and behind a router that is gone nothing arrives: the services
-    # count both, and what the monitor saw then proves nothing.
-    excused = Intervals()
-    for fault in ledger.faults:
-        begin, end = fault.window_s
-        for second in ledger.seconds if fault.kind in ("disk_full", "restart_router") else ():
-            if begin - 1.0 <= second.t_s <= end and second.samples:
-                excused.add(second.seq - second.samples + 1, second.seq + 1)
     nowhere = Intervals()
     for start, stop in seen.minus(found):
         nowhere.add(start, stop)
-    missing = sum(stop - start for start, stop in nowhere.minus(excused))
+    missing = sum(stop - start for start, stop in nowhere.minus(_excused(ledger)))
     return missing, {
         "seen": len(seen),
         "received_by_monitor": received,
@@ -138,6 +133,25 @@ def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[in
         "in_no_recording": len(nowhere),
         "in_no_recording_and_no_fault_on": missing,
     }
+
+
+def _excused(ledger: Ledger) -> Intervals:
+    """Samples of which the services could not keep what the monitor saw.
+
+    While no file may grow nothing can be kept, and behind a router that is gone nothing arrives: the services count
+    both, and what the monitor saw then proves nothing.
+    """
+    excused = Intervals()
+    for fault in ledger.faults:
+        begin, end = fault.window_s
+        if fault.kind not in ("disk_full", "restart_router"):
+            continue
+        for last, second in itertools.pairwise(ledger.seconds):
+            if begin - 1.0 <= second.t_s <= end and second.samples:
+                # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
+                follows = 0 < second.seq - last.seq < _RESTARTED
+                excused.add(last.seq + 1 if follows else second.seq - second.samples + 1, second.seq + 1)
+    return excused
 
 
 def _withheld(stage: dict[str, Any]) -> int:

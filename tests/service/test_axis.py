@@ -168,6 +168,19 @@ def test_a_stage_that_counts_anew_goes_on_being_learnt(models: dict[str, Inverse
     assert abs(u[0] - u[1]) < 0.2  # nothing of what was learnt is lost
 
 
+def test_what_is_told_while_samples_are_handled_belongs_together(models: dict[str, InverseModel]) -> None:
+    """A status that was made half way through a restart had the new count of restarts with the old number."""
+    axis = make_axis(models)
+    axis.handle(recording(5000))
+    before = axis.tally
+    assert (before.seq, before.samples, sum(before.gates.values())) == (4999, axis.sequence.counters(), 5000)
+    told = []
+    axis.at_snapshot = lambda: told.append((axis.tally, axis.sequence.restarts))
+    axis.handle(recording(400))
+    assert told == [(before, 1)]
+    assert (axis.tally.seq, axis.tally.samples["restarts"], sum(axis.tally.gates.values())) == (399, 1, 5400)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_bad_samples_change_no_model(bad: float, models: dict[str, InverseModel]) -> None:
     axis = make_axis(models)

@@ -103,6 +103,18 @@ def test_the_memory_is_that_of_the_samples_carried_along_what_is_under_way(
         np.testing.assert_array_equal(plain.u_V, axis.answer(FeedforwardQuery(y, v, a, memory, name)).u_V)
 
 
+@pytest.mark.parametrize(
+    ("y", "u", "field"), [([40.0, 99.0], [4.0, 4.0], "pending.y_um[1]"), ([40.0], [-1.0], "pending.u_V[0]")]
+)
+def test_what_no_answer_can_have_been_is_refused(
+    models: dict[str, InverseModel], y: list[float], u: list[float], field: str
+) -> None:
+    axis = make_axis(models)
+    with pytest.raises(FieldError) as refused:
+        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(0, np.array(y), np.array(u))))
+    assert refused.value.field == field
+
+
 def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None) -> Trajectory:
     reply = FeedforwardReply(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, 0, "m", tracked_memory=True)
     return as_trajectory(reply, extended(under_way(before, begin), begin, y, reply.u_V))

@@ -24,6 +24,7 @@ from service.soak.monitor import Track
 from service.soak.plan import TAIL_S, WARM_S, known_kinds, make_plan
 from service.soak.processor import Others
 from service.soak.reference import PERIOD_S, SoakReference
+from service.soak.run import _excused
 from service.soak.settling import settle
 from service.soak.setup import Control
 from service.stage_faults import Fault, Injector, decode_fault
@@ -371,6 +372,22 @@ def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> Non
 
 def test_a_lost_record_breaks_the_run() -> None:
     assert broken(verdict(healthy(), missing=1)) == {"no_record_lost"}
+
+
+def test_what_was_seen_just_before_the_router_went_proves_nothing() -> None:
+    """The second in which 640 samples never came has fewer samples than numbers; all its numbers are excused."""
+    ledger = healthy()
+    first = 0
+    for k, second in enumerate(ledger.seconds):
+        first += 1640 if k == 10 else 1000
+        second.seq = first - 1
+    ledger.faults = [Happened("restart_router", 10.4, 10.5)]
+    ((start, stop),) = _excused(ledger).spans
+    # From the second before the fault to the end of the time in which all must be well again.
+    assert start == 10_000
+    assert stop == 10_000 + 1640 + 1000 * (math.floor(10.5 + KINDS["restart_router"].recover_s) - 10)
+    ledger.faults = [Happened("gap", 10.4, 10.5)]
+    assert len(_excused(ledger)) == 0
 
 
 def test_status_is_flattened() -> None:

@@ -190,5 +190,6 @@ HONEST = [
     wire.encode_samples([1, 2], [0.0, 1e-3], [1.0, 2.0], [3.0, 4.0]),
     wire.encode_command(3, [1.0, 2.0]),
     encode_query([1.0, 2.0], [0.0, 0.0], [0.0, 0.0], [0.5], "mpi"),
+    encode_query([1.0], [0.0], model="mpi", pending=wire_query.Pending(3, np.ones(2), np.ones(2))),
     encode_reply(FeedforwardReply(np.ones(2), np.ones(2), np.zeros(2, np.uint8), np.ones(1), 5, "mpi")),
 ]
