@@ -19,6 +19,10 @@ T = TypeVar("T")
 #: quarter of an hour. What has lived shorter than the last of them after it is not judged.
 MEMORY_WARM_S: Final = (180.0, 900.0)
 MEMORY_LEAST_S: Final = 300.0
+#: A process under faults has a few levels of memory in use: as the one that serves, as the one that stands by, with a
+#: state just handed over. Seen over half an hour of two processes that did not grow: 162 to 177 MB. A line from one of
+#: them to another is no growth.
+LEVELS_KB: Final = 15_000.0
 _MINUTE_S: Final = 60.0
 #: Of a small object of Python's on average: its allocator's pools over their blocks, as measured in a service.
 _BLOCK_BYTES: Final = 100.0
@@ -26,7 +30,7 @@ _BLOCK_BYTES: Final = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """A slope and twice its standard error, both kB per hour."""
+    """A slope and by how much it may be wrong, both kB per hour."""
 
     slope: float
     doubt: float
@@ -40,10 +44,10 @@ def memory_slope(ledger: Ledger) -> Trend | None:
     take samples from the window, change the model or the role. A slope of 1 MB an hour shows in half an hour without
     faults, and in hours with them; the doubt says so.
     """
-    used = _in_use(ledger)
+    used, levels_kb = _in_use(ledger), LEVELS_KB if ledger.faults else 0.0
     if used:
-        return _longest(used, lambda t, kb: _trend(*_minutes(t, kb, np.median)))
-    return _longest(_resident(ledger), lambda t, kb: _trend(*_minutes(t, kb, np.min)))
+        return _longest(used, lambda t, kb: _trend(*_minutes(t, kb, np.median), levels_kb))
+    return _longest(_resident(ledger), lambda t, kb: _trend(*_minutes(t, kb, np.min), levels_kb))
 
 
 def resident_growth(ledger: Ledger) -> float | None:
@@ -105,8 +109,11 @@ def _minutes(t_s: FloatArray, kb: FloatArray, of: Callable[[FloatArray], Any]) -
     return t_s[0] + _MINUTE_S * (there + 0.5), np.array([float(of(kb[minute == m])) for m in there])
 
 
-def _trend(t_s: FloatArray, kb: FloatArray) -> Trend:
-    """Median of the slopes between the two halves (Theil and Sen's, each point with the one half a run later)."""
+def _trend(t_s: FloatArray, kb: FloatArray, levels_kb: float) -> Trend:
+    """Median of the slopes between the two halves (Theil and Sen's, each point with the one half a run later).
+
+    ``levels_kb`` : by how much what is in use may differ from one minute to another without growing.
+    """
     half = len(t_s) // 2
     slope = float(np.median((kb[half : 2 * half] - kb[:half]) / (t_s[half : 2 * half] - t_s[:half])))
     left = kb - slope * t_s
@@ -117,7 +124,7 @@ def _trend(t_s: FloatArray, kb: FloatArray) -> Trend:
     error = math.sqrt(
         square * (1.0 + alike) / (1.0 - alike) / max(len(kb) - 2, 1) / float(np.sum((t_s - t_s.mean()) ** 2))
     )
-    return Trend(3600.0 * slope, 2.0 * 3600.0 * error)
+    return Trend(3600.0 * slope, 3600.0 * max(2.0 * error, levels_kb / float(np.ptp(t_s))))
 
 
 def summary(ledger: Ledger, invariants: Mapping[str, Invariant], samples: dict[str, int]) -> dict[str, Any]:

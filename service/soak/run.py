@@ -26,6 +26,9 @@ OURS = ("soak.json", "report.md", "plan.json", "error.png", "latency.png", "memo
         "a", "b", "logs")  # fmt: skip
 #: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
 OWN_STAGE_RATIO = 2.0
+#: What waits to be written when the disk is full, or to be passed on when the router dies, is lost too, s; and a second
+#: is told by its beginning.
+WAITING_S = 1.0
 #: Numbers that go on by more than this are those of another life of the stage.
 _RESTARTED = 10_000_000
 
@@ -147,7 +150,7 @@ def _excused(ledger: Ledger) -> Intervals:
         if fault.kind not in ("disk_full", "restart_router"):
             continue
         for last, second in itertools.pairwise(ledger.seconds):
-            if begin - 1.0 <= second.t_s <= end and second.samples:
+            if begin - WAITING_S - 1.0 <= second.t_s <= end and second.samples:
                 # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
                 follows = 0 < second.seq - last.seq < _RESTARTED
                 excused.add(last.seq + 1 if follows else second.seq - second.samples + 1, second.seq + 1)
