@@ -64,7 +64,8 @@ def read_parquet(path: Path, content: bytes) -> Table:
     from pyarrow import parquet
 
     try:
-        table = parquet.read_table(io.BytesIO(content))
+        # Without a pool of threads: a process that ends right after it was begun is aborted by its runtime.
+        table = parquet.ParquetFile(io.BytesIO(content), pre_buffer=False).read(use_threads=False)
     except (pa.ArrowInvalid, OSError) as error:
         raise InputError(f"{path}: is not a whole Parquet file ({error})") from error
     return Table(str(path), {name: _from_arrow(table.column(name)) for name in table.column_names})
