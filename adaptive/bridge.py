@@ -22,8 +22,8 @@ Voltage = Callable[[FloatArray, FloatArray], float]
 STEPS, SLOPE_SHARE = 2, 1e-5
 #: A slope outside these shares of the mean one is the model's error, not the stage's.
 SLOPES = (0.4, 2.5)
-#: A place further from the middle of the range than this many ranges is none; NaN is not either.
-FAR_RANGES = 1.5
+#: A place further from the middle of the range than this many ranges is none, and a reading no reading.
+FAR_OUT = 1.5
 #: Readings before the doubtful one from which the model's error is taken.
 ANCHORS = 4
 
@@ -102,7 +102,7 @@ class Bridging:
             there = self._voltage(bridge, y)
             slope = (self._voltage(bridge, y + h) - there) / h
             y -= (there - u_V) / min(max(slope, low), high)
-        if not abs(y - middle_um) <= FAR_RANGES * (m.y_max_um - m.y_min_um):
+        if not abs(y - middle_um) <= FAR_OUT * (m.y_max_um - m.y_min_um):
             y = before  # the model has lost its way: no stage goes there
         m.advance(y, bridge.memory)
         bridge.before_um, bridge.last_um = before, y

@@ -27,7 +27,7 @@ from adaptive.admission import (
     watch_reading,
     watch_voltage,
 )
-from adaptive.bridge import Bridging, Voltage
+from adaptive.bridge import FAR_OUT, Bridging, Voltage
 from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig, part_of
 from adaptive.smoothing import FixedLagSmoother
@@ -46,8 +46,6 @@ from adaptive.surprise import (
 from adaptive.track import Pair, Step, Taken, Track
 from adaptive.types import FloatArray, Sample, StateDict
 
-#: A reading further from the middle of the identified range than this many ranges is none, however long it lasts.
-FAR_OUT = 1.5
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
 #: Samples without a reading whose voltages are kept.
@@ -244,9 +242,8 @@ class Front:
 
         ``frozen`` : for a model in the frame that learning began with.
         """
-        if self.track is None:
-            return self.base.rest_memory(self.base.features.y_rest_um)
-        if self._hold is not None and not self._hold.taken and not frozen:
+        assert self.track is not None
+        if self._hold is not None and self.holds and not frozen:
             return self._hold.bridge.memory.copy()
         return self.track.memory_now(frozen)
 
@@ -259,19 +256,18 @@ class Front:
         self.gates.since_jump += 1
         return self.track.advance(step)
 
-    def to_base_frame(self) -> bool:
-        """Go back to the frame that learning began with, and the memory tracked in it. False where it is that already.
+    def to_base_frame(self) -> None:
+        """Go back to the frame that learning began with, and the memory tracked in it; nothing without a jump.
 
         For when the model of the beginning is right again: then no jump has moved the sensor for good.
         """
         track = self.track
         if track is None or self.jumps == self.undone or track.served == self.base.features:
-            return False
+            return
         track.features = track.served = self.base.features
         track.memory, track.switch = track.frozen_memory.copy(), 0
         self._before, self._hold = None, None
         self.undone += 1
-        return True
 
     def creep(self, by_um: float) -> None:
         """The stage has crept by so much, µm, that no voltage made. Not while a jump of the frame is under way."""

@@ -20,7 +20,7 @@ from enum import Enum
 import numpy as np
 
 from adaptive.admission import REPEATED, AdmissionConfig
-from adaptive.bridge import Bridge
+from adaptive.bridge import SLOPES, Bridge
 from adaptive.features import FeatureMap
 from adaptive.learner_config import part_of
 from adaptive.smoothing import FixedLagSmoother
@@ -32,8 +32,6 @@ MOST_HELD, PROBATION = 40, 64
 #: Samples that are bridged at most while there are no readings, or only repeated ones. The hysteresis memory stays true
 #: for as long, and would be wrong after a restart until the stage wipes that out.
 MOST_BRIDGED = 4096
-#: The least slope of displacement over voltage, relative to the mean one, just after a turning point.
-LEAST_SLOPE = 0.4
 #: A jump of place that scales the displacement by less than this, or more than its inverse, is taken for an offset.
 JUMP_RATIO = 0.85
 #: Share of the way that the bridge has gone by which it may be wrong, and of a level by which readings may scatter.
@@ -121,7 +119,7 @@ def near_old(hold: Hold, tolerance_um: float) -> bool:
 
 def is_stuck(hold: Hold, stuck_um: float) -> bool:
     """Whether the last readings are equal although the stage has moved: no sensor that works shows that."""
-    return hold.same >= REPEATED and hold.high_um - hold.low_um > LEAST_SLOPE * stuck_um
+    return hold.same >= REPEATED and hold.high_um - hold.low_um > SLOPES[0] * stuck_um
 
 
 def needed(config: AdmissionConfig, away_um: float, range_um: float, trusted: bool) -> int:
@@ -143,12 +141,11 @@ def judge(
     if np.isnan(away_um):
         return Verdict.WAIT if last + 1 < MOST_BRIDGED else Verdict.LOST
     stuck = is_stuck(hold, stuck_um)
-    if stuck or not near_old(hold, tolerance_um):
-        hold.worst_um = max(hold.worst_um, abs(away_um))
+    if not stuck and near_old(hold, tolerance_um):
+        return Verdict.BACK
+    hold.worst_um = max(hold.worst_um, abs(away_um))
     if stuck:
         return Verdict.WAIT if last + 1 < MOST_BRIDGED else Verdict.LOST
-    if near_old(hold, tolerance_um):
-        return Verdict.BACK
     if hold.level < 0 or not _same_level(hold, tolerance_um):
         hold.level = last
     count = int(np.count_nonzero(~np.isnan(hold.y_um[hold.level :])))

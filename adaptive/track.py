@@ -173,11 +173,12 @@ class Track:
         end, slots = self.state.count, self.u_V.shape[0]
         past = np.arange(max(end - self.lag, 0), end)
         y_um = self.y_um[past % slots]
-        if frozen or self.features is self.served:
-            features, after = (self.base, self.frozen_memory.copy()) if frozen else (self.served, self.memory.copy())
-            track_memory(y_um, after, features.arrays)
+        if frozen:
+            after = self.frozen_memory.copy()
+            track_memory(y_um, after, self.base.arrays)
             return after
         after = self.memory.copy()
+        # Readings from before a jump are in the frame from before it; else the two frames are one.
         jumped = int(np.searchsorted(past, self.switch - self.lag))
         track_memory(y_um[:jumped], after, self.features.arrays)
         track_memory(y_um[jumped:], after, self.served.arrays)

@@ -82,13 +82,14 @@ def restore_axis(axis: Axis, state: StateDict) -> None:
         seq, frozen_by, dead = int(state["seq"]), str(state["frozen_by"]), bool(state["dead"])
         adoptions = [Retuned.from_json(entry, "adoptions") for entry in json.loads(str(state["adoptions"]))]
         # From here on nothing is looked up that may be missing but in these, which check before they change.
-        SampleClock(axis.dt_s).restore(clock)
+        going_on = SampleClock(axis.dt_s)
+        going_on.restore(clock)
         axis.sequence.restore(sequence)
         axis.tracker.restore(tracker)
         axis.watch.restore(watch, watched)
     except (KeyError, TypeError, ValueError, InputError) as error:
         raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
-    axis.clock.restore(clock)
+    axis.clock = going_on
     axis._gates = {name: int(count) for name, count in under("gates.", state).items()}
     axis._frozen_by, axis._learner_dead = frozen_by, dead
     axis.adoptions.replace(adoptions)
