@@ -31,21 +31,26 @@ def errors(plan: Plan, model: LssvmInverse, age: int) -> dict[str, float]:
     """One run at an age in ticks: percent of the range, of the parts named in ``GOALS`` and of what was "before"."""
     (wanted_um, v_um_per_s, a_um_per_s2), y_um = plan.reference(), np.zeros(plan.ticks)
     stage, learner = Stage(plan.stage(changing=True)), Learner.from_model(model)
-    state, memory = stage.initial_state(), learner.memory()
-    block = plan.block if age else 1
-    past: list[tuple[int, LssvmInverse]] = [(-1, learner.snapshot())]
+    state, block = stage.initial_state(), plan.block if age else 1
+    past: list[tuple[int, LssvmInverse, FloatArray]] = [(-1, learner.snapshot(), learner.memory())]
     for first in range(0, plan.ticks, block):
         part = slice(first, first + block)
         while len(past) > 1 and past[1][0] <= first - max(age, 1):
             past.pop(0)
-        answer = past[0][1].feedforward(wanted_um[part], v_um_per_s[part], a_um_per_s2[part], memory)
-        memory = answer.memory
+        seen, served, memory = past[0]
+        # As the service answers a caller that gives ``begin``: from its own memory on, over what is under way.
+        way = slice(seen + 1, first)
+        memory = served.track(wanted_um[way], v_um_per_s[way], a_um_per_s2[way], np.zeros(first - seen - 1), memory)
+        answer = served.feedforward(wanted_um[part], v_um_per_s[part], a_um_per_s2[part], memory)
         u_V = np.clip(answer.u_V, stage.config.u_min_V, stage.config.u_max_V)
         y_um[part] = stage.run(state, u_V)[0]
         for k in range(first, first + block):
             learner.handle(Sample(k, k * plan.dt_s, float(u_V[k - first]), float(y_um[k])))
             if k % block == 0:
-                past.append((k, learner.snapshot()))
+                now = learner.snapshot()
+                memory = learner.memory_for(now)
+                assert memory is not None  # it has seen a sample
+                past.append((k, now, memory))
     return _parts(plan, 100.0 * np.abs(y_um - wanted_um) / plan.range_um)
 
 

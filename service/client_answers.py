@@ -98,6 +98,21 @@ def extended(before: Pending | None, begin: int, y_um: FloatArray, u_V: FloatArr
     return Pending(before.first, np.concatenate([before.y_um, y_um]), np.concatenate([before.u_V, u_V]))
 
 
+@dataclass(slots=True)
+class Commanded:
+    """What a run in one process has commanded so far: it asks as a client on the wire does that gives ``begin``."""
+
+    answer: Trajectory | None = None
+
+    def before(self, begin: int) -> Pending | None:
+        """What is under way before sample ``begin``."""
+        return under_way(self.answer, begin)
+
+    def take(self, begin: int, y_um: FloatArray, reply: FeedforwardReply) -> None:
+        """The (n,) voltages of ``reply`` for ``y_um``, µm, are commanded from sample ``begin`` on."""
+        self.answer = as_trajectory(reply, extended(self.before(begin), begin, y_um, reply.u_V))
+
+
 def continued(
     memory: ArrayLike | None, model: str, u_before_V: float, after: Point | Trajectory | None, begin: int | None = None
 ) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 from adaptive.identification import identify_lssvm
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray
+from service.client_answers import Commanded
 from service.config import AxisConfig
 from service.guard import Limits
 from service.modelfile import Bundle, BundleMeta
@@ -100,7 +101,8 @@ def run_scenario(
     n = wanted.y_um.size // BLOCK * BLOCK
     u_V = {name: np.zeros(n) for name in MODELS}
     y_um = {name: np.zeros(n) for name in MODELS}
-    memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
+    commanded = Commanded()
+    memory: FloatArray | None = None
     last_V = dict.fromkeys(MODELS, float("nan"))
     names: dict[str, int] = {}
     gate = np.zeros(n, dtype=np.int16)
@@ -124,9 +126,16 @@ def run_scenario(
         as_of = max(-1, part.start - LEAD - MARGIN)
         for name in MODELS:
             points = (wanted.y_um[part], wanted.v_um_per_s[part], wanted.a_um_per_s2[part])
-            reply = axis.answer(FeedforwardQuery(*points, memory[name], name, as_of, last_V[name]))
-            u_V[name][part] = reply.u_V
-            memory[name], last_V[name] = reply.memory, float(reply.u_V[-1])
+            # The samples are of the adaptive twin's stage, which the axis tracks; the other's memory travels.
+            mine = name == ADAPTIVE
+            pending = commanded.before(part.start) if mine else None
+            query = FeedforwardQuery(*points, None if mine else memory, name, as_of, last_V[name], pending)
+            reply = axis.answer(query)
+            u_V[name][part], last_V[name] = reply.u_V, float(reply.u_V[-1])
+            if mine:
+                commanded.take(part.start, wanted.y_um[part], reply)
+            else:
+                memory = reply.memory
     learner = axis.learner
     return Course(
         scenario=scenario,

@@ -25,6 +25,7 @@ the adaptive error may be at most 1.1 times the frozen model's plus three noise 
 
   dehyst scenarios --out out/scenarios
   dehyst scenarios --only glitches --seeds 10 --out out/glitches
+  dehyst scenarios --only dwell --rest 1 --out out/stop
   dehyst scenarios --only gain_step --only creep --config learner.toml --out out/tuned
 """
 
@@ -37,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="where table, JSON and pictures go")
     add("--seeds", type=int, default=2, metavar="N", help="scenarios of each kind, seeds 1 to N (2)")
     add("--only", action="append", default=[], metavar="NAME", help="a kind, or kind/seed; as often as needed (all)")
+    add("--rest", type=float, default=600.0, metavar="S", help="length of the rest of a dwell, s (600)")
     add("--config", type=Path, metavar="FILE", help="settings of the learner: a TOML file, or a service's")
     add("--jobs", type=int, default=1, metavar="N", help="scenarios at a time, one processor each (1)")
     add("--no-pictures", action="store_true", help="draw nothing")
@@ -54,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--seeds", args.seeds, "an integer from 1 to 1000")
     if not 1 <= args.jobs <= 64:
         raise FieldError("--jobs", args.jobs, "an integer from 1 to 64")
+    if not 0.0 < args.rest <= 86_400.0:
+        raise FieldError("--rest", args.rest, "a time above 0 s, up to a day (86400 s)")
     settings = read_learner_settings(args.config).settings if args.config is not None else {}
     chosen = _chosen(args.only, args.seeds)
     try:
@@ -61,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         raise InputError(f"--out: got {args.out}, expected a folder that can be written to: {error}") from error
     start = time.perf_counter()
-    tasks = [(kind, seed, settings, None if args.no_pictures else args.out) for kind, seed in chosen]
+    tasks = [(kind, seed, args.rest, settings, None if args.no_pictures else args.out) for kind, seed in chosen]
     verdicts: list[Verdict] = []
     for verdict in _all(tasks, args.jobs):
         verdicts.append(verdict)
@@ -106,7 +110,7 @@ def _chosen(only: list[str], seeds: int) -> list[tuple[str, int]]:
     return list(dict.fromkeys(chosen))
 
 
-def _all(tasks: list[tuple[str, int, dict[str, Any], Path | None]], jobs: int) -> Any:
+def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs: int) -> Any:
     if jobs == 1:
         yield from map(_one, tasks)
         return
@@ -117,14 +121,14 @@ def _all(tasks: list[tuple[str, int, dict[str, Any], Path | None]], jobs: int) -
         yield from pool.map(_one, tasks)
 
 
-def _one(task: tuple[str, int, dict[str, Any], Path | None]) -> Verdict:
+def _one(task: tuple[str, int, float, dict[str, Any], Path | None]) -> Verdict:
     from service.scenarios import judge
     from service.scenarios_pictures import draw_course
     from service.scenarios_run import run_scenario
     from sim.scenarios import scenario
 
-    kind, seed, settings, out = task
-    course = run_scenario(scenario(kind, seed), settings)
+    kind, seed, rest_s, settings, out = task
+    course = run_scenario(scenario(kind, seed, rest_s), settings)
     verdict = judge(course)
     if out is not None:
         draw_course(out / f"{kind}_{seed}.png", course, verdict)

@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from service.axis import Axis
-from service.client_answers import Trajectory, as_trajectory, extended, under_way
+from service.client_answers import Commanded
 from service.demo.plan import MODELS, TEACHER, Plan
 from service.demo.run import Run, empty
 from service.recorder import Recorder
@@ -30,7 +30,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
     states = {name: stage.initial_state() for name in MODELS}
     u_V, y_um, std_V = empty(plan), empty(plan), empty(plan)
     memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
-    taught: Trajectory | None = None
+    commanded = Commanded()
     last_V = {name: float("nan") for name in MODELS}
     durations, notes = [], []
     for block in range(n // size + ahead + 1):
@@ -59,7 +59,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
         part = slice(block * size, (block + 1) * size)
         for name in MODELS:
             # The service tracks the teacher's stage; the memory of the others travels.
-            pending = under_way(taught, part.start) if name == TEACHER else None
+            pending = commanded.before(part.start) if name == TEACHER else None
             query = FeedforwardQuery(
                 wanted[0][part], wanted[1][part], wanted[2][part], memory[name], name, plan.as_of(block), last_V[name],
                 pending,
@@ -70,7 +70,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
             u_V[name][part], std_V[name][part] = reply.u_V, reply.std_V
             last_V[name] = float(reply.u_V[-1])
             if name == TEACHER:
-                taught = as_trajectory(reply, extended(pending, part.start, wanted[0][part], reply.u_V))
+                commanded.take(part.start, wanted[0][part], reply)
             else:
                 memory[name] = reply.memory
     samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}

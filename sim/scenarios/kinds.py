@@ -96,13 +96,8 @@ def glitches(seed: int, rng: np.random.Generator) -> Scenario:
     return replace(_base("glitches", seed, text, preset("rich", seed=seed)), readings=bad)
 
 
-def dwell(seed: int, rng: np.random.Generator) -> Scenario:
-    """Full strokes, ten minutes at rest, and the same full strokes again."""
-    return dwelling(seed, rng, DWELL_S)
-
-
-def dwelling(seed: int, rng: np.random.Generator, rest_s: float) -> Scenario:
-    """The same with another length of rest, s."""
+def dwell(seed: int, rng: np.random.Generator, rest_s: float = DWELL_S) -> Scenario:
+    """Full strokes, ten minutes (or ``rest_s``) at rest, and the same full strokes again."""
     before_s, after_s = 10.0, 15.0
     hertz = float(rng.uniform(0.5, 1.0))
     level = float(rng.uniform(LOW_UM + 10.0, HIGH_UM - 10.0))
@@ -163,10 +158,16 @@ KINDS: Final[dict[str, Callable[[int, np.random.Generator], Scenario]]] = {
 }
 
 
-def scenario(kind: str, seed: int) -> Scenario:
-    """The scenario of a kind and a seed, 1 or more. Raises InputError on an unknown kind or seed."""
+def scenario(kind: str, seed: int, rest_s: float = DWELL_S) -> Scenario:
+    """The scenario of a kind and a seed, 1 or more; ``rest_s`` is the length of the rest of a ``dwell``, s.
+
+    Raises InputError on an unknown kind or seed, and on a rest of no length.
+    """
     if kind not in KINDS:
         raise InputError(f"kind: got {kind!r}, expected one of: {', '.join(KINDS)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 1:
         raise InputError(f"seed: got {seed!r}, expected an integer from 1 on")
-    return KINDS[kind](seed, np.random.default_rng((seed, list(KINDS).index(kind))))
+    if not 0.0 < rest_s <= 86_400.0:
+        raise InputError(f"rest_s: got {rest_s!r}, expected a time above 0 s, up to a day")
+    rng = np.random.default_rng((seed, list(KINDS).index(kind)))
+    return dwell(seed, rng, rest_s) if kind == "dwell" else KINDS[kind](seed, rng)

@@ -9,7 +9,7 @@ import pytest
 
 from adaptive.errors import InputError
 from sim.scenarios import KINDS, Readings, Scenario, scenario
-from sim.scenarios.kinds import dwelling
+from sim.scenarios.kinds import dwell
 from sim.scenarios.motion import Parts, Tones, in_band, strokes
 from sim.scenarios.readings import glitch_burst
 from sim.stage import Stage
@@ -19,7 +19,7 @@ KINDS_SEEDS = [(kind, seed) for kind in KINDS for seed in (1, 2)]
 
 def shortened(kind: str, seed: int) -> Scenario:
     """The scenario of a kind; the dwell with a rest that a test can afford."""
-    return dwelling(seed, np.random.default_rng(seed), 4.0) if kind == "dwell" else scenario(kind, seed)
+    return dwell(seed, np.random.default_rng(seed), 4.0) if kind == "dwell" else scenario(kind, seed)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -81,7 +81,7 @@ def test_the_gain_ramp_ends_at_the_gain_it_names() -> None:
 
 
 def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:
-    s = dwelling(1, np.random.default_rng(1), 5.0)
+    s = dwell(1, np.random.default_rng(1), 5.0)
     assert s.quiet_s is not None
     r, dt = s.reference(), s.stage.dt_s
     start, stop = (round(t / dt) for t in s.quiet_s)
@@ -90,6 +90,16 @@ def test_the_dwell_rests_and_strokes_alike_before_and_after() -> None:
     assert np.ptp(before) == pytest.approx(s.range_um, rel=1e-3)
     assert np.ptp(after) == pytest.approx(s.range_um, rel=1e-3)
     assert scenario("dwell", 1).quiet_s == (25.0, 625.0)
+    stopped = scenario("dwell", 1, 1.0)
+    assert stopped.quiet_s == (25.0, 26.0)
+    assert stopped.duration_s == 41.0
+    assert np.array_equal(stopped.reference().y_um[:25_000], scenario("dwell", 1).reference().y_um[:25_000])
+
+
+@pytest.mark.parametrize("rest_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rest_takes_a_time(rest_s: float) -> None:
+    with pytest.raises(InputError, match="rest_s"):
+        scenario("dwell", 1, rest_s)
 
 
 def test_glitches_spoil_their_samples_only_and_the_same_in_blocks() -> None:
