@@ -14,8 +14,8 @@ from adaptive.errors import InputError
 EPILOG = """\
 What runs in real time: a router, two services (one a hot standby), a simulated stage, a controller, a second client
 that measures, a bare echo, and the viewer's stream; each a process of its own, on this machine's loopback. --fast runs
-what can happen to samples in one process. Times are in s, min or h: 90s, 30m, 2h. Results: soak.json, report.md,
-pictures, plan.json with every fault as it happened.
+what can happen to samples in one process. Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results: soak.json, report.md,
+pictures, plan.json with every fault as it happened; soak.json is there every minute, with what has been judged by then.
 
   dehyst soak --duration 5m
   dehyst soak --duration 40s --faults kill_primary,nan,gap --out out/short
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     add = parser.add_argument
-    add("--duration", default="30m", metavar="T", help="how long, with its unit: 90s, 30m, 2h (default: %(default)s)")
+    add("--duration", default="30m", metavar="T", help="how long: 90s, 30m, 2h, 3d (default: %(default)s)")
     add("--seed", type=int, default=1, metavar="N", help="of the plan, the reference and the stage's noise (1)")
     add("--out", type=Path, default=Path("out/soak"), metavar="DIR", help="where the results go (default: %(default)s)")
     add("--fast", action="store_true", help="one process, as fast as possible; faults of processes are left out")
@@ -58,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
         kinds = tuple(name for name in kinds if KINDS[name].fast)
     stop = StopSignal()
     from service.soak import run as soak
+    from service.soak.outcome import HELD, verdict_line
 
     done = soak.run(
         args.out,
@@ -67,10 +68,11 @@ def run(args: argparse.Namespace) -> int:
         stopped=lambda: bool(stop.reason),
         say=_say,
     )
+    _say(f"      {verdict_line(done.found)}")
     print(json.dumps(done.found) if args.json else (args.out / "report.md").read_text(encoding="utf-8"))
     if done.interrupted:
         return 130
-    return 0 if done.found["verdict"] == "held" else 1
+    return 0 if done.found["verdict"] == HELD else 1
 
 
 def seconds(text: str) -> float:
@@ -82,7 +84,7 @@ def seconds(text: str) -> float:
         value = math.nan
     if not LEAST_S <= value <= MOST_S:
         raise InputError(
-            f"--duration: got {text!r}, expected {LEAST_S:g}s to {MOST_S / 86400:g}d, such as 90s, 30m, 2h"
+            f"--duration: got {text!r}, expected {LEAST_S:g}s to {MOST_S / 86400:g}d, such as 90s, 30m, 2h, 3d"
         )
     return value
 

@@ -43,7 +43,7 @@ KINDS: Final[dict[str, Kind]] = {
     "clock_back": Kind("the wall clock of the service set back by an hour", MACHINE, (2.0, 4.0), 3.0),
     "disk_full": Kind("no more bytes for the recordings", MACHINE, (3.0, 5.0), 10.0),
     "cpu_stolen": Kind("a busy process for each core", MACHINE, (1.5, 3.0), 4.0, 0.5),
-    "bad_queries": Kind("a burst of malformed, foreign and oversized queries", PROCESS, (1.0, 2.0), 3.0),
+    "bad_queries": Kind("a burst of malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0),
     "gap": Kind("samples that never come", STAGE, (0.3, 2.0), 5.0, fast=True),
     "duplicate": Kind("every sample twice", STAGE, (0.5, 2.0), 3.0, fast=True),
     "reorder": Kind("messages in the wrong order", STAGE, (0.5, 2.0), 3.0, fast=True),

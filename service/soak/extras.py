@@ -1,23 +1,21 @@
-"""Small processes beside a soak: echo, slow subscriber, busy core, a client that sends rubbish.
+"""Small processes beside a soak: echo, slow subscriber, busy core, and a client that sends rubbish.
 
 ``python -m service.soak.extras WHAT ENDPOINT [ARGUMENTS]``; each says ``ready`` and goes on until it is ended.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 
-import numpy as np
 import zenoh
 
 from service.keys import Keys
 from service.server import tune_process
 from service.session import open_client
+from service.soak.rubbish import rubbish
 from service.soak.setup import AXIS, STAGE
 from service.stopping import StopSignal
-from service.wire_query import encode_query
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.
 ECHO_KEY = "soak_echo"
@@ -63,41 +61,6 @@ def busy(_: str) -> int:
         for _i in range(100_000):
             value = value * 1.0000001 % 2.0
     return 0
-
-
-def rubbish(endpoint: str, seed: int) -> int:
-    """Ask what cannot be answered, as quickly as the answers come; prints how many got an error, an answer, nothing."""
-    stop = StopSignal()
-    rng = np.random.default_rng(seed)
-    keys = Keys(STAGE, AXIS)
-    got = {"error": 0, "answer": 0, "nothing": 0}
-    with open_client(endpoint, 20.0) as session:
-        print("ready", flush=True)
-        while not stop.reason:
-            said = "nothing"
-            for reply in session.get(keys.feedforward, payload=_bad_payload(rng), timeout=1.0):
-                said = "error" if reply.err is not None else "answer"
-            got[said] += 1
-            # Nobody is to be kept from asking: a burst is many, not all there is room for.
-            time.sleep(0.001)
-    print(json.dumps(got), flush=True)
-    return 0
-
-
-def _bad_payload(rng: np.random.Generator) -> bytes:
-    good = encode_query([40.0], [0.0], [0.0])
-    choice = int(rng.integers(6))
-    if choice == 0:
-        return rng.bytes(int(rng.integers(0, 400)))
-    if choice == 1:
-        return good[: int(rng.integers(len(good)))]
-    if choice == 2:
-        return good + rng.bytes(int(rng.integers(1, 200_000)))
-    if choice == 3:
-        return encode_query([1e9], [0.0], [0.0])
-    if choice == 4:
-        return encode_query([40.0], [0.0], [0.0], memory=np.zeros(int(rng.integers(100, 4000))))
-    return encode_query([40.0], [0.0], [0.0], model="nobody")
 
 
 if __name__ == "__main__":

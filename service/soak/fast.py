@@ -12,15 +12,16 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from service.axis import Axis
-from service.client_answers import Trajectory, as_trajectory, extended, under_way
+from service.client_answers import Commanded
 from service.config import AxisConfig
 from service.guard import Limits
 from service.models import load_axis
+from service.soak.interim import Interim
 from service.soak.ledger import Happened, Ledger, Row, flat
-from service.soak.monitor import Track
 from service.soak.plan import Planned, SoakPlan
 from service.soak.reference import SoakReference
 from service.soak.setup import AXIS, SERVED, STAGE, Control
+from service.soak.track import Track
 from service.soak.world import SAMPLES_A_MESSAGE
 from service.stage_faults import CHANGE, Fault, Injector
 from service.wire import SampleBatch
@@ -31,14 +32,14 @@ _PROGRESS_S = 5.0
 
 
 def run_fast(
-    out: Path, stage: StageConfig, control: Control, plan: SoakPlan, stopped: Callable[[], bool],
-    say: Callable[[str], None],
-) -> tuple[Ledger, dict[str, int]]:  # fmt: skip
-    """Run the plan; returns what was seen and the counts of samples. Times are those of the stage."""
+    out: Path, stage: StageConfig, control: Control, plan: SoakPlan, ledger: Ledger, interim: Interim,
+    stopped: Callable[[], bool], say: Callable[[str], None],
+) -> dict[str, int]:  # fmt: skip
+    """Run the plan and fill the ledger; returns the counts of samples. Times are those of the stage."""
     limits = Limits(control.u_min_V, control.u_max_V, control.slew_V_per_s)
     config = AxisConfig(AXIS, out / "model.npz", limits, served=SERVED, snapshot_every=control.block)
     turn = _Turns(Stage(stage), load_axis(STAGE, config), control)
-    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, "fast")
+    ledger.seconds = turn.track.seconds
     waiting = list(plan.faults)
     under_way: list[tuple[float, Happened]] = []
     begin, told_s = time.monotonic(), 0.0
@@ -58,6 +59,7 @@ def run_fast(
             ledger.counters.append((turn.now_s, "service", Row(flat(turn.status()))))
             # Nobody else takes them.
             ledger.events += [{"t_s": turn.now_s, **event} for event in turn.axis.take_events()]
+            interim.due(turn.now_s, lambda: _samples(turn))
         if time.monotonic() - told_s >= _PROGRESS_S:
             told_s = time.monotonic()
             done = turn.now_s / plan.duration_s
@@ -71,10 +73,14 @@ def run_fast(
     ledger.duration_s = turn.now_s
     ledger.seconds = turn.track.seconds[:-1] or turn.track.seconds
     ledger.notes.append("In one process: latency, memory, recordings and take-overs are not part of this run.")
+    return _samples(turn)
+
+
+def _samples(turn: _Turns) -> dict[str, int]:
     status = turn.status()
     samples = {name: int(status["samples"][name]) for name in ("received", "lost", "late", "restarts")}
-    withheld = {"withheld_by_faults": turn.injector.counts["gap"]}
-    return ledger, {"read": turn.k, **samples, "learnt": turn.axis.gates.get("learnt", 0), **withheld}
+    learnt = turn.axis.gates.get("learnt", 0)
+    return {"read": turn.k, **samples, "learnt": learnt, "withheld_by_faults": turn.injector.counts["gap"]}
 
 
 class _Turns:
@@ -90,7 +96,7 @@ class _Turns:
         self._reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
         self._commands: dict[int, FloatArray] = {}
         self._asked = 0
-        self._answer: Trajectory | None = None
+        self._commanded = Commanded()
         self._last_V = math.nan
         self._told = 0
 
@@ -148,11 +154,11 @@ class _Turns:
     def _ask(self) -> None:
         size = self._control.block
         motion = self._reference.rows(self._asked, size)
-        pending = under_way(self._answer, self._asked)
+        pending = self._commanded.before(self._asked)
         reply = self.axis.answer(
             FeedforwardQuery(motion[0], motion[1], motion[2], u_before_V=self._last_V, pending=pending)
         )
-        self._answer = as_trajectory(reply, extended(pending, self._asked, motion[0], reply.u_V))
+        self._commanded.take(self._asked, motion[0], reply)
         self._last_V = float(reply.u_V[-1])
         self._commands[self._asked] = reply.u_V
         self.track.want(self._asked, motion[0])

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from service.soak.invariant import Invariant, most
-from service.soak.ledger import Ledger
+from service.soak.invariant import Invariant, most, unjudged
+from service.soak.ledger import FAST, Ledger
 from service.soak.machine import Machine
-from service.soak.outcome import Trend, memory_slope, resident_growth
-from service.soak.timing import answered_again, queries_answered, recovers
+from service.soak.memory import Trend, memory_slope, resident_growth
+from service.soak.safety import answers_safe, safe_voltages, takeover_continuous
+from service.soak.timing import answered_again, follower_age, queries_answered, recovers
+from service.soak.track import Second
 
-#: Mean |error| outside fault windows, in percent of the commanded range.
-TRACKING_PCT: Final = 0.1
+#: Mean |error| outside fault windows, in percent of the commanded range. Seen in runs that were well: 0.024 to 0.032.
+TRACKING_PCT: Final = 0.05
 MEMORY_KB_PER_HOUR: Final = 1024.0
 #: What lies free between other things goes up and down by so much, of some 300 MB.
 RESIDENT_MB: Final = 30.0
@@ -22,80 +24,87 @@ UNDER_WAY = 64
 
 def judge(ledger: Ledger, missing: int | None, tracking_pct: float = TRACKING_PCT) -> dict[str, Invariant]:
     """All invariants; `settle` comes first. ``missing``: samples that were seen and are in no recording."""
-    seconds, probes = ledger.seconds, ledger.probes
-    held = {round(s.t_s) + i for s in seconds if s.held for i in (0, 1)}
-    quiet = [s for s in seconds if s.judged and ledger.quiet(s.t_s) and ledger.quiet(s.t_s + 1.0)]
-    quiet = [s for s in quiet if round(s.t_s) not in held]
-    judged = sum(s.judged for s in quiet)
-    error_pct = 100.0 * sum(s.error_sum_um for s in quiet) / judged / ledger.range_um if judged else None
-    step = max((s.step_max_V for s in seconds), default=0.0) / ledger.step_limit_V
-    found = {
-        "voltages_finite": most(sum(s.not_finite for s in seconds), 0, "samples", "applied voltages that are finite"),
-        "voltages_within_limits": most(
-            max((s.beyond_V for s in seconds), default=0.0), 1e-9, "V", "applied voltage beyond its limits"
-        ),
-        "voltages_within_slew": most(
-            step, 1.0 + 1e-6, "limits", "largest step of the applied voltage, over what the slew limit allows"
-        ),
-        "answers_safe": most(
-            sum(p.unsafe for p in probes) + ledger.unsafe_blocks,
-            0,
-            "answers",
-            "answers that were not finite, beyond a limit or too steep",
-        ),
-    }
-    if ledger.mode != "fast":
-        takeovers = [f.window_s for f in ledger.faults if f.kind in ("kill_primary", "stop_primary")]
-        steps = [s.step_max_V for s in seconds if any(a - 1.0 <= s.t_s <= b for a, b in takeovers)]
-        found["takeover_continuous"] = most(
-            max(steps, default=0.0) / ledger.step_limit_V, 1.0 + 1e-6, "limits", "the same, around a take-over"
-        )
+    found = safe_voltages(ledger) | {"answers_safe": answers_safe(ledger)}
+    if ledger.mode != FAST:
         machine = Machine(ledger.bare, ledger.others)
+        found["takeover_continuous"] = takeover_continuous(ledger)
         found["queries_answered"] = queries_answered(ledger, machine)
         found["answered_again"] = answered_again(ledger, machine)
+        found["follower_age"] = follower_age(ledger, machine)
     found["recovers_by_itself"] = recovers(ledger)
     found["faults_happened"] = most(
         int(bool(ledger.planned) and not ledger.faults), 0, "runs", "runs with a plan of which not one fault began"
     )
-    found["faults_told"] = most(
-        sum(1 for f in ledger.faults if not f.told), 0, "faults", "faults that no counter and no event told of"
-    )
-    found["samples_accounted"] = _accounted(ledger)
-    found["processes_alive"] = most(len(ledger.ended), 0, "processes", "processes that ended by themselves")
+    found["faults_told"] = faults_told(ledger)
+    found["samples_accounted"] = samples_accounted(ledger)
+    found["processes_alive"] = processes_alive(ledger)
     if missing is not None:
         found["no_record_lost"] = most(missing, 0, "samples", "samples that came and are in nobody's recording")
-    found["tracking"] = Invariant(
-        None if error_pct is None else error_pct <= tracking_pct, error_pct, tracking_pct, "% of range",
-        f"mean |error| outside fault windows, over {len(quiet)} s in which every voltage came in time"
-        + ("" if quiet else ": not judged"),
-    )  # fmt: skip
-    found["memory"] = _memory(memory_slope(ledger))
-    grown = resident_growth(ledger)
-    found["memory_resident"] = Invariant(
-        grown is None or grown <= RESIDENT_MB, grown, RESIDENT_MB, "MB",
-        "resident memory of that process in its last five minutes above that of the first five after warm-up"
-        + ("" if grown is not None else ": too short a run to judge"),
-    )  # fmt: skip
+    found["tracking"] = tracking(tracked(ledger, ledger.seconds), ledger.range_um, tracking_pct)
+    # What a run in one process has in use is also the stage's and the controller's.
+    short = "in one process" if ledger.mode == FAST else "too short a run"
+    found["memory"] = _memory(memory_slope(ledger), short)
+    found["memory_resident"] = _resident(resident_growth(ledger), short)
     return found
 
 
-def _memory(trend: Trend | None) -> Invariant:
+def faults_told(ledger: Ledger) -> Invariant:
+    """Of every fault somebody has told."""
+    untold = sum(1 for f in ledger.faults if not f.told)
+    return most(untold, 0, "faults", "faults that no counter and no event told of")
+
+
+def processes_alive(ledger: Ledger) -> Invariant:
+    """Nobody ends but by a fault."""
+    return most(len(ledger.ended), 0, "processes", "processes that ended by themselves")
+
+
+def tracked(ledger: Ledger, seconds: list[Second]) -> list[Second]:
+    """Of the ``seconds`` those that tell how good the model is: no fault on, and every voltage there in time."""
+    held = {round(s.t_s) + i for s in seconds if s.held for i in (0, 1)}
+    quiet = [s for s in seconds if s.judged and ledger.quiet(s.t_s) and ledger.quiet(s.t_s + 1.0)]
+    return [s for s in quiet if round(s.t_s) not in held]
+
+
+def tracking(quiet: list[Second], range_um: float, limit_pct: float) -> Invariant:
+    """The mean |error| of those seconds."""
+    return mean_error(sum(s.error_sum_um for s in quiet), sum(s.judged for s in quiet), len(quiet), range_um, limit_pct)
+
+
+def mean_error(sum_um: float, judged: int, seconds: int, range_um: float, limit_pct: float) -> Invariant:
+    """From the sum of |error|, µm, of so many samples in so many seconds."""
+    error_pct = 100.0 * sum_um / judged / range_um if judged else None
+    text = f"mean |error| outside fault windows, over {seconds} s in which every voltage came in time"
+    if error_pct is None:
+        return unjudged(limit_pct, "% of range", "no such second", text)
+    return Invariant(error_pct <= limit_pct, error_pct, limit_pct, "% of range", text)
+
+
+def _memory(trend: Trend | None, short: str) -> Invariant:
     """Broken where it grows beyond doubt, held where it does not; else this run cannot tell, and says so."""
     text = "growth of what the longest-lived serving process has in use, after warm-up"
     if trend is None:
-        return Invariant(True, None, MEMORY_KB_PER_HOUR, "kB/hour", f"{text}: too short a run to judge")
+        return unjudged(MEMORY_KB_PER_HOUR, "kB/hour", short, text)
     held: bool | None = None
     if trend.slope <= MEMORY_KB_PER_HOUR and trend.doubt <= MEMORY_KB_PER_HOUR:
         held = True
     elif trend.slope - trend.doubt > MEMORY_KB_PER_HOUR:
         held = False
-    told = f"{text}, ± {trend.doubt:.0f}"
+    told, why = f"{text}, ± {trend.doubt:.0f}", ""
     if held is None:
         told += ": not judged, a run without faults (--faults none) or one of hours tells"
-    return Invariant(held, trend.slope, MEMORY_KB_PER_HOUR, "kB/hour", told)
+        why = "too short a run for its doubt"
+    return Invariant(held, trend.slope, MEMORY_KB_PER_HOUR, "kB/hour", told, why)
 
 
-def _accounted(ledger: Ledger) -> Invariant:
+def _resident(grown_mb: float | None, short: str) -> Invariant:
+    text = "resident memory of that process in its last five minutes above that of the first five after warm-up"
+    if grown_mb is None:
+        return unjudged(RESIDENT_MB, "MB", short, text)
+    return Invariant(grown_mb <= RESIDENT_MB, grown_mb, RESIDENT_MB, "MB", text)
+
+
+def samples_accounted(ledger: Ledger) -> Invariant:
     """Numbers handled = samples received - late + lost, and received = all verdicts; between any two statuses."""
     worst, where = 0.0, ""
     last: dict[str, Mapping[str, float]] = {}

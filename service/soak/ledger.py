@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from service.soak.catalogue import KINDS
-from service.soak.monitor import Second
+from service.soak.track import Second
+
+#: The mode of a run in one process, and of one in real time.
+FAST: Final = "fast"
+REAL_TIME: Final = "real_time"
+#: Longest time that anything may take to be well again, s.
+_LONGEST_S: Final = max(kind.recover_s for kind in KINDS.values())
 
 
 @dataclass
@@ -30,32 +37,37 @@ class Happened:
     value: float = 0.0
 
     @property
+    def ended(self) -> bool:
+        """Whether it is over."""
+        return math.isfinite(self.end_s)
+
+    @property
     def window_s(self) -> tuple[float, float]:
         """From its beginning until everything has to be well again."""
-        end = self.end_s if np.isfinite(self.end_s) else self.begin_s
+        end = self.end_s if self.ended else self.begin_s
         return self.begin_s, end + KINDS[self.kind].recover_s
 
 
 @dataclass
 class Probe:
-    """A second of the prober: round trips in µs, and what else it counted."""
+    """A second of the prober: round trips in µs, ages of the followed model in s, and what else it counted."""
 
     t_s: float
     service_us: Sequence[float]
     echo_us: Sequence[float]
+    ages_s: Sequence[float]
     failed: int
     unsafe: int
     silent_s: float
-    age_s: float
     error: str = ""
 
 
 def probe_of(told: dict[str, Any], t_s: float) -> Probe:
     """The prober's line as a probe at ``t_s``."""
-    names = ("failed", "unsafe", "silent_s", "age_s", "error")
     # Packed: a run may last for days.
-    service_us, echo_us = array("f", told["service_us"]), array("f", told["echo_us"])
-    return Probe(t_s, service_us, echo_us, **{name: told[name] for name in names})
+    service_us, echo_us, ages_s = (array("f", told[name]) for name in ("service_us", "echo_us", "ages_s"))
+    names = ("failed", "unsafe", "silent_s", "error")
+    return Probe(t_s, service_us, echo_us, ages_s, **{name: told[name] for name in names})
 
 
 @dataclass
@@ -92,8 +104,32 @@ class Ledger:
     others: list[tuple[float, float]] = field(default_factory=list)
 
     def quiet(self, t_s: float) -> bool:
-        """Whether no fault, and no recovery from one, is under way at ``t_s``."""
-        return not any(begin - 1.0 <= t_s <= end for begin, end in (f.window_s for f in self.faults))
+        """Whether no fault, and no recovery from one, is under way at ``t_s``.
+
+        Faults are in order, and none begins before the one before it has ended.
+        """
+        at = bisect_right(self.faults, t_s + 1.0, key=lambda fault: fault.begin_s)
+        for i in range(at - 1, -1, -1):
+            if t_s <= self.faults[i].window_s[1]:
+                return False
+            if self.faults[i].begin_s + _LONGEST_S < t_s:
+                return True
+        return True
+
+    def seconds_between(self, begin_s: float, end_s: float) -> list[Second]:
+        """Those that begin from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.seconds, begin_s, key=lambda second: second.t_s)
+        return self.seconds[first : bisect_right(self.seconds, end_s, key=lambda second: second.t_s)]
+
+    def probes_between(self, begin_s: float, end_s: float) -> list[Probe]:
+        """Those that were told from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.probes, begin_s, key=lambda probe: probe.t_s)
+        return self.probes[first : bisect_right(self.probes, end_s, key=lambda probe: probe.t_s)]
+
+    def events_between(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
+        """Those that came from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.events, begin_s, key=lambda event: event["t_s"])
+        return self.events[first : bisect_right(self.events, end_s, key=lambda event: event["t_s"])]
 
     def counters_between(self, begin_s: float, end_s: float) -> list[tuple[float, str, Mapping[str, float]]]:
         """The counters from ``begin_s`` to ``end_s``. They come in order but for a second or two."""

@@ -10,11 +10,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import psutil
 
 from service.errors import ServiceError
 from service.soak.actions import Actions
+from service.soak.interim import Interim
 from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
 from service.soak.monitor import Monitor
 from service.soak.plan import SoakPlan
@@ -35,17 +37,21 @@ LASTING = ("router", "a", "b", "stage", "controller", "prober", "echo", "viewer"
 
 
 def run_live(
-    out: Path, stage: StageConfig, control: Control, model: Path, plan: SoakPlan, stopped: Callable[[], bool], say: Say
-) -> tuple[Ledger, Monitor]:
-    """Run the plan; ``stopped`` ends it early. Raises ServiceError where the processes do not come up."""
-    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, "real_time")
-    with World(out, stage, control, model) as world:
+    out: Path, stage: StageConfig, control: Control, plan: SoakPlan, ledger: Ledger, interim: Interim,
+    stopped: Callable[[], bool], say: Say,
+) -> Monitor:  # fmt: skip
+    """Run the plan and fill the ledger; ``stopped`` ends it early. The models are in ``out``.
+
+    Raises ServiceError where the processes do not come up.
+    """
+    with World(out, stage, control, out / "model.npz") as world:
         say("      starting router, services, stage, controller, prober, echo, viewer")
         world.start()
         monitor = Monitor(world.endpoint, control, time.monotonic())
         try:
             _wait_for_samples(monitor)
-            watch = _Watch(world, monitor, ledger, say)
+            ledger.seconds, ledger.events = monitor.track.seconds, monitor.events
+            watch = _Watch(world, monitor, ledger, interim, say)
             try:
                 watch.run(plan, stopped)
             finally:
@@ -55,8 +61,7 @@ def run_live(
             world.stop()
             monitor.close()
     ledger.seconds = monitor.track.seconds[:-1] or monitor.track.seconds
-    ledger.events = monitor.events
-    return ledger, monitor
+    return monitor
 
 
 def _wait_for_samples(monitor: Monitor) -> None:
@@ -70,8 +75,9 @@ def _wait_for_samples(monitor: Monitor) -> None:
 class _Watch:
     """The loop of a run, and the thread that looks at processes and statuses once a second."""
 
-    def __init__(self, world: World, monitor: Monitor, ledger: Ledger, say: Say) -> None:
+    def __init__(self, world: World, monitor: Monitor, ledger: Ledger, interim: Interim, say: Say) -> None:
         self._world, self._monitor, self._ledger, self._say = world, monitor, ledger, say
+        self._interim = interim
         self._actions = Actions(world, monitor)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._observe, name="soak-observe")
@@ -80,8 +86,7 @@ class _Watch:
 
     def run(self, plan: SoakPlan, stopped: Callable[[], bool]) -> None:
         monitor, ledger = self._monitor, self._ledger
-        monitor.start_s = time.monotonic()
-        monitor.track.seconds.clear()
+        monitor.begin()
         self._thread.start()
         waiting = list(enumerate(plan.faults))
         under_way: list[tuple[int, float, Happened]] = []
@@ -109,6 +114,7 @@ class _Watch:
                     under_way.remove((index, end_s, happened))
             self._actions.tick()
             self._progress(plan)
+            self._interim.due(monitor.now(), self._samples)
             time.sleep(_TICK_S)
         for _, fault in waiting:
             # Such as one that waited to the end for the standby to be synced, and those behind it.
@@ -192,6 +198,9 @@ class _Watch:
         if share is not None:
             self._ledger.others.append((self._monitor.now(), share))
 
+    def _samples(self) -> dict[str, int]:
+        return self._monitor.samples() | {"withheld_by_faults": withheld(self._monitor.stage)}
+
     def _progress(self, plan: SoakPlan) -> None:
         now = self._monitor.now()
         if now - self._told_s < _PROGRESS_S:
@@ -206,3 +215,8 @@ class _Watch:
             f"  [{'#' * filled:<20}] {now:6.0f} of {plan.duration_s:g} s  error {mae:.3f} % of range{well}, "
             f"{len(self._ledger.faults)} of {len(plan.faults)} faults, last {last}, {self._actions.primary} serves"
         )
+
+
+def withheld(stage: dict[str, Any]) -> int:
+    """How many samples the stage did not send because it was told so."""
+    return int(stage.get("faults", {}).get("gap", 0))

@@ -47,6 +47,10 @@ class Machine:
         late_s, others = (max(self._within(which, begin_s, end_s), default=0.0) for which in (0, 1))
         return late_s > STALLED_S or others > TAKEN_SHARE
 
+    def taken(self, begin_s: float, end_s: float) -> bool:
+        """Whether others had so much of it that what computes may have had to wait."""
+        return max(self._within(1, begin_s, end_s), default=0.0) > BUSY_SHARE
+
     def allowed_s(self, begin_s: float, end_s: float) -> float:
         """What a query may take longer than on a machine that is free, s."""
         return HANDOVERS * max(self._within(0, begin_s, end_s), default=0.0)

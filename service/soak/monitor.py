@@ -1,127 +1,25 @@
-"""Watches a soak from outside: the samples of the stage, what was wanted, what the services say, what processes take.
-
-Seconds are kept, not samples, so that a run of days fits into memory.
-"""
+"""Watches a soak from outside: the samples of the stage, what was wanted and sent, what the services say of it."""
 
 from __future__ import annotations
 
 import json
-import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import zenoh
 
 from adaptive.errors import InputError
 from service import wire
 from service.keys import Keys
 from service.session import open_client
-from service.soak.intervals import Intervals
 from service.soak.setup import AXIS, STAGE, Control
+from service.soak.track import Second, Track
 from service.stage_node import status_key
 
-#: Samples for which the reference is remembered.
-_RING = 16_384
-_MAX_EVENTS = 20_000
-
-
-@dataclass
-class Second:
-    """One second of samples: how many, the sums and worst of |error| in µm, and of the voltages what was worst.
-
-    ``held`` samples had no command of their own in time: the stage held the last one.
-    """
-
-    t_s: float
-    seq: int = 0
-    samples: int = 0
-    judged: int = 0
-    error_sum_um: float = 0.0
-    error_max_um: float = 0.0
-    step_max_V: float = 0.0
-    beyond_V: float = 0.0
-    held: int = 0
-    not_finite: int = 0
-
-    @property
-    def mae_um(self) -> float:
-        """Mean |error|, µm; NaN where nothing could be judged."""
-        return self.error_sum_um / self.judged if self.judged else math.nan
-
-
-@dataclass
-class Track:
-    """What the samples of a stage show, second by second; fed with batches, in the order of arrival.
-
-    ``clock`` tells the time of a batch, s, on the axis of the report.
-    """
-
-    control: Control
-    clock: Callable[[], float]
-    seconds: list[Second] = field(default_factory=list)
-    seen: Intervals = field(default_factory=Intervals)
-
-    def __post_init__(self) -> None:
-        self._wanted = np.full(_RING, np.nan)
-        self._wanted_seq = np.full(_RING, -1, dtype=np.int64)
-        self._commanded_V = np.full(_RING, np.nan)
-        self._commanded_seq = np.full(_RING, -1, dtype=np.int64)
-        self._u_V, self._seq = math.nan, -2
-        self.newest = -1
-        self.received = 0
-        self.repeated = 0
-
-    def want(self, first: int, y_um: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        """The reference from sample ``first`` on, µm."""
-        numbers = np.arange(first, first + y_um.size)
-        self._wanted[numbers % _RING] = y_um
-        self._wanted_seq[numbers % _RING] = numbers
-
-    def command(self, first: int, u_V: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        """Voltages sent for the samples from ``first`` on, V."""
-        numbers = np.arange(first, first + u_V.size)
-        self._commanded_V[numbers % _RING] = u_V
-        self._commanded_seq[numbers % _RING] = numbers
-
-    def take(self, batch: wire.SampleBatch) -> None:
-        """Samples as they came."""
-        now = self.clock()
-        if not self.seconds or now - self.seconds[-1].t_s >= 1.0:
-            self.seconds.append(Second(math.floor(now)))
-        second = self.seconds[-1]
-        c, seq, u_V = self.control, batch.seq, batch.u_V
-        self.received += len(batch)
-        fresh = seq > self.newest if abs(int(seq[0]) - self.newest) < 10_000_000 else np.ones(len(batch), dtype=bool)
-        self.repeated += len(batch) - int(np.count_nonzero(fresh))
-        self.seen.add_all(seq)
-        second.samples += len(batch)
-        second.seq = int(seq[-1])
-        slots = seq % _RING
-        in_time = (self._commanded_seq[slots] == seq) & (self._commanded_V[slots] == u_V)
-        second.held += len(batch) - int(np.count_nonzero(in_time))
-        finite = np.isfinite(u_V)
-        second.not_finite += int(np.count_nonzero(~finite))
-        if finite.any():
-            beyond = max(float(u_V[finite].max()) - c.u_max_V, c.u_min_V - float(u_V[finite].min()))
-            second.beyond_V = max(second.beyond_V, beyond)
-        if fresh.all():
-            # The step is that of samples that follow one another; what lies between others nobody saw.
-            before = np.concatenate(([self._u_V], u_V[:-1]))
-            follows = np.diff(seq, prepend=self._seq) == 1
-            if follows.any():
-                second.step_max_V = max(second.step_max_V, float(np.max(np.abs(u_V - before)[follows])))
-            self._u_V, self._seq = float(u_V[-1]), int(seq[-1])
-            self.newest = int(seq[-1])
-        known = (self._wanted_seq[seq % _RING] == seq) & np.isfinite(batch.y_um)
-        if known.any():
-            error = np.abs(self._wanted[seq % _RING] - batch.y_um)[known]
-            second.judged += error.size
-            second.error_sum_um += float(error.sum())
-            second.error_max_um = max(second.error_max_um, float(error.max()))
+#: So many events are kept: those of months, or of some days in which everybody complains.
+_MAX_EVENTS = 500_000
 
 
 class Monitor:
@@ -160,6 +58,14 @@ class Monitor:
             if len(self.events) < _MAX_EVENTS:
                 self.events.append({"t_s": round(self.now(), 3), "event": event, "detail": str(sample.key_expr)})
 
+    def begin(self) -> None:
+        """Let time begin now, and forget what was seen before."""
+        with self._lock:
+            self.start_s = time.monotonic()
+            self.track.seconds.clear()
+            self.events.clear()
+            self.statuses.clear()
+
     def now(self) -> float:
         """Seconds since the watch began."""
         return time.monotonic() - self.start_s
@@ -182,7 +88,12 @@ class Monitor:
         self.track.want(block.seq, block.values)
 
     def _command(self, payload: bytes) -> None:
-        block = wire.decode_command(payload)
+        try:
+            block = wire.decode_command(payload)
+        except InputError:
+            # What is no number, or not even a block, is refused by whoever reads it: the breach is that it was sent.
+            self.track.refuse_command()
+            raise
         self.track.command(block.seq, block.values)
 
     def _event(self, payload: bytes) -> None:
@@ -210,6 +121,11 @@ class Monitor:
     def put(self, key: str, value: dict[str, Any]) -> None:
         """Publish JSON, to the stage or the controller."""
         self._session.put(key, json.dumps(value))
+
+    def samples(self) -> dict[str, int]:
+        """How many samples have been seen so far, and how many came."""
+        with self._lock:
+            return {"seen": len(self.track.seen), "received_by_monitor": self.track.received}
 
     def latest(self) -> tuple[Second | None, int]:
         """The second before the present one, and the newest number."""

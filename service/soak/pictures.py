@@ -15,7 +15,7 @@ import numpy as np
 from service.soak.catalogue import KINDS, MACHINE, PROCESS, STAGE
 from service.soak.judge import TRACKING_PCT
 from service.soak.ledger import Ledger
-from service.soak.outcome import warm_up_s
+from service.soak.memory import warm_up_s
 
 #: Colour-blind safe: where a fault happens.
 COLOURS = {PROCESS: "#d55e00", STAGE: "#0072b2", MACHINE: "#cc79a7"}

@@ -1,7 +1,7 @@
 """A second client of a soak as a process: asks for points and a bare echo in turns, and follows the model.
 
 ``python -m service.soak.prober CONTROL.json ENDPOINT`` prints a line of JSON every second: round trips in µs, how long
-nobody answered, voltages that were not as promised, the age of the followed model.
+nobody answered, voltages that were not as promised, and with every query how old the followed model was.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Prober:
     def _clear(self) -> None:
         self.told: dict[str, Any] = {
             "service_us": [], "echo_us": [], "failed": 0, "refused": 0, "unsafe": 0, "silent_s": 0.0,
-            "fallback": 0, "error": "",
+            "fallback": 0, "error": "", "ages_s": [],
         }  # fmt: skip
 
     def ask(self) -> None:
@@ -81,11 +81,15 @@ class Prober:
                 reply.ok.payload.to_bytes()
                 self.told["echo_us"].append(round(1e6 * (time.perf_counter() - begin), 1))
 
-    def report(self, **more: Any) -> str:
+    def look(self, age_s: float) -> None:
+        """At the age of the followed model, s."""
+        self.told["ages_s"].append(round(age_s, 4))
+
+    def report(self) -> str:
         """The second's line, and a new second."""
         # A silence that has not ended is told too.
         self.told["silent_s"] = round(max(self.told["silent_s"], time.monotonic() - self._answered_s), 4)
-        line = json.dumps({"t_s": round(time.monotonic(), 3), **self.told, **more})
+        line = json.dumps({"t_s": round(time.monotonic(), 3), **self.told})
         self._clear()
         return line
 
@@ -113,9 +117,10 @@ def main(argv: list[str]) -> int:
                     prober.ask()
                     prober.echo()
                     time.sleep(PAUSE_S)
+                    prober.look(follower.age_s)
                     if time.monotonic() >= next_s:
                         next_s += 1.0
-                        print(prober.report(age_s=round(follower.age_s, 4)), flush=True)
+                        print(prober.report(), flush=True)
                 echo.undeclare()  # type: ignore[no-untyped-call]
     except DehystError as error:
         print(json.dumps({"fatal": str(error)}), flush=True)

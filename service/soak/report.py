@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from service.soak.catalogue import KINDS
-from service.soak.ledger import Ledger
+from service.soak.ledger import REAL_TIME, Ledger
+from service.soak.outcome import verdict_line
 from service.soak.plan import SoakPlan
 
 
 def report(found: dict[str, Any], ledger: Ledger, plan: SoakPlan, pictures: list[str], interrupted: bool) -> str:
     """The page, from what is in ``soak.json`` and what it leaves out."""
-    lines = [f"# Soak: {found['verdict']}", ""]
-    how = "in real time, in processes" if ledger.mode == "real_time" else "in one process, as fast as it goes"
+    lines = [f"# Soak: {verdict_line(found)}", ""]
+    how = "in real time, in processes" if ledger.mode == REAL_TIME else "in one process, as fast as it goes"
     lines.append(
         f"{found['duration_s']:g} s of {plan.duration_s:g} s {how}; seed {plan.seed}; {len(ledger.faults)} of "
         f"{len(plan.faults)} planned faults." + (" Interrupted: this is what ran." if interrupted else "")
@@ -54,7 +55,7 @@ def report(found: dict[str, Any], ledger: Ledger, plan: SoakPlan, pictures: list
             f"{ratios[0]:.2f} and {ratios[1]:.2f} times.",
         ]  # fmt: skip
     slope = found["memory_slope_kb_per_hour"]
-    lines += ["", "## Memory", "", "Too short a run to judge." if slope is None else f"{slope:.0f} kB an hour."]
+    lines += ["", "## Memory", "", "Not judged." if slope is None else f"{slope:.0f} kB an hour."]
     samples = ", ".join(f"{name} {value}" for name, value in found["samples"].items())
     lines += ["", "## Samples", "", f"{samples}.", ""]
     lines += [f"![{name}]({name})" for name in pictures]

@@ -10,27 +10,29 @@ from pathlib import Path
 from typing import Any
 
 from service.output_folder import clear_output
+from service.soak.interim import Interim
 from service.soak.intervals import Intervals
-from service.soak.judge import judge
-from service.soak.ledger import Ledger
-from service.soak.live import Say, run_live
-from service.soak.outcome import summary
+from service.soak.judge import TRACKING_PCT, judge
+from service.soak.ledger import FAST, REAL_TIME, Ledger
+from service.soak.live import Say, run_live, withheld
+from service.soak.outcome import PART, summary, write_found
 from service.soak.plan import SoakPlan
 from service.soak.recorded import recorded
 from service.soak.report import report
 from service.soak.settling import settle
 from service.soak.setup import identify, stage_of
+from service.soak.track import OTHER_LIFE
 
 #: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
-OURS = ("soak.json", "report.md", "plan.json", "error.png", "latency.png", "memory.png", "soak.rrd", "model.npz",
-        "a", "b", "logs")  # fmt: skip
+OURS = ("soak.json", f"soak.json{PART}", "report.md", "plan.json", "error.png", "latency.png", "memory.png", "soak.rrd",
+        "model.npz", "a", "b", "logs")  # fmt: skip
 #: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
 OWN_STAGE_RATIO = 2.0
 #: What waits to be written when the disk is full, or to be passed on when the router dies, is lost too, s; and a second
 #: is told by its beginning.
 WAITING_S = 1.0
-#: Numbers that go on by more than this are those of another life of the stage.
-_RESTARTED = 10_000_000
+#: No second without a sample is longer than this, s.
+_BEFORE_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,24 +59,27 @@ def run(
     say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, {where}")
     if plan.left_out:
         say(f"      no time for: {', '.join(plan.left_out)}")
+    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
+    ledger.planned = len(plan.faults)
+    # With a stage of one's own the limit is known when the first fault begins; the end judges it.
+    interim = Interim(ledger, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
     missing: int | None = None
     if fast:
         from service.soak.fast import run_fast
 
-        ledger, samples = run_fast(out, stage, control, plan, stopped, say)
+        samples = run_fast(out, stage, control, plan, ledger, interim, stopped, say)
     else:
-        ledger, monitor = run_live(out, stage, control, out / "model.npz", plan, stopped, say)
+        monitor = run_live(out, stage, control, plan, ledger, interim, stopped, say)
         missing, samples = _kept(out, ledger, monitor.track.seen, monitor.track.received)
-        samples |= {"withheld_by_faults": _withheld(monitor.stage)}
+        samples |= {"withheld_by_faults": withheld(monitor.stage)}
         samples |= {"without_their_voltage_in_time": sum(s.held for s in ledger.seconds)}
     say("[3/3] judging and drawing")
-    ledger.planned = len(plan.faults)
     settle(ledger)
     invariants = judge(ledger, missing, **_tracking_limit(ledger, stage_file))
     found = summary(ledger, invariants, samples)
     ledger.notes += _machine(ledger)
     interrupted = ledger.duration_s < plan.duration_s - 1.0
-    (out / "soak.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_found(out / "soak.json", found)
     pictures = _draw(out, ledger)
     text = report(found, ledger, plan, pictures, interrupted)
     (out / "report.md").write_text(text, encoding="utf-8")
@@ -149,16 +154,14 @@ def _excused(ledger: Ledger) -> Intervals:
         begin, end = fault.window_s
         if fault.kind not in ("disk_full", "restart_router"):
             continue
-        for last, second in itertools.pairwise(ledger.seconds):
+        # From some time before: whose last second is that which the first of them follows.
+        around = ledger.seconds_between(begin - _BEFORE_S, end)
+        for last, second in itertools.pairwise(around):
             if begin - WAITING_S - 1.0 <= second.t_s <= end and second.samples:
                 # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
-                follows = 0 < second.seq - last.seq < _RESTARTED
+                follows = 0 < second.seq - last.seq < OTHER_LIFE
                 excused.add(last.seq + 1 if follows else second.seq - second.samples + 1, second.seq + 1)
     return excused
-
-
-def _withheld(stage: dict[str, Any]) -> int:
-    return int(stage.get("faults", {}).get("gap", 0))
 
 
 def _draw(out: Path, ledger: Ledger) -> list[str]:

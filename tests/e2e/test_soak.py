@@ -36,7 +36,7 @@ def test_a_killed_primary_and_poisoned_samples_in_real_processes(tmp_path: Path)
     found = read(tmp_path)
     assert found == json.loads(done.stdout)
     assert set(found) == {
-        "verdict", "duration_s", "faults", "invariants", "latency", "memory_slope_kb_per_hour", "samples"
+        "verdict", "not_judged", "duration_s", "faults", "invariants", "latency", "memory_slope_kb_per_hour", "samples"
     }  # fmt: skip
     assert {name for name in SAFE if not found["invariants"][name]["held"]} == set(), done.stderr
     assert found["faults"]["kill_primary"]["count"] == found["faults"]["nan"]["count"] == 1
@@ -45,11 +45,40 @@ def test_a_killed_primary_and_poisoned_samples_in_real_processes(tmp_path: Path)
     assert found["latency"]["p50_us"] > 0.0 < found["latency"]["echo_p50_us"]
     assert found["samples"]["seen"] > 15_000
     assert found["samples"]["in_no_recording_and_no_fault_on"] == 0
+    assert {"memory", "memory_resident"} <= set(found["not_judged"]), "too short a run"
+    line = f"{found['verdict']}; not judged: "
+    assert line in done.stderr
+    assert "memory (too short a run)" in done.stderr
     report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert report.startswith(f"# Soak: {line}")
     for name in ("error.png", "latency.png", "memory.png"):
         assert (tmp_path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         assert name in report
     assert [f["kind"] for f in json.loads((tmp_path / "plan.json").read_text())["faults"]] == ["kill_primary", "nan"]
+
+
+#: What a soak does to processes and to the machine, but for what the test above does.
+PROCESSES = ("stop_primary", "kill_standby", "kill_viewer", "slow_viewer", "restart_stage", "restart_router",
+             "clock_back", "disk_full", "cpu_stolen", "bad_queries")  # fmt: skip
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.timeout(420)
+def test_every_fault_of_processes_and_machine_happens_and_is_told(tmp_path: Path) -> None:
+    """Each once, one after the other: what must hold however busy the machine is, holds. Times are not judged here."""
+    done = subprocess.run(
+        command(tmp_path, "--duration", "116s", "--seed", "237", "--faults", ",".join(PROCESSES)),
+        capture_output=True, text=True, timeout=400, check=False,
+    )  # fmt: skip
+    assert done.returncode in (0, 1), done.stderr
+    found = read(tmp_path)
+    assert [kind for kind in PROCESSES if kind not in found["faults"]] == [], done.stderr
+    assert {kind for kind, fault in found["faults"].items() if not fault["told_by"]} == set()
+    assert found["faults"]["bad_queries"]["told_by"] == ["queries.errors+samples.malformed"]
+    must = {"answers_safe", "voltages_finite", "voltages_within_limits", "voltages_within_slew", "faults_told",
+            "samples_accounted", "processes_alive"}  # fmt: skip
+    assert {name: found["invariants"][name] for name in must if not found["invariants"][name]["held"]} == {}
 
 
 @pytest.mark.e2e
@@ -109,5 +138,8 @@ def test_what_cannot_be_asked_for_is_said(tmp_path: Path, capsys: pytest.Capture
     for options, named in ((["--rate", "1"], "--rate: got 1"), (["--batch", "0"], "--batch: got 0")):
         assert main(["bench", "--latency", *options]) == 2
         assert named in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["soak", "--help"])
+    assert "90s, 30m, 2h, 3d" in capsys.readouterr().out
     assert main(["soak", "--list"]) == 0
     assert "kill_primary" in capsys.readouterr().out

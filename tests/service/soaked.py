@@ -6,9 +6,9 @@ from typing import Any
 
 from service.soak.judge import judge
 from service.soak.ledger import Happened, Ledger, Probe
-from service.soak.monitor import Second
 from service.soak.outcome import summary
 from service.soak.settling import settle
+from service.soak.track import Second
 
 
 def healthy(duration_s: int = 40) -> Ledger:
@@ -19,7 +19,7 @@ def healthy(duration_s: int = 40) -> Ledger:
     for k in range(duration_s):
         bad = 10 <= k < 12
         ledger.seconds.append(Second(float(k), 1000 * k, 1000, 1000, 1000 * (2.0 if bad else 0.03), 2.0, 0.2))
-        ledger.probes.append(Probe(k + 0.9, [200.0, 220.0], [150.0, 160.0], 0, 0, 0.02, 0.02))
+        ledger.probes.append(Probe(k + 0.9, [200.0, 220.0], [150.0, 160.0], [0.02, 0.03], 0, 0, 0.02))
         lost += 1000 if k == 10 else 0
         ledger.counters.append(
             (
@@ -38,4 +38,4 @@ def verdict(ledger: Ledger, missing: int = 0) -> dict[str, Any]:
 
 
 def broken(found: dict[str, Any]) -> set[str]:
-    return {name for name, row in found["invariants"].items() if not row["held"]}
+    return {name for name, row in found["invariants"].items() if row["held"] is False}

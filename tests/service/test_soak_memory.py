@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.soak.ledger import Ledger, Row
-from service.soak.outcome import memory_slope, resident_growth
+from service.soak.memory import memory_slope, resident_growth
 from tests.service.soaked import broken, healthy, verdict
 
 
@@ -93,5 +93,18 @@ def test_resident_memory_is_judged_by_what_it_ends_at() -> None:
     assert "memory_resident" in broken(verdict(ledger))
     ledger.memory["a"] = [(float(s), 200_000.0 + 1024.0 * (40.0 if 400.0 < s < 900.0 else 0.0), 17) for s in t]
     assert resident_growth(ledger) == pytest.approx(0.0)
+    assert verdict(ledger)["invariants"]["memory_resident"]["held"] is True
     ledger.memory["a"] = ledger.memory["a"][:700]
     assert resident_growth(ledger) is None
+
+
+def test_too_short_a_run_says_that_it_does_not_tell() -> None:
+    for mode, why in (("real_time", "too short a run"), ("fast", "in one process")):
+        ledger = healthy()
+        ledger.mode = mode
+        found = verdict(ledger)
+        for name in ("memory", "memory_resident"):
+            assert found["invariants"][name]["held"] is None
+            assert found["invariants"][name]["why"] == why
+            assert name in found["not_judged"]
+        assert found["verdict"] == "held"
