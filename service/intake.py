@@ -25,6 +25,8 @@ T = TypeVar("T")
 #: How long after the first message the others are waited for that are handled with it, s. To be woken costs as much as
 #: to learn from two samples, and a query meets a core, a cache and an interpreter's lock that are busy less often.
 GATHER_S: Final = 0.005
+#: In a recording: what was never handled, because too much waited already.
+DROPPED: Final = "dropped"
 #: Diagnostics are taken every so many seconds of samples, the points of the window every so many of those.
 DIAGNOSTICS_S: Final = 0.05
 _WINDOW_EVERY: Final = 20
@@ -113,15 +115,20 @@ class Intake:
     def offer(self, batch: SampleBatch) -> bool:
         """Queue samples for the learner; False if they were dropped because it is too far behind."""
         with self._ready:
-            if self._closing or self.waiting + len(batch) > self.axis.config.queue_samples:
+            fits = not self._closing and self.waiting + len(batch) <= self.axis.config.queue_samples
+            if fits:
+                self._queue.append(batch)
+                self.waiting += len(batch)
+                self._ready.notify()
+            else:
                 if not self.dropped:
                     self.axis.note("samples_dropped", "the learner is behind and its queue is full; see the status")
                 self.dropped += len(batch)
-                return False
-            self._queue.append(batch)
-            self.waiting += len(batch)
-            self._ready.notify()
-        return True
+        # Nobody will handle them: they are recorded apart from those that the learner goes through.
+        put_aside = None if fits else getattr(self.sink, "put_aside", None)
+        if put_aside is not None:
+            put_aside(batch.seq, batch.t_s, batch.u_V, batch.y_um, DROPPED)
+        return fits
 
     def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
         """Do ``work`` in the thread that handles samples, after those that have come; what it returns or raises.

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -54,6 +56,8 @@ class Rows:
 
     def part(self, start: int, stop: int) -> Rows:
         """Rows ``start`` up to ``stop``."""
+        if start == 0 and stop == len(self):
+            return self
         cut = slice(start, stop)
         return Rows(self.seq[cut], self.t_s[cut], self.u_V[cut], self.y_um[cut], self.reason[cut])
 
@@ -97,9 +101,9 @@ class Journal:
         self._words = words
         self.rows += len(rows)
 
-    def sync(self) -> None:
-        """Have it on the disk itself."""
-        os.fsync(self._fd)
+    def handle(self) -> int:
+        """Another descriptor of the file, which whoever asks for it closes."""
+        return os.dup(self._fd)
 
     def close(self) -> None:
         """Let go of the file; never raises."""
@@ -116,6 +120,38 @@ class Journal:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._size)
             raise
+
+
+class Syncer:
+    """Has a journal on the disk itself every so often, beside the thread that writes: a disk may take its time, and
+    what waits for it in memory would be lost with the process.
+    """
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self._at = time.monotonic()
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+
+    def look(self, journal: Journal) -> None:
+        """Begin where it is due. Raises OSError where the last time failed."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+        now = time.monotonic()
+        if now - self._at < self._every_s or (self._thread is not None and self._thread.is_alive()):
+            return
+        self._at = now
+        self._thread = threading.Thread(target=self._sync, args=(journal.handle(),), name="sync", daemon=True)
+        self._thread.start()
+
+    def _sync(self, handle: int) -> None:
+        try:
+            os.fsync(handle)
+        except OSError as error:
+            self._error = error
+        finally:
+            os.close(handle)
 
 
 def _definition(number: int, word: str) -> Any:

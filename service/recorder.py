@@ -1,10 +1,10 @@
 """Every sample onto disk, in a thread of its own, without ever holding up who hands it over.
 
-``put`` only appends to a bounded queue; where the queue is full the samples are dropped and counted. The thread
-appends them to a journal every few hundredths of a second, has a segment of bounded length made of each journal, and
-removes the oldest segment when all of them together outgrow their share of the disk. A disk that fails (full,
-read-only, gone) degrades the recording and nothing else: samples are counted as lost, and a new segment is tried
-again after a while.
+``put`` only appends to a bounded queue and wakes the thread; where the queue is full the samples are dropped and
+counted. Within about a millisecond the thread appends them to a journal, which outlives this process. It has a segment
+of bounded length made of each journal, and removes the oldest when all of them outgrow their share of the disk. A disk
+that fails (full, read-only, gone) degrades the recording and nothing else: samples are counted as lost, and a new
+segment is tried again after a while.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from service.journal import Journal, Rows
+from service.journal import Journal, Rows, Syncer
 from service.recorder_config import RecorderConfig
 from service.recorder_files import Closer, claim, journal_of, make_room, next_number
 
@@ -48,8 +48,10 @@ class Recorder:
         # Whether journals may lie there that are to be closed; whether one of them is this recorder's own.
         self._left_open, self._own = True, False
         self._closer: Closer | None = None
+        # Writes what nobody handles into a folder of its own, from the first such sample on.
+        self._aside: Recorder | None = None
         self._not_before = 0.0
-        self._synced_at = time.monotonic()
+        self._syncer = Syncer(config.sync_s)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -76,10 +78,25 @@ class Recorder:
                 return False
             self._queue.append((first, rows))
             self._waiting += len(rows)
+        # What a killed process has only in memory is lost: the thread takes it now and not when its pause is over.
+        self._wake.set()
         return True
 
+    def put_aside(
+        self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]
+    ) -> bool:
+        """As :meth:`put`, for samples that nobody handles: into a folder of their own, since they have no place in the
+        order in which a restart and a replay go through the others.
+        """
+        with self._lock:
+            if self._aside is None and not self._stop:
+                self._aside = Recorder(self.config.aside())
+            aside = self._aside
+        return aside is not None and aside.put(seq, t_s, u_V, y_um, reason)
+
     def counters(self) -> dict[str, Any]:
-        """Samples offered, written, dropped (queue full) and lost (disk); segments closed and removed; the last error.
+        """Samples offered, written, dropped (queue full) and lost (disk); segments closed and removed; the last error;
+        samples written ``aside``.
 
         ``degraded`` is True from a failure of the disk until the next batch is written.
         """
@@ -88,6 +105,7 @@ class Recorder:
                 **self._counts,
                 "salvaged": self._salvaged,
                 "waiting": self._waiting,
+                "aside": 0 if self._aside is None else self._aside.counters()["written"],
                 "degraded": bool(self._error),
                 "error": self._error,
             }
@@ -98,6 +116,8 @@ class Recorder:
             self._stop = True
         self._wake.set()
         self._thread.join(timeout_s)
+        if self._aside is not None:
+            self._aside.close(timeout_s)
         return not self._thread.is_alive()
 
     def rebase(self, index: int) -> None:
@@ -107,7 +127,8 @@ class Recorder:
 
     def _run(self) -> None:
         while True:
-            # Reading the flag before the queue: what was handed over before the stop is still written.
+            # In this order: what is handed over meanwhile wakes it once more, and what came before the stop is written.
+            self._wake.clear()
             stop = self._stop
             taken = self._take()
             if taken is not None:
@@ -130,6 +151,8 @@ class Recorder:
             self._waiting = 0
         if not parts:
             return None
+        if len(parts) == 1:  # nearly always
+            return parts[0][1], parts[0][0] + np.arange(len(parts[0][1]))
         rows = Rows(
             np.concatenate([p.seq for _, p in parts]),
             np.concatenate([p.t_s for _, p in parts]),
@@ -175,9 +198,8 @@ class Recorder:
                 if self._segment.rows >= self.config.segment_rows:
                     self._segment.close()
                     self._segment, self._left_open, self._own = None, True, True
-            if self._segment is not None and time.monotonic() - self._synced_at >= self.config.sync_s:
-                self._synced_at = time.monotonic()
-                self._segment.sync()
+            if self._segment is not None:
+                self._syncer.look(self._segment)
             if time.monotonic() >= self._not_before:
                 with self._lock:
                     self._error = ""

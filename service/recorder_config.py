@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 from service.errors import FieldError
+
+#: Folder, in that of a recorder, for samples that were never handled; what reads a folder passes over such names.
+ASIDE: Final = "_aside"
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +23,8 @@ class RecorderConfig:
     max_bytes : all closed segments together, bytes; the oldest are removed beyond that. The journals of the newest two
     segments, 40 bytes a sample, come on top.
     queue_samples : samples that may wait for the disk.
-    flush_s : longest time that a sample waits in memory, s: what a killed process loses.
+    flush_s : longest time that a sample waits in memory, s. It is about a millisecond where the disk keeps up: handing
+    samples over wakes who writes them. And how often it is looked whether a segment is closed.
     sync_s : longest time that a sample waits for the disk itself, s: what a cut of the power loses.
     retry_s : pause after a failure of the disk, s.
     """
@@ -40,3 +45,7 @@ class RecorderConfig:
         for name in ("flush_s", "sync_s", "retry_s"):
             if not getattr(self, name) > 0.0:
                 raise FieldError(name, getattr(self, name), "a positive time in s")
+
+    def aside(self) -> RecorderConfig:
+        """For samples that nobody handles: beside the others, with a tenth of their share of the disk on top of it."""
+        return replace(self, directory=self.directory / ASIDE, max_bytes=max(1, self.max_bytes // 10))

@@ -14,6 +14,7 @@ import pytest
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
+from service import checkpoint
 from service.axis import Axis
 from service.axis_state import axis_state, fingerprint, restore_axis
 from service.checkpoint import CheckpointFolder, CheckpointMeta, decode_checkpoint, encode_checkpoint, is_kept
@@ -21,7 +22,7 @@ from service.config import AxisConfig
 from service.guard import Limits
 from service.intake import Intake
 from service.keeper import Keeper, restore_newest
-from service.modelfile import Bundle, BundleMeta
+from service.modelfile import UNITS, Bundle, BundleMeta
 from service.models import load_axis, make_learner
 from service.wire import SampleBatch
 from tests.service.conftest import DT_S, make_models
@@ -77,7 +78,7 @@ def test_an_axis_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> No
 
 
 def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refused_with_the_reason(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     axis, kept = make_axis(), folder(tmp_path)
     axis.handle(recording(0, 500))
@@ -94,6 +95,16 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
         assert restore_newest(fresh, kept) == 1
         foreign.unlink()
         assert any(words in e["detail"] for e in fresh.take_events() if e["event"] == "checkpoint_refused")
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "UNITS", {**UNITS, "y": "nm"})
+        in_nm = kept.write(meta(axis), state)
+    fresh = make_axis()
+    assert restore_newest(fresh, kept) == 1
+    in_nm.unlink()
+    refused, restored = fresh.take_events()
+    assert (refused["event"], restored["event"]) == ("checkpoint_refused", "restored")
+    assert "units is {'y': 'nm'" in refused["detail"]
+    assert "expected {'y': 'um'" in refused["detail"]
     path = kept.write(meta(axis), state)
     whole = path.read_bytes()
     for damaged in (whole[:-1], whole[:40], b"", whole[:5000] + b"\xff" + whole[5001:], b"x" * 100):

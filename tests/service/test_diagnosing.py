@@ -311,12 +311,14 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
     config.write_text(
         f'stage = "demo"\nlisten = ["{endpoint}"]\n[[axis]]\nname = "x"\nmodel = {json.dumps(str(model_file))}\n'
         "u_min_V = -2.0\nu_max_V = 10.0\nslew_V_per_s = 4000.0\n"
+        f"recorder = {json.dumps(str(tmp_path / 'recording'))}\n"
         "[axis.diagnosis]\nhistory_s = 8\nreference_s = 4\nrecent_s = 3\ncollect_s = 2.5\n"
         f"reports = {json.dumps(str(tmp_path / 'reports'))}\n"
         "[axis.retuning]\nperiod_s = 0.0\nfresh = 60\ntorch = false\n"
         "search = {starts = 2, rows = 100, iterations = 15}\n"
     )
     u_V = voltages(model_file, 20.0)
+    began_at = time.time()
     cli = [sys.executable, "-m", "service.cli"]
     serve = subprocess.Popen([*cli, "serve", "--config", str(config), "--json"], stdout=subprocess.PIPE, text=True)
     stage = None
@@ -350,9 +352,19 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
             assert last["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.004)
             last = eventually(lambda: client.status()["retuning"]["last"], 60.0)
             assert last["outcome"] in ("better", "worse", "unchanged"), last
-            ask = [*cli, "ask-diagnosis", "--report", "--recent", "4", "--endpoint", endpoint, "--json"]
+            ask = [*cli, "ask-diagnosis", "--report", "--recent", "4", "--endpoint", endpoint, "--who", "bob", "--json"]
             asked = subprocess.run(ask, capture_output=True, text=True, timeout=60, check=True)
             assert json.loads(asked.stdout)["result"] == {"started": True, "job": 2}
+            written = (tmp_path / "recording" / "operations.jsonl").read_text().splitlines()
+            journal = [json.loads(line) for line in written]
+            assert [(line["who"], line["verb"], line["ok"]) for line in journal] == [
+                ("alice", "retune", True),
+                ("bob", "diagnose", True),
+            ]
+            assert journal[1]["arguments"] == {"recent_s": 4.0, "report": True}
+            times = [began_at, *(line["time_unix_s"] for line in journal), time.time()]
+            assert times == sorted(times)
+            assert 1000 < journal[0]["seq"] < journal[1]["seq"]
             eventually(lambda: client.status()["diagnosis"]["finished"] == 2, 120.0)
             folder = Path(client.status()["diagnosis"]["last"]["report"]["folder"])
             assert folder.parent == tmp_path / "reports"

@@ -16,10 +16,14 @@ import pytest
 
 from adaptive.errors import InputError
 from service import recorder_files
+from service.intake import Intake
 from service.journal import Journal, Rows, read_journal
 from service.recorder import Recorder, RecorderConfig
+from service.recorder_config import ASIDE
 from service.recorder_files import segments
 from sim.recordings import check, read
+from tests.service.test_checkpoint import make_axis
+from tests.service.test_checkpoint import recording as arriving
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -57,6 +61,62 @@ def test_what_was_put_is_read_back_to_the_last_bit_across_segments(tmp_path: Pat
     np.testing.assert_array_equal(recording.y_um, y_um)
     assert recording.reason.tolist() == ["learnt"] * 1000 + ["redundant"] * 1000
     assert [f.kind for f in check(recording)] == ["note"]
+
+
+def written_rows(directory: Path) -> int:
+    """Rows in the files of the open segments, as a killed process would leave them."""
+    return sum(len(read_journal(path)[0]) for path in directory.glob("*.journal"))
+
+
+def test_what_was_put_is_in_the_file_at_once_however_long_the_disk_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the pause of the thread that writes nor the disk's own sync may keep samples in memory."""
+    hold, took_s = threading.Event(), []
+    monkeypatch.setattr(os, "fsync", lambda fd: hold.wait(60.0))
+    with Recorder(RecorderConfig(tmp_path, flush_s=60.0, sync_s=1e-3)) as recorder:
+        try:
+            for k in range(100):
+                begin = time.perf_counter()
+                recorder.put(*block(5 * k, 5), reason="learnt")
+                while recorder.counters()["written"] < 5 * (k + 1):
+                    assert time.perf_counter() - begin < 10.0, "left in memory"
+                    time.sleep(1e-4)
+                took_s.append(time.perf_counter() - begin)
+                time.sleep(1e-3)
+            assert written_rows(tmp_path) == 500
+        finally:
+            hold.set()
+    print(f"in the file after {1e3 * np.median(took_s):.2f} ms, at most {1e3 * max(took_s):.1f} ms")
+    assert np.median(took_s) < 0.01
+    assert len(read(tmp_path)) == 500
+
+
+def test_a_disk_that_cannot_sync_is_one_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ill = threading.Event()
+    ill.set()
+
+    def fsync(_: int) -> None:
+        if ill.is_set():
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with Recorder(config(tmp_path, sync_s=0.01)) as recorder:
+        k = 0
+
+        def fed_until(degraded: bool) -> bool:
+            nonlocal k
+            recorder.put(*block(k, 10), reason="learnt")
+            k += 10
+            return bool(recorder.counters()["degraded"]) == degraded
+
+        wait_for(lambda: fed_until(True))
+        assert "Input/output error" in recorder.counters()["error"]
+        ill.clear()
+        wait_for(lambda: fed_until(False))
+    counters = recorder.counters()
+    assert counters["offered"] == counters["written"] + counters["lost"] == k
+    assert len(read(tmp_path)) == counters["written"]
 
 
 def test_refused_samples_are_kept_as_they_came(tmp_path: Path) -> None:
@@ -287,3 +347,28 @@ def test_bad_configuration_and_bad_rows(tmp_path: Path) -> None:
         config(tmp_path, segment_rows=0)
     with Recorder(config(tmp_path)) as recorder, pytest.raises(InputError, match="y_um: got 1 values, expected 2"):
         recorder.put([1, 2], [0.0, 0.1], [1.0, 2.0], [1.0], "learnt")
+
+
+def test_what_was_dropped_before_it_was_handled_is_recorded_apart(tmp_path: Path) -> None:
+    axis = make_axis(queue_samples=100)
+    with Recorder(config(tmp_path)) as recorder:
+        intake = Intake(axis, lambda: None, recorder)  # not started yet: nobody takes
+        offered = [intake.offer(arriving(first, 30)) for first in range(0, 150, 30)]
+        assert offered == [True, True, True, False, False]
+        intake.start()
+        intake.close()
+        wait_for(lambda: recorder.counters()["written"] == 90 and recorder.counters()["aside"] == 60)
+        # They count for nothing by which a restart goes on.
+        assert recorder.index == axis.sequence.received == 90
+        behind = recorder_files.rows_behind(tmp_path, 60)
+        assert behind is not None
+        assert behind.seq.tolist() == list(range(60, 90))
+    handled, dropped = read(tmp_path), read(tmp_path / ASIDE)
+    assert handled.seq is not None
+    assert dropped.seq is not None
+    assert dropped.reason is not None
+    assert handled.seq.tolist() == list(range(90))
+    assert dropped.seq.tolist() == list(range(90, 150))
+    assert set(dropped.reason) == {"dropped"}
+    np.testing.assert_array_equal(dropped.y_um, arriving(90, 60).y_um)
+    assert not recorder.put_aside(*block(0, 1), reason="dropped")

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import json
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from service.checkpoint import CheckpointFolder, decode_checkpoint
 from service.client import Client
+from service.session import open_service
 from service.wire_query import STALE
 from sim.recordings import read
 from tests.service.conftest import unused_port, write_config
@@ -20,6 +26,10 @@ from tests.service.living import Asker, Process, Stage, eventually
 pytestmark = pytest.mark.e2e
 ROOT = Path(__file__).resolve().parents[2]
 EXTRA = 'recorder = "rec"\ncheckpoints = "kept"\ncheckpoint_s = 0.5\nstale_s = 0.4\nserved = "lssvm_adaptive"\n'
+#: What was handled is in the journal after about a millisecond: it is looked so long before a kill what was told, s.
+WRITTEN_S = 0.005
+#: From the start to ready on a machine that is free, s.
+READY_S = 2.0
 #: Loaded before anything else: a clock of the wall that stands a day earlier and runs backwards.
 BACKWARDS = "import time\n_now = time.time\n_start = _now()\ntime.time = lambda: 2 * _start - _now() - 86400.0\n"
 
@@ -87,13 +97,102 @@ def test_a_killed_service_goes_on_with_all_that_it_had(tmp_path: Path, processes
     np.testing.assert_array_equal(recorded.seq, np.arange(recorded.seq[-1] + 1))
     assert recorded.seq[-1] >= first_sent
 
-    # The newest checkpoint is cut off, and one of another axis lies there: the one before is taken, with the reason.
+    # The newest checkpoint is cut off, and one of another axis lies there: the one before is taken, with the reasons.
     kept = sorted((tmp_path / "kept").glob("*.ckpt"))
+    meta, state = decode_checkpoint(kept[-2].read_bytes())
     kept[-1].write_bytes(kept[-1].read_bytes()[:-100])
+    of_y = CheckpointFolder(tmp_path / "kept", "demo", "y", meta.dt_s, 1000).write(replace(meta, axis="y"), state)
+    assert of_y > kept[-1]
+    # What is told at a start is told to whoever listens already.
+    ear = f"tcp/127.0.0.1:{unused_port()}"
+    config.write_text(config.read_text().replace("listen = ", f'connect = ["{ear}"]\nlisten = '))
+    events: list[dict[str, Any]] = []
+    with open_service([ear]) as listening:
+        listening.declare_subscriber(
+            "dehyst/v1/demo/x/event", lambda sample: events.append(json.loads(sample.payload.to_bytes()))
+        )
+        processes.append(Process(*serve))
+        eventually(lambda: "learnt_again" in [event["event"] for event in events], 10.0)
+        told = [(event["event"], event["detail"]) for event in events]
+        assert [name for name, _ in told[:3]] == ["checkpoint_refused", "checkpoint_refused", "restored"]
+        assert "axis is 'y', expected 'x'" in told[0][1]
+        assert "damaged or cut off" in told[1][1]
+        assert told[2][1].endswith(f"sample {meta.seq}")
+        with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0) as client:
+            # What came behind it is in the journal.
+            assert client.status()["seq"] == recorded.seq[-1]
+
+
+def test_killed_while_samples_flow_it_loses_no_record_and_next_to_no_learning(
+    tmp_path: Path, processes: list[Process]
+) -> None:
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA.replace("checkpoint_s = 0.5\n", ""))
+    endpoint = f"tcp/127.0.0.1:{port}"
+    serve = ("serve", "--config", str(config))
     processes.append(Process(*serve))
-    with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0) as client:
-        # What came behind it is in the journal.
-        assert client.status()["seq"] == recorded.seq[-1]
+    first = 0
+    # What was under way at each kill: behind what had been told, up to what had been sent.
+    under_way: list[int] = []
+    with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0, retry_s=20.0) as client:
+        for goes_on in (False, False, False, True):
+            with Stage([endpoint], first=first) as stage:
+                learnt = client.status()["samples"]["learnt"]
+                eventually(lambda least=learnt + 1500: client.status()["samples"]["learnt"] > least)
+                pause_s = WRITTEN_S + late_s()
+                before = client.status()
+                told = max(before["seq"], client.point(40.0).snapshot_seq)
+                time.sleep(pause_s)
+                sent = stage.sent - 1
+                processes[-1].process.kill()
+                processes[-1].process.wait(10)
+                if goes_on:
+                    processes.append(started_in_time(serve))
+                    eventually(lambda least=sent: client.point(40.0) and client.status()["seq"] > least + 500)
+                    sent = client.status()["seq"]
+            first = stage.sent
+            if not goes_on:
+                processes.append(started_in_time(serve))
+                client.point(40.0)
+                after = client.status()
+                print(f"told {told} {1e3 * pause_s:.1f} ms before the kill, sent {sent}, going on from {after['seq']}")
+                assert after["instance"] != before["instance"]
+                assert told <= after["seq"]
+                assert sent - after["seq"] <= 1000
+                assert after["samples"]["learnt"] >= before["samples"]["learnt"]
+                sent = first - 1
+            under_way += range(told + 1, sent + 1)
+        eventually(lambda: client.status()["seq"] == first - 1)
+        last = client.status()
+    processes[-1].send(signal.SIGTERM)
+    assert processes[-1].process.wait(30) == 0
+    recorded = read(tmp_path / "rec")
+    assert recorded.seq is not None
+    assert len(np.unique(recorded.seq)) == len(recorded)
+    # What is missing was under way, or came while there was nobody to take it; and it is counted.
+    missing = np.setdiff1d(np.arange(first), recorded.seq)
+    assert np.setdiff1d(missing, under_way).size == 0
+    assert last["samples"]["lost"] == missing.size
+
+
+def late_s() -> float:
+    """The most that this machine lets a bare loop wait now, s."""
+    worst_s = 0.0
+    for _ in range(100):
+        begin = time.monotonic()
+        time.sleep(1e-3)
+        worst_s = max(worst_s, time.monotonic() - begin - 1e-3)
+    return worst_s
+
+
+def started_in_time(command: tuple[str, ...]) -> Process:
+    """A process that was ready in time; what others had of the processors meanwhile is not its fault."""
+    process = Process(*command)
+    waited_s = 0.0
+    with contextlib.suppress(OSError, IndexError, ValueError):  # not every system tells it
+        waited_s = 1e-9 * int(Path(f"/proc/{process.process.pid}/schedstat").read_text().split()[1])
+    print(f"ready {process.start_s:.2f} s after the start, {waited_s:.2f} s of which it waited for a processor")
+    assert process.start_s < READY_S + waited_s
+    return process
 
 
 def test_the_wall_clock_decides_nothing() -> None:

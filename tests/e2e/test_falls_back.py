@@ -1,0 +1,217 @@
+"""Readings that lie, samples that stop, a model gone bad, a stage that dies, each done to real processes.
+
+The service falls back on the last good model, then on the baseline, says so in status and answers, and comes back by
+itself; every voltage that leaves meanwhile is finite, within its limits and within its slew.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from service import wire
+from service.client import Client, Trajectory
+from service.identifying import identify_one
+from service.modelfile import BundleMeta, write_bundle
+from service.session import open_client
+from service.stage_faults import fault_key
+from service.wire_query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
+from sim.presets import preset
+from sim.signals import training_input
+from sim.stage import Stage
+from tests.service.conftest import unused_port
+from tests.service.living import Process
+
+pytestmark = [pytest.mark.e2e, pytest.mark.slow]
+DT_S = 1e-3
+SERVED, BASELINE = "lssvm_adaptive", "linear"
+U_MIN_V, U_MAX_V, SLEW_V_PER_S = -2.0, 10.0, 4000.0
+#: How long a fault lasts: the last good model is served for a second, the baseline takes over within another.
+FAULT_S = 4.0
+#: How long the service may take to come back once the fault is over.
+BACK_S = 15.0
+WANTED_UM = 40.0 + 2.0 * np.sin(2 * np.pi * 5.0 * DT_S * np.arange(20))
+#: Loaded before anything else: while the file is there, what is learnt is forty times too much.
+ILL = """
+import os
+from dataclasses import replace
+from adaptive.learner import Learner
+_snapshot = Learner.snapshot
+def snapshot(self):
+    model = _snapshot(self)
+    return replace(model, beta=40.0 * model.beta) if os.path.exists({flag!r}) else model
+Learner.snapshot = snapshot
+"""
+Look = tuple[dict[str, Any], Trajectory]
+
+
+def identified(path: Path) -> Path:
+    """A baseline and what learns, identified on the stage that the processes simulate."""
+    stage = Stage(preset("rich", dt_s=DT_S, seed=20))
+    u_V = training_input(DT_S, 10.0)[1]
+    y_um = stage.run(stage.initial_state(), u_V)[0]
+    models = {name: identify_one(name, u_V, y_um, DT_S, 200) for name in (BASELINE, SERVED)}
+    write_bundle(path, models, BundleMeta("demo", "x", DT_S, y_min_um=float(y_um.min()), y_max_um=float(y_um.max())))
+    return path
+
+
+class World:
+    """A service and a stage as processes, a client that looks at the service, and what it tells of events."""
+
+    def __init__(self, folder: Path) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{unused_port()}"
+        #: While it is there, what is learnt is forty times too much.
+        self.ill = folder / "ill"
+        (folder / "path").mkdir()
+        (folder / "path" / "sitecustomize.py").write_text(ILL.format(flag=str(self.ill)))
+        model, config = identified(folder / "x.npz"), folder / "serve.toml"
+        config.write_text(
+            f'stage = "demo"\nlisten = ["{self.endpoint}"]\n[[axis]]\nname = "x"\nmodel = {json.dumps(str(model))}\n'
+            f"u_min_V = {U_MIN_V}\nu_max_V = {U_MAX_V}\nslew_V_per_s = {SLEW_V_PER_S}\n"
+            f'served = "{SERVED}"\nstale_s = 0.3\nlast_good_s = 1.0\n'
+        )
+        self.events: list[str] = []
+        self.processes = [Process("serve", "--config", str(config), path=folder / "path")]
+        self.session: zenoh.Session = open_client(self.endpoint, 20.0)
+        self.client = Client.connect(self.endpoint, timeout_s=2.0, wait_s=20.0)
+        self.session.declare_subscriber(self.client.keys.event, self._told)
+        self.stage = self.start_stage()
+
+    def _told(self, sample: zenoh.Sample) -> None:
+        event = json.loads(sample.payload.to_bytes())["event"]
+        if not event.startswith("champion"):  # which of the models is the best is another matter
+            self.events.append(event)
+
+    def start_stage(self) -> Process:
+        """A stage that counts from 0 and takes faults."""
+        process = Process("stage", "--endpoint", self.endpoint, "--batch", "5", "--seed", "21", "--inject")
+        self.processes.append(process)
+        self.drive(0)
+        return process
+
+    def drive(self, first: int) -> None:
+        """Command voltages that swing over most of the stage's range, for a minute from sample ``first`` on."""
+        for seq in range(first, first + 60_000, 1000):
+            t_s = DT_S * np.arange(seq, seq + 1000)
+            u_V = 3.5 * (1.0 - np.cos(2 * np.pi * 0.9 * t_s)) + 0.3 * np.sin(2 * np.pi * 7.0 * t_s)
+            block = wire.encode_command(seq, u_V)
+            self.session.put(self.client.keys.command, block, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def hurt(self, fault: str) -> None:
+        self.session.put(fault_key("demo", "x"), json.dumps({"fault": fault, "duration_s": FAULT_S}))
+
+    def look(self) -> Look:
+        """A status and an answer, which is checked: whatever happens inside, a voltage that leaves is safe to apply."""
+        status, answer = self.client.status(), self.client.trajectory(WANTED_UM)
+        assert np.isfinite(answer.u_V).all()
+        assert (answer.u_V >= U_MIN_V).all()
+        assert (answer.u_V <= U_MAX_V).all()
+        assert np.max(np.abs(np.diff(answer.u_V))) <= SLEW_V_PER_S * DT_S * (1.0 + 1e-9)
+        assert answer.model == SERVED
+        return status, answer
+
+    def until(self, condition: Callable[[dict[str, Any], Trajectory], bool], within_s: float, what: str) -> list[Look]:
+        """All looks up to the first of which ``condition`` is true; fails after ``within_s``."""
+        looks, end = [self.look()], time.monotonic() + within_s
+        while not condition(*looks[-1]):
+            status, answer = looks[-1]
+            told = {name: status[name] for name in ("trouble", "trust", "stale", "seq")}
+            assert time.monotonic() < end, f"not in {within_s:g} s: {what}; {told}, flags {np.unique(answer.flags)}"
+            time.sleep(0.02)
+            looks.append(self.look())
+        return looks
+
+    def begin(self) -> None:
+        """Let it learn, until the learner answers alone."""
+        self.until(lambda s, a: s["samples"]["learnt"] > 1000 and own(s, a), 30.0, "the learner serves")
+        self.drive(self.client.status()["seq"])
+        self.events.clear()
+
+    def falls_back(self, is_told: Callable[[dict[str, Any]], bool]) -> None:
+        """It tells what is wrong and serves the last good model, then the baseline stands in, named and flagged."""
+        looks = self.until(lambda s, a: is_told(s), FAULT_S, "it is told")
+        looks = looks[-1:] + self.until(lambda s, a: stands_in(a), FAULT_S, f"{BASELINE} stands in")
+        assert all(is_told(status) for status, _ in looks)
+        alone = [status for status, a in looks if not (a.flags & (STAND_IN | BLENDED)).any()]
+        assert len(alone) > 3, "the last good model was served before"
+        assert len({status["fingerprint"] for status in alone}) == 1, "and was not taught any more"
+        # It stays so for as long as it is wrong, or nearly: the fault began a little before its effect.
+        assert is_told(self.look()[0])
+
+    def comes_back(self) -> None:
+        """By itself, in bounded time, and learns again."""
+        self.until(own, FAULT_S + BACK_S, "the learner serves again")
+        learnt = self.client.status()["samples"]["learnt"]
+        self.until(lambda s, a: s["samples"]["learnt"] > learnt + 100 and own(s, a), BACK_S, "it learns again")
+
+    def close(self) -> None:
+        self.client.close()
+        self.session.close()  # type: ignore[no-untyped-call]
+        for process in reversed(self.processes):
+            process.kill()
+
+
+def own(status: dict[str, Any], answer: Trajectory) -> bool:
+    """Whether the learner answers alone, and nothing is wrong."""
+    odd = (answer.flags & (STAND_IN | BLENDED | STALE | NOT_FINITE_REPLACED)).any() or answer.stand_in
+    return not (odd or answer.fallback or status["trouble"] or status["stale"])
+
+
+def stands_in(answer: Trajectory) -> bool:
+    """Whether the baseline answers in its place, and says so."""
+    return bool((answer.flags & STAND_IN).all()) and answer.stand_in == BASELINE and answer.fallback
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    made = World(tmp_path_factory.mktemp("world"))
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize(("fault", "trouble"), [("nan", "samples_poisoned"), ("freeze", "sensor_frozen")])
+def test_samples_that_lie(world: World, fault: str, trouble: str) -> None:
+    world.begin()
+    world.hurt(fault)
+    world.falls_back(lambda s: s["trouble"] == trouble)
+    world.comes_back()
+    assert world.events == ["trouble", "learner_went_back", "recovered"]
+
+
+def test_samples_that_stop(world: World) -> None:
+    world.begin()
+    world.hurt("gap")
+    world.falls_back(lambda s: s["stale"])
+    assert (world.look()[1].flags & STALE).all()
+    world.comes_back()
+    assert (world.events[0], world.events.count("fresh"), world.events.count("stale")) == ("stale", 1, 1)
+
+
+def test_a_model_gone_bad(world: World) -> None:
+    world.begin()
+    world.ill.touch()
+    world.falls_back(lambda s: s["trouble"] == "model_bad")
+    world.ill.unlink()
+    world.comes_back()
+    assert world.events == ["trouble", "recovered"]
+
+
+def test_a_stage_that_is_killed_and_started_again(world: World) -> None:
+    world.begin()
+    before = world.client.status()
+    world.stage.kill()
+    world.falls_back(lambda s: s["stale"])
+    # The new one counts from 0, is taken up all the same, and taught from.
+    world.start_stage()
+    world.comes_back()
+    after = world.client.status()
+    assert (before["samples"]["restarts"], after["samples"]["restarts"]) == (0, 1)
+    assert after["instance"] == before["instance"]
+    assert {"stale", "fresh", "stage_restarted"} <= set(world.events)
