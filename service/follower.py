@@ -22,6 +22,15 @@ from service.fallback import Answer, Rules, answer_safely
 from service.guard import Limits, check_domain
 from service.motion import derivatives
 from service.wire_model import ModelMessage, decode_model
+from service.wire_query import (
+    BLENDED,
+    LIMITED_SLEW,
+    LIMITED_VOLTAGE,
+    NOT_FINITE_REPLACED,
+    OUTSIDE_DOMAIN,
+    STALE,
+    STAND_IN,
+)
 
 
 class Follower:
@@ -34,6 +43,9 @@ class Follower:
     ----------
     memory : (m,) hysteresis memory after the last point answered.
     received, refused : snapshots taken over, and those that could not be used.
+    last_flags : what was done to the last voltage answered, bits as in a reply (``service.wire_query.flag_names``).
+    last_std_V : one standard deviation of it, V; NaN where the model has no notion of it, and before any answer.
+    last_trajectory : all that :meth:`trajectory` last answered, deviations and stand-in among it; None before any.
     """
 
     def __init__(
@@ -65,6 +77,12 @@ class Follower:
             self._newest[0].memory.copy() if memory is None else np.array(memory, dtype=np.float64).reshape(-1)
         )
         self._u_before_V = math.nan
+        self.last_flags = 0
+        self.last_std_V = math.nan
+        self.last_trajectory: Answer | None = None
+        #: Who gave the last answer: the model itself, and the name of what stood in for it where the flags say so.
+        self._answered: InverseModel | None = None
+        self._stand_in = ""
         self._one = (np.empty(1), np.empty(1), np.empty(1))
         self._result = (np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_))
 
@@ -97,23 +115,37 @@ class Follower:
         y, v, a = self._one
         y[0], v[0], a[0] = y_um, v_um_per_s, a_um_per_s2
         after = self.memory.copy()
-        u_V, std_V, within = self._result
+        u_V, std_V, inside = self._result
         if type(model) is LssvmInverse and after.size == model.memory_size:
-            model.evaluate_into(y, v, a, after, u_V, std_V, within)
-        elif not (type(model) is ChampionInverse and model.evaluate_into(y, v, a, after, u_V, std_V, within)):
+            model.evaluate_into(y, v, a, after, u_V, std_V, inside)
+        elif not (type(model) is ChampionInverse and model.evaluate_into(y, v, a, after, u_V, std_V, inside)):
             forward = model.feedforward(y, v, a, self.memory)
-            u_V, within, after = forward.u_V, forward.inside, forward.memory
+            u_V, std_V, inside, after = forward
         u = u_V.item(0)
-        before = self._u_before_V
-        if not (math.isfinite(u) and (within.item(0) or not message.safety.blends) and self._trust() == 1.0):
+        within = inside.item(0)
+        trust, stale = self._standing()
+        if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely((y, v, a)).u_V[0])
-        # The guard of one point without its arrays: the same order, the same numbers.
+        # The guard of one point without its arrays: the same order, the same numbers, the same flags.
         self.memory = after
-        u = min(max(u, limits.u_min_V), limits.u_max_V)
+        flags = (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
+        if u < limits.u_min_V:
+            u = limits.u_min_V
+            flags |= LIMITED_VOLTAGE
+        elif u > limits.u_max_V:
+            u = limits.u_max_V
+            flags |= LIMITED_VOLTAGE
+        before = self._u_before_V
         if math.isfinite(before):
             step = limits.slew_V_per_s * model.dt_s
-            u = min(max(u, before - step), before + step)
-        self._u_before_V = u
+            if u > before + step:
+                u = before + step
+                flags |= LIMITED_SLEW
+            elif u < before - step:
+                u = before - step
+                flags |= LIMITED_SLEW
+        self._u_before_V, self._answered, self._stand_in = u, model, ""
+        self.last_flags, self.last_std_V = flags, std_V.item(0)
         return u
 
     def trajectory(
@@ -127,33 +159,50 @@ class Follower:
             if not np.isfinite(values).all():
                 raise FieldError(field, "NaN or infinity", "finite numbers")
         check_domain(y, self.limits)
-        got = self._safely((y, v, a))
+        self.last_trajectory = got = self._safely((y, v, a))
         return got.u_V, got.flags
+
+    @property
+    def source(self) -> str:
+        """Which model gave the last voltage: a competition's champion, "A+B" where B was blended in, a stand-in alone.
+
+        Empty before any, and where nobody could say anything and the voltage before was held.
+        """
+        if self.last_flags & STAND_IN:
+            return self._stand_in
+        answered = self._answered
+        if answered is None or self.last_flags & NOT_FINITE_REPLACED:
+            return ""
+        own = answered.names[answered.champion] if isinstance(answered, ChampionInverse) else self.name
+        return f"{own}+{self._stand_in}" if self.last_flags & BLENDED else own
 
     @property
     def stale(self) -> bool:
         """Whether snapshots have stopped coming."""
-        stale_s = self._newest[0].safety.stale_s
-        return 0.0 < stale_s < self.age_s and self._expected
+        return self._standing()[1]
 
     @property
     def _expected(self) -> bool:
         """Whether snapshots come: some did, after the first one was fetched."""
         return self._subscriber is not None and self.received > 1
 
-    def _trust(self) -> float:
+    def _standing(self) -> tuple[float, bool]:
+        """(weight of the model inside its domain, whether snapshots have stopped coming)."""
         safety = self._newest[0].safety
         if not self._expected:
-            return safety.trust
-        return safety.trust * trust_by_age(self.age_s, safety.stale_s, safety.last_good_s)[0]
+            return safety.trust, False
+        weight, stale = trust_by_age(self.age_s, safety.stale_s, safety.last_good_s)
+        return safety.trust * weight, stale
 
     def _safely(self, points: tuple[FloatArray, FloatArray, FloatArray]) -> Answer:
         """What the service would answer; advances memory and the voltage from which the slew limit counts."""
         message = self._newest[0]
         safety = message.safety
-        rules = Rules(self.limits, safety.blend_share, self._trust(), self.stale)
+        rules = Rules(self.limits, safety.blend_share, *self._standing())
         got = answer_safely(message.model, self.memory, points, self._u_before_V, rules, safety.stand_in, safety.blends)
         self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
+        self._answered, self._stand_in = message.model, got.stand_in
+        self.last_flags, self.last_std_V = int(got.flags[-1]), float(got.std_V[-1])
         return got
 
     def close(self) -> None:

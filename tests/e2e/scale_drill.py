@@ -16,22 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from service.access.files import Plan, create
-from service.client import Client
-from service.errors import ServiceError
-from service.keys import Keys
 from service.modelfile import BundleMeta, write_bundle
-from service.operating.remote import operate, statuses
-from service.session import open_client
+from tests.e2e.scale_client import AXES, BEFORE_S, RATE_HZ, STAGES
 from tests.e2e.scale_hosts import Host, make_hub
 from tests.service.conftest import make_models, unused_port
 
-RATE_HZ = 100
-STAGES = ("left", "right")
-AXES = ("x", "y")
-_BEFORE_S, _AFTER_S = 2.0, 4.0
 USERS = {
     "relay": "router", "one": "service", "two": "service", "left": "stage", "right": "stage",
-    "plot": "client", "alice": "operator",
+    "plot": "client", "loop": "controller", "alice": "operator",
 }  # fmt: skip
 
 
@@ -89,7 +81,7 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
                 *cli, "stage", "--free-run", "--name", stage, "--axis", "x", "--twins", "y", "--rate", str(RATE_HZ),
                 "--batch", "5", "--endpoint", router, "--zenoh-config", str(folder / f"{stage}.json5"),
             )  # fmt: skip
-        client = lab.start("-m", "tests.e2e.scale_drill", str(folder), "--ask", router)
+        client = lab.start("-m", "tests.e2e.scale_client", str(folder), router)
         _line(client)
         _say("the client is answered by every axis")
         told = {f"{h}/{s}": ready for (h, s), ready in roles.items()}
@@ -99,7 +91,7 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
             "epochs": {key: ready["epoch"] for key, ready in told.items()},
             "stalled_s": stall.end(),
         }
-        time.sleep(_BEFORE_S)
+        time.sleep(BEFORE_S)
         lost_at = time.monotonic()
         _say("host one is lost")
         one.lose()
@@ -110,54 +102,6 @@ def drill(folder: Path, namespaces: bool) -> dict[str, Any]:
     finally:
         for host in hosts:
             host.stop()
-
-
-def ask(folder: Path, router: str) -> int:
-    """The client on the lab's host: every axis twenty times a second, and what it was told."""
-    config = folder / "plot.json5"
-    told: dict[str, list[tuple[float, float, float | None, str]]] = {}
-    clients = {(stage, axis): _connected(router, stage, axis, config) for stage in STAGES for axis in AXES}
-    with open_client(router, zenoh_config=config) as session:
-        before = _short(statuses(session, timeout_s=1.0))
-    print(json.dumps({"ready": True}), flush=True)
-    start = time.monotonic()
-    for k in range(int(20 * (_BEFORE_S + _AFTER_S))):
-        time.sleep(max(0.0, start + k / 20 - time.monotonic()))
-        for (stage, axis), client in clients.items():
-            at = time.monotonic()
-            u_V, failure = None, ""
-            try:
-                u_V = client.point(40.0, model="linear").u_V
-            except ServiceError as error:
-                failure = type(error).__name__
-            told.setdefault(f"{stage}/{axis}", []).append((at, time.monotonic() - at, u_V, failure))
-    for client in clients.values():
-        client.close()
-    with open_client(router, zenoh_config=config) as session:
-        after = _short(statuses(session, timeout_s=1.0))
-    with open_client(router, zenoh_config=folder / "alice.json5") as session:
-        done = operate(session, Keys("left", "x"), "freeze", "alice")
-    print(json.dumps({"asked": told, "before": before, "after": after, "operated": done}), flush=True)
-    return 0
-
-
-def _connected(router: str, stage: str, axis: str, config: Path) -> Client:
-    """A client that has been answered once."""
-    until = time.monotonic() + 20.0
-    while True:
-        try:
-            return Client.connect(router, stage, axis, timeout_s=0.5, wait_s=10.0, zenoh_config=config)
-        except ServiceError:
-            if time.monotonic() >= until:
-                raise
-
-
-def _short(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [
-        {"stage": s["stage"], "axis": s["axis"], "instance": s["instance"], "role": s["role"], "seq": s["seq"],
-         "received": s["samples"]["received"]}
-        for s in found
-    ]  # fmt: skip
 
 
 def _config(at: Path, zenoh_config: Path, stage: str, router: str) -> Path:
@@ -190,10 +134,7 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--processes", action="store_true", help="plain processes instead of namespaces")
-    parser.add_argument("--ask", metavar="ENDPOINT", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.ask:
-        return ask(args.folder, args.ask)
     print(json.dumps(drill(args.folder, not args.processes)), flush=True)
     return 0
 

@@ -7,26 +7,32 @@ import json
 import shutil
 import subprocess
 import sys
-import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
-from service.keys import Keys
-from service.session import open_client, open_router, open_service
+from service.client import Client, Point
+from service.errors import ServiceError
+from service.keys import AUTO
+from tests.e2e.scale_client import LEARNT
 from tests.e2e.scale_hosts import ENTER, namespaces_missing
-from tests.service.conftest import unused_port
+from tests.service.conftest import unused_port, write_config
+from tests.service.living import Process, Stage, eventually
 
 pytestmark = pytest.mark.e2e
 #: Longest time without an answer while the standby takes over from a host that vanished: its lease is 1 s.
 _TAKEN_OVER_S = 6.0
 #: Signs of life come every quarter of a lease of 1 s: a machine that stands still for so long makes services look dead.
 _STALL_S = 0.7
+#: What answers where a query names no model.
+DEFAULT = AUTO
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the openssl command is not installed")
-@pytest.mark.timeout(170)
+@pytest.mark.timeout(300)
 def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path, record_property: Any) -> None:
     missing = namespaces_missing()
     record_property("hosts", f"processes: {missing}" if missing else "network namespaces")
@@ -35,7 +41,7 @@ def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path, record_prop
     enter, options = ((), ("--processes",)) if missing else (ENTER, ())
     done = subprocess.run(
         [*enter, sys.executable, "-m", "tests.e2e.scale_drill", str(tmp_path / "access"), *options],
-        capture_output=True, text=True, timeout=160, check=False, cwd=Path(__file__).parents[2],
+        capture_output=True, text=True, timeout=280, check=False, cwd=Path(__file__).parents[2],
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     seen = json.loads(done.stdout.splitlines()[-1])
@@ -66,24 +72,90 @@ def test_a_host_is_lost_and_its_axes_go_on_elsewhere(tmp_path: Path, record_prop
             assert not [failure for *_, failure in rows if failure]
             assert after[name]["received"] > before[name]["received"]
     assert client["operated"]["instance"] == after["left/x"]["instance"]
+    for name, rows in client["learnt"].items():
+        _survived(name, rows, seen["lost_at_s"])
+        assert before[name]["synced"]
+        assert after[name]["synced"]
+        # It goes on learning, and counts on from where the other was.
+        assert after[name]["learnt"] > before[name]["learnt"]
 
 
-def test_a_service_that_loses_its_router_moves_to_the_next() -> None:
-    first, second = (f"tcp/127.0.0.1:{unused_port()}" for _ in range(2))
-    key = Keys("demo", "x").status
-    one = open_router([first])
-    two = open_router([second], [first])
-    with two, open_service([], [first, second]) as service, open_client(second, 5.0) as client:
-        queryable = service.declare_queryable(key, lambda query: (query.reply(key, b"here"), query.drop()))
+def _survived(name: str, rows: list[dict[str, Any]], lost_at_s: float) -> None:
+    """What was learnt before the loss is what whoever serves now has learnt, to the last bit of each answer."""
+    for asked in LEARNT:
+        then = [row for row in rows if row["asked"] == asked and row["at"] < lost_at_s]
+        held = [row for row in then if row["now"] is not None]
+        assert len(held) >= 3, (name, asked, then)
+        # Among them the last one that was heard of before the loss.
+        assert held[-1]["seq"] == max(row["seq"] for row in then)
+        for row in held:
+            assert row["now"] == row["then"], (name, asked, row["seq"])
+            assert row["then"][0] == (asked or DEFAULT)
+    # The same question has another answer from one snapshot to the next: there was something to be lost.
+    learnt = {row["then"][1] for row in rows if row["asked"] == "lssvm_adaptive" and row["at"] < lost_at_s}
+    assert len(learnt) > 1, name
 
-        def asked() -> bool:
-            return any(reply.ok is not None for reply in client.get(key, timeout=0.5))
 
-        until = time.monotonic() + 10.0
-        while not asked():
-            assert time.monotonic() < until
-        one.close()
-        until = time.monotonic() + 10.0
-        while not asked():
-            assert time.monotonic() < until, "the service did not come back by the other router"
-        queryable.undeclare()
+def test_a_service_that_loses_its_router_moves_to_the_next(tmp_path: Path) -> None:
+    """Two routers and a service as processes; the one that the service is connected to is killed."""
+    ports = unused_port(), unused_port()
+    first, second = (f"tcp/127.0.0.1:{port}" for port in ports)
+    with ExitStack() as running:
+
+        def start(*arguments: str) -> Process:
+            process = Process(*arguments)
+            running.callback(process.kill)
+            return process
+
+        routers = {
+            ports[0]: start("router", "--listen", first),
+            ports[1]: start("router", "--listen", second, "--connect", first),
+        }
+        config = write_config(tmp_path, 1)
+        text = config.read_text(encoding="utf-8").replace('listen = ["tcp/127.0.0.1:1"]', "listen = []")
+        assert "listen = []\n" in text
+        config.write_text(f'connect = ["{first}", "{second}"]\n{text}', encoding="utf-8")
+        service = start("serve", "--config", str(config))
+        assert service.ready["listen"] == []
+        lost = next(port for port in ports if port in _linked(service))
+        other = next(port for port in ports if port != lost)
+        # Stage and client are at the other router all along: what changes is where the service is.
+        endpoint = f"tcp/127.0.0.1:{other}"
+        with Stage([endpoint]), Client.connect(endpoint, wait_s=20.0, timeout_s=1.0, retry_s=0.0) as client:
+            assert client.status()["instance"] == service.ready["instance"]
+            before = eventually(lambda: _learns(client, 100))
+            learnt = client.point(40.0)
+            routers[lost].kill()
+            after = eventually(lambda: _learns(client, before["samples"]["learnt"] + 100))
+            # The very service, with what it had learnt; it heard the stage again, and it answers.
+            assert after["instance"] == service.ready["instance"]
+            assert after["snapshot_seq"] > before["snapshot_seq"]
+            assert after["synced"]
+            answered = eventually(lambda: _answered(client))
+            assert answered.model == learnt.model
+            assert not answered.fallback
+            assert client.point(40.0, model="linear").u_V == pytest.approx(39 / 11)
+            assert other in _linked(service)
+            assert lost not in _linked(service)
+        assert service.process.poll() is None
+
+
+def _linked(process: Process) -> set[int]:
+    """The ports at the other ends of its connections."""
+    return {link.raddr.port for link in psutil.Process(process.process.pid).net_connections("tcp") if link.raddr}
+
+
+def _learns(client: Client, samples: int) -> dict[str, Any] | None:
+    """The status, once so many samples have been learnt from."""
+    try:
+        status = client.status()
+    except ServiceError:
+        return None
+    return status if status["samples"]["learnt"] > samples else None
+
+
+def _answered(client: Client) -> Point | None:
+    try:
+        return client.point(40.0)
+    except ServiceError:
+        return None

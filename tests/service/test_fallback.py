@@ -19,7 +19,16 @@ from service.config import AxisConfig
 from service.fallback import Answer, Rules, StandIn, answer_safely, domain_weight
 from service.guard import Limits
 from service.wire_model import decode_model, encode_model
-from service.wire_query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, FeedforwardQuery
+from service.wire_query import (
+    BLENDED,
+    LIMITED_SLEW,
+    LIMITED_VOLTAGE,
+    NOT_FINITE_REPLACED,
+    OUTSIDE_DOMAIN,
+    STALE,
+    STAND_IN,
+    FeedforwardQuery,
+)
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0, -50.0, 150.0)
@@ -190,16 +199,17 @@ wild = st.floats(allow_nan=True, allow_infinity=True)
     u=st.lists(wild, min_size=1, max_size=12),
     other=wild,
     std=wild,
+    other_std=wild,
     trust=st.floats(0.0, 1.0),
     before=st.one_of(st.just(math.nan), st.floats(0.0, 10.0)),
     inside=st.booleans(),
     raises=st.booleans(),
 )
 def test_whatever_the_models_say_what_leaves_is_finite_within_limits_and_within_slew(
-    u: list[float], other: float, std: float, trust: float, before: float, inside: bool, raises: bool
+    u: list[float], other: float, std: float, other_std: float, trust: float, before: float, inside: bool, raises: bool
 ) -> None:
     n = len(u)
-    stand_in = StandIn("other", Says((other,) * n, std), np.zeros(1))
+    stand_in = StandIn("other", Says((other,) * n, other_std), np.zeros(1))
     got = answer_safely(
         Says(tuple(u), std, inside, raises), np.zeros(1), points(np.full(n, 40.0)), before,
         Rules(LIMITS, trust=trust), stand_in,
@@ -209,6 +219,35 @@ def test_whatever_the_models_say_what_leaves_is_finite_within_limits_and_within_
     steps = np.diff(got.u_V if math.isnan(before) else np.concatenate([[before], got.u_V]))
     assert (np.abs(steps) <= LIMITS.slew_V_per_s * DT_S * (1 + 1e-12)).all()
     assert np.isfinite(got.memory).all()
+    # What is not the model's own is flagged, with what was done to it and who stood in.
+    own = np.full(n, math.nan) if raises else np.array(u)
+    assert got.flags[got.u_V != own].all()
+    assert got.flags.size == got.std_V.size == n
+    assert bool(got.stand_in) == bool((got.flags & (BLENDED | STAND_IN)).any())
+    for u_V, flags, its_own in zip(got.u_V.tolist(), got.flags.tolist(), own.tolist(), strict=True):
+        assert bool(flags & OUTSIDE_DOMAIN) == (raises or not inside)
+        assert flags & NOT_FINITE_REPLACED or math.isfinite(its_own)
+        if not flags & (BLENDED | STAND_IN | NOT_FINITE_REPLACED | LIMITED_VOLTAGE | LIMITED_SLEW):
+            assert u_V == its_own
+    # A deviation is none where nobody states one, and never negative where those who answered state none such.
+    if not (std < 0.0 or other_std < 0.0):
+        assert (np.isnan(got.std_V) | (got.std_V >= 0.0)).all()
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    own_V=st.floats(0.0, 10.0), other_V=st.floats(0.0, 10.0), std=st.floats(1e-6, 1e3),
+    other_std=st.floats(1e-6, 1e3), trust=st.floats(0.0, 1.0),
+)  # fmt: skip
+def test_a_mixture_is_never_surer_than_both_and_knows_how_far_they_are_apart(
+    own_V: float, other_V: float, std: float, other_std: float, trust: float
+) -> None:
+    stand_in = StandIn("other", Says((other_V,), other_std), np.zeros(1))
+    got = answer_safely(
+        Says((own_V,), std), np.zeros(1), points(np.array([40.0])), math.nan, Rules(LIMITS, trust=trust), stand_in
+    )
+    least, most = min(std, other_std), max(std, other_std) + abs(own_V - other_V)
+    assert least * (1 - 1e-9) <= got.std_V[0] <= most * (1 + 1e-9)
 
 
 def test_a_snapshot_in_another_process_answers_to_the_same_bit_outside_the_domain_too() -> None:
