@@ -9,19 +9,25 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
 
+from adaptive.types import FloatArray
 from service import wire
 from service.keys import Keys
 from service.server import tune_process
 from service.session import open_client, open_service
 from service.stopping import StopSignal
+from service.wire import SampleBatch
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.
 ECHO_KEY = "echo"
 STAGE, AXIS = "bench", "x"
+#: How long the stage waits for somebody to listen before its first sample, and for its last one to be on its way, s.
+_HEARD_S = 20.0
+_FLUSH_S = 0.3
 
 
 def echo(endpoint: str) -> int:
@@ -44,15 +50,27 @@ def echo(endpoint: str) -> int:
     return 0
 
 
+def sent(u_V: FloatArray, y_um: FloatArray, rate_hz: float, batch: int, message: int) -> SampleBatch:
+    """The samples of message number ``message``: (n,) voltages V and readings µm over and over, ``batch`` a message."""
+    seq = np.arange(message * batch, (message + 1) * batch)
+    at = message % (u_V.size // batch) * batch
+    return SampleBatch(seq, seq / rate_hz, u_V[at : at + batch], y_um[at : at + batch])
+
+
 def feed(endpoint: str, path: Path, rate_hz: float, batch: int) -> int:
-    """Publish the samples in ``path`` (arrays u_V and y_um) at ``rate_hz``, over and over, ``batch`` a message."""
+    """Publish the samples in ``path`` (arrays u_V and y_um) at ``rate_hz``, over and over, ``batch`` a message.
+
+    Begins when it is heard, so that the first sample that it counts is the first that arrives.
+    """
     stop = StopSignal()
     with np.load(path) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
-    n = u_V.size // batch
     with open_client(endpoint, 10.0) as session:
         block = zenoh.CongestionControl.BLOCK
         publisher = session.declare_publisher(Keys(STAGE, AXIS).sample, congestion_control=block, express=True)
+        if not _heard(publisher):
+            print("nobody listens to the samples", file=sys.stderr)
+            return 1
         print("ready", flush=True)
         start, k, late, worst_s = time.perf_counter(), 0, 0, 0.0
         while not stop.reason:
@@ -63,15 +81,27 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int) -> int:
             elif -rest > batch / rate_hz:
                 late += 1
             worst_s = max(worst_s, -rest)
-            seq = np.arange(k * batch, (k + 1) * batch)
-            at = slice(k % n * batch, (k % n + 1) * batch)
-            publisher.put(wire.encode_samples(seq, seq / rate_hz, u_V[at], y_um[at]))
+            made = sent(u_V, y_um, rate_hz, batch, k)
+            publisher.put(wire.encode_samples(made.seq, made.t_s, made.u_V, made.y_um))
             k += 1
         taken_s = time.perf_counter() - start
+        time.sleep(_FLUSH_S)
         publisher.undeclare()  # type: ignore[no-untyped-call]
     told = {"sent": k * batch, "rate_hz": k * batch / taken_s, "late": late, "worst_late_ms": 1e3 * worst_s}
     print(json.dumps(told), flush=True)
     return 0
+
+
+def _heard(publisher: Any) -> bool:
+    """Whether somebody subscribes to what ``publisher`` puts, waited for."""
+    until = time.monotonic() + _HEARD_S
+    while time.monotonic() < until:
+        status = publisher.matching_status
+        # An object that is always true in this release, a plain truth value by its own type stub.
+        if getattr(status, "matching", status):
+            return True
+        time.sleep(0.01)
+    return False
 
 
 if __name__ == "__main__":

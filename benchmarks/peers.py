@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from benchmarks.solver import make_window
 Peer = tuple[Callable[[FloatArray], float], Callable[[int], object]]
 
 
-def bench_peers(n: int, steps: int) -> dict[str, dict[str, float]]:
+def bench_peers(n: int, steps: int) -> dict[str, dict[str, Any]]:
     """Median time of learning one sample with a window of ``n``, and the error of predicting it, by solver.
 
-    A peer that is not installed is left out; ``pip install dehyst[peers]`` brings all of them.
+    Of one that cannot be imported the reason stands under "missing"; ``pip install dehyst[peers]`` brings them all.
     """
     X, y = stream(n + steps)
     y = y - y[:n].mean()
@@ -33,11 +34,12 @@ def bench_peers(n: int, steps: int) -> dict[str, dict[str, float]]:
         "sklearn_gpr": _gaussian_process,
         "krls": _krls,
     }
-    report: dict[str, dict[str, float]] = {}
+    report: dict[str, dict[str, Any]] = {}
     for name, make in makers.items():
         try:
             predict, learn = make(X, y, n)
-        except ImportError:
+        except ImportError as error:
+            report[name] = {"missing": str(error)}
             continue
         taken, errors = np.empty(steps), np.empty(steps)
         for i in range(steps):
@@ -52,7 +54,8 @@ def bench_peers(n: int, steps: int) -> dict[str, dict[str, float]]:
             "samples": float(steps),
         }
     for entry in report.values():
-        entry["over_dehyst"] = entry["update_us"] / report["dehyst"]["update_us"]
+        if "missing" not in entry:
+            entry["over_dehyst"] = entry["update_us"] / report["dehyst"]["update_us"]
     return report
 
 

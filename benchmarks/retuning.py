@@ -20,8 +20,8 @@ import numpy as np
 from adaptive.residual import Hyperparameters, WindowData
 from adaptive.retune_config import RetuneConfig
 from adaptive.types import FloatArray
-from benchmarks.latency import WINDOW, _World, _world
 from benchmarks.latency_processes import AXIS, STAGE
+from benchmarks.latency_world import WINDOW, World, world
 from benchmarks.measuring import DIMENSION, stream
 from service.client import Client
 from service.retuning.job import Job, pack
@@ -67,17 +67,17 @@ def retuning(seconds: float = 30.0, pairs: int = 4) -> dict[str, Any]:
     load_before, rows = os.getloadavg()[0], []
     tuning = Tuning()
     with (
-        _world(1000.0, 1, False) as world,
-        Client.connect(world.serve_at, STAGE, AXIS, wait_s=60.0) as client,
+        world(1000.0, 1, False) as around,
+        Client.connect(around.serve_at, STAGE, AXIS, wait_s=60.0) as client,
     ):
-        _phase(world, client, WARM_S, None)
+        _phase(around, client, WARM_S, None)
         for pair in range(pairs):
             row: dict[str, dict[str, float]] = {}
             for busy in (False, True) if pair % 2 == 0 else (True, False):
                 try:
                     if busy:
-                        _phase(world, client, WARM_S, tuning)
-                    taken = _phase(world, client, seconds, tuning if busy else None)
+                        _phase(around, client, WARM_S, tuning)
+                    taken = _phase(around, client, seconds, tuning if busy else None)
                 finally:
                     tuning.stop()
                 name = "with" if busy else "without"
@@ -98,9 +98,9 @@ def retuning(seconds: float = 30.0, pairs: int = 4) -> dict[str, Any]:
     }
 
 
-def _phase(world: _World, client: Client, seconds: float, tuning: Tuning | None) -> FloatArray:
+def _phase(around: World, client: Client, seconds: float, tuning: Tuning | None) -> FloatArray:
     """Wall time of each query in a phase, µs."""
-    y, v, a = (column.tolist() for column in world.motion)
+    y, v, a = (column.tolist() for column in around.motion)
     taken: list[float] = []
     point = client.point(y[0])
     end = time.monotonic() + seconds

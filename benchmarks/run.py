@@ -57,6 +57,9 @@ def page(report: dict[str, Any]) -> str:
         lines += ["", "p99 over the median at N = 500: " + ", ".join(f"{name} {value:.2f}" for name, value in spread)]
     lines += ["", "The same stream, N = 500: learning one sample, and the error of predicting it before", ""]
     for name, row in report["peers"].items():
+        if "missing" in row:
+            lines.append(f"{name:>14} not installed: {row['missing']}")
+            continue
         lines.append(f"{name:>14} {row['update_us']:>12.1f} µs {row['over_dehyst']:>8.1f} x   RMSE {row['rmse']:.5f}")
     lines += ["", "Relative error of alpha after many updates, near-duplicates in the stream", ""]
     for row in report["drift"]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,18 +12,29 @@ from benchmarks import run
 from benchmarks.drift import bench_drift
 from benchmarks.peers import bench_peers
 from benchmarks.solver import bench_window
+from service.cli import main
 
 #: What `dehyst bench --json` is read for.
 WINDOW_KEYS = {
-    "update_us",
-    "update_p99_us",
-    "predict_us",
+    "update_min_us",
+    "update_p99_over_median",
     "variance_us",
+    "variance_over_dsymv",
     "dsymv_us",
     "memory_pass_us",
-    "update_over_dsymv",
-    "refit_us",
+    "cholesky_update_us",
+    "plain_update_us",
+    "loo_us",
+    "cholesky_loo_us",
+    "refit_over_update",
+    *(
+        f"{name}_{figure}"
+        for name in ("update", "predict", "refit")
+        for figure in ("us", "p99_us", "over_dsymv", "over_memory_pass")
+    ),
 }
+SIZES = (100, 250, 500, 1000, 2000)
+PEERS = {"dehyst", "krls", "sklearn_krr", "sklearn_gpr"}
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +46,20 @@ def report() -> dict[str, object]:
     }
 
 
-def test_the_window_is_measured_beside_its_yardsticks(report: dict[str, object]) -> None:
-    row = report["window"]["100"]  # type: ignore[index]
+def check_window(row: dict[str, float]) -> None:
+    """Every key is there, and each figure is of what its name says."""
     assert row.keys() >= WINDOW_KEYS
     assert all(value > 0 for value in row.values())
-    assert row["update_over_dsymv"] == pytest.approx(row["update_us"] / row["dsymv_us"])
+    for name in ("update", "predict", "refit"):
+        assert row[f"{name}_over_dsymv"] == pytest.approx(row[f"{name}_us"] / row["dsymv_us"])
+        assert row[f"{name}_over_memory_pass"] == pytest.approx(row[f"{name}_us"] / row["memory_pass_us"])
+        assert row[f"{name}_p99_us"] >= row[f"{name}_us"]
     # What is timed is the recursion and not something that has stopped working: the samples are still solved.
     assert row["worst_residual"] < 1e-9
+
+
+def test_the_window_is_measured_beside_its_yardsticks(report: dict[str, object]) -> None:
+    check_window(report["window"]["100"])  # type: ignore[index]
 
 
 def test_peers_learn_the_same_stream(report: dict[str, object]) -> None:
@@ -60,3 +81,44 @@ def test_the_page_names_every_size(report: dict[str, object]) -> None:
     assert "100" in page
     assert "krls" in page
     assert page.count("updates") == len(report["drift"]) + 1  # type: ignore[arg-type]
+
+
+def test_the_command_reports_every_size_every_peer_and_the_drift(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`dehyst bench --json` itself; only the work behind each of its keys is made smaller."""
+    asked: dict[str, list[tuple[Any, ...]]] = {"window": [], "peers": [], "drift": []}
+
+    def window(n: int, repeats: int) -> dict[str, float]:
+        asked["window"].append((n, repeats))
+        return bench_window(n // 10, 25)
+
+    def peers(n: int, steps: int) -> dict[str, Any]:
+        asked["peers"].append((n, steps))
+        return bench_peers(n // 10, 3)
+
+    def drift(updates: int, size: int = 100, **more: Any) -> list[dict[str, float | str]]:
+        asked["drift"].append((updates, size))
+        return [row | {"size": float(size)} for row in bench_drift(200, size // 5, checks=2, **more)]
+
+    for name, stand_in in (("bench_window", window), ("bench_peers", peers), ("bench_drift", drift)):
+        monkeypatch.setattr(run, name, stand_in)
+    assert main(["bench", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert list(told["window"]) == [str(n) for n in SIZES]
+    assert [n for n, _ in asked["window"]] == list(SIZES)
+    for row in told["window"].values():
+        check_window(row)
+    # One that is not installed says so; it may not just be gone.
+    assert set(told["peers"]) == PEERS
+    for name, row in told["peers"].items():
+        if "missing" in row:
+            assert name != "dehyst"
+            assert row["missing"]
+        else:
+            assert row["over_dehyst"] == pytest.approx(row["update_us"] / told["peers"]["dehyst"]["update_us"])
+            assert np.isfinite(row["rmse"])
+    assert [n for n, _ in asked["peers"]] == [500]
+    assert asked["drift"] == [(1_000_000, 100), (1_000_000, 500)]
+    assert {row["size"] for row in told["drift"]} == {100.0, 500.0}
+    assert {row["form"] for row in told["drift"] if row["size"] == 100.0} == {"inverse", "cholesky", "auto"}

@@ -1,0 +1,143 @@
+"""Whether a live service has learnt from its samples exactly what they teach: compared with an axis fed off line.
+
+The learner is deterministic sample by sample, so the state of the live one must be that of the other to the last bit,
+however its samples were gathered on the way. One sample that was dropped, doubled or exchanged makes another state.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import zenoh
+from threadpoolctl import threadpool_limits
+
+from adaptive.types import StateDict
+from benchmarks.latency_processes import AXIS, STAGE, sent
+from benchmarks.latency_world import READY_S, World
+from service.axis import Axis
+from service.axis_state import fingerprint
+from service.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
+from service.client import Client
+from service.config import AxisConfig, read_config
+from service.errors import ServiceError
+from service.models import load_axis
+from service.retuning.adoption import Retuned
+from service.wire import joined
+
+#: Messages that the axis off line is given at once: another number than a live service ever gathers.
+_PORTION: Final = 37
+#: Longest time for the queue of the service to be emptied, and for nothing more to come once it is, s.
+_DRAIN_S: Final = 60.0
+_STILL_S: Final = 5.0
+#: So many of what differs are named.
+_NAMED: Final = 8
+
+
+@dataclass(slots=True)
+class Adopted:
+    """The hyper-parameters that the live learner has adopted, each at a definite sample; heard from the events."""
+
+    session: zenoh.Session
+    key: str
+    retuned: list[Retuned] = field(default_factory=list)
+    _subscriber: Any = None
+
+    def __enter__(self) -> Adopted:
+        self._subscriber = self.session.declare_subscriber(self.key, self._hear)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._subscriber.undeclare()
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        told = json.loads(sample.payload.to_bytes())
+        if told.get("event") == "retuned":
+            self.retuned.append(Retuned.from_json(told["retuned"]))
+
+
+def exactness(world: World, client: Client, adopted: Adopted) -> dict[str, Any]:
+    """End the stage, let the service handle what is queued, and compare its learner; counts and verdict for JSON."""
+    world.feed.stop()
+    count = int(world.feed.last_json()["sent"])
+    status = _drained(client, count)
+    live = _live_state(client)
+    axis = taught(world, count, adopted.retuned)
+    differs = differing(live, offline_state(axis))
+    told = fingerprint(axis.newest.models[axis.config.learn])
+    if status["fingerprint"] != told:
+        differs.append("fingerprint")
+    samples = status["samples"]
+    return {
+        "learnt_exactly": not differs,
+        "sent": count,
+        "handled": samples["received"],
+        "learnt": samples["learnt"],
+        **{name: samples[name] for name in ("dropped", "lost", "late", "waiting")},
+        "retuned": len(adopted.retuned),
+        "fingerprint": status["fingerprint"],
+        "fingerprint_offline": told,
+        "differs": differs[:_NAMED],
+    }
+
+
+def taught(world: World, count: int, retuned: list[Retuned]) -> Axis:
+    """An axis of the same configuration, given the first ``count`` samples of the stage here, off line."""
+    with np.load(world.samples) as kept:
+        u_V, y_um = kept["u_V"], kept["y_um"]
+    config: AxisConfig = read_config(world.config).axes[0]
+    # One BLAS thread as in the service: several may sum in another order.
+    with threadpool_limits(1):
+        axis = load_axis(STAGE, config)
+        for entry in retuned:
+            axis.adopt_at(entry)
+        messages = count // world.batch
+        for first in range(0, messages, _PORTION):
+            part = range(first, min(first + _PORTION, messages))
+            axis.handle(joined([sent(u_V, y_um, world.rate_hz, world.batch, k) for k in part]))
+    return axis
+
+
+def offline_state(axis: Axis) -> StateDict:
+    """The state of an axis as it would arrive from a service: there and back through its bytes."""
+    meta = CheckpointMeta(STAGE, AXIS, axis.dt_s, axis.handled_seq, axis.sequence.received)
+    return decode_checkpoint(b"".join(encode_checkpoint(meta, axis.state_dict())))[1]
+
+
+def differing(live: StateDict, offline: StateDict) -> list[str]:
+    """Names of the entries that are not the same to the last bit, or not in both."""
+    return [name for name in sorted({*live, *offline}) if not _same(live.get(name), offline.get(name))]
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    return type(a) is type(b) and bool(a == b)
+
+
+def _drained(client: Client, count: int) -> dict[str, Any]:
+    """The status once all ``count`` samples are handled, or once nothing moves any more."""
+    until = time.monotonic() + _DRAIN_S
+    seq, still_since = -2, time.monotonic()
+    while True:
+        status, now = client.status(), time.monotonic()
+        if status["seq"] != seq or status["samples"]["waiting"]:
+            seq, still_since = status["seq"], now
+        done = seq >= count - 1 and not status["samples"]["waiting"]
+        if done or now - still_since >= _STILL_S or now >= until:
+            return status
+        time.sleep(0.05)
+
+
+def _live_state(client: Client) -> StateDict:
+    """The state of the service as it hands it to a standby. Raises ServiceError where it does not."""
+    until = time.monotonic() + READY_S
+    while time.monotonic() < until:
+        for reply in client._session.get(client.keys.state, timeout=READY_S):
+            if reply.ok is not None:
+                return decode_checkpoint(reply.ok.payload.to_bytes())[1]
+        time.sleep(0.1)  # it refuses while its learner is busy for seconds
+    raise ServiceError(f"{client.keys.state}: the service did not tell its state")
