@@ -42,7 +42,8 @@ class Replayed:
     adaptive_V, frozen_V : foretold less applied voltage, of the learning model and of the one it began as.
     std_V : what the learning model stated as one standard deviation of it.
     gain_um_per_V : mean gain of the recording, by which a voltage error is seen as displacement.
-    row_t_s, gate : of every row of the recording, in its order: time, and index into ``gates`` of what was said of it.
+    row_seq, row_t_s, gate : of every row of the recording, in its order: number, time, and index into ``gates`` of what
+    was said of it.
     notes : by name, the learner's diagnostics; ``note_t_s`` their times, one a block.
     counters : the learner's own. repaired : what had to be repaired for the scoring.
     """
@@ -54,6 +55,7 @@ class Replayed:
     frozen_V: FloatArray
     std_V: FloatArray
     gain_um_per_V: float
+    row_seq: NDArray[np.int64]
     row_t_s: FloatArray
     gate: NDArray[np.int16]
     gates: tuple[str, ...]
@@ -148,6 +150,7 @@ def replay(
         frozen_V=error_V[1],
         std_V=std_V,
         gain_um_per_V=abs(float(np.polyfit(grid.u_V, grid.y_um, 1)[0])),
+        row_seq=seq,
         row_t_s=recording.t_s,
         gate=gate,
         gates=tuple(names),

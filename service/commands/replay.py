@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="window of the running mean error in the picture, s (0.5)",
     )
-    add("--out", type=Path, required=True, metavar="DIR", help="where JSON, pictures and the model at the end go")
+    add("--out", type=Path, required=True, metavar="DIR", help="where JSON, every decision, pictures and the model go")
     add("--no-pictures", action="store_true", help="draw nothing")
     add("--json", action="store_true", help="print JSON in place of the table")
     add_mapping_arguments(parser)
@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from service.models import load_axis
     from service.replay import AGE_S, Replayed, replay, summary
     from service.replay_axis import axis_config
+    from service.replay_gates import write_gates
     from service.retuning.adoption import read as read_adoptions
 
     def say(text: str) -> None:
@@ -117,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
         **summary(done, span_V),
     }
     (args.out / "replay.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    write_gates(args.out / "gates.csv", done)
     write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
     if not args.no_pictures:
         from service.replay_pictures import draw_errors, draw_gates
@@ -150,5 +152,5 @@ def table(numbers: dict[str, Any], out: Path) -> str:
     )
     lines.append("samples by what the learner said: " + ", ".join(f"{k} {v}" for k, v in numbers["gates"].items()))
     lines += [f"  repaired for scoring: {line}" for line in numbers["repaired"]]
-    lines.append(f"replay.json, errors.png, gates.png and the model at the end, model.npz, are in {out}/")
+    lines.append(f"replay.json, gates.csv, errors.png, gates.png and the model at the end, model.npz, are in {out}/")
     return "\n".join(lines)

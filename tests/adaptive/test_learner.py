@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from adaptive.drift import DriftFilter
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.learner import Learner, LearnerConfig
@@ -206,6 +207,53 @@ def test_bad_seconds_are_noticed_fallen_back_from_and_rolled_back(model: LssvmIn
     assert learner.snapshot().valid
     assert learner.counters()["rollbacks"] >= 1
     assert learner.diagnostics()["recent_rms_error_pct"] < 0.15
+
+
+def test_a_rollback_takes_the_estimate_back_and_not_the_place(
+    model: LssvmInverse, quiet: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """beta is that of a good time, to the last bit; the count of samples and the stage's turning points go on."""
+    learner, bystander = Learner.from_model(model), Learner.from_model(model)
+    bystander.freeze()
+    betas: list[FloatArray] = []
+    went_back: list[tuple[FloatArray, FloatArray]] = []
+    go_back = DriftFilter.go_back
+
+    def seen(self: DriftFilter, mark: tuple[FloatArray, FloatArray]) -> None:
+        before = self.beta
+        go_back(self, mark)
+        went_back.append((before, self.beta))
+        # Ready for what may have changed: the covariance is the marked one, opened.
+        assert np.all(np.diag(self.covariance - mark[1]) >= 0.0)
+
+    monkeypatch.setattr(DriftFilter, "go_back", seen)
+    k = -1
+    while not went_back and k < 7000:
+        k += 1
+        # For a second a voltage that the motion has not answered to; the twin that learns nothing sees it too.
+        u = float(quiet.u[k]) + (0.6 * math.sin(0.05 * (k - 3500)) if 3500 <= k < 4500 else 0.0)
+        sample = Sample(k, k * DT, u, float(quiet.y[k]))
+        learner.handle(sample)
+        bystander.handle(sample)
+        betas.append(learner.parts.filter.beta)
+    ((before, after),) = went_back
+    assert learner.counters()["rollbacks"] == 1
+    # What it went back to it once was, while all was well and after it had learnt something.
+    once = [i for i, beta in enumerate(betas) if np.array_equal(beta, after)]
+    assert once
+    assert 1000 < once[-1] < 3500
+    assert not np.array_equal(after, model.beta)
+    assert np.abs(before - after).max() > 1e-3 * model.span_V
+    # The place is that of one that never took anything back.
+    mine, its = learner.parts.front.track, bystander.parts.front.track
+    assert mine is not None
+    assert its is not None
+    assert learner.seq == bystander.seq == k
+    np.testing.assert_array_equal(mine.frozen_memory, its.frozen_memory)
+    assert mine.state.count == its.state.count
+    assert learner.handle(Sample(k, k * DT, float(quiet.u[k]), float(quiet.y[k]))) == "duplicate"
+    learner.handle(Sample(k + 1, (k + 1) * DT, float(quiet.u[k + 1]), float(quiet.y[k + 1])))
+    assert learner.seq == k + 1
 
 
 def test_fifo_is_selectable(model: LssvmInverse, quiet: Run) -> None:
