@@ -89,6 +89,7 @@ class Learner:
         if taken.undone:
             # What was learnt since the jump was learnt of a stage that never was.
             parts.filter.restore(parts.jump_mark)
+            parts.window.keep()
             self._cache = None
         if taken.jump_um:
             parts.judgement.doubt_V2 += (JUMP_DOUBT * taken.jump_um / front.range_um * self.base.span_V) ** 2
@@ -99,7 +100,7 @@ class Learner:
         for step in taken.steps:
             pair, switched = front.advance(step)
             if switched:
-                parts.filter.expect_change()
+                parts.expect_change()
             if not taken.refused:
                 outcome = admission.SETTLING if pair is None else self._teach(pair)
         return outcome
@@ -135,9 +136,8 @@ class Learner:
             parts.judge(target - float(self._basis @ parts.delay.push(beta)), frozen_error_V)
             if self._frozen:
                 return admission.FROZEN
-            if parts.filter.update(self._basis, target, not rest, weight) == "outlier":
+            if not parts.follow(self._basis, target, pair.u_V, weight, rest):
                 return admission.OUTLIER
-            parts.take_rest(pair.u_V, moving=not rest)
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis @ parts.filter.beta), weight)
@@ -209,7 +209,7 @@ class Learner:
         """Load (or compile) the window's steps on a copy: neither the first sample that teaches nor the first other
         hyper-parameters must wait for them."""
         capacity = self.config.window
-        window = ResidualWindow.from_model(self.base, capacity, self.config.eviction)
+        window = ResidualWindow.from_model(self.base, capacity, self.config.eviction, self.config.solver)
         if len(window) < capacity:
             window.learn(10.0 + np.zeros(self.base.features.kernel_size), 0.0)
         window.learn(window.arrays()[0][0], 0.0)

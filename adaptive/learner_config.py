@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from adaptive.admission import AdmissionConfig
 from adaptive.drift import DriftConfig
 from adaptive.errors import InputError
-from adaptive.residual import Eviction
+from adaptive.residual import Eviction, SolverConfig
 from adaptive.smoothing import SmootherConfig
 from adaptive.types import StateDict
 from adaptive.weights import WeightConfig
@@ -49,6 +49,7 @@ class LearnerConfig:
     admission: AdmissionConfig = field(default_factory=AdmissionConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
     weights: WeightConfig = field(default_factory=WeightConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
 
     def __post_init__(self) -> None:
         if self.window < 10:
@@ -70,7 +71,8 @@ class LearnerConfig:
 
     def state_dict(self) -> StateDict:
         """All fields under flat names."""
-        parts = {"admission": asdict(self.admission), "drift": asdict(self.drift), "weights": asdict(self.weights)}
+        names = ("admission", "drift", "weights", "solver")
+        parts = {name: asdict(getattr(self, name)) for name in names}
         flat = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
         return {**own, **flat}
@@ -84,6 +86,7 @@ class LearnerConfig:
             admission=AdmissionConfig(**part_of(values, "admission")),
             drift=DriftConfig(**part_of(values, "drift")),
             weights=WeightConfig(**part_of(values, "weights")),
+            solver=SolverConfig(**part_of(values, "solver")),
         )
 
     def smoother(self, dt_s: float) -> SmootherConfig:

@@ -45,7 +45,7 @@ class Parts:
         covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
         step_s = config.filter_every * base.dt_s
         self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
-        self.window = ResidualWindow.from_model(base, config.window, config.eviction)
+        self.window = ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark: Mark = self.filter.mark()
         self.next_mark: Mark = self.mark
         self.jump_mark: Mark = self.mark
@@ -61,6 +61,26 @@ class Parts:
     def voltage(self, basis: FloatArray, kernel: FloatArray) -> float:
         """What the learnt model asks for, V, at basis (p,) and kernel inputs (d,)."""
         return float(basis @ self.filter.beta) + self.window.mean(kernel)
+
+    def expect_change(self) -> None:
+        """The stage has changed: the filter follows faster, and what the window has from before will count less."""
+        self.filter.expect_change()
+        self.window.expect_change()
+
+    def follow(self, basis: FloatArray, target_V: float, u_V: float, weight: float, rest: bool) -> bool:
+        """A step of the filter towards ``target_V`` at basis (p,); False for an outlier, which teaches nothing.
+
+        ``u_V`` : the voltage there. ``rest`` : whether the stage is at rest.
+        """
+        said = self.filter.update(basis, target_V, not rest, weight)
+        if said == "outlier":
+            return False
+        if said == "burst":
+            self.window.expect_change()
+        if self.judgement.valid and not self.front.on_probation:
+            self.window.let_go(self.config.weights.before_change)
+        self.take_rest(u_V, moving=not rest)
+        return True
 
     def take_rest(self, u_V: float, moving: bool) -> None:
         """After a step of the filter: at rest, let what the constant has gained go over to the frame."""

@@ -54,6 +54,7 @@ def diagnostics(learner: Learner) -> dict[str, Any]:
         "std_V": float(np.sqrt(j.variance_V2)),
         "window_samples": float(len(parts.window)),
         "window_residual_V": parts.window.residual_V,
+        "window_cholesky": float(parts.window.form == "cholesky"),
         "valid": float(j.valid),
         "fallback": float(j.fallback),
         "frozen": float(learner.frozen),

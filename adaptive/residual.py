@@ -13,12 +13,30 @@ from adaptive.errors import InputError
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, StateDict
 from adaptive.weights import WeightConfig
-from adaptive.window import Window, WindowConfig
+from adaptive.window import Backend, Form, Window, WindowConfig
+from adaptive.window_healing import Healing
 from adaptive.window_state import IntArray, Status
 
 Eviction = Literal["nearest", "fifo"]
 #: A sample this close (kernel value) to one that the window holds takes its slot even where there is room.
 SAME = 0.98
+#: No slot.
+NOWHERE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """How the window is solved: ``form``, ``backend``, ``accuracy`` as of `adaptive.window.WindowConfig`.
+
+    Raises InputError where they are not known, not positive, or do not go together (plain has no Cholesky form).
+    """
+
+    form: Form = "auto"
+    backend: Backend = "compiled"
+    accuracy: float = 1e-8
+
+    def __post_init__(self) -> None:
+        WindowConfig(1, (1.0,), 1.0, (), self.form, self.backend, self.accuracy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,28 +72,37 @@ class ResidualWindow:
     rest of the range stays, however long the stage dwells in one place. ``"fifo"`` drops the oldest.
     """
 
-    def __init__(self, capacity: int, model: LssvmInverse, eviction: Eviction = "nearest") -> None:
+    def __init__(
+        self, capacity: int, model: LssvmInverse, eviction: Eviction = "nearest", solver: SolverConfig | None = None
+    ) -> None:
         self.eviction: Eviction = eviction
         widths = tuple(float(w) for w in model.widths)
-        self._config = WindowConfig(capacity, widths, model.gamma)
+        s = solver or SolverConfig()
+        self._config = WindowConfig(capacity, widths, model.gamma, (), s.form, s.backend, s.accuracy)
         #: Variance of the kernel part away from samples, V².
         self.kernel_variance = model.kernel_variance
         self._window = Window(self._config)
+        self._healing = Healing(self._window)
         self._born = np.zeros(capacity, dtype=np.int64)
         # The weights that samples came with, before they faded.
         self._own = np.ones(capacity)
         self._clock = 0
+        # The samples up to this one are from before the last change; the slots from here on may hold some (-1: none).
+        self._changed, self._next = 0, NOWHERE
 
     @classmethod
-    def from_model(cls, model: LssvmInverse, capacity: int, eviction: Eviction = "nearest") -> ResidualWindow:
+    def from_model(
+        cls, model: LssvmInverse, capacity: int, eviction: Eviction = "nearest", solver: SolverConfig | None = None
+    ) -> ResidualWindow:
         """A window that holds a model's samples and predicts as its kernel part does; the last ``capacity`` of them."""
-        made = cls(capacity, model, eviction)
+        made = cls(capacity, model, eviction, solver)
         n = model.support.shape[0]
         if n:
             # A solution knows its targets: y = K alpha + alpha / gamma; its bias is in the linear part already.
             targets = kernels.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
+            made._healing = Healing(made._window)
         return made
 
     def __len__(self) -> int:
@@ -86,12 +113,22 @@ class ResidualWindow:
         """Worst row residual of the last round over all rows, V."""
         return self._window.round_residual
 
+    @property
+    def form(self) -> str:
+        """``inverse`` or ``cholesky``, whichever is at work."""
+        return self._window.form
+
     def mean(self, kernel: FloatArray) -> float:
         """Prediction at one point (d,), V."""
         return self._window.predict(kernel)
 
     def learn(self, kernel: FloatArray, target_V: float, weight: float = 1.0) -> str:
-        """Take one sample, of a noise weight. Returns "learnt", or "numerics" where the step was refused, undone."""
+        """Take one sample, of a noise weight. Returns "learnt", or "numerics" where the step was refused, undone.
+
+        A refusal of the window's numerics starts its healing: the same solution is served, and steps that it can't take
+        are refused, until a new factorisation is swapped in, `window_healing.STEPS` samples later.
+        """
+        self._healing.step()
         window, n = self._window, len(self._window)
         slot, value = -1, 0.0
         if n:
@@ -105,9 +142,8 @@ class ResidualWindow:
         elif self.eviction == "fifo":
             slot = int(np.argmin(self._born[:n]))
         status = self._step(slot, room, kernel, target_V, weight)
-        # In line and not beside the work, so that a replay heals at the same sample; queries are not held up by it.
-        if status == Status.ILL_CONDITIONED and window.heal():
-            status = self._step(slot, room, kernel, target_V, weight)
+        if status == Status.ILL_CONDITIONED and n:
+            self._healing.begin()
         if status != Status.ACCEPTED:
             return admission.NUMERICS
         self._born[slot] = self._clock
@@ -122,6 +158,30 @@ class ResidualWindow:
         slot = self._clock % n
         age_s = float(self._clock - self._born[slot]) * step_s
         self._window.reweight(slot, weights.faded(float(self._own[slot]), age_s))
+
+    def expect_change(self) -> None:
+        """The stage has changed: what is in the window is from before. See `let_go`."""
+        self._changed, self._next = self._clock, 0
+
+    def keep(self) -> None:
+        """There was no change: what has not been let go stays as it is."""
+        self._next = NOWHERE
+
+    def let_go(self, most: float) -> None:
+        """Let one sample from before the last change count ``most`` at most, another at each call.
+
+        It is not taken out: where nothing newer has come it is still the best there is, but who is nearer or newer now
+        outvotes it. One a call, so that no sample has to wait for five hundred steps of the window.
+        """
+        n = len(self._window)
+        while 0 <= self._next < n:
+            slot = self._next
+            self._next += 1
+            if self._born[slot] <= self._changed and self._own[slot] > most:
+                if self._window.reweight(slot, most) == Status.ACCEPTED:
+                    self._own[slot] = most
+                return
+        self._next = NOWHERE
 
     def _step(self, slot: int, room: bool, kernel: FloatArray, target_V: float, weight: float) -> Status:
         return (
@@ -169,6 +229,7 @@ class ResidualWindow:
         c = self._config
         made.eviction, made._clock, made._born = self.eviction, self._clock, self._born.copy()
         made._own = self._own.copy()
+        made._changed, made._next = self._changed, self._next
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
@@ -178,7 +239,8 @@ class ResidualWindow:
         if len(self._window):
             made._window = self._window.with_hyperparameters(widths, float(hyper.gamma))
             made.kernel_variance = made._window.scale
-        made._window.arrays.C[ws.STEPS : ws.COUNTERS] += self._window.arrays.C[ws.STEPS : ws.COUNTERS]
+        made._healing = Healing(made._window)
+        made._window.arrays.C[ws.EVENTS] += self._window.arrays.C[ws.EVENTS]
         return made
 
     def _newest(self, count: int) -> IntArray:
@@ -192,10 +254,13 @@ class ResidualWindow:
             "born": self._born.copy(),
             "own_weights": self._own.copy(),
             "clock": self._clock,
+            "changed": self._changed,
+            "next": self._next,
             "kernel_variance": self.kernel_variance,
         }
         hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
-        return {**self._window.state_dict(), **own, **hyper}
+        healing = {f"healing.{name}": value for name, value in self._healing.state_dict().items()}
+        return {**self._window.state_dict(), **own, **hyper, **healing}
 
     def restore(self, values: StateDict) -> None:
         """Go on from a ``state_dict``. Raises InputError where it is of another capacity or number of inputs."""
@@ -203,9 +268,13 @@ class ResidualWindow:
         widths = tuple(float(w) for w in values["widths"])
         self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.linear, c.form, c.backend, c.accuracy)
         self._window = Window.from_state(self._config, values)
+        prefix = "healing."
+        healing = {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
+        self._healing = Healing.from_state(self._window, healing)
         self._born = np.array(values["born"], dtype=np.int64)
         self._own = np.array(values["own_weights"], dtype=np.float64)
         self._clock = int(values["clock"])
+        self._changed, self._next = int(values["changed"]), int(values["next"])
         self.kernel_variance = float(values["kernel_variance"])
 
 

@@ -14,22 +14,24 @@ from adaptive.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class WeightConfig:
-    """All weights 1, nothing forgotten: the default.
+    """All weights 1, but for samples from before a change.
 
     near_bad : weight of a pair whose smoothing has looked at a reading that was refused.
     on_probation : weight for as long as a jump may still be undone.
     acceleration : noise that acceleration adds, as a share of the ordinary, at full scale of the feature map: the
     weight is 1/(1 + (acceleration a/scale)²). What the smoother leaves is worst where the motion turns fast.
     half_life_s : time after which a sample of the window counts half, s; 0 for never.
+    before_change : most that a sample counts from before a change of the stage that was found; 1 to keep them all.
     """
 
     near_bad: float = 1.0
     on_probation: float = 1.0
     acceleration: float = 0.0
     half_life_s: float = 0.0
+    before_change: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("near_bad", "on_probation"):
+        for name in ("near_bad", "on_probation", "before_change"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InputError(f"weights.{name}: got {getattr(self, name)}, expected a weight above 0, up to 1")
         for name in ("acceleration", "half_life_s"):

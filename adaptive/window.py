@@ -8,6 +8,7 @@ kernel column, one pass over one triangle. Compiled code of other modules steps 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Literal
@@ -48,7 +49,7 @@ class WindowConfig:
     linear: tuple[int, ...] = ()
     form: Form = "auto"
     backend: Backend = "compiled"
-    accuracy: float = 1e-6
+    accuracy: float = 1e-8
 
     def __post_init__(self) -> None:
         if self.capacity < 1:
@@ -57,6 +58,11 @@ class WindowConfig:
             raise InputError("widths: got none, expected one kernel width a feature")
         object.__setattr__(self, "widths", tuple(map(float, kernels.as_widths(self.widths, len(self.widths)))))
         object.__setattr__(self, "gamma", lssvm.check_gamma(self.gamma))
+        if not ws.LEAST_PRECISION <= self.gamma <= ws.MOST_PRECISION:
+            raise InputError(
+                f"gamma: got {self.gamma!r}, expected {ws.LEAST_PRECISION:g} to {ws.MOST_PRECISION:g}: beyond, double "
+                "precision does not tell a sample's noise from the kernel"
+            )
         object.__setattr__(self, "linear", lssvm.check_linear(self.linear, len(self.widths)))
         if self.form not in ("inverse", "cholesky", "auto"):
             raise InputError(f"form: got {self.form!r}, expected 'inverse', 'cholesky' or 'auto'")
@@ -65,7 +71,7 @@ class WindowConfig:
         if self.backend == "plain" and self.form == "cholesky":
             raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
         if not self.accuracy > 0:
-            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-6 say")
+            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-8 say")
 
     @property
     def dimension(self) -> int:
@@ -122,8 +128,13 @@ class Window:
                 f"X, y, weights: got shapes {X.shape}, {y.shape}, {w.shape}, expected (n, {config.dimension}), (n,), "
                 f"(n,) with 1 <= n <= {config.capacity}, the capacity"
             )
-        if not (np.all(np.isfinite(X)) and np.all(np.isfinite(y)) and np.all(np.isfinite(w)) and np.all(w > 0)):
-            raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
+        precision = config.gamma * w
+        held = np.all(np.abs(X) <= ws.MOST) and np.all(np.abs(y) <= ws.MOST)
+        if not (held and np.all((precision >= ws.LEAST_PRECISION) & (precision <= ws.MOST_PRECISION))):
+            raise InputError(
+                f"X, y, weights: got values that are not finite, larger than {ws.MOST:g}, or weights with gamma w not "
+                f"within {ws.LEAST_PRECISION:g} to {ws.MOST_PRECISION:g}; normalise, and drop what is no number"
+            )
         window = cls(config)
         A = window.arrays
         A.C[ws.COUNT] = n
@@ -247,13 +258,13 @@ class Window:
         """Largest residual of all rows, in target units. O(N²)."""
         return float(self._core.worst_residual(self.arrays))
 
-    def refine(self) -> None:
-        """One step of iterative refinement of beta and alpha; O(N² p)."""
-        self._core.refine(self.arrays)
+    def refine(self) -> bool:
+        """One step of iterative refinement of beta and alpha; O(N² p). False, and nothing changed, where not finite."""
+        return self._solved_anew(self._core.refine)
 
     def resum(self) -> bool:
-        """Beta and alpha anew from the factorisation as it stands; O(N² p). False where they are not finite."""
-        return bool(self._core.resum(self.arrays))
+        """Beta and alpha anew from the factorisation as it stands; O(N² p). False as `refine`."""
+        return self._solved_anew(self._core.resum)
 
     def condition(self) -> float:
         """Upper bound of cond(R), close for wide kernels; O(N²)."""
@@ -270,16 +281,19 @@ class Window:
         P = A.R.copy()
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
             lapack.cholesky_upper(P, n)
-            A.order[:n] = np.arange(n)
         else:
             lapack.cholesky_lower(P, n)
             lapack.inverse_from_cholesky(P, n)
+        before = ws.duplicate(A)
         A.P[:] = P
+        if A.C[ws.FORM] == ws.CHOLESKY_FORM:
+            A.order[:n] = np.arange(n)
         A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
-        A.C[ws.PENDING], A.C[ws.UNDO] = 0, ws.UNDO_NOTHING
-        A.C[ws.REFRESHES] += 1
+        A.C[ws.PENDING], A.C[ws.UNDO], A.C[ws.CARRIED] = 0, ws.UNDO_NOTHING, 0
         if not self._core.resum(A):
+            ws.take_over(A, before)
             raise NumericsError("window: its solution is not finite after a new factorisation; lower gamma")
+        A.C[ws.REFRESHES] += 1
 
     def switch_form(self, form: Literal["inverse", "cholesky"]) -> None:
         """Go on in the other form; one factorisation."""
@@ -287,8 +301,7 @@ class Window:
             raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
         wanted = ws.CHOLESKY_FORM if form == "cholesky" else ws.INVERSE_FORM
         if self.arrays.C[ws.FORM] != wanted:
-            self.arrays.C[ws.FORM] = wanted
-            self.rebuild()
+            self._rebuild_as(wanted)
 
     def heal(self) -> bool:
         """Factor anew after a refused step, in the form that the samples' condition calls for now (``auto``).
@@ -298,14 +311,37 @@ class Window:
         """
         if len(self) == 0:
             return False
-        free = self.config.form == "auto" and self.config.backend == "compiled"
-        if free and not condition.inverse_form_serves(self.condition(), self.config.accuracy):
-            self.arrays.C[ws.FORM] = ws.CHOLESKY_FORM
         try:
-            self.rebuild()
+            self._rebuild_as(self.form_called_for())
         except NumericsError:
             return False
         return True
+
+    def form_called_for(self) -> int:
+        """Of a new factorisation: the form at work, or Cholesky where that is free and the condition asks for it."""
+        free = self.config.form == "auto" and self.config.backend == "compiled"
+        if free and not condition.inverse_form_serves(self.condition(), self.config.accuracy):
+            return ws.CHOLESKY_FORM
+        return int(self.arrays.C[ws.FORM])
+
+    def _rebuild_as(self, form: int) -> None:
+        before = int(self.arrays.C[ws.FORM])
+        self.arrays.C[ws.FORM] = form
+        try:
+            self.rebuild()
+        except NumericsError:
+            self.arrays.C[ws.FORM] = before
+            raise
+
+    def _solved_anew(self, solve: Callable[[WindowArrays], bool]) -> bool:
+        A = self.arrays
+        before = [field.copy() for field in (A.S, A.G, A.beta, A.V)]
+        good = bool(solve(A))
+        if not good:
+            for field, kept in zip((A.S, A.G, A.beta, A.V), before, strict=True):
+                field[...] = kept
+            A.C[ws.ILL_STEPS] += 1
+        return good
 
     def with_hyperparameters(self, widths: tuple[float, ...], gamma: float) -> Window:
         """A new window over the same samples with other hyper-parameters; counters start anew."""
@@ -351,10 +387,15 @@ class Window:
         """Raises InputError where a field is missing or its shape is not that of ``config``."""
         window = cls(config)
         for name, field in window.arrays._asdict().items():
-            if name not in state or np.shape(state[name]) != field.shape:
-                got = np.shape(state[name]) if name in state else "nothing"
+            given = np.shape(state[name]) if name in state else ()
+            # An older version's lacks the last rows of V and C, which are zero where nothing is known yet.
+            older = name in ("V", "C") and len(given) == field.ndim and given[1:] == field.shape[1:]
+            if name not in state or not (given == field.shape or (older and given[0] < field.shape[0])):
+                got = given if name in state else "nothing"
                 raise InputError(f"{name}: got {got}, expected an array {field.shape}; the state is of another window")
-            field[...] = state[name]
+            field[: len(state[name])] = state[name]
+        if np.shape(state["C"]) != window.arrays.C.shape:
+            window.arrays.C[ws.UNDO] = ws.UNDO_NOTHING
         return window
 
     def _config_with(self, widths: tuple[float, ...], gamma: float) -> WindowConfig:

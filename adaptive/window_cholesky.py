@@ -6,13 +6,15 @@ that beta follows in O(N p) and alpha by one back solve. The error of alpha grow
 square as that of the inverse does, for about twice the time.
 
 Column j of L is row j of ``P`` (contiguous). Positions are the order of the factor, ``order`` names their
-slots: the slot a sample lies in never matters to the numerics.
+slots: the slot a sample lies in never matters to the numerics. Rotations can't be turned back to the last bit, so a
+step first copies the factor into the triangle of P that is free.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from adaptive import window_diagonal as diagonal
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
 from adaptive.window_common import (
@@ -22,8 +24,10 @@ from adaptive.window_common import (
     finite,
     half_norm_small,
     keep_for_undo,
+    left_out,
     move_sample,
     restore_sample,
+    restore_solution,
     row_residual,
     solve_small,
     write_sample,
@@ -32,20 +36,23 @@ from adaptive.window_pass import backward_columns, forward_columns, rotate_colum
 from adaptive.window_state import (
     ACCEPTED,
     ALPHA,
+    CARRIED,
     COLUMN,
     COUNT,
+    DIAGONAL,
     GAMMA,
     ILL_CONDITIONED,
     MINUS,
+    PK,
     PLUS,
     SY,
     TRIAL,
     UNDO,
     UNDO_APPEND,
     UNDO_NOTHING,
+    UNDO_PLACE,
     UNDO_REPLACE,
     UNDO_SLOT,
-    W,
     WindowArrays,
     Y,
     Z,
@@ -131,17 +138,25 @@ def _add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
 
 
 @compiled_reassociating
-def finish(A: WindowArrays) -> bool:
-    """beta and alpha from T = L^-1 [H y]. False, with both spoilt, where they are not finite."""
-    p, n = A.H.shape[0], A.C[COUNT]
-    sy, t = A.V[SY], A.V[Z]
-    good = True
+def factor_design(A: WindowArrays) -> bool:
+    """G <- the factor of T_H'T_H. False where that is not finite."""
+    p, n, good = A.H.shape[0], A.C[COUNT], True
     for c in range(p):
         for r in range(c, p):
             A.G[r, c] = dot(A.S[r], A.S[c], n)
             good = good and np.isfinite(A.G[r, c])
-        A.beta[c] = dot(A.S[c], sy, n)
     factor_small(A.G)
+    return good
+
+
+@compiled_reassociating
+def finish(A: WindowArrays) -> bool:
+    """beta and alpha from T = L^-1 [H y]. False, with both spoilt, where they are not finite."""
+    p, n = A.H.shape[0], A.C[COUNT]
+    sy, t = A.V[SY], A.V[Z]
+    good = factor_design(A)
+    for c in range(p):
+        A.beta[c] = dot(A.S[c], sy, n)
     solve_small(A.G, A.beta)
     for j in range(n):
         t[j] = sy[j]
@@ -154,17 +169,47 @@ def finish(A: WindowArrays) -> bool:
 
 
 @compiled_reassociating
-def _put_back(A: WindowArrays, slot: int) -> None:
-    """Bring the sample kept in U back to ``slot``, which the factor does not hold at the moment."""
-    n, p, half = A.C[COUNT], A.H.shape[0], A.V[TRIAL]
-    A.C[COUNT] = n + 1
-    restore_sample(A)
-    A.C[COUNT] = n
+def _keep_factor(A: WindowArrays) -> None:
+    """Copy the factor into the strictly lower triangle of P, last row first, and its diagonal into PK."""
+    n = A.C[COUNT]
     for i in range(n):
-        half[i] = A.U[p + 2, A.order[i]]
-    forward(A, half)
-    noise = 1.0 / (A.F[GAMMA] * A.V[W, slot])
-    _add(A, slot, half, np.sqrt(max(1.0 + noise - dot(half, half, n), noise)))
+        A.V[PK, i] = A.P[i, i]
+        source, target = A.P[i, i + 1 : n], A.P[n - 1 - i]
+        for j in range(source.shape[0]):
+            target[j] = source[j]
+
+
+@compiled_reassociating
+def _take_back(A: WindowArrays) -> None:
+    """The window as it was before the sample of UNDO_SLOT was taken out of the factor, to the last bit.
+
+    COUNT is what it was then.
+    """
+    n, place = A.C[COUNT], A.C[UNDO_PLACE]
+    for i in range(n):
+        source, target = A.P[n - 1 - i], A.P[i, i + 1 : n]
+        for j in range(target.shape[0]):
+            target[j] = source[j]
+    for i in range(n):
+        A.P[i, i] = A.V[PK, i]
+    for r in range(n - 1 - place):
+        A.order[n - 1 - r] = A.order[n - 2 - r]
+    A.order[place] = A.C[UNDO_SLOT]
+    restore_solution(A)
+    restore_sample(A)
+    factor_design(A)
+    A.C[UNDO] = UNDO_NOTHING
+
+
+@compiled_reassociating
+def _begin_to_take_out(A: WindowArrays, slot: int) -> int:
+    """Keep all that `_take_back` needs. Returns the position of ``slot``."""
+    place = position_of(A, slot)
+    keep_for_undo(A, slot, UNDO_REPLACE)
+    A.C[UNDO_PLACE] = place
+    _keep_factor(A)
+    diagonal.prepare(A, place)
+    return place
 
 
 @compiled_reassociating
@@ -172,13 +217,12 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
     """The sample of ``slot`` makes way for a new one whose kernel column is in COLUMN. Returns a status."""
     n = A.C[COUNT]
     column, half = A.V[COLUMN], A.V[TRIAL]
-    position = position_of(A, slot)
-    keep_for_undo(A, slot, UNDO_REPLACE)
-    for i in range(position):
+    place = _begin_to_take_out(A, slot)
+    for i in range(place):
         half[i] = column[A.order[i]]
-    for i in range(position + 1, n):
+    for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
-    _delete(A, position, half)
+    _delete(A, place, half)
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n - 1)
     good = s > _SCHUR_SHARE * noise
@@ -188,15 +232,26 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
         A.C[COUNT] = n - 1
         _add(A, slot, half, np.sqrt(s))
         good = finish(A)
-        if not good:
-            A.C[COUNT] = n - 1
     if not good:
-        # T of the other samples may be spoilt by nothing: only the last position held the bad one.
-        _put_back(A, slot)
-        finish(A)
-        A.C[UNDO] = UNDO_NOTHING
+        A.C[COUNT] = n
+        _take_back(A)
         return ILL_CONDITIONED
+    diagonal.leave(A, slot, n)
+    diagonal.come(A, slot)
     return ACCEPTED
+
+
+@compiled_reassociating
+def undo(A: WindowArrays) -> None:
+    """Take back the last replace or append, to the last bit; the caller has seen that there is one."""
+    if A.C[UNDO] == UNDO_REPLACE:
+        _take_back(A)
+    else:
+        A.C[COUNT] -= 1
+        restore_solution(A)
+        factor_design(A)
+        A.C[UNDO] = UNDO_NOTHING
+    A.C[CARRIED] = 0
 
 
 @compiled_reassociating
@@ -208,63 +263,39 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     forward(A, half)
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n)
-    keep_for_undo(A, n, UNDO_APPEND)
     if not s > _SCHUR_SHARE * noise:
-        A.C[UNDO] = UNDO_NOTHING
         return ILL_CONDITIONED
+    keep_for_undo(A, n, UNDO_APPEND)
     write_sample(A, n, x, y, w)
     _add(A, n, half, np.sqrt(s))
     if not finish(A):
-        A.C[COUNT] = n
-        finish(A)
-        A.C[UNDO] = UNDO_NOTHING
+        undo(A)
         return ILL_CONDITIONED
+    diagonal.come(A, n)
     return ACCEPTED
 
 
 @compiled_reassociating
-def undo(A: WindowArrays) -> None:
-    """Take back the last replace or append, to round-off; the caller has seen that there is one."""
-    A.C[COUNT] -= 1
-    if A.C[UNDO] == UNDO_REPLACE:
-        _put_back(A, A.C[UNDO_SLOT])
-    finish(A)
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
-def remove(A: WindowArrays, slot: int) -> None:
-    """Empty a slot; the last slot's sample moves into it."""
+def remove(A: WindowArrays, slot: int) -> int:
+    """Empty a slot; the last slot's sample moves into it. Returns a status."""
     last = A.C[COUNT] - 1
     scratch = A.V[TRIAL]
+    place = _begin_to_take_out(A, slot)
     for i in range(last + 1):
         scratch[i] = 0.0
-    _delete(A, position_of(A, slot), scratch)
+    _delete(A, place, scratch)
+    if not finish(A):
+        A.C[COUNT] = last + 1
+        _take_back(A)
+        return ILL_CONDITIONED
+    diagonal.leave(A, slot, last + 1)
     if slot != last:
         A.C[COUNT] = last + 1
         move_sample(A, last, slot)
         A.C[COUNT] = last
         A.order[position_of(A, last)] = slot
-    finish(A)
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
-def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Change the noise weight of one sample: out and in again. Returns a status."""
-    n, half = A.C[COUNT], A.V[TRIAL]
-    position = position_of(A, slot)
-    for i in range(position):
-        half[i] = A.R[slot, A.order[i]]
-    for i in range(position + 1, n):
-        half[i - 1] = A.R[slot, A.order[i]]
-    _delete(A, position, half)
-    noise = 1.0 / (A.F[GAMMA] * w)
-    s = max(1.0 + noise - dot(half, half, n - 1), noise)
-    A.V[W, slot] = w
-    A.R[slot, slot] = 1.0 + noise
-    _add(A, slot, half, np.sqrt(s))
-    finish(A)
+        A.V[ALPHA, slot] = A.V[ALPHA, last]
+        A.V[DIAGONAL, slot] = A.V[DIAGONAL, last]
     A.C[UNDO] = UNDO_NOTHING
     return ACCEPTED
 
@@ -298,7 +329,7 @@ def refine(A: WindowArrays) -> bool:
     backward(A, t)
     for i in range(n):
         A.V[ALPHA, A.order[i]] += t[i]
-    return good and finite(t, n)
+    return good and finite(A.beta, p) and finite(A.V[ALPHA], n)
 
 
 @compiled_reassociating
@@ -324,23 +355,27 @@ def variance(A: WindowArrays, k: FloatArray, u: FloatArray) -> float:
 
 @compiled_reassociating
 def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """alpha_i / (P_ii - S_i G^-1 S_i') into ``out``. O(N³): the factor does not know the diagonal of its inverse."""
-    n, p, half, u = A.C[COUNT], A.H.shape[0], A.V[MINUS], A.small[1, : A.H.shape[0]]
-    for r in range(n):
-        # Column r of L^-1 is zero above r: forward substitution from there on.
+    """alpha_i / (P_ii - S_i G^-1 S_i') into ``out``. O(N² p) where the diagonal of P is carried along, else O(N³).
+
+    S_i G^-1 S_i' is the sum of squares of row i of L'^-1 T g'^-1, with g the factor of G.
+    """
+    n, p, t, u = A.C[COUNT], A.H.shape[0], A.V[TRIAL], A.small[1]
+    d = diagonal.ask(A)
+    for i in range(n):
+        out[i] = d[i]
+    for c in range(p):
+        for r in range(n):
+            t[r] = 0.0
+        for k in range(c + 1):
+            r = c - k
+            u[r] = 1.0 if k == 0 else 0.0
+            for j in range(r + 1, c + 1):
+                u[r] -= A.G[j, r] * u[j]
+            # A column that the samples do not tell apart has no part in it.
+            u[r] = u[r] / A.G[r, r] if A.G[r, r] > 0.0 and A.G[c, c] > 0.0 else 0.0
+            add_scaled(t, u[r], A.S[r], n)
+        backward(A, t)
         for i in range(n):
-            half[i] = 0.0
-        half[r] = 1.0
-        for k in range(r, n):
-            t = half[k] / A.P[k, k]
-            half[k] = t
-            row = A.P[k]
-            for i in range(k + 1, n):
-                half[i] -= row[i] * t
-        diagonal = 0.0
-        for k in range(r, n):
-            diagonal += half[k] * half[k]
-        for c in range(p):
-            u[c] = dot(A.S[c], half, n)
-        slot = A.order[r]
-        out[slot] = A.V[ALPHA, slot] / (diagonal - half_norm_small(A.G, u))
+            out[A.order[i]] -= t[i] * t[i]
+    for i in range(n):
+        out[i] = left_out(A.V[ALPHA, i], d[i], out[i])

@@ -15,6 +15,9 @@ from adaptive.window_state import (
     CURSOR,
     GAMMA,
     LAST_WORST,
+    LEAST_PRECISION,
+    MOST,
+    MOST_PRECISION,
     RESIDUAL,
     RESIDUALS_EXCEEDED,
     ROUND_WORST,
@@ -32,6 +35,8 @@ from adaptive.window_state import (
 
 #: An unpenalised column whose pivot falls below this share is not told apart by the samples: its coefficient is 0.
 _PIVOT_SHARE = 1e-11
+#: A sample without which the unpenalised part is not determined leaves nothing of its diagonal but rounding.
+_UNDETERMINED = 1e-13
 #: A few units in the last place of the terms of a row's residual.
 _ROUND_OFF = 1e-15
 
@@ -101,12 +106,25 @@ def half_norm_small(G: FloatArray, u: FloatArray) -> float:
 
 
 @compiled_reassociating
-def acceptable(x: FloatArray, y: float, w: float) -> bool:
-    """Finite features and target, positive finite weight."""
-    total = y * 0.0 + w * 0.0
-    for i in range(x.shape[0]):
-        total += x[i] * 0.0
-    return total == 0.0 and w > 0.0
+def bounded(a: FloatArray, n: int, most: float) -> bool:
+    """True where the first n elements are numbers of at most this size."""
+    good = True
+    for j in range(n):
+        good = good and abs(a[j]) <= most
+    return good
+
+
+@compiled_reassociating
+def acceptable_weight(A: WindowArrays, w: float) -> bool:
+    """True where the sample's noise variance 1/(gamma w) is one that double precision can tell from the kernel."""
+    precision: float = A.F[GAMMA] * w
+    return precision >= LEAST_PRECISION and precision <= MOST_PRECISION
+
+
+@compiled_reassociating
+def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
+    """Features and target that are numbers of at most MOST, a weight as above."""
+    return bounded(x, x.shape[0], MOST) and abs(y) <= MOST and acceptable_weight(A, w)
 
 
 @compiled_reassociating
@@ -259,3 +277,9 @@ def move_sample(A: WindowArrays, source: int, target: int) -> None:
             A.R[target, j] = A.R[source, j]
             A.R[j, target] = A.R[source, j]
     A.R[target, target] = own
+
+
+@compiled_reassociating
+def left_out(alpha: float, diagonal: float, without: float) -> float:
+    """The leave-one-out residual alpha/without; NaN where the others do not determine the unpenalised part."""
+    return alpha / without if without > _UNDETERMINED * diagonal else np.nan

@@ -1,7 +1,9 @@
 """One compiled step of either form of the window, with its checks: what `Window` and other compiled code call.
 
 Every function takes the window's arrays and returns a status (`window_state.Status`) or a number. Nothing
-allocates, nothing raises, and no step leaves the window non-finite.
+allocates, nothing raises, and no step leaves the window non-finite: one that would is refused, counted and taken back.
+What it holds and its solution are then what they were to the last bit; so is the factor of the Cholesky form, while
+the inverse form's P may have taken in the rank-2 term that was pending, which is its value but for rounding.
 """
 
 from __future__ import annotations
@@ -14,10 +16,14 @@ from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
 from adaptive.window_common import (
     acceptable,
+    acceptable_weight,
     add_scaled,
+    bounded,
     design_value,
     dot,
+    keep_for_undo,
     kernel_column,
+    restore_solution,
     rotate_residual,
     row_residual,
 )
@@ -34,11 +40,17 @@ from adaptive.window_state import (
     ILL_CONDITIONED,
     ILL_STEPS,
     INVERSE_FORM,
+    LAST_WORST,
+    LEAST_FACTOR,
+    MOST,
+    MOST_FACTOR,
     NEGLIGIBLE,
     NO_SLOT,
     NOTHING_TO_UNDO,
     REFINEMENTS,
     RESIDUAL,
+    ROUND_WORST,
+    ROUNDS,
     STEPS,
     SY,
     UNDO,
@@ -78,14 +90,35 @@ def _refined(A: WindowArrays) -> bool:
 
 
 @compiled_reassociating
-def _conclude(A: WindowArrays, status: int) -> int:
-    if status == ACCEPTED and not rotate_residual(A) and not _refined(A) and A.C[FORM] == INVERSE_FORM:
+def _take_back(A: WindowArrays) -> None:
+    if A.C[FORM] == INVERSE_FORM:
         inverse.undo(A)
-        status = ILL_CONDITIONED
+    else:
+        cholesky.undo(A)
+
+
+@compiled_reassociating
+def _checked(A: WindowArrays, status: int) -> int:
+    """What a step comes to once the next row of the round is looked at. A refused one is counted, the row looked at
+    again next time: the residual of what was taken back is not the window's."""
+    if status == ACCEPTED:
+        residual, worst, last = A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST]
+        cursor, rounds = A.C[CURSOR], A.C[ROUNDS]
+        if not rotate_residual(A) and not _refined(A):
+            _take_back(A)
+            A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST] = residual, worst, last
+            A.C[CURSOR], A.C[ROUNDS] = cursor, rounds
+            status = ILL_CONDITIONED
+    if status == ILL_CONDITIONED:
+        A.C[ILL_STEPS] += 1
+    return status
+
+
+@compiled_reassociating
+def _conclude(A: WindowArrays, status: int) -> int:
+    status = _checked(A, status)
     if status == ACCEPTED:
         A.C[STEPS] += 1
-    elif status == ILL_CONDITIONED:
-        A.C[ILL_STEPS] += 1
     return status
 
 
@@ -95,7 +128,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
 
     Checks one rotating row's residual afterwards and refines where it exceeds the tolerance.
     """
-    if not acceptable(x, y, w):
+    if not acceptable(A, x, y, w):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
     if slot < 0 or slot >= A.C[COUNT]:
@@ -109,7 +142,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
 @compiled_reassociating
 def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     """One more slot, for (x, y) of noise weight w. O(N²)."""
-    if not acceptable(x, y, w):
+    if not acceptable(A, x, y, w):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
     if A.C[COUNT] >= A.P.shape[0]:
@@ -122,13 +155,10 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 @compiled_reassociating
 def undo(A: WindowArrays) -> int:
-    """Take back the last `replace` or `append`, if nothing but predictions happened since. O(N)."""
+    """Take back the last `replace` or `append`, if nothing but predictions happened since. O(N), or O(N²)."""
     if A.C[UNDO] == UNDO_NOTHING:
         return NOTHING_TO_UNDO
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.undo(A)
-    else:
-        cholesky.undo(A)
+    _take_back(A)
     A.C[UNDONE] += 1
     return ACCEPTED
 
@@ -139,37 +169,54 @@ def remove(A: WindowArrays, slot: int) -> int:
     if slot < 0 or slot >= A.C[COUNT]:
         return NO_SLOT
     if A.C[FORM] == INVERSE_FORM:
-        inverse.remove(A, slot)
+        status = inverse.remove(A, slot)
     else:
-        cholesky.remove(A, slot)
-    return ACCEPTED
-
-
-@compiled_reassociating
-def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Give the sample in ``slot`` the noise weight w. O(N²)."""
-    if slot < 0 or slot >= A.C[COUNT]:
-        return NO_SLOT
-    if not (w > 0.0 and w * 0.0 == 0.0):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    if A.C[FORM] == INVERSE_FORM:
-        status = inverse.reweight(A, slot, w)
-    else:
-        status = cholesky.reweight(A, slot, w)
+        status = cholesky.remove(A, slot)
     if status != ACCEPTED:
         A.C[ILL_STEPS] += 1
     return status
 
 
 @compiled_reassociating
-def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
-    """All targets y <- (1 + gain) y + offset, in O(N p): the offset lies in the span of the unpenalised part."""
-    if not ((gain + offset) * 0.0 == 0.0 and gain > -1.0):
+def reweight(A: WindowArrays, slot: int, w: float) -> int:
+    """Give the sample in ``slot`` the noise weight w: out and in again, which stays exact for any change. O(N²)."""
+    if slot < 0 or slot >= A.C[COUNT]:
+        return NO_SLOT
+    if not acceptable_weight(A, w):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
+    x = A.small[0, : A.X.shape[0]]
+    for i in range(x.shape[0]):
+        x[i] = A.X[i, slot]
+    for j in range(A.C[COUNT]):
+        A.V[COLUMN, j] = A.R[slot, j]
+    if A.C[FORM] == INVERSE_FORM:
+        status = _checked(A, inverse.replace(A, slot, x, A.V[Y, slot], w))
+    else:
+        status = _checked(A, cholesky.replace(A, slot, x, A.V[Y, slot], w))
+    A.C[UNDO] = UNDO_NOTHING
+    return status
+
+
+@compiled_reassociating
+def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
+    """All targets y <- (1 + gain) y + offset, in O(N p): the offset lies in the span of the unpenalised part."""
     n, y, sy, alpha, first = A.C[COUNT], A.V[Y], A.V[SY], A.V[ALPHA], A.S[0]
-    factor = 1.0 + gain
+    factor, most, total = 1.0 + gain, abs(offset), 0.0
+    if factor >= LEAST_FACTOR and factor <= MOST_FACTOR and most <= MOST:
+        for j in range(n):
+            most = max(most, abs(factor * y[j] + offset))
+            total += (factor * sy[j] + offset * first[j]) * 0.0 + factor * alpha[j] * 0.0
+    else:
+        most = np.inf
+    if not most <= MOST:
+        A.C[BAD_INPUTS] += 1
+        return BAD_INPUT
+    for c in range(A.beta.shape[0]):
+        total += factor * A.beta[c] * 0.0
+    if total != 0.0:
+        A.C[ILL_STEPS] += 1
+        return ILL_CONDITIONED
     for j in range(n):
         y[j] = factor * y[j] + offset
         sy[j] = factor * sy[j] + offset * first[j]
@@ -184,23 +231,36 @@ def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
 @compiled_reassociating
 def shift_targets(A: WindowArrays, delta: FloatArray) -> int:
     """All targets y <- y + delta, (N,) by slot. O(N²): one product."""
-    n = A.C[COUNT]
-    total = 0.0
+    n, shifted = A.C[COUNT], A.V[COLUMN]
     for j in range(n):
-        total += delta[j] * 0.0
-    if total != 0.0:
+        shifted[j] = A.V[Y, j] + delta[j]
+    if not bounded(shifted, n, MOST):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
-    add_scaled(A.V[Y], 1.0, delta, n)
+    keep_for_undo(A, 0, UNDO_NOTHING)
     if A.C[FORM] == INVERSE_FORM:
         inverse.solve(A, delta, A.V[Z])
         add_scaled(A.V[SY], 1.0, A.V[Z], n)
-        inverse.finish(A)
+        good = inverse.finish(A)
     else:
         cholesky.shift_targets(A, delta)
-        cholesky.finish(A)
-    A.C[UNDO] = UNDO_NOTHING
+        good = cholesky.finish(A)
+    if not good:
+        restore_solution(A)
+        factor_design(A)
+        A.C[ILL_STEPS] += 1
+        return ILL_CONDITIONED
+    for j in range(n):
+        A.V[Y, j] = shifted[j]
     return ACCEPTED
+
+
+@compiled_reassociating
+def factor_design(A: WindowArrays) -> bool:
+    """G anew from S."""
+    if A.C[FORM] == INVERSE_FORM:
+        return inverse.factor_design(A)
+    return cholesky.factor_design(A)
 
 
 @compiled_reassociating
@@ -250,7 +310,7 @@ def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float,
 
 @compiled_reassociating
 def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """Exact leave-one-out residuals into ``out`` (N,). O(N p²), in the Cholesky form O(N³)."""
+    """Exact leave-one-out residuals into ``out`` (N,). O(N p²); in the Cholesky form as `window_diagonal` says."""
     if A.C[FORM] == INVERSE_FORM:
         inverse.leave_one_out(A, out)
     else:

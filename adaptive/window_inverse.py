@@ -24,6 +24,7 @@ from adaptive.window_common import (
     finite,
     half_norm_small,
     keep_for_undo,
+    left_out,
     move_sample,
     restore_sample,
     restore_solution,
@@ -49,7 +50,6 @@ from adaptive.window_state import (
     UNDO_NOTHING,
     UNDO_REPLACE,
     UNDO_SLOT,
-    W,
     WindowArrays,
     Y,
     Z,
@@ -149,6 +149,17 @@ def _lower_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
 
 
 @compiled_reassociating
+def _take_out(A: WindowArrays, slot: int, p: FloatArray) -> None:
+    """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
+    n = A.C[COUNT]
+    for c in range(A.H.shape[0]):
+        add_scaled(A.S[c], -A.S[c, slot] / p[slot], p, n)
+        A.S[c, slot] = 0.0
+    add_scaled(A.V[SY], -A.V[SY, slot] / p[slot], p, n)
+    A.V[SY, slot] = 0.0
+
+
+@compiled_reassociating
 def _take_in(A: WindowArrays, slot: int, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
     n = A.C[COUNT]
@@ -173,23 +184,20 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
     keep_for_undo(A, slot, UNDO_REPLACE)
     _lift_column(A, slot, p)
     pkk = p[slot]
-    factor = dot(p, b, n) / pkk
+    factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
         q[j] = z[j] - factor * p[j]
     q[slot] = 0.0
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
-    good = pkk > 0.0 and s > _SCHUR_SHARE * noise
+    # What P gains and loses on its diagonal bounds what it does elsewhere.
+    good = pkk > 0.0 and s > _SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
     if good:
         q[slot] = -1.0
-        for c in range(A.H.shape[0]):
-            add_scaled(A.S[c], -A.S[c, slot] / pkk, p, n)
-            A.S[c, slot] = 0.0
-        add_scaled(A.V[SY], -A.V[SY, slot] / pkk, p, n)
-        A.V[SY, slot] = 0.0
+        _take_out(A, slot, p)
         write_sample(A, slot, x, y, w)
         _take_in(A, slot, q, s)
-        good = finish(A) and finite(q, n)
+        good = finish(A)
     if not good:
         # write_sample may not have run: restoring writes the same values again.
         restore_solution(A)
@@ -214,7 +222,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
     keep_for_undo(A, n, UNDO_APPEND)
-    good = s > _SCHUR_SHARE * noise
+    good = s > _SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
     if good:
         q[n] = -1.0
         for c in range(A.H.shape[0]):
@@ -225,7 +233,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         write_sample(A, n, x, y, w)
         A.C[COUNT] = n + 1
         _take_in(A, n, q, s)
-        good = finish(A) and finite(q, n + 1)
+        good = finish(A)
         A.C[COUNT] = n
     if not good:
         restore_solution(A)
@@ -259,15 +267,22 @@ def undo(A: WindowArrays) -> None:
 
 
 @compiled_reassociating
-def remove(A: WindowArrays, slot: int) -> None:
-    """Empty a slot; the last slot's sample moves into it."""
+def remove(A: WindowArrays, slot: int) -> int:
+    """Empty a slot; the last slot's sample moves into it. Returns a status."""
     flush(A)
     n, p = A.C[COUNT], A.V[PK]
+    keep_for_undo(A, slot, UNDO_NOTHING)
     _lift_column(A, slot, p)
     pkk = p[slot]
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], -A.S[c, slot] / pkk, p, n)
-    add_scaled(A.V[SY], -A.V[SY, slot] / pkk, p, n)
+    good = pkk > 0.0 and np.isfinite(dot(p, p, n) / pkk)
+    if good:
+        _take_out(A, slot, p)
+        good = finish(A)
+    if not good:
+        restore_solution(A)
+        factor_design(A)
+        _lower_column(A, slot, p)
+        return ILL_CONDITIONED
     _pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[MINUS, slot] = 0.0
     A.C[PENDING] = 1
@@ -283,38 +298,11 @@ def remove(A: WindowArrays, slot: int) -> None:
         for c in range(A.H.shape[0]):
             A.S[c, slot] = A.S[c, last]
         A.V[SY, slot] = A.V[SY, last]
+        A.V[ALPHA, slot] = A.V[ALPHA, last]
         move_sample(A, last, slot)
     for j in range(n):
         A.P[last, j] = 0.0
     A.C[COUNT] = last
-    finish(A)
-
-
-@compiled_reassociating
-def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Change the noise weight of one sample: a rank-1 change of R. Returns a status."""
-    flush(A)
-    n, p = A.C[COUNT], A.V[PK]
-    row = A.P[slot]
-    for j in range(slot + 1):
-        p[j] = row[j]
-    for i in range(slot + 1, n):
-        p[i] = A.P[i, slot]
-    change = 1.0 / (A.F[GAMMA] * w) - 1.0 / (A.F[GAMMA] * A.V[W, slot])
-    t = 1.0 + change * p[slot]
-    if not (t > 0.0 and np.isfinite(t)):
-        return ILL_CONDITIONED
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], -change * A.S[c, slot] / t, p, n)
-    add_scaled(A.V[SY], -change * A.V[SY, slot] / t, p, n)
-    if change > 0.0:
-        _pend(A.V[MINUS], p, np.sqrt(change / t), n)
-    else:
-        _pend(A.V[PLUS], p, np.sqrt(-change / t), n)
-    A.C[PENDING] = 1
-    A.V[W, slot] = w
-    A.R[slot, slot] = 1.0 + 1.0 / (A.F[GAMMA] * w)
-    finish(A)
     return ACCEPTED
 
 
@@ -365,4 +353,4 @@ def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
             diagonal += A.V[PLUS, i] ** 2 - A.V[MINUS, i] ** 2
         for c in range(p):
             u[c] = A.S[c, i]
-        out[i] = A.V[ALPHA, i] / (diagonal - half_norm_small(A.G, u))
+        out[i] = left_out(A.V[ALPHA, i], diagonal, diagonal - half_norm_small(A.G, u))

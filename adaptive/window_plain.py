@@ -2,7 +2,7 @@
 
 For machines without a compiler's runtime, and to read: it is the same recursion, one BLAS call a line. Slots
 that are not in use are zero in every array, so that BLAS runs over all of them in place. The rank-2 term is
-applied at once; `undo` takes it off again.
+pending while a step is checked and applied when it is adopted; `undo` takes it off again.
 """
 
 from __future__ import annotations
@@ -17,11 +17,16 @@ from adaptive.window_state import WindowArrays
 _SCHUR_SHARE = 0.5
 _PIVOT_SHARE = 1e-11
 _ROUND_OFF = 1e-15
+_UNDETERMINED = 1e-13
 
 
 def _multiply(A: WindowArrays, b: FloatArray) -> FloatArray:
-    """P b; Fortran sees the lower triangle of P as the upper one of its transpose."""
-    return np.asarray(blas.dsymv(1.0, A.P.T, b, lower=0), dtype=np.float64)
+    """P b, with what is pending; Fortran sees the lower triangle of P as the upper one of its transpose."""
+    z = np.asarray(blas.dsymv(1.0, A.P.T, b, lower=0), dtype=np.float64)
+    if A.C[ws.PENDING]:
+        minus, plus = A.V[ws.MINUS], A.V[ws.PLUS]
+        z += (plus @ b) * plus - (minus @ b) * minus
+    return z
 
 
 def _rank_one(A: WindowArrays, factor: float, v: FloatArray) -> None:
@@ -126,39 +131,53 @@ def _restore(A: WindowArrays) -> None:
 
 
 def _acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
-    good = bool(np.all(np.isfinite(x)) and np.isfinite(y) and np.isfinite(w) and w > 0)
+    precision = float(A.F[ws.GAMMA]) * w
+    good = ws.LEAST_PRECISION <= precision <= ws.MOST_PRECISION
+    good = bool(good and np.all(np.abs(x) <= ws.MOST) and abs(y) <= ws.MOST)
     A.C[ws.BAD_INPUTS] += not good
     return good
 
 
+def _take_out(A: WindowArrays, slot: int, p: FloatArray) -> None:
+    """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
+    A.S[...] -= np.outer(A.S[:, slot] / p[slot], p)
+    A.V[ws.SY] -= (A.V[ws.SY, slot] / p[slot]) * p
+    A.S[:, slot], A.V[ws.SY, slot] = 0.0, 0.0
+
+
 def _take_in(A: WindowArrays, slot: int, b: FloatArray, q: FloatArray, x: FloatArray, y: float, w: float) -> bool:
-    """The second half of a step: P, S and Sy gain q q'/s. False, with all but P's column restored, if it is bad."""
+    """The second half of a step: S, Sy and, pending, P gain q q'/s. False if that is bad."""
     noise = 1.0 / (A.F[ws.GAMMA] * w)
     s = 1.0 + noise - b @ q
-    good = bool(s > _SCHUR_SHARE * noise)
-    if good:
-        q[slot] = -1.0
-        row = b.copy()
-        row[slot] = 1.0 + noise
-        _write(A, slot, x, y, w, row)
-        A.S[...] += np.outer(A.H @ q / s, q)
-        A.V[ws.SY] += (A.V[ws.Y] @ q / s) * q
-        good = _finish(A) and bool(np.all(np.isfinite(q)))
-    if good:
-        scaled = q / np.sqrt(s)
-        A.V[ws.PLUS] = scaled
-        _rank_one(A, 1.0, scaled)
-    return good
+    if not (s > _SCHUR_SHARE * noise and np.isfinite(q @ q / s)):
+        return False
+    q[slot] = -1.0
+    row = b.copy()
+    row[slot] = 1.0 + noise
+    _write(A, slot, x, y, w, row)
+    A.S[...] += np.outer(A.H @ q / s, q)
+    A.V[ws.SY] += (A.V[ws.Y] @ q / s) * q
+    A.V[ws.PLUS] = q / np.sqrt(s)
+    A.C[ws.PENDING] = 1
+    return _finish(A)
 
 
 def _row_residual(A: WindowArrays, i: int) -> float:
     return float(abs(A.V[ws.Y, i] - A.R[i] @ A.V[ws.ALPHA] - A.H[:, i] @ A.beta))
 
 
-def _conclude(A: WindowArrays) -> int:
+def _rotated(A: WindowArrays) -> bool:
+    """As `window_core._checked`: look at the next row, refine where it is off. False where that did not help."""
     n, i = A.C[ws.COUNT], A.C[ws.CURSOR]
     i = 0 if i >= n else i
     residual = _row_residual(A, i)
+    size = abs(A.V[ws.Y, i]) + abs(A.beta[0]) + np.sqrt(A.V[ws.ALPHA] @ A.V[ws.ALPHA])
+    allowed = A.F[ws.TOLERANCE] * np.sqrt(A.V[ws.ALPHA] @ A.V[ws.ALPHA]) / (np.sqrt(n) * A.F[ws.GAMMA])
+    if not residual <= allowed + _ROUND_OFF * size:
+        A.C[ws.RESIDUALS_EXCEEDED] += 1
+        # As in the core: a refinement that does not contract shows an inverse gone wrong.
+        if not (refine(A) and _row_residual(A, i) <= max(ws.CONTRACTION * residual, ws.NEGLIGIBLE * size)):
+            return False
     A.F[ws.RESIDUAL] = residual
     A.F[ws.ROUND_WORST] = max(A.F[ws.ROUND_WORST], residual)
     A.C[ws.CURSOR] = i + 1
@@ -166,18 +185,39 @@ def _conclude(A: WindowArrays) -> int:
         A.C[ws.CURSOR] = 0
         A.F[ws.LAST_WORST], A.F[ws.ROUND_WORST] = A.F[ws.ROUND_WORST], 0.0
         A.C[ws.ROUNDS] += 1
-    length = np.sqrt(A.V[ws.ALPHA] @ A.V[ws.ALPHA])
-    allowed = A.F[ws.TOLERANCE] * length / (np.sqrt(n) * A.F[ws.GAMMA])
-    if not residual <= allowed + _ROUND_OFF * (abs(A.V[ws.Y, i]) + abs(A.beta[0]) + length):
-        A.C[ws.RESIDUALS_EXCEEDED] += 1
-        # As in the core: a refinement that does not contract shows an inverse gone wrong.
-        size = abs(A.V[ws.Y, i]) + abs(A.beta[0]) + length
-        if not (refine(A) and _row_residual(A, i) <= max(ws.CONTRACTION * residual, ws.NEGLIGIBLE * size)):
-            _take_back(A)
-            A.C[ws.ILL_STEPS] += 1
-            return ws.ILL_CONDITIONED
+    return True
+
+
+def _conclude(A: WindowArrays, good: bool) -> int:
+    """Adopt what is pending, or refuse the step: P has not been touched."""
+    good = good and _rotated(A)
+    A.C[ws.PENDING] = 0
+    if not good:
+        A.C[ws.COUNT] -= A.C[ws.UNDO] == ws.UNDO_APPEND
+        _restore(A)
+        A.C[ws.ILL_STEPS] += 1
+        return ws.ILL_CONDITIONED
+    if A.C[ws.UNDO] == ws.UNDO_REPLACE:
+        _rank_one(A, -1.0, A.V[ws.MINUS])
+        _set_column(A, A.C[ws.UNDO_SLOT], 0.0)
+    _rank_one(A, 1.0, A.V[ws.PLUS])
     A.C[ws.STEPS] += 1
     return ws.ACCEPTED
+
+
+def _exchange(A: WindowArrays, slot: int, b: FloatArray, x: FloatArray, y: float, w: float) -> int:
+    """The sample of ``slot`` makes way for one whose kernel column is ``b``."""
+    _keep(A, slot, ws.UNDO_REPLACE)
+    b[slot] = 0.0
+    p = _column(A, slot)
+    own = float(p[slot])
+    if not (own > 0.0 and np.isfinite(p @ p / own)):
+        return _conclude(A, False)
+    q = _multiply(A, b) - (p @ b / own) * p
+    q[slot] = 0.0
+    A.V[ws.PK], A.V[ws.MINUS] = p, p / np.sqrt(own)
+    _take_out(A, slot, p)
+    return _conclude(A, _take_in(A, slot, b, q, x, y, w))
 
 
 def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
@@ -186,26 +226,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
         return ws.BAD_INPUT
     if not 0 <= slot < A.C[ws.COUNT]:
         return ws.NO_SLOT
-    _keep(A, slot, ws.UNDO_REPLACE)
-    b = _kernel(A, x)
-    b[slot] = 0.0
-    p = _column(A, slot)
-    q = _multiply(A, b) - (p @ b / p[slot]) * p
-    q[slot] = 0.0
-    removed = p / np.sqrt(p[slot])
-    A.V[ws.PK], A.V[ws.MINUS] = p, removed
-    _rank_one(A, -1.0, removed)
-    _set_column(A, slot, 0.0)
-    A.S[...] -= np.outer(A.S[:, slot] / p[slot], p)
-    A.V[ws.SY] -= (A.V[ws.SY, slot] / p[slot]) * p
-    A.S[:, slot], A.V[ws.SY, slot] = 0.0, 0.0
-    if _take_in(A, slot, b, q, x, y, w):
-        return _conclude(A)
-    _rank_one(A, 1.0, removed)
-    _set_column(A, slot, p)
-    _restore(A)
-    A.C[ws.ILL_STEPS] += 1
-    return ws.ILL_CONDITIONED
+    return _exchange(A, slot, _kernel(A, x), x, y, w)
 
 
 def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
@@ -217,26 +238,16 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         return ws.NO_SLOT
     _keep(A, slot, ws.UNDO_APPEND)
     b = _kernel(A, x)
+    A.V[ws.MINUS] = 0.0
     A.C[ws.COUNT] = slot + 1
-    if _take_in(A, slot, b, _multiply(A, b), x, y, w):
-        return _conclude(A)
-    A.C[ws.COUNT] = slot
-    _restore(A)
-    A.C[ws.ILL_STEPS] += 1
-    return ws.ILL_CONDITIONED
+    return _conclude(A, _take_in(A, slot, b, _multiply(A, b), x, y, w))
 
 
 def undo(A: WindowArrays) -> int:
-    """As `window_core.undo`, to round-off."""
-    if A.C[ws.UNDO] == ws.UNDO_NOTHING:
-        return ws.NOTHING_TO_UNDO
-    _take_back(A)
-    A.C[ws.UNDONE] += 1
-    return ws.ACCEPTED
-
-
-def _take_back(A: WindowArrays) -> None:
+    """As `window_core.undo`; P to round-off, what is held and its solution to the last bit."""
     kind = A.C[ws.UNDO]
+    if kind == ws.UNDO_NOTHING:
+        return ws.NOTHING_TO_UNDO
     _rank_one(A, -1.0, A.V[ws.PLUS])
     if kind == ws.UNDO_REPLACE:
         _rank_one(A, 1.0, A.V[ws.MINUS])
@@ -244,6 +255,8 @@ def _take_back(A: WindowArrays) -> None:
     else:
         A.C[ws.COUNT] -= 1
     _restore(A)
+    A.C[ws.UNDONE] += 1
+    return ws.ACCEPTED
 
 
 def remove(A: WindowArrays, slot: int) -> int:
@@ -252,8 +265,15 @@ def remove(A: WindowArrays, slot: int) -> int:
     if not 0 <= slot <= last:
         return ws.NO_SLOT
     p = _column(A, slot)
-    A.S[...] -= np.outer(A.S[:, slot] / p[slot], p)
-    A.V[ws.SY] -= (A.V[ws.SY, slot] / p[slot]) * p
+    _keep(A, slot, ws.UNDO_REPLACE)
+    good = bool(p[slot] > 0.0 and np.isfinite(p @ p / p[slot]))
+    if good:
+        _take_out(A, slot, p)
+        good = _finish(A)
+    if not good:
+        _restore(A)
+        A.C[ws.ILL_STEPS] += 1
+        return ws.ILL_CONDITIONED
     _rank_one(A, -1.0 / p[slot], p)
     if slot != last:
         moved, row = _column(A, last), A.R[last].copy()
@@ -261,10 +281,9 @@ def remove(A: WindowArrays, slot: int) -> int:
         moved[last] = row[last] = 0.0
         _set_column(A, slot, moved)
         _write(A, slot, A.X[:, last].copy(), A.V[ws.Y, last], A.V[ws.W, last], row)
-        A.S[:, slot], A.V[ws.SY, slot] = A.S[:, last], A.V[ws.SY, last]
+        A.S[:, slot], A.V[ws.SY, slot], A.V[ws.ALPHA, slot] = A.S[:, last], A.V[ws.SY, last], A.V[ws.ALPHA, last]
     _clear(A, last)
     A.C[ws.COUNT], A.C[ws.UNDO] = last, ws.UNDO_NOTHING
-    _finish(A)
     return ws.ACCEPTED
 
 
@@ -272,34 +291,28 @@ def reweight(A: WindowArrays, slot: int, w: float) -> int:
     """As `window_core.reweight`."""
     if not 0 <= slot < A.C[ws.COUNT]:
         return ws.NO_SLOT
-    if not _acceptable(A, A.X[:, slot], 0.0, w):
+    x = A.X[:, slot].copy()
+    if not _acceptable(A, x, 0.0, w):
         return ws.BAD_INPUT
-    p = _column(A, slot)
-    change = 1.0 / (A.F[ws.GAMMA] * w) - 1.0 / (A.F[ws.GAMMA] * A.V[ws.W, slot])
-    t = 1.0 + change * p[slot]
-    if not (t > 0 and np.isfinite(t)):
-        A.C[ws.ILL_STEPS] += 1
-        return ws.ILL_CONDITIONED
-    A.S[...] -= np.outer(change * A.S[:, slot] / t, p)
-    A.V[ws.SY] -= (change * A.V[ws.SY, slot] / t) * p
-    _rank_one(A, -change / t, p)
-    A.V[ws.W, slot] = w
-    A.R[slot, slot] = 1.0 + 1.0 / (A.F[ws.GAMMA] * w)
+    status = _exchange(A, slot, A.R[slot].copy(), x, float(A.V[ws.Y, slot]), w)
+    A.C[ws.STEPS] -= status == ws.ACCEPTED
     A.C[ws.UNDO] = ws.UNDO_NOTHING
-    _finish(A)
-    return ws.ACCEPTED
+    return status
 
 
 def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
     """As `window_core.rescale_targets`."""
-    if not (np.isfinite(gain) and np.isfinite(offset) and gain > -1.0):
+    n, factor = A.C[ws.COUNT], 1.0 + gain
+    good = ws.LEAST_FACTOR <= factor <= ws.MOST_FACTOR and abs(offset) <= ws.MOST
+    if not (good and np.all(np.abs(factor * A.V[ws.Y, :n] + offset) <= ws.MOST)):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
-    n = A.C[ws.COUNT]
-    A.V[ws.Y, :n] = (1.0 + gain) * A.V[ws.Y, :n] + offset
-    A.V[ws.SY] = (1.0 + gain) * A.V[ws.SY] + offset * A.S[0]
-    A.V[ws.ALPHA] *= 1.0 + gain
-    A.beta[:] *= 1.0 + gain
+    sy, alpha, beta = factor * A.V[ws.SY] + offset * A.S[0], factor * A.V[ws.ALPHA], factor * A.beta
+    if not np.all(np.isfinite(np.concatenate([sy, alpha, beta]))):
+        A.C[ws.ILL_STEPS] += 1
+        return ws.ILL_CONDITIONED
+    A.V[ws.Y, :n] = factor * A.V[ws.Y, :n] + offset
+    A.V[ws.SY], A.V[ws.ALPHA], A.beta[:] = sy, alpha, beta
     A.beta[0] += offset
     A.C[ws.UNDO] = ws.UNDO_NOTHING
     return ws.ACCEPTED
@@ -307,13 +320,18 @@ def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
 
 def shift_targets(A: WindowArrays, delta: FloatArray) -> int:
     """As `window_core.shift_targets`."""
-    if not np.all(np.isfinite(delta)):
+    shifted = A.V[ws.Y] + delta
+    if not np.all(np.abs(shifted) <= ws.MOST):
         A.C[ws.BAD_INPUTS] += 1
         return ws.BAD_INPUT
-    A.V[ws.Y] += delta
+    before = A.V[ws.SY].copy(), A.V[ws.ALPHA].copy(), A.beta.copy()
     A.V[ws.SY] += _multiply(A, delta)
+    if not _finish(A):
+        A.V[ws.SY], A.V[ws.ALPHA], A.beta[:] = before
+        A.C[ws.ILL_STEPS] += 1
+        return ws.ILL_CONDITIONED
+    A.V[ws.Y] = shifted
     A.C[ws.UNDO] = ws.UNDO_NOTHING
-    _finish(A)
     return ws.ACCEPTED
 
 
@@ -357,7 +375,10 @@ def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
     """As `window_core.leave_one_out`."""
     n = A.C[ws.COUNT]
     half = _half_small(A, A.S[:, :n])
-    out[:n] = A.V[ws.ALPHA, :n] / (np.diag(A.P)[:n] - np.sum(half * half, axis=0))
+    diagonal = np.diag(A.P)[:n]
+    without = diagonal - np.sum(half * half, axis=0)
+    known = without > _UNDETERMINED * diagonal
+    out[:n] = np.where(known, A.V[ws.ALPHA, :n] / np.where(known, without, 1.0), np.nan)
 
 
 def worst_residual(A: WindowArrays) -> float:

@@ -3,7 +3,7 @@
 A refresh costs O(N³), some hundred steps' worth. It is split in three: `begin` copies the state (on the
 stepping thread, O(N²)), `Refresh.factor` does the work on any thread without the interpreter's lock, `finish`
 (again on the stepping thread) carries over what was learnt meanwhile, one ordinary step a changed slot, and
-swaps the arrays in.
+swaps the arrays in. What comes of it depends on when it was begun and finished, not on when the factor was ready.
 """
 
 from __future__ import annotations
@@ -12,16 +12,22 @@ import numpy as np
 
 from adaptive import window_state as ws
 from adaptive.errors import NumericsError
+from adaptive.types import StateDict
 from adaptive.window import Window
 from adaptive.window_state import IntArray
 
+#: What a factorisation is made from; factoring does not write to these.
+_FIELDS = ("R", "X", "scaled", "H")
+
 
 class Refresh:
-    """One refresh under way."""
+    """One refresh under way. ``form`` : of the new factorisation, that of the window unless given."""
 
-    def __init__(self, window: Window) -> None:
+    def __init__(self, window: Window, form: int | None = None) -> None:
         self._source = window
+        self._form = int(window.arrays.C[ws.FORM])
         self._copy = window.copy()
+        self._copy.arrays.C[ws.FORM] = self._form if form is None else form
         self._count = len(window)
         self._factored = False
 
@@ -29,6 +35,11 @@ class Refresh:
         """Factor the copy. Any thread. Raises NumericsError where R is not positive definite."""
         self._copy.rebuild()
         self._factored = True
+
+    @property
+    def factored(self) -> bool:
+        """Whether `factor` has done its work."""
+        return self._factored
 
     def changed_slots(self) -> IntArray:
         """Slots whose sample or weight differs from the copy's, in order."""
@@ -45,8 +56,7 @@ class Refresh:
         catch-up refused.
         """
         n, source, copy = len(self._source), self._source.arrays, self._copy
-        same_form = source.C[ws.FORM] == copy.arrays.C[ws.FORM]
-        if not self._factored or n < self._count or not same_form:
+        if not self._factored or n < self._count or source.C[ws.FORM] != self._form:
             return False
         y, w = source.V[ws.Y], source.V[ws.W]
         for slot in self.changed_slots():
@@ -56,9 +66,8 @@ class Refresh:
             if copy.append(np.ascontiguousarray(source.X[:, slot]), y[slot], w[slot]) != ws.ACCEPTED:
                 return False
         copy.arrays.V[ws.Y, :n] = y[:n]
-        refreshes = copy.arrays.C[ws.REFRESHES]
-        copy.arrays.C[ws.CURSOR : ws.COUNTERS] = source.C[ws.CURSOR : ws.COUNTERS]
-        copy.arrays.C[ws.REFRESHES] = refreshes
+        copy.arrays.C[ws.CURSOR : ws.UNDO_PLACE] = source.C[ws.CURSOR : ws.UNDO_PLACE]
+        copy.arrays.C[ws.REFRESHES] += 1
         copy.arrays.F[ws.RESIDUAL : ws.LAST_WORST + 1] = source.F[ws.RESIDUAL : ws.LAST_WORST + 1]
         if not copy.resum():
             return False
@@ -66,9 +75,28 @@ class Refresh:
         self._source.arrays = copy.arrays
         return True
 
+    def state_dict(self) -> StateDict:
+        """What the factorisation is made from, as it was at the beginning; while `factor` runs, too."""
+        A = self._copy.arrays
+        fields = {name: getattr(A, name).copy() for name in _FIELDS}
+        samples = {"y": A.V[ws.Y].copy(), "w": A.V[ws.W].copy()}
+        return {**fields, **samples, "count": self._count, "form": self._form, "new_form": int(A.C[ws.FORM])}
 
-def begin(window: Window) -> Refresh:
+    @classmethod
+    def from_state(cls, window: Window, state: StateDict) -> Refresh:
+        """The refresh of ``window`` that a ``state_dict`` is of; its factor, made again, comes out the same."""
+        made = cls(window, int(state["new_form"]))
+        A = made._copy.arrays
+        for name in _FIELDS:
+            getattr(A, name)[...] = state[name]
+        A.V[ws.Y], A.V[ws.W] = state["y"], state["w"]
+        A.C[ws.COUNT] = made._count = int(state["count"])
+        made._form = int(state["form"])
+        return made
+
+
+def begin(window: Window, form: int | None = None) -> Refresh:
     """Start refreshing ``window``, which may go on stepping. Raises NumericsError while it is empty."""
     if len(window) == 0:
         raise NumericsError("refresh: the window is empty, there is nothing to factor; wait for samples")
-    return Refresh(window)
+    return Refresh(window, form)

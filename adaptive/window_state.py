@@ -22,7 +22,8 @@ class WindowArrays(NamedTuple):
     """State of a window; see `adaptive.window` for what it means and `allocate` for how it starts.
 
     P : (N, N) lower triangle of R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS and PLUS of
-        V). In the Cholesky form: the upper triangle holds L' with R = L L' in the order of ``order``.
+        V). In the Cholesky form the upper triangle holds L' with R = L L' in the order of ``order``; the strictly
+        lower one keeps it as it was before the last replacement, its diagonal in row PK of V.
     R : (N, N) Omega + diag(1/(gamma w)), both triangles.
     X : (d, N) features.  scaled : (d, N) features divided by their widths.  inverse_widths : (d,).
     H : (p, N) design.  S : (p, N) P H; in the Cholesky form L^-1 H, by position.  G : (p, p) lower factor of H'PH.
@@ -50,15 +51,17 @@ class WindowArrays(NamedTuple):
 
 
 # Rows of V. SY is P y (Cholesky form: L^-1 y, by position); MINUS and PLUS are the pending rank-2 term; PK is
-# the column that the last replacement took out of P; the rest is scratch.
-Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K = range(12)
-ROWS = 12
+# the column that the last replacement took out of P; DIAGONAL that of R^-1 by slot, where the Cholesky form carries it
+# along (C[CARRIED]); the rest is scratch.
+Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K, DIAGONAL = range(13)
+ROWS = 13
 
 # Elements of F.
 GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, PIVOT = range(8)
 FLOATS = 8
 
-# Elements of C.
+# Elements of C. UNDO_PLACE: where in the factor the replaced sample stood. CARRIED: for how many more steps the
+# Cholesky form carries DIAGONAL along; 0 where it does not know it.
 (
     COUNT,
     FORM,
@@ -74,8 +77,21 @@ FLOATS = 8
     REFRESHES,
     UNDONE,
     ROUNDS,
-) = range(14)
-COUNTERS = 14
+    UNDO_PLACE,
+    CARRIED,
+) = range(16)
+COUNTERS = 16
+
+#: The counters that add up over a window's life.
+EVENTS = slice(STEPS, UNDO_PLACE)
+
+#: Largest size of a feature or a target that is taken: they are normalised, of order 1. Of a window that has held much
+#: larger ones, all digits are theirs; with this one a step of refinement brings the others back.
+MOST = 1e9
+#: gamma w, one over the noise variance of a sample: outside of these double precision has no digit for noise or kernel.
+LEAST_PRECISION, MOST_PRECISION = 1e-15, 1e15
+#: Least and most that targets may be scaled by at once.
+LEAST_FACTOR, MOST_FACTOR = 1e-9, 1e9
 
 #: A refinement that leaves more than this share of the residual that asked for it shows an inverse gone wrong.
 CONTRACTION = 0.5
@@ -94,7 +110,7 @@ class Status(IntEnum):
     """How a step of the window ended. All but ACCEPTED leave the window as it was."""
 
     ACCEPTED = 0
-    #: A sample with a value that is not finite, or a weight that is not positive.
+    #: A value that is not finite or larger than MOST, a weight that is not positive or whose noise is out of range.
     BAD_INPUT = 1
     #: The step would have left the finite numbers or lost positive definiteness.
     ILL_CONDITIONED = 2
@@ -142,3 +158,9 @@ def allocate(
 def duplicate(arrays: WindowArrays) -> WindowArrays:
     """An independent copy of the whole state."""
     return WindowArrays(**{name: field.copy() for name, field in arrays._asdict().items()})
+
+
+def take_over(arrays: WindowArrays, source: WindowArrays) -> None:
+    """Write the state of ``source``, a window of the same sizes, into ``arrays`` in place."""
+    for field, kept in zip(arrays, source, strict=True):
+        field[...] = kept

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from service.axis import Axis
 
 #: Of what is written here; another one is refused.
-STATE_SCHEMA: Final = 2
+STATE_SCHEMA: Final = 3
 #: Parts of a learner's state that tell what it is and not what it has learnt: its settings, and of the model that it
 #: began from what no re-tuning changes. They must be those of the present one.
 _FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")

@@ -17,6 +17,7 @@ SCHEMA: Final = 1
 #: What of the learner's diagnostics a status repeats, once a second.
 _QUALITY: Final = (
     "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
+    "window_residual_V", "window_cholesky",
 )  # fmt: skip
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,9 @@ from adaptive.residual import ResidualWindow
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import Sample
 from adaptive.weights import WeightConfig
+from sim.presets import preset
+from sim.signals import training_input
+from sim.stage import Stage
 
 DT = 1e-3
 Recording = tuple[np.ndarray, np.ndarray]
@@ -33,8 +38,10 @@ def test_what_is_doubtful_counts_less() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"near_bad": 0.0}, {"on_probation": 1.5}, {"acceleration": -1.0}, {"half_life_s": float("nan")}]
-)
+    "bad",
+    [{"near_bad": 0.0}, {"on_probation": 1.5}, {"acceleration": -1.0}, {"half_life_s": float("nan")},
+     {"before_change": 0.0}],
+)  # fmt: skip
 def test_bad_configuration_is_named(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
         WeightConfig(**bad)
@@ -97,3 +104,60 @@ def test_fading_starts_from_the_weight_that_a_sample_came_with(model: LssvmInver
         assert least <= after.weights[place] < most
         others = [i for i in range(1, 10) if i != place]
         assert np.all(after.weights[others] > 2.0 * after.weights[place])
+
+
+def filled(model: LssvmInverse, n: int = 10) -> ResidualWindow:
+    """A window of samples too far apart to be each other's neighbours."""
+    window = ResidualWindow(n, model)
+    for k in range(n):
+        window.learn(np.full(model.features.kernel_size, 50.0 * k), 0.01 * k, 0.02 if k == 3 else 1.0)
+    return window
+
+
+def test_what_is_from_before_a_change_is_let_go_one_a_step(model: LssvmInverse) -> None:
+    window = filled(model)
+    window.let_go(0.05)
+    np.testing.assert_array_equal(window.data().weights, [1.0] * 3 + [0.02] + [1.0] * 6)
+    window.expect_change()
+    window.learn(np.full(model.features.kernel_size, 50.0 * 6), 1.0)
+    window.let_go(0.05)
+    assert np.count_nonzero(window.data().weights == 0.05) == 1
+    again = ResidualWindow(10, model)
+    again.restore(window.state_dict())
+    other = window.with_hyperparameters(window.hyper)
+    for held in (window, again, other):
+        for _ in range(20):
+            held.let_go(0.05)
+        # The one that counted less already, and the one that has come since, are as they were.
+        np.testing.assert_array_equal(held.data().weights, [0.05] * 3 + [0.02] + [0.05] * 2 + [1.0] + [0.05] * 3)
+
+
+def test_where_nothing_has_changed_nothing_more_is_let_go(model: LssvmInverse) -> None:
+    window = filled(model)
+    window.expect_change()
+    window.let_go(0.05)
+    window.keep()
+    for _ in range(20):
+        window.let_go(0.05)
+    assert np.count_nonzero(window.data().weights == 0.05) == 1
+
+
+@pytest.mark.parametrize("before_change", [0.05, 1.0])
+def test_a_change_that_is_found_lets_go_of_the_window(model: LssvmInverse, before_change: float) -> None:
+    """A gain that drops by 6 %: within two seconds all that is left from before counts a twentieth."""
+    at, n = 2000, 4500
+    config = replace(preset("rich", seed=3), changes=((at * DT, {"gain_drift.gain": -0.06}),))
+    u = training_input(DT, 10.0)[1][:n]
+    stage = Stage(config)
+    y, _ = stage.run(stage.initial_state(), u)
+    learner = Learner.from_model(model, LearnerConfig(weights=WeightConfig(before_change=before_change)))
+    for k in range(n):
+        if k == at:
+            held = learner.window_data()
+            np.testing.assert_array_equal(held.weights, 1.0)
+        learner.handle(Sample(k, k * DT, float(u[k]), float(y[k])))
+    held = learner.window_data()
+    old = held.age > (n - at) / LearnerConfig().learn_every
+    assert old.any()
+    np.testing.assert_array_equal(held.weights[old], before_change)
+    np.testing.assert_array_equal(held.weights[held.age < 100], 1.0)

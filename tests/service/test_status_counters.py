@@ -22,7 +22,7 @@ from service.status import axis_status
 from service.wire import SampleBatch
 
 DT_S = 1e-3
-#: What issue 5 asks to be published of the numerics: residuals, refinements, refreshes, and steps refused and undone.
+#: What is published of the numerics: residuals, refinements, refreshes, and steps refused and undone.
 WINDOW = {
     "steps", "bad_inputs", "ill_conditioned", "undone", "residuals_exceeded", "residual_rounds", "refinements",
     "refreshes",
@@ -62,6 +62,9 @@ def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseMo
         name: count for name, count in first.items() if name.startswith("window_")
     }
     assert first["window_steps"] > 100
+    quality = axis_status(Keys("demo", "x"), "one", axis, intake, LatencyMeter(), None)["quality"]
+    assert quality["window_cholesky"] == float(window.form == "cholesky")
+    assert 0.0 <= quality["window_residual_V"] < 1e-6
     assert first["window_residual_rounds"] >= 1
     # A step that is refused shows there, like every other.
     assert window.learn(np.full(models["lssvm_adaptive"].features.kernel_size, np.nan), 0.0) == "numerics"  # type: ignore[attr-defined]
