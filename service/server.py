@@ -25,6 +25,7 @@ from service.memory import TRIM_S, give_back, keep_little
 from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
 from service.standby.estate import Estate, of_standby
+from service.standby.reach import Reach
 from service.standby.succession import Succession
 
 #: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
@@ -157,7 +158,8 @@ class Service:
                 )
                 self.axes.append(server)
                 _restore(server)
-                succession = Succession(self._session, server, patience_s, estate)
+                reach = Reach(self._session, behind_routers=not config.listen)
+                succession = Succession(self._session, server, patience_s, reach, estate)
                 self._successions.append(succession)
                 server.listen()
                 succession.start()

@@ -16,6 +16,7 @@ from adaptive.errors import DehystError, ModelFileError
 from service.axis_server import PRIMARY, STANDBY, AxisServer
 from service.standby.claims import Claims
 from service.standby.estate import Estate, inherit
+from service.standby.reach import Reach
 from service.standby.shadow import Shadow
 
 #: Events of the serving instance after which its model is another than the samples alone would make it.
@@ -31,16 +32,18 @@ class Succession:
     Parameters
     ----------
     server : listens already. patience_s : how long to look for one that serves before serving oneself, s.
-    estate : where the other instance of a pair keeps its checkpoints and recordings, if that is on this host.
+    reach : whether this instance can be heard at all. estate : where the other instance of a pair keeps its
+    checkpoints and recordings, if that is on this host.
     """
 
     def __init__(
-        self, session: zenoh.Session, server: AxisServer, patience_s: float, estate: Estate | None = None
+        self, session: zenoh.Session, server: AxisServer, patience_s: float, reach: Reach, estate: Estate
     ) -> None:
         self.server = server
         self.claims = Claims(server.keys, server.instance)
         self.shadow = Shadow(server.axis, server.intake, changed=server.keeper.at_once, torn=self._differs)
-        self._estate = estate or Estate()
+        self._estate = estate
+        self._reach = reach
         self._refused = ""
         self._session = session
         self._patience_s = patience_s
@@ -123,8 +126,10 @@ class Succession:
                 self._yield_to(first.instance)
             return
         if first is None:
-            # Who has stood by knows that the one that served is gone; who has just begun looks around first.
-            if self.settled.is_set() or time.monotonic() >= until:
+            # Who has stood by knows that the one that served is gone; who has just begun looks around first. Who is
+            # cut off knows nothing.
+            looked = self.settled.is_set() or time.monotonic() >= until
+            if looked and not self._reach.cut_off() and self.claims.first() is None:
                 self._take_over()
             return
         self.settled.set()

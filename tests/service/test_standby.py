@@ -159,6 +159,43 @@ def test_a_router_that_is_started_again_is_found_again(tmp_path: Path, processes
         assert client.status()["epoch"] == 1
 
 
+def test_a_standby_that_loses_its_router_does_not_take_itself_for_the_successor(
+    tmp_path: Path, processes: list[Process]
+) -> None:
+    """It hears that everybody has gone. The one that serves goes on; killed, it is still succeeded."""
+    endpoint = f"tcp/127.0.0.1:{unused_port()}"
+    config = write_config(tmp_path, 1, extra='recorder = "rec"\n')
+    text = config.read_text().replace('listen = ["tcp/127.0.0.1:1"]', f'listen = []\nconnect = ["{endpoint}"]')
+    config.write_text(text)
+    router = ("router", "--listen", endpoint)
+    processes.append(Process(*router))
+    processes.append(Process("serve", "--config", str(config)))
+    processes.append(Process("serve", "--config", str(config), "--standby"))
+    first, second = (process.ready["instance"] for process in processes[1:])
+    assert [process.ready["role"] for process in processes[1:]] == ["primary", "standby"]
+    events: list[dict[str, Any]] = []
+    with (
+        Client.connect(endpoint, timeout_s=0.5, wait_s=20.0, retry_s=20.0) as client,
+        Stage([endpoint]),
+        open_client(endpoint) as session,
+    ):
+        session.declare_subscriber(client.keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+        eventually(lambda: client.status()["samples"]["learnt"] > 100)
+        processes[0].process.kill()
+        time.sleep(1.0)
+        processes.append(Process(*router))
+        asker = Asker(client)
+        asker.ask_for(3.0)
+        status = client.status()
+        assert (status["instance"], status["epoch"], status["role"]) == (first, 1, "primary")
+        assert not [e for e in events if e["event"] in ("took_over", "stood_down")]
+        processes[1].process.kill()
+        asker.ask_for(1.0)
+        assert asker.silence_s < 1.0
+        status = client.status()
+        assert (status["instance"], status["epoch"], status["role"]) == (second, 2, "primary")
+
+
 def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processes: list[Process]) -> None:
     config = write_config(tmp_path, port := unused_port())
     endpoint = f"tcp/127.0.0.1:{port}"
