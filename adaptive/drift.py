@@ -21,7 +21,7 @@ import numpy as np
 
 from adaptive import drift_step
 from adaptive.errors import InputError
-from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
+from adaptive.features_loops import ACCELERATION, MOTION_COLUMNS, VELOCITY
 from adaptive.types import FloatArray, StateDict
 
 

@@ -19,10 +19,11 @@ from adaptive.adoption import adopt
 from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig
 from adaptive.learner_parts import Parts, restored, state_of
-from adaptive.residual import Hyperparameters, ResidualWindow, WindowData
+from adaptive.residual import ResidualWindow
 from adaptive.snapshot import LssvmInverse
 from adaptive.track import Pair
 from adaptive.types import FloatArray, Sample, StateDict
+from adaptive.window_data import Hyperparameters, WindowData
 
 __all__ = ["Hyperparameters", "Learner", "LearnerConfig", "WindowData"]
 

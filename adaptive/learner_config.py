@@ -7,10 +7,11 @@ from dataclasses import asdict, dataclass, field, replace
 from adaptive.admission import AdmissionConfig
 from adaptive.drift import DriftConfig
 from adaptive.errors import InputError
-from adaptive.residual import Eviction, SolverConfig
+from adaptive.residual import Eviction
 from adaptive.smoothing import SmootherConfig
 from adaptive.types import StateDict
 from adaptive.weights import WeightConfig
+from adaptive.window_config import SolverConfig
 
 
 def part_of(state: StateDict, name: str) -> StateDict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -13,7 +12,9 @@ from adaptive.errors import InputError
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, StateDict
 from adaptive.weights import WeightConfig
-from adaptive.window import Backend, Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import SolverConfig, WindowConfig
+from adaptive.window_data import Hyperparameters, WindowData
 from adaptive.window_healing import Healing
 from adaptive.window_state import IntArray, Status
 
@@ -22,47 +23,6 @@ Eviction = Literal["nearest", "fifo"]
 SAME = 0.98
 #: No slot.
 NOWHERE = -1
-
-
-@dataclass(frozen=True, slots=True)
-class SolverConfig:
-    """How the window is solved: ``form``, ``backend``, ``accuracy`` as of `adaptive.window.WindowConfig`.
-
-    Raises InputError where they are not known, not positive, or do not go together (plain has no Cholesky form).
-    """
-
-    form: Form = "auto"
-    backend: Backend = "compiled"
-    accuracy: float = 1e-8
-
-    def __post_init__(self) -> None:
-        WindowConfig(1, (1.0,), 1.0, (), self.form, self.backend, self.accuracy)
-
-
-@dataclass(frozen=True, slots=True)
-class Hyperparameters:
-    """gamma : regularisation, positive. widths : (d,) kernel widths, one an input, dimensionless, positive."""
-
-    gamma: float
-    widths: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class WindowData:
-    """A copy of what the window holds, for tuning it elsewhere.
-
-    Attributes
-    ----------
-    kernel : (n, d) kernel inputs, dimensionless. targets_V : (n,) voltage less the linear part, V.
-    weights : (n,) noise weights. age : (n,) steps of the window since each sample came, 0 for the newest.
-    hyper : what the window works with.
-    """
-
-    kernel: FloatArray
-    targets_V: FloatArray
-    weights: FloatArray
-    age: FloatArray
-    hyper: Hyperparameters
 
 
 class ResidualWindow:

@@ -16,10 +16,10 @@ from scipy.optimize import minimize
 
 from adaptive.errors import InputError, NumericsError
 from adaptive.evidence import Problem, evaluate, problem
-from adaptive.residual import Hyperparameters, WindowData
 from adaptive.retune_config import RetuneConfig
 from adaptive.retune_trial import Trial, compare, fresh_rows
 from adaptive.types import FloatArray
+from adaptive.window_data import Hyperparameters, WindowData
 
 __all__ = ["Proposal", "RetuneConfig", "Trial", "compare", "fresh_rows", "propose"]
 

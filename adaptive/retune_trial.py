@@ -12,10 +12,12 @@ import numpy as np
 
 from adaptive import kernels
 from adaptive.errors import InputError, NumericsError
-from adaptive.residual import SAME, Hyperparameters, WindowData
+from adaptive.residual import SAME
 from adaptive.retune_config import RetuneConfig
 from adaptive.types import BoolArray, FloatArray
-from adaptive.window import Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import WindowConfig
+from adaptive.window_data import Hyperparameters, WindowData
 from adaptive.window_state import Status
 
 #: Independent samples below which nothing is said: a deviation estimated from fewer says too little.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.compiled import compiled, compiled_reassociating
-from adaptive.features import FeatureArrays, advance, fill
+from adaptive.features_loops import FeatureArrays, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, FloatArray
 from adaptive.window_state import IntArray

@@ -1,109 +1,32 @@
 """The sliding window: an LSSVM over at most N samples, exact after every sample that comes, goes or changes.
 
-`WindowConfig` says what it is, `WindowArrays` is its state, `Window` joins the two behind one interface with
-two forms (the inverse, the Cholesky factor) and two backends (compiled, numpy). A step costs O(N²): one
-kernel column, one pass over one triangle. Compiled code of other modules steps the arrays directly through
+`WindowConfig` says what it is, `WindowArrays` is its state, `WindowReading` what is read of it; `Window` is all of it
+behind one interface with two forms (the inverse, the Cholesky factor) and two backends (compiled, numpy). A step costs
+O(N²): one kernel column, one pass over one triangle. Compiled code of other modules steps the arrays directly through
 `adaptive.window_core`. The direct solver `adaptive.lssvm.fit` is the oracle of all of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from adaptive import condition, kernels, lapack, lssvm, window_core, window_handle, window_plain
+from adaptive import condition, kernels, lapack, lssvm
 from adaptive import window_state as ws
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray, StateDict
+from adaptive.window_config import WindowConfig
+from adaptive.window_reading import WindowReading
 from adaptive.window_state import Status, WindowArrays
 
-Form = Literal["inverse", "cholesky", "auto"]
-Backend = Literal["compiled", "plain"]
 
-
-@dataclass(frozen=True, slots=True)
-class WindowConfig:
-    """What a window is. Features and targets are normalised (dimensionless, of order 1).
-
-    Attributes
-    ----------
-    capacity : N, the number of slots.
-    widths : kernel width of each of the d features, (2.31).
-    gamma : regularisation, > 0; the noise variance of sample i is 1/(gamma w_i) of the kernel's.
-    linear : features that enter an unpenalised linear part beside the bias.
-    form : ``inverse`` is the fastest, its error grows with cond(R)²; ``cholesky`` takes about twice the time, its
-        error grows with cond(R); ``auto`` takes the one that ``accuracy`` and the condition of the samples call
-        for, each time the window is made from samples or healed (an empty one starts as ``inverse``).
-    backend : ``compiled``, or ``plain`` numpy and scipy (inverse form only).
-    accuracy : relative error of alpha to be kept. A step whose checked row shows more than a quarter of it (other
-        rows may be worse) is followed by a step of refinement, some six products long. Infinite: never.
-    """
-
-    capacity: int
-    widths: tuple[float, ...]
-    gamma: float
-    linear: tuple[int, ...] = ()
-    form: Form = "auto"
-    backend: Backend = "compiled"
-    accuracy: float = 1e-8
-
-    def __post_init__(self) -> None:
-        if self.capacity < 1:
-            raise InputError(f"capacity: got {self.capacity}, expected the number of samples to keep, at least 1")
-        if len(self.widths) < 1:
-            raise InputError("widths: got none, expected one kernel width a feature")
-        object.__setattr__(self, "widths", tuple(map(float, kernels.as_widths(self.widths, len(self.widths)))))
-        object.__setattr__(self, "gamma", lssvm.check_gamma(self.gamma))
-        if not ws.LEAST_PRECISION <= self.gamma <= ws.MOST_PRECISION:
-            raise InputError(
-                f"gamma: got {self.gamma!r}, expected {ws.LEAST_PRECISION:g} to {ws.MOST_PRECISION:g}: beyond, double "
-                "precision does not tell a sample's noise from the kernel"
-            )
-        object.__setattr__(self, "linear", lssvm.check_linear(self.linear, len(self.widths)))
-        if self.form not in ("inverse", "cholesky", "auto"):
-            raise InputError(f"form: got {self.form!r}, expected 'inverse', 'cholesky' or 'auto'")
-        if self.backend not in ("compiled", "plain"):
-            raise InputError(f"backend: got {self.backend!r}, expected 'compiled' or 'plain'")
-        if self.backend == "plain" and self.form == "cholesky":
-            raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
-        if not self.accuracy > 0:
-            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-8 say")
-
-    @property
-    def dimension(self) -> int:
-        """Number of features d."""
-        return len(self.widths)
-
-
-class Window:
+class Window(WindowReading):
     """A window with its state; see the module. Not for two threads at a time.
 
     Steps return a `Status` and never raise on data; a step that is not ``ACCEPTED`` leaves the window as it was.
     """
-
-    def __init__(self, config: WindowConfig, arrays: WindowArrays | None = None) -> None:
-        self.config = config
-        form = ws.CHOLESKY_FORM if config.form == "cholesky" else ws.INVERSE_FORM
-        self.arrays = arrays or ws.allocate(
-            config.capacity, np.array(config.widths), config.gamma, config.linear, 0.25 * config.accuracy, form
-        )
-
-    @property
-    def arrays(self) -> WindowArrays:
-        """The state; its arrays are written in place."""
-        return self._arrays
-
-    @arrays.setter
-    def arrays(self, arrays: WindowArrays) -> None:
-        self._arrays = arrays
-        # What answers, and what it is given: compiled code a handle, numpy the arrays.
-        compiled = self.config.backend == "compiled"
-        self._answers: ModuleType = window_handle if compiled else window_plain
-        self._given: Any = window_handle.handle_of(arrays) if compiled else arrays
 
     def __reduce__(self) -> tuple[type[Window], tuple[WindowConfig, WindowArrays]]:
         # A handle is of one process, and of these arrays.
@@ -150,46 +73,6 @@ class Window:
         window.rebuild()
         return window
 
-    # --- what it holds -------------------------------------------------------------------------------------
-
-    def __len__(self) -> int:
-        return int(self.arrays.C[ws.COUNT])
-
-    @property
-    def full(self) -> bool:
-        """True where every slot is taken."""
-        return len(self) == self.config.capacity
-
-    @property
-    def form(self) -> str:
-        """``inverse`` or ``cholesky``, whichever is at work."""
-        return "cholesky" if self.arrays.C[ws.FORM] == ws.CHOLESKY_FORM else "inverse"
-
-    @property
-    def X(self) -> FloatArray:
-        """Features by slot, (n, d), a copy."""
-        return np.ascontiguousarray(self.arrays.X[:, : len(self)].T)
-
-    @property
-    def y(self) -> FloatArray:
-        """Targets by slot, (n,), a copy."""
-        return self.arrays.V[ws.Y, : len(self)].copy()
-
-    @property
-    def weights(self) -> FloatArray:
-        """Noise weights by slot, (n,), a copy."""
-        return self.arrays.V[ws.W, : len(self)].copy()
-
-    @property
-    def alpha(self) -> FloatArray:
-        """Dual weights by slot, (n,), a copy."""
-        return self.arrays.V[ws.ALPHA, : len(self)].copy()
-
-    @property
-    def beta(self) -> FloatArray:
-        """Bias, then the slopes of the linear part, (p,), a copy."""
-        return self.arrays.beta.copy()
-
     # --- steps ---------------------------------------------------------------------------------------------
 
     def append(self, x: FloatArray, y: float, weight: float = 1.0) -> Status:
@@ -222,41 +105,7 @@ class Window:
         padded[: len(self)] = delta
         return Status(self._core.shift_targets(self.arrays, padded))
 
-    # --- answers -------------------------------------------------------------------------------------------
-
-    def predict(self, x: FloatArray) -> float:
-        """Mean at one point ``x`` (d,); 0 while the window is empty."""
-        return float(self._answers.predict(self._given, self._point(x)))
-
-    def predict_with_variance(self, x: FloatArray, include_noise: bool = False) -> tuple[float, float]:
-        """Mean and variance at one point, of the function or of a sample of weight 1, in squared target units."""
-        mean, latent, scale = self._answers.predict_with_variance(self._given, self._point(x))
-        noise = 1.0 / self.config.gamma if include_noise else 0.0
-        return float(mean), float((latent + noise) * scale)
-
-    @property
-    def scale(self) -> float:
-        """Variance of the kernel process, y'alpha/(n - p); the noise variance is scale/gamma."""
-        return float(self._core.scale(self.arrays))
-
-    def leave_one_out(self) -> FloatArray:
-        """y_i minus what the others predict for it, exact, by slot, (n,)."""
-        out = np.zeros(self.config.capacity)
-        self._core.leave_one_out(self.arrays, out)
-        return out[: len(self)]
-
-    def model(self) -> lssvm.LssvmModel:
-        """The solution as an immutable model; copies O(N d) numbers."""
-        sigma = np.array(self.config.widths)
-        return lssvm.LssvmModel(
-            self.X, self.alpha, self.beta, sigma, self.config.gamma, self.weights, self.config.linear, self.scale
-        )
-
     # --- numerics ------------------------------------------------------------------------------------------
-
-    def worst_residual(self) -> float:
-        """Largest residual of all rows, in target units. O(N²)."""
-        return float(self._core.worst_residual(self.arrays))
 
     def refine(self) -> bool:
         """One step of iterative refinement of beta and alpha; O(N² p). False, and nothing changed, where not finite."""
@@ -265,11 +114,6 @@ class Window:
     def resum(self) -> bool:
         """Beta and alpha anew from the factorisation as it stands; O(N² p). False as `refine`."""
         return self._solved_anew(self._core.resum)
-
-    def condition(self) -> float:
-        """Upper bound of cond(R), close for wide kernels; O(N²)."""
-        n = len(self)
-        return condition.condition_bound(self.arrays.R[:n, :n], self.config.gamma, self.arrays.V[ws.W, :n])
 
     def rebuild(self) -> None:
         """Factor R anew in place, by Cholesky; O(N³), without the interpreter's lock.
@@ -347,31 +191,6 @@ class Window:
         """A new window over the same samples with other hyper-parameters; counters start anew."""
         return Window.from_samples(self._config_with(widths, gamma), self.X, self.y, self.weights)
 
-    def counters(self) -> dict[str, int]:
-        """What happened since the window was made."""
-        C = self.arrays.C
-        names = {
-            "steps": ws.STEPS,
-            "bad_inputs": ws.BAD_INPUTS,
-            "ill_conditioned": ws.ILL_STEPS,
-            "undone": ws.UNDONE,
-            "residuals_exceeded": ws.RESIDUALS_EXCEEDED,
-            "residual_rounds": ws.ROUNDS,
-            "refinements": ws.REFINEMENTS,
-            "refreshes": ws.REFRESHES,
-        }
-        return {name: int(C[index]) for name, index in names.items()}
-
-    @property
-    def last_residual(self) -> float:
-        """Residual of the row checked last, in target units."""
-        return float(self.arrays.F[ws.RESIDUAL])
-
-    @property
-    def round_residual(self) -> float:
-        """Largest residual over the last whole round of rows, in target units."""
-        return float(self.arrays.F[ws.LAST_WORST])
-
     # --- keeping -------------------------------------------------------------------------------------------
 
     def copy(self) -> Window:
@@ -401,13 +220,3 @@ class Window:
     def _config_with(self, widths: tuple[float, ...], gamma: float) -> WindowConfig:
         c = self.config
         return WindowConfig(c.capacity, widths, gamma, c.linear, c.form, c.backend, c.accuracy)
-
-    def _point(self, x: Any) -> FloatArray:
-        point = np.ascontiguousarray(x, dtype=np.float64)
-        if point.shape != (self.config.dimension,):
-            raise InputError(f"x: got shape {point.shape}, expected ({self.config.dimension},), one value a feature")
-        return point
-
-    @property
-    def _core(self) -> ModuleType:
-        return window_core if self.config.backend == "compiled" else window_plain

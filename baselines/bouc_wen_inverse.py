@@ -15,7 +15,8 @@ import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from baselines.bouc_wen import BoucWenParameters, crossing, hysteresis_step
+from baselines.bouc_wen import BoucWenParameters
+from baselines.bouc_wen_step import crossing, hysteresis_step
 from baselines.points import memory_copy, model_fields, model_state, points, same_length
 from baselines.records import Domain, positive
 

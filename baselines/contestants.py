@@ -15,7 +15,8 @@ from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.linear import LinearInverse
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline
-from baselines.online_least_squares import LinearOnline, MpiOnline
+from baselines.online_linear import LinearOnline
+from baselines.online_mpi import MpiOnline
 
 #: Makes a model that has failed anew, from its last snapshot.
 Revive = Callable[[InverseModel], OnlineModel]

@@ -22,7 +22,8 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen import TABLE_2_1, BoucWenParameters, hysteresis_step, poles, run_stage, settled
+from baselines.bouc_wen import TABLE_2_1, BoucWenParameters
+from baselines.bouc_wen_step import hysteresis_step, poles, run_stage, settled
 from baselines.records import IdentificationReport, record
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.

@@ -20,8 +20,8 @@ from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.finite import all_finite
 from adaptive.types import FloatArray, StateDict
-from baselines.bouc_wen import hysteresis_step, settled, stage_output, stage_step
 from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.bouc_wen_step import hysteresis_step, settled, stage_output, stage_step
 from baselines.online import OnlineBaseline, field_of, prefixed, without_prefix
 
 _NUDGE = 1e-3

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen import BoucWenParameters, hysteresis_step, poles, run_stage
+from baselines.bouc_wen import BoucWenParameters
+from baselines.bouc_wen_step import hysteresis_step, poles, run_stage
 from baselines.dead_zone import dead_zone
 from baselines.identify_mpi import SLOPE_FLOOR, MpiGrid
 from baselines.play import play_run, play_start

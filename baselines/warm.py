@@ -10,7 +10,8 @@ from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.bounded import bounded_minimum
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
-from baselines.online_least_squares import LeastSquaresConfig, MpiOnline
+from baselines.online_least_squares import LeastSquaresConfig
+from baselines.online_mpi import MpiOnline
 from baselines.play import play_run
 from baselines.prandtl_ishlinskii import MpiParameters
 from baselines.records import Domain

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from adaptive import lssvm, window_core
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from adaptive.window import Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import Form, WindowConfig
 from adaptive.window_state import WindowArrays
 
 #: gamma and width that give condition numbers from some 1e3 to 1e8 with windows of 100 samples in three dimensions.

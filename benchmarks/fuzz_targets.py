@@ -20,7 +20,7 @@ from adaptive.snapshot import LssvmInverse
 from adaptive.types import InverseModel
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.points import Domain
-from service import checkpoint, wire, wire_model, wire_query
+from service import checkpoint, wire, wire_model, wire_query, wire_reply
 from service.errors import error_from_json, error_to_json
 from service.operating.request import Request, decode_request, encode_request
 from service.stage_faults import decode_fault
@@ -107,7 +107,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "command": lambda: _refusing(wire.decode_command),
     "reference": lambda: _refusing(wire.decode_reference),
     "query": lambda: _refusing(wire_query.decode_query),
-    "reply": lambda: _refusing(wire_query.decode_reply),
+    "reply": lambda: _refusing(wire_reply.decode_reply),
     "answer": _answering,
     "model": lambda: _refusing(wire_model.decode_model),
     "framed": lambda: _framed_model,
@@ -134,14 +134,14 @@ def seeds(target: str) -> list[bytes]:
         framed.append(size.to_bytes(2, "little") + payload[24:])
     meta = checkpoint.CheckpointMeta("demo", "x", 1e-3, 41, 40)
     kept = b"".join(checkpoint.encode_checkpoint(meta, {"a": np.arange(3.0), "name": "x", "n": 2, "b": np.eye(2)}))
-    reply = wire_query.FeedforwardReply(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
+    reply = wire_reply.FeedforwardReply(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
     return {
         "samples": [wire.encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, np.nan, 2.0], [3.0, 4.0, np.inf])],
         "command": [wire.encode_command(9, y)],
         "reference": [wire.encode_reference(9, y)],
         "query": query,
         "answer": query,
-        "reply": [wire_query.encode_reply(reply)],
+        "reply": [wire_reply.encode_reply(reply)],
         "model": sent,
         "framed": framed,
         "checkpoint": [kept[8:10] + kept[32:], b""],

@@ -20,7 +20,8 @@ from benchmarks.latency_processes import AXIS, ECHO_KEY, STAGE
 from benchmarks.latency_world import READY_S, WINDOW, World, world
 from service.client import Client
 from service.session import open_client
-from service.wire_query import FeedforwardReply, encode_query, encode_reply
+from service.wire_query import encode_query
+from service.wire_reply import FeedforwardReply, encode_reply
 
 TRAJECTORY = 100
 #: Of a query, s: on a machine with too much to do it is late, and that is to be measured.

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.residual import Hyperparameters, WindowData
 from adaptive.retune_config import RetuneConfig
 from adaptive.types import FloatArray
+from adaptive.window_data import Hyperparameters, WindowData
 from benchmarks.latency_processes import AXIS, STAGE
 from benchmarks.latency_world import WINDOW, World, world
 from benchmarks.measuring import DIMENSION, stream

@@ -15,7 +15,8 @@ from service.errors import FieldError
 from service.fallback import Rules, StandIn, answer_safely
 from service.guard import Limits, check_domain, check_voltages
 from service.keys import AUTO
-from service.wire_query import NEWEST, FeedforwardQuery, FeedforwardReply, Pending
+from service.wire_query import NEWEST, FeedforwardQuery, Pending
+from service.wire_reply import FeedforwardReply
 
 
 @dataclass(frozen=True, slots=True)

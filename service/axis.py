@@ -28,7 +28,8 @@ from service.tracking import MemoryTracker
 from service.watch import Watch, WatchConfig
 from service.wire import SampleBatch
 from service.wire_model import Safety
-from service.wire_query import FeedforwardQuery, FeedforwardReply
+from service.wire_query import FeedforwardQuery
+from service.wire_reply import FeedforwardReply
 
 __all__ = ["Axis", "Served"]
 

@@ -18,7 +18,8 @@ from service.keeper import Keeper
 from service.keys import Keys
 from service.latency import LatencyMeter
 from service.wire_model import encode_model
-from service.wire_query import decode_query, encode_reply
+from service.wire_query import decode_query
+from service.wire_reply import encode_reply
 
 JSON: Final = "application/json"
 #: Longest time that a sample takes from being passed on to others to the queue of this instance, s.

@@ -31,7 +31,8 @@ from service.keys import AUTO, Keys
 from service.motion import derivatives
 from service.session import DEFAULT_ENDPOINT, open_client
 from service.wire import check_finite, check_seq, column, encode_command, encode_reference
-from service.wire_query import NEWEST, FeedforwardReply, decode_reply, encode_query
+from service.wire_query import NEWEST, encode_query
+from service.wire_reply import FeedforwardReply, decode_reply
 
 _BEHIND_PAUSE_S: Final = 0.001
 #: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.

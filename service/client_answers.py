@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from adaptive.types import FloatArray
 from service.errors import FieldError
-from service.wire_query import FeedforwardReply, Pending
+from service.wire_query import Pending
+from service.wire_reply import FeedforwardReply
 
 #: Samples under way that are kept: those after the newest snapshot matter, which is some tens of samples old.
 UNDER_WAY: Final = 512
@@ -24,7 +25,7 @@ class Trajectory:
     Attributes
     ----------
     u_V, std_V : (n,) voltage and its standard deviation, V.
-    flags : (n,) bits, see :func:`service.wire_query.flag_names`.
+    flags : (n,) bits, see :func:`service.wire_flags.flag_names`.
     memory : (m,) hysteresis memory after the last point. model : that answered. snapshot_seq : the last sample it
     had seen. fallback : whether something went wrong and a stand-in answered for it. tracked_memory : whether the
     memory was the service's own. stand_in : name of the model that answered, in part or whole, where the flags say so.

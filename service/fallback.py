@@ -21,7 +21,7 @@ from adaptive.snapshot import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.champion import ChampionInverse
 from service.guard import Limits, guard, guarded
-from service.wire_query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
+from service.wire_flags import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
 
 
 class StandIn(NamedTuple):

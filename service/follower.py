@@ -21,8 +21,7 @@ from service.errors import FieldError
 from service.fallback import Answer, Rules, answer_safely
 from service.guard import Limits, check_domain
 from service.motion import derivatives
-from service.wire_model import ModelMessage, decode_model
-from service.wire_query import (
+from service.wire_flags import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -31,6 +30,7 @@ from service.wire_query import (
     STALE,
     STAND_IN,
 )
+from service.wire_model import ModelMessage, decode_model
 
 
 class Follower:
@@ -43,7 +43,7 @@ class Follower:
     ----------
     memory : (m,) hysteresis memory after the last point answered.
     received, refused : snapshots taken over, and those that could not be used.
-    last_flags : what was done to the last voltage answered, bits as in a reply (``service.wire_query.flag_names``).
+    last_flags : what was done to the last voltage answered, bits as in a reply (``service.wire_flags.flag_names``).
     last_std_V : one standard deviation of it, V; NaN where the model has no notion of it, and before any answer.
     last_trajectory : all that :meth:`trajectory` last answered, deviations and stand-in among it; None before any.
     """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from adaptive.compiled import compiled
 from adaptive.types import BoolArray, FloatArray
 from service.errors import FieldError
-from service.wire_query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from service.wire_flags import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 
 
 @dataclass(frozen=True, slots=True)

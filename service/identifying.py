@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import DehystError, InputError
-from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.identification import identify_lssvm
+from adaptive.identification_config import IdentifyConfig
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi

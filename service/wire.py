@@ -38,6 +38,8 @@ KIND_NAMES: Final = {
 #: Longest block that is taken, so that one message cannot ask for all of the memory.
 MAX_COUNT: Final = 65_536
 MAX_SEQ: Final = 2**62
+MAX_MEMORY: Final = 4096
+MAX_NAME_BYTES: Final = 64
 
 HEADER: Final = struct.Struct("<BBHI")
 _BLOCK: Final = struct.Struct("<BBHIq")
@@ -111,6 +113,22 @@ def check_seq(field: str, seq: int) -> int:
     if not 0 <= seq <= MAX_SEQ:
         raise FieldError(field, seq, "a sequence number from 0 to 2**62")
     return int(seq)
+
+
+def check_sizes(m: int, name_bytes: int) -> None:
+    """InputError where a memory or a name is longer than the wire takes."""
+    if m > MAX_MEMORY:
+        raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
+    if name_bytes > MAX_NAME_BYTES:
+        raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
+
+
+def check_name(raw: bytes) -> str:
+    """A model's name in UTF-8, else InputError."""
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        raise FieldError("model", repr(raw), "a name in UTF-8") from error
 
 
 def doubles(data: bytes, offset: int, count: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Binary payloads of a feedforward query and its reply; docs/protocol.md is the page about them."""
+"""Binary payload of a feedforward query; docs/protocol.md is the page about it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import struct
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from adaptive.finite import all_finite
 from adaptive.types import FloatArray
 from service.errors import FieldError
 from service.wire import (
     FEEDFORWARD_QUERY,
-    FEEDFORWARD_REPLY,
+    MAX_NAME_BYTES,
     MAX_SEQ,
     VERSION,
     check_finite,
     check_header,
     check_length,
+    check_name,
     check_seq,
+    check_sizes,
     column,
     doubles,
 )
@@ -28,40 +30,10 @@ from service.wire import (
 HAS_ACCELERATION: Final = 1
 HAS_MEMORY: Final = 2
 HAS_PENDING: Final = 4
-#: Reply options: the learner has not yet handled all that ``as_of`` needs, so this answer may differ from a repeated
-#: one; the query brought no memory, so the service's own was used; another model than the one asked for answered in
-#: part or whole because something went wrong; the name of the model that stood in follows that of the one asked.
-BEHIND: Final = 1
-TRACKED_MEMORY: Final = 2
-FALLBACK: Final = 4
-HAS_STAND_IN: Final = 8
-
-#: What was done to a voltage, one bit each, as documented in docs/protocol.md.
-LIMITED_VOLTAGE: Final = 1
-LIMITED_SLEW: Final = 2
-OUTSIDE_DOMAIN: Final = 4
-NOT_FINITE_REPLACED: Final = 8
-BLENDED: Final = 16
-STAND_IN: Final = 32
-STALE: Final = 64
-FLAG_NAMES: Final = {
-    LIMITED_VOLTAGE: "limited_voltage",
-    LIMITED_SLEW: "limited_slew",
-    OUTSIDE_DOMAIN: "outside_domain",
-    NOT_FINITE_REPLACED: "not_finite_replaced",
-    BLENDED: "blended",
-    STAND_IN: "stand_in",
-    STALE: "stale",
-}
-
-MAX_MEMORY: Final = 4096
 #: Samples that may be under way.
 MAX_PENDING: Final = 4096
-MAX_NAME_BYTES: Final = 64
 #: ``as_of`` of a query that takes the newest snapshot.
 NEWEST: Final = -1
-#: Snapshots from before the first sample have this number.
-_LEAST_SEQ: Final = -1
 
 # version, kind, options, n, as_of, u_before_V, m, bytes of the name
 _QUERY: Final = struct.Struct("<BBHIqdII")
@@ -69,8 +41,6 @@ _QUERY: Final = struct.Struct("<BBHIqdII")
 _PENDING: Final = struct.Struct("<qI")
 # y, v, a of a query for one point
 _ONE_POINT: Final = struct.Struct("<3d")
-# version, kind, options, n, snapshot_seq, m, bytes of the name
-_REPLY: Final = struct.Struct("<BBHIqII")
 
 
 class Pending(NamedTuple):
@@ -107,39 +77,6 @@ class FeedforwardQuery(NamedTuple):
     as_of: int = NEWEST
     u_before_V: float = float("nan")
     pending: Pending | None = None
-
-
-class FeedforwardReply(NamedTuple):
-    """Voltages for n desired points.
-
-    Attributes
-    ----------
-    u_V : (n,) finite and within the limits, V.
-    std_V : (n,) one standard deviation, V; NaN where the model has no notion of it.
-    flags : (n,) bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE.
-    memory : (m,) after the last point, for the next query.
-    snapshot_seq : the last sample that the answering snapshot had seen, -1 before any.
-    model : name of the model that was asked.
-    stand_in : name of the model that answered where the flags say NOT_FINITE_REPLACED or STAND_IN, and with a share
-    where they say BLENDED; empty where no point is of it.
-    behind, tracked_memory, fallback : the reply's options, see the module's constants.
-    """
-
-    u_V: FloatArray
-    std_V: FloatArray
-    flags: NDArray[np.uint8]
-    memory: FloatArray
-    snapshot_seq: int
-    model: str
-    behind: bool = False
-    tracked_memory: bool = False
-    fallback: bool = False
-    stand_in: str = ""
-
-
-def flag_names(bits: int) -> list[str]:
-    """The names of the bits set in a point's flags."""
-    return [name for bit, name in FLAG_NAMES.items() if bits & bit]
 
 
 def encode_query(
@@ -187,7 +124,7 @@ def decode_query(data: bytes) -> FeedforwardQuery:
     """The query in a payload. Raises InputError where it is malformed, not finite, or out of bounds."""
     options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY | HAS_PENDING)
     *_, as_of, u_before_V, m, name_bytes = _QUERY.unpack_from(data)
-    _check_sizes(m, name_bytes)
+    check_sizes(m, name_bytes)
     if m and not options & HAS_MEMORY:
         raise FieldError("m", m, "0 where the options say that there is no memory")
     if not NEWEST <= as_of <= MAX_SEQ:
@@ -207,59 +144,8 @@ def decode_query(data: bytes) -> FeedforwardQuery:
             check_finite(name, part)
     return FeedforwardQuery(
         y, v, a, memory if options & HAS_MEMORY else None,
-        _name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
+        check_name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
     )  # fmt: skip
-
-
-def encode_reply(reply: FeedforwardReply) -> bytes:
-    """Payload of a reply."""
-    options = BEHIND * reply.behind | TRACKED_MEMORY * reply.tracked_memory | FALLBACK * reply.fallback
-    name = reply.model.encode()
-    if reply.stand_in:
-        options |= HAS_STAND_IN
-        name += b"/" + reply.stand_in.encode()
-    n, m = reply.u_V.size, reply.memory.size
-    return b"".join(
-        (
-            _REPLY.pack(VERSION, FEEDFORWARD_REPLY, options, n, reply.snapshot_seq, m, len(name)),
-            reply.u_V.astype("<f8", copy=False).tobytes(),
-            reply.std_V.astype("<f8", copy=False).tobytes(),
-            reply.memory.astype("<f8", copy=False).tobytes(),
-            reply.flags.tobytes(),
-            name,
-        )
-    )
-
-
-def decode_reply(data: bytes) -> FeedforwardReply:
-    """The reply in a payload. Raises InputError where it is malformed or a voltage is not finite."""
-    options, n = check_header(data, FEEDFORWARD_REPLY, _REPLY.size, BEHIND | TRACKED_MEMORY | FALLBACK | HAS_STAND_IN)
-    *_, snapshot_seq, m, name_bytes = _REPLY.unpack_from(data)
-    _check_sizes(m, name_bytes // 2)
-    if snapshot_seq < _LEAST_SEQ:
-        raise FieldError("snapshot_seq", snapshot_seq, "-1 or more")
-    end = _REPLY.size + 8 * (2 * n + m)
-    check_length(data, end + n + name_bytes)
-    values = doubles(data, _REPLY.size, 2 * n + m)
-    u, std, memory = values[:n], values[n : 2 * n], values[2 * n :]
-    check_finite("u_V", u)
-    check_finite("memory", memory)
-    flags = np.frombuffer(data, dtype=np.uint8, count=n, offset=end)
-    name, stand_in = _name(data[end + n :]), ""
-    if options & HAS_STAND_IN:
-        name, _, stand_in = name.partition("/")
-    return FeedforwardReply(
-        u,
-        std,
-        flags,
-        memory,
-        snapshot_seq,
-        name,
-        bool(options & BEHIND),
-        bool(options & TRACKED_MEMORY),
-        bool(options & FALLBACK),
-        stand_in,
-    )
 
 
 def _pending(data: bytes, begin: int, options: int) -> Pending:
@@ -284,17 +170,3 @@ def _same_length(field: str, values: ArrayLike, n: int) -> FloatArray:
     if array.size != n:
         raise FieldError(field, f"{array.size} values", f"{n}, as many as y_um")
     return array
-
-
-def _check_sizes(m: int, name_bytes: int) -> None:
-    if m > MAX_MEMORY:
-        raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
-    if name_bytes > MAX_NAME_BYTES:
-        raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
-
-
-def _name(raw: bytes) -> str:
-    try:
-        return raw.decode()
-    except UnicodeDecodeError as error:
-        raise FieldError("model", repr(raw), "a name in UTF-8") from error

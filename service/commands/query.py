@@ -15,7 +15,8 @@ from adaptive.types import FloatArray
 from service.client import Client, Trajectory
 from service.errors import FieldError
 from service.session import DEFAULT_ENDPOINT
-from service.wire_query import NEWEST, flag_names
+from service.wire_flags import flag_names
+from service.wire_query import NEWEST
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from adaptive.residual import Hyperparameters
 from adaptive.types import OnlineModel
+from adaptive.window_data import Hyperparameters
 from service.errors import FieldError
 
 FILE: Final = "retuned.jsonl"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.residual import Hyperparameters, WindowData
 from adaptive.types import FloatArray
+from adaptive.window_data import Hyperparameters, WindowData
 from service.background import BackgroundJob
 
 

@@ -16,8 +16,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.residual import Hyperparameters, WindowData
 from adaptive.types import OnlineModel
+from adaptive.window_data import Hyperparameters, WindowData
 from service.errors import FieldError
 from service.retuning.adoption import Retuned, append
 from service.retuning.job import Job, pack

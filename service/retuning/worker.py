@@ -23,8 +23,8 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` of the arrays, or
     ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
     from adaptive.errors import DehystError
-    from adaptive.residual import Hyperparameters
     from adaptive.retune import RetuneConfig, compare, propose
+    from adaptive.window_data import Hyperparameters
     from service.retuning.job import unpack
 
     data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}

@@ -22,7 +22,8 @@ from service.session import open_client
 from service.soak.extras import ECHO_KEY
 from service.soak.setup import AXIS, STAGE, Control
 from service.stopping import StopSignal
-from service.wire_query import FeedforwardReply, encode_query, encode_reply
+from service.wire_query import encode_query
+from service.wire_reply import FeedforwardReply, encode_reply
 
 #: Pause between two rounds of one query and one echo, s; and the time-out of both.
 PAUSE_S, TIMEOUT_S = 0.01, 0.1

@@ -3,58 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from service.view import style
+from service.view.canvas import Canvas
 from service.view.feed import Diagnostics, Event, Health, IntArray, Record, SceneConfig, Status, Tracking
 from service.view.plane import Plane, grown
+from service.view.trail import PLANE_EVERY_S, Trail
+from service.view.values import as_markdown, column, number
 
 #: Points of one loop: enough for the eye, few enough to send again and again.
 LOOP_POINTS = 600
-#: How often the planes and the averages are drawn again, s of the stage's time.
-PLANE_EVERY_S = 0.25
-MEAN_EVERY_S = 0.05
 #: Units run at the same time; one that is this far behind the last reference drawn has begun anew, s.
 REFERENCE_AHEAD_S = 2.0
 #: Single values that make a column of their own; a column of one row costs Rerun as much as one of a hundred.
 SINGLES = 64
 #: One change is often noted by several: what comes this soon after a change is part of it, s.
 CHANGES_APART_S = 5.0
-
-
-class Canvas(Protocol):
-    """Something that draws. Times in s of the stage, with the sequence number of the newest sample then."""
-
-    def scalars(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None: ...
-    def strips(
-        self, path: str, t_s: float, seq: int, strips: Sequence[FloatArray], colour: style.Colour, radius: float
-    ) -> None: ...
-    def points(
-        self,
-        path: str,
-        t_s: float,
-        seq: int,
-        positions: FloatArray,
-        colour: style.Colour,
-        radius: float,
-        labels: Sequence[str] | None = None,
-    ) -> None: ...
-    def text(self, path: str, t_s: float, seq: int, text: str, level: str) -> None: ...
-    def document(self, path: str, t_s: float, seq: int, markdown: str) -> None: ...
-
-
-@dataclass(slots=True)
-class _Trail:
-    """The last samples of one unit: columns t_s, u_V, y_um, reference_um."""
-
-    rows: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
-    next_mean_s: float = -math.inf
-    next_plane_s: float = -math.inf
 
 
 @dataclass(slots=True)
@@ -65,7 +35,7 @@ class Scene:
     config: SceneConfig
     t_s: float = field(init=False, default=0.0)
     seq: int = field(init=False, default=0)
-    _trails: dict[str, _Trail] = field(init=False, default_factory=dict)
+    _trails: dict[str, Trail] = field(init=False, default_factory=dict)
     _reference_limits: tuple[float, float] | None = field(init=False, default=None)
     _referenced_s: float = field(init=False, default=-math.inf)
     _planes: dict[str, Plane] = field(init=False, default_factory=dict)
@@ -136,54 +106,29 @@ class Scene:
 
     def _trail(self, record: Tracking, main: bool) -> None:
         """Averages and planes, at their own pace, from the trail that the unit leaves."""
-        trail = self._trails.setdefault(record.model, _Trail())
+        trail = self._trails.setdefault(record.model, Trail())
         if len(trail.rows) and record.t_s[0] < trail.rows[-1, 0]:
-            trail = self._trails[record.model] = _Trail()  # The stage has begun anew.
-        trail.rows = np.concatenate(
-            [trail.rows, np.column_stack([record.t_s, record.u_V, record.y_um, record.reference_um])]
-        )
+            trail = self._trails[record.model] = Trail()  # The stage has begun anew.
+        trail.add(record)
         self._mean_errors(record, trail)
-        # Planes are drawn as they stood every PLANE_EVERY_S, however long the record is (offline: all of a run).
-        first, last = float(record.t_s[0]), float(record.t_s[-1])
-        due = max(trail.next_plane_s, math.ceil(first / PLANE_EVERY_S - 1e-6) * PLANE_EVERY_S)
-        while due <= last:
-            start, stop = np.searchsorted(trail.rows[:, 0], [due - self.config.loop_s, due], side="right")
-            if stop > start:
-                self._draw_planes(record, main, trail.rows[start:stop], due)
-            due = (math.floor(due / PLANE_EVERY_S + 1e-6) + 1) * PLANE_EVERY_S
-            if stop < len(trail.rows):  # Nothing is drawn for a time in which there are no samples.
-                due = max(due, math.ceil(trail.rows[stop, 0] / PLANE_EVERY_S - 1e-6) * PLANE_EVERY_S)
-        trail.next_plane_s = due
+        for due, rows in trail.loops_due(record, self.config.loop_s):
+            self._draw_planes(record, main, rows, due)
         keep_s = max(self.config.loop_s, self.config.mae_s) + 2 * PLANE_EVERY_S
-        trail.rows = trail.rows[trail.rows[:, 0] > last - keep_s]
+        trail.forget(float(record.t_s[-1]) - keep_s)
 
-    def _mean_errors(self, record: Tracking, trail: _Trail) -> None:
+    def _mean_errors(self, record: Tracking, trail: Trail) -> None:
         range_um = self.config.range_um
         if range_um is None and self._reference_limits is not None:
             range_um = self._reference_limits[1] - self._reference_limits[0]
         if not range_um or range_um <= 0:
             return
-        t_s, size = trail.rows[:, 0], np.abs(trail.rows[:, 3] - trail.rows[:, 2])
-        known = np.isfinite(size)
-        total = np.concatenate([[0.0], np.cumsum(np.where(known, size, 0.0))])
-        count = np.concatenate([[0], np.cumsum(known)])
-        start = max(trail.next_mean_s, float(record.t_s[0]))
-        at_s = np.unique(np.ceil(record.t_s / MEAN_EVERY_S - 1e-6))
-        last = math.floor(record.t_s[-1] / MEAN_EVERY_S + 1e-6)
-        at_s = at_s[(at_s >= math.ceil(start / MEAN_EVERY_S - 1e-6)) & (at_s <= last)]
-        trail.next_mean_s = (at_s[-1] + 1) * MEAN_EVERY_S if at_s.size else start
-        at_s = at_s * MEAN_EVERY_S
-        high = np.searchsorted(t_s, at_s + 1e-9, side="right")
-        low = np.searchsorted(t_s, at_s - self.config.mae_s + 1e-9, side="right")
-        n = count[high] - count[low]
-        some = n > 0
-        if some.any():
-            mean_pct = 100.0 / range_um * (total[high] - total[low])[some] / n[some]
-            seq = np.interp(at_s[some], record.t_s, record.seq).astype(np.int64)
-            self.canvas.scalars(style.mean_error(record.model), at_s[some], seq, mean_pct)
+        at_s, mean_pct = trail.mean_errors_due(record, self.config.mae_s, range_um)
+        if at_s.size:
+            seq = np.interp(at_s, record.t_s, record.seq).astype(np.int64)
+            self.canvas.scalars(style.mean_error(record.model), at_s, seq, mean_pct)
             # Rerun has no logarithmic axis, and the models lie two decades apart.
             decades = np.log10(np.maximum(mean_pct, 1e-6))
-            self.canvas.scalars(style.mean_error_log(record.model), at_s[some], seq, decades)
+            self.canvas.scalars(style.mean_error_log(record.model), at_s, seq, decades)
 
     def _draw_planes(self, record: Tracking, main: bool, rows: FloatArray, at_s: float) -> None:
         seq = int(np.interp(at_s, record.t_s, record.seq))
@@ -301,41 +246,3 @@ class Scene:
     def _flush(self, path: str) -> None:
         t_s, seq, values = zip(*self._singles.pop(path), strict=True)
         self.canvas.scalars(path, np.array(t_s), np.array(seq, dtype=np.int64), np.array(values))
-
-
-def number(value: Any) -> float | None:
-    """A finite number, or None for all else: JSON of a peer may hold anything."""
-    if not isinstance(value, (int, float, np.integer, np.floating)):
-        return None
-    try:
-        value = float(value)
-    except OverflowError:  # JSON knows integers of any length.
-        return None
-    return value if math.isfinite(value) else None
-
-
-def column(value: Any) -> FloatArray | None:
-    """A list of numbers as (n,) doubles, or None for all else."""
-    if not isinstance(value, (list, tuple, np.ndarray)) or not len(value):
-        return None
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return array if array.ndim == 1 else None
-
-
-def as_markdown(title: str, fields: Mapping[str, Any], depth: int = 2) -> str:
-    """A status as a table, nested names joined by dots; long lists are cut."""
-    rows: list[str] = []
-
-    def walk(prefix: str, part: Mapping[str, Any], left: int) -> None:
-        for name, value in part.items():
-            if isinstance(value, Mapping) and left:
-                walk(f"{prefix}{name}.", value, left - 1)
-            else:
-                shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-                rows.append(f"| {prefix}{name} | {shown[:80].replace('|', '/')} |")
-
-    walk("", fields, depth)
-    return "\n".join([f"**{title}**", "", "| what | value |", "|---|---|", *rows])

@@ -7,18 +7,14 @@ for its numbers become clearly better with it. The model is frozen: nothing that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from adaptive.errors import InputError
-from adaptive.types import BoolArray, FloatArray, InverseModel
-from sim.changes.columns import OFFSET, Candidate, Scales, Stretch, base_of, candidates, hum, slow
+from adaptive.types import FloatArray, InverseModel
+from sim.changes.columns import OFFSET, Scales, Stretch
+from sim.changes.comparison import Change, Comparison, phrase
+from sim.changes.regression import Problem, enough, problem_of, solve_scaled
 
-SCHEMA = 1
-#: Blocks are this long, s; every fifth is held out in turn.
-BLOCK_S, FOLDS = 0.25, 5
 #: A cause must remove this share of the held-out squared error, by so many standard errors.
 LEAST_GAIN, LEAST_SIGMAS = 0.1, 3.0
 #: One that does as well within this share of the gain, or within so many standard errors, is an alternative.
@@ -28,119 +24,22 @@ GROWN, GROWN_SHARE = 1.3, 5e-4
 MOST_CAUSES = 3
 
 
-@dataclass(frozen=True)
-class Change:
-    """One cause: its numbers with 95 % intervals, and the share of the held-out squared error that it removed."""
-
-    name: str
-    alternatives: tuple[str, ...]
-    numbers: dict[str, float]
-    intervals: dict[str, tuple[float, float]]
-    heldout_gain: float
-    text: str
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What has changed. Errors are rms of the frozen model, as displacement, µm.
-
-    ``verdict``: ``unchanged``; ``changed``, by ``changes``; ``unexplained``: grown, and no cause known explains it.
-    ``gain_t_s``, ``gain``: the stage's relative gain over time, stretch by stretch, against the reference.
-    """
-
-    verdict: str
-    changes: tuple[Change, ...]
-    before_um: float
-    recent_um: float
-    left_um: float
-    text: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON form."""
-        return {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "text": self.text,
-            "error_before_um": self.before_um,
-            "error_recent_um": self.recent_um,
-            "error_explained_um": self.left_um,
-            "effects": [
-                {
-                    "name": c.name,
-                    "alternatives": list(c.alternatives),
-                    "parameters": c.numbers,
-                    "intervals": {name: list(span) for name, span in c.intervals.items()},
-                    "heldout_gain": c.heldout_gain,
-                    "text": c.text,
-                }
-                for c in self.changes
-            ],
-        }
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Both stretches as one regression: targets, common columns, the causes' (zero before), blocks and folds."""
-
-    r: FloatArray
-    common: FloatArray
-    causes: tuple[Candidate, ...]
-    block: FloatArray
-    recent: BoolArray
-
-    def errors(self, chosen: tuple[int, ...]) -> FloatArray:
-        """Held-out errors (n,) with the causes ``chosen``, each block predicted from the other folds."""
-        x = np.column_stack([self.common, *(self.causes[i].columns for i in chosen)])
-        x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-        out = np.empty_like(self.r)
-        for fold in range(FOLDS):
-            test = self.block % FOLDS == fold
-            beta = _solve(x[~test], self.r[~test])
-            out[test] = self.r[test] - x[test] @ beta
-        return out
-
-    def by_block(self, errors: FloatArray) -> FloatArray:
-        """Sums of squares over each block, of both stretches: what is common to them would take half of a change."""
-        place = np.unique(self.block, return_inverse=True)[1]
-        return np.asarray(np.bincount(place, weights=errors**2))
-
-    def fit(self, chosen: tuple[int, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coefficients of all columns, their standard errors (by blocks, errors being correlated), and what is left."""
-        x = np.column_stack([self.common, *(self.causes[i].columns for i in chosen)])
-        size = np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-        beta = _solve(x / size, self.r)
-        left = self.r - (x / size) @ beta
-        rows = (x / size) * left[:, None]
-        place = np.unique(self.block, return_inverse=True)[1]
-        scores = np.zeros((int(place.max()) + 1, x.shape[1]))
-        np.add.at(scores, place, rows)
-        bread = np.linalg.pinv((x / size).T @ (x / size), rcond=1e-10, hermitian=True)
-        cover = bread @ (scores.T @ scores) @ bread
-        return beta / size, np.sqrt(np.maximum(np.diag(cover), 0.0)) / size, left
-
-
-def _solve(x: FloatArray, r: FloatArray) -> FloatArray:
-    """Least squares of columns of unit norm, a trace of ridge against those that this data cannot tell apart."""
-    gram = x.T @ x
-    return np.asarray(np.linalg.solve(gram + 1e-5 * np.eye(gram.shape[0]), x.T @ r))
-
-
 def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Comparison:
     """What has changed from ``reference`` to ``recent``, seen by ``model`` frozen.
 
     Raises InputError where a stretch is too short or does not move.
     """
     for name, stretch in (("reference", reference), ("recent", recent)):
-        _enough(name, int(stretch.scored.sum()), stretch.dt_s)
+        enough(name, int(stretch.scored.sum()), stretch.dt_s)
     scales = Scales.of(reference)
     if not (np.isfinite(scales.slope_V_per_um) and scales.slope_V_per_um != 0.0 and scales.range_um > 0.0):
         raise InputError("reference: got a stretch that does not move, expected motion: move the stage")
-    problem, common = _problem(model, reference, recent, scales)
+    problem, common = problem_of(model, reference, recent, scales)
     chosen, gains = _search(problem)
     after = problem.errors(chosen)
     now = problem.recent
     # What the error was and has become: with the common part as the reference alone knows it.
-    first = _solve_scaled(common[~now], problem.r[~now])
+    first = solve_scaled(common[~now], problem.r[~now])
     flat = (problem.r - common @ first) / scales.slope_V_per_um
     before_um, recent_um = _rms(flat[~now]), _rms(flat[now])
     left_um = _rms(after[now]) / abs(scales.slope_V_per_um)
@@ -160,57 +59,7 @@ def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Compari
     return Comparison(verdict, changes, before_um, recent_um, left_um, text)
 
 
-def _enough(name: str, n: int, dt_s: float) -> None:
-    if n * dt_s < FOLDS * BLOCK_S or n < 200:
-        raise InputError(
-            f"{name}: got {n} usable samples ({n * dt_s:.3g} s) after what only settles the loop's memory, expected at "
-            f"least {FOLDS * BLOCK_S:g} s and 200: wait for more, or move further"
-        )
-
-
-def _problem(model: InverseModel, reference: Stretch, recent: Stretch, scales: Scales) -> tuple[_Problem, FloatArray]:
-    rows, targets, shared, marks, blocks = [], [], [], [], []
-    found: list[Candidate] = []
-    kept = np.empty(0, dtype=np.intp)
-    first = 0
-    for stretch, is_recent in ((reference, False), (recent, True)):
-        base = base_of(model, stretch, scales)
-        found = candidates(model, stretch, scales, base)
-        own = [c.columns for c in found]
-        keep = stretch.scored & base.sure
-        name = "recent" if is_recent else "reference"
-        _enough(name, int(keep.sum()), stretch.dt_s)
-        shared.append(np.column_stack([slow(stretch.motion[:, 0], stretch.dt_s, scales), *own])[keep])
-        rows.append([c[keep] if is_recent else np.zeros_like(c[keep]) for c in own])
-        targets.append((stretch.u_V - base.u_V)[keep])
-        marks.append(np.full(int(keep.sum()), is_recent))
-        index = first + np.arange(stretch.u_V.size) // max(1, round(BLOCK_S / stretch.dt_s))
-        first = int(index[-1]) + 1
-        blocks.append(index[keep])
-        kept = np.flatnonzero(keep)
-    common, r = np.vstack(shared), np.concatenate(targets)
-    now = np.concatenate(marks)
-    causes = [
-        Candidate(c.name, c.alternatives, c.numbers, c.least, np.vstack([rows[0][i], rows[1][i]]))
-        for i, c in enumerate(found)
-    ]
-    # A mains line is sought in what the rest leaves of the recent stretch.
-    left = np.zeros(recent.u_V.size)
-    left[kept] = (r - common @ _solve_scaled(common, r))[now]
-    line = hum(recent, left)
-    if line is not None:
-        columns = np.zeros((r.size, 2))
-        columns[now] = line.columns[kept]
-        causes.append(Candidate(line.name, (), line.numbers, 0.0, columns))
-    return _Problem(r, common, tuple(causes), np.concatenate(blocks), now), common
-
-
-def _solve_scaled(x: FloatArray, r: FloatArray) -> FloatArray:
-    size = np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-    return np.asarray(_solve(x / size, r) / size)
-
-
-def _search(problem: _Problem) -> tuple[tuple[int, ...], dict[int, float]]:
+def _search(problem: Problem) -> tuple[tuple[int, ...], dict[int, float]]:
     """Causes one after the other, the one that removes most first; and the share that each removed.
 
     An offset is in from the start, because creep and warmth always move one a little; whether it is worth a name
@@ -239,7 +88,7 @@ def _search(problem: _Problem) -> tuple[tuple[int, ...], dict[int, float]]:
     return (chosen, gains) if gains else _alone(problem, chosen)
 
 
-def _alone(problem: _Problem, otherwise: tuple[int, ...]) -> tuple[tuple[int, ...], dict[int, float]]:
+def _alone(problem: Problem, otherwise: tuple[int, ...]) -> tuple[tuple[int, ...], dict[int, float]]:
     """The one cause that explains most without an offset beside it, where a short or narrow motion mixes the two up."""
     none = problem.errors(())
     best: tuple[float, int] | None = None
@@ -251,7 +100,7 @@ def _alone(problem: _Problem, otherwise: tuple[int, ...]) -> tuple[tuple[int, ..
     return ((best[1],), {best[1]: best[0]}) if best is not None else (otherwise, {})
 
 
-def _won(problem: _Problem, before: FloatArray, after: FloatArray) -> tuple[float, float]:
+def _won(problem: Problem, before: FloatArray, after: FloatArray) -> tuple[float, float]:
     """Share of the held-out squared error that is gone, and by how many standard errors."""
     base = problem.by_block(before)
     won = base - problem.by_block(after)
@@ -259,14 +108,14 @@ def _won(problem: _Problem, before: FloatArray, after: FloatArray) -> tuple[floa
     return share, float(won.sum() / max(float(np.std(won)) * np.sqrt(won.size), 1e-30))
 
 
-def _large(problem: _Problem, chosen: tuple[int, ...]) -> bool:
+def _large(problem: Problem, chosen: tuple[int, ...]) -> bool:
     """Whether the last of ``chosen`` has a number beyond the size below which nobody would call it a change."""
     cause = problem.causes[chosen[-1]]
     beta, _, _ = problem.fit(chosen)
     return bool(np.max(np.abs(beta[-len(cause.numbers) :])) > cause.least)
 
 
-def _rivals(problem: _Problem, chosen: tuple[int, ...], place: int) -> tuple[str, ...]:
+def _rivals(problem: Problem, chosen: tuple[int, ...], place: int) -> tuple[str, ...]:
     """Causes that do as well in the place of ``chosen[place]``, within what these blocks can tell."""
     rest = chosen[:place] + chosen[place + 1 :]
     mine, less = problem.by_block(problem.errors(chosen)), problem.by_block(problem.errors(rest))
@@ -282,7 +131,7 @@ def _rivals(problem: _Problem, chosen: tuple[int, ...], place: int) -> tuple[str
     return tuple(names)
 
 
-def _named(problem: _Problem, chosen: tuple[int, ...], gains: dict[int, float], scales: Scales) -> tuple[Change, ...]:
+def _named(problem: Problem, chosen: tuple[int, ...], gains: dict[int, float], scales: Scales) -> tuple[Change, ...]:
     beta, sigma, _ = problem.fit(chosen)
     at = problem.common.shape[1]
     out = []
@@ -301,27 +150,6 @@ def _named(problem: _Problem, chosen: tuple[int, ...], gains: dict[int, float], 
             text += f" (or {', '.join(others)})"
         out.append(Change(cause.name, others, numbers, intervals, gains[i], text))
     return tuple(sorted(out, key=lambda c: -c.heldout_gain))
-
-
-def phrase(name: str, values: FloatArray, scales: Scales) -> str:
-    """A cause as a person would say it, with its size."""
-    first = float(values[0])
-    match name:
-        case "gain_drift":
-            return f"gain drift, {100.0 * first:+.1f} %"
-        case "thermal_drift":
-            return f"thermal drift or another offset, {first:+.3g} µm"
-        case "sensor_lag":
-            return f"lag, {1e3 * first:+.3g} ms"
-        case "payload_change":
-            return f"payload on the stage, {first:+.2g} s² of 1/ω²"
-        case "sensor_nonlinearity":
-            return f"bend of the characteristic, {100.0 * first:+.2g} % of half the range"
-        case "hysteresis_shape":
-            return f"shape of the loop, {100.0 * float(np.sum(values)):+.2g} % of the motion"
-        case "mains_hum":
-            return f"mains hum, {float(np.hypot(*values)) / abs(scales.slope_V_per_um) * 1e3:.3g} nm"
-    return name
 
 
 def _rms(values: FloatArray) -> float:

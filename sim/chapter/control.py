@@ -16,7 +16,7 @@ from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.fit import fit_bouc_wen, fit_mpi
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline
-from baselines.online_least_squares import MpiOnline
+from baselines.online_mpi import MpiOnline
 from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Score
 from sim.chapter.references import control_references

@@ -17,7 +17,9 @@ from adaptive import lssvm
 from adaptive.errors import InputError
 from adaptive.evidence import Evidence, problem
 from adaptive.features import FeatureMap
-from adaptive.identification import IdentifyConfig, design_features, prior_deviations
+from adaptive.identification import design_features
+from adaptive.identification_config import IdentifyConfig
+from adaptive.identification_fit import prior_deviations
 from adaptive.inference import InferenceConfig, infer
 from adaptive.lssvm import LssvmModel
 from adaptive.scaling import MinMaxScaling

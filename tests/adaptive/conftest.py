@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.identification import identify_lssvm
+from adaptive.identification_config import IdentifyConfig
 from adaptive.snapshot import LssvmInverse
 from sim.presets import preset
 from sim.signals import training_input

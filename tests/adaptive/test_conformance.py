@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.identification import identify_lssvm
+from adaptive.identification_config import IdentifyConfig
 from adaptive.learner import Learner, LearnerConfig
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import InverseModel, OnlineModel, Sample
@@ -19,7 +20,8 @@ from baselines.competition_making import of_models
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline
-from baselines.online_least_squares import LinearOnline, MpiOnline
+from baselines.online_linear import LinearOnline
+from baselines.online_mpi import MpiOnline
 from baselines.prandtl_ishlinskii import MpiParameters
 from baselines.records import Domain
 

@@ -9,10 +9,10 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.evidence import evaluate, problem
-from adaptive.residual import Hyperparameters, WindowData
 from adaptive.retune import Proposal, RetuneConfig, bounds_of, compare, fresh_rows, pattern, propose
 from adaptive.retune_trial import significance
 from adaptive.types import FloatArray
+from adaptive.window_data import Hyperparameters, WindowData
 
 NARROW = Hyperparameters(1e5, (0.12, 0.12))
 GOOD = Hyperparameters(2e3, (1.0, 0.8))

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from adaptive import lssvm
 from adaptive import window_state as ws
 from adaptive.errors import InputError, NumericsError
-from adaptive.window import Backend, Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import Backend, Form, WindowConfig
 from adaptive.window_state import Status
 
 KINDS: list[tuple[Form, Backend]] = [("inverse", "compiled"), ("cholesky", "compiled"), ("inverse", "plain")]

@@ -10,7 +10,8 @@ import pytest
 
 from adaptive import window_core, window_handle
 from adaptive.types import FloatArray
-from adaptive.window import Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import Form, WindowConfig
 from adaptive.window_refresh import begin
 
 

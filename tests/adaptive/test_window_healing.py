@@ -13,10 +13,11 @@ import pytest
 
 from adaptive import admission, lapack, lssvm, window_refresh
 from adaptive.errors import InputError, NumericsError
-from adaptive.residual import ResidualWindow, SolverConfig
+from adaptive.residual import ResidualWindow
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray
-from adaptive.window import Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import Form, SolverConfig, WindowConfig
 from adaptive.window_healing import STEPS
 from adaptive.window_refresh import Refresh
 from adaptive.window_state import CHOLESKY_FORM

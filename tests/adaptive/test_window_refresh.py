@@ -9,7 +9,8 @@ import pytest
 
 from adaptive import lssvm, window_refresh
 from adaptive.errors import NumericsError
-from adaptive.window import Backend, Form, Window, WindowConfig
+from adaptive.window import Window
+from adaptive.window_config import Backend, Form, WindowConfig
 from adaptive.window_state import TOLERANCE, Status
 
 N, D = 30, 2

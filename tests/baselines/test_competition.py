@@ -19,7 +19,7 @@ from baselines.champion import ChampionInverse
 from baselines.competition import Competition, CompetitionConfig
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
-from baselines.online_least_squares import MpiOnline
+from baselines.online_mpi import MpiOnline
 from baselines.prandtl_ishlinskii import MpiParameters
 from baselines.records import Domain
 from baselines.succession import FAILED, WINS, Succession

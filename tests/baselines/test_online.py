@@ -14,7 +14,9 @@ from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
-from baselines.online_least_squares import LeastSquaresConfig, LinearOnline, MpiOnline
+from baselines.online_least_squares import LeastSquaresConfig
+from baselines.online_linear import LinearOnline
+from baselines.online_mpi import MpiOnline
 from baselines.play import play_run
 from baselines.prandtl_ishlinskii import MpiParameters
 from baselines.records import Domain

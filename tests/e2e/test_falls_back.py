@@ -22,7 +22,7 @@ from service.identifying import identify_one
 from service.modelfile import BundleMeta, write_bundle
 from service.session import open_client
 from service.stage_faults import fault_key
-from service.wire_query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
+from service.wire_flags import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
 from sim.presets import preset
 from sim.signals import training_input
 from sim.stage import Stage

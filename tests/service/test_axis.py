@@ -21,7 +21,9 @@ from service.modelfile import Bundle, BundleMeta
 from service.models import load_axis, make_learner
 from service.sequence import RESTART_AFTER
 from service.wire import SampleBatch, decode_samples, encode_samples, joined
-from service.wire_query import NOT_FINITE_REPLACED, FeedforwardQuery, FeedforwardReply
+from service.wire_flags import NOT_FINITE_REPLACED
+from service.wire_query import FeedforwardQuery
+from service.wire_reply import FeedforwardReply
 
 DT_S = 1e-3
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)

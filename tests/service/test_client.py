@@ -31,7 +31,7 @@ from service.errors import (
 from service.keys import Keys
 from service.motion import derivatives
 from service.session import open_service
-from service.wire_query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
+from service.wire_flags import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3

@@ -55,7 +55,8 @@ def recorded() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def bundle(recorded: tuple[np.ndarray, np.ndarray]) -> Bundle:
-    from adaptive.identification import IdentifyConfig, identify_lssvm
+    from adaptive.identification import identify_lssvm
+    from adaptive.identification_config import IdentifyConfig
 
     u_V, y_um = (column[:6000] for column in recorded)
     found: dict[str, InverseModel] = {

@@ -18,8 +18,7 @@ from service.axis import Axis
 from service.config import AxisConfig
 from service.fallback import Answer, Rules, StandIn, answer_safely, domain_weight
 from service.guard import Limits
-from service.wire_model import decode_model, encode_model
-from service.wire_query import (
+from service.wire_flags import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -27,8 +26,9 @@ from service.wire_query import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
-    FeedforwardQuery,
 )
+from service.wire_model import decode_model, encode_model
+from service.wire_query import FeedforwardQuery
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0, -50.0, 150.0)

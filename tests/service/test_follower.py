@@ -18,8 +18,7 @@ from service.axis import Axis
 from service.config import AxisConfig
 from service.follower import Follower
 from service.guard import Limits
-from service.wire_model import Safety, decode_model, encode_model
-from service.wire_query import (
+from service.wire_flags import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -27,9 +26,10 @@ from service.wire_query import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
-    FeedforwardQuery,
-    FeedforwardReply,
 )
+from service.wire_model import Safety, decode_model, encode_model
+from service.wire_query import FeedforwardQuery
+from service.wire_reply import FeedforwardReply
 from tests.service.conftest import make_models
 
 LIMITS = Limits(0.0, 7.0, 2000.0, -50.0, 150.0)

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from adaptive.errors import InputError
 from service.guard import Limits, check_domain, guard
-from service.wire_query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from service.wire_flags import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 
 LIMITS = Limits(-1.0, 9.0, 500.0, 0.0, 90.0)
 DT_S = 1e-3

@@ -15,7 +15,8 @@ from adaptive.types import FloatArray, InverseModel
 from service.client import Client
 from service.client_answers import UNDER_WAY, Trajectory, as_trajectory, continued, extended, under_way
 from service.errors import FieldError
-from service.wire_query import FeedforwardQuery, FeedforwardReply, Pending, decode_query, encode_query
+from service.wire_query import FeedforwardQuery, Pending, decode_query, encode_query
+from service.wire_reply import FeedforwardReply
 from tests.service.test_axis import make_axis, parts, recording
 
 FINITE = st.floats(-1e6, 1e6)

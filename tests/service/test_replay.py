@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.identification import identify_lssvm
+from adaptive.identification_config import IdentifyConfig
 from adaptive.learner import Learner
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel

@@ -18,7 +18,7 @@ import pytest
 from service.checkpoint import CheckpointFolder, decode_checkpoint
 from service.client import Client
 from service.session import open_service
-from service.wire_query import STALE
+from service.wire_flags import STALE
 from sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually

@@ -14,10 +14,11 @@ import psutil
 import pytest
 
 from adaptive import retune
-from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.residual import Hyperparameters, WindowData
+from adaptive.identification import identify_lssvm
+from adaptive.identification_config import IdentifyConfig
 from adaptive.retune_config import RetuneConfig
 from adaptive.types import FloatArray
+from adaptive.window_data import Hyperparameters, WindowData
 from service import models
 from service.axis import Axis
 from service.config import AxisConfig

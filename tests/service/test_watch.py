@@ -20,7 +20,8 @@ from service.guard import Limits
 from service.modelfile import Bundle, BundleMeta
 from service.models import load_axis, make_learner
 from service.wire import SampleBatch
-from service.wire_query import STAND_IN, FeedforwardQuery
+from service.wire_flags import STAND_IN
+from service.wire_query import FeedforwardQuery
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)

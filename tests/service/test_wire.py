@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
-from service import wire, wire_query
+from service import wire, wire_flags, wire_query
 from service.errors import FieldError
 from service.wire_model import decode_model, encode_model
-from service.wire_query import FeedforwardReply, decode_query, decode_reply, encode_query, encode_reply
+from service.wire_query import decode_query, encode_query
+from service.wire_reply import FeedforwardReply, decode_reply, encode_reply
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 ANY = st.floats()
@@ -74,7 +75,7 @@ def test_replies_come_back() -> None:
     for name in ("u_V", "std_V", "flags", "memory"):
         np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
     assert (got.snapshot_seq, got.model, got.behind, got.tracked_memory, got.fallback) == (77, "mpi", True, False, True)
-    assert wire_query.flag_names(6) == ["limited_slew", "outside_domain"]
+    assert wire_flags.flag_names(6) == ["limited_slew", "outside_domain"]
 
 
 def test_the_layout_is_that_of_the_page() -> None:

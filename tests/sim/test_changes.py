@@ -12,7 +12,8 @@ from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel
 from baselines.fit import fit_mpi
 from sim.changes.columns import Scales, Stretch, base_of
-from sim.changes.compare import Comparison, compare
+from sim.changes.compare import compare
+from sim.changes.comparison import Comparison
 from sim.presets import preset
 from sim.signals import training_input
 from sim.stage import Stage, StageConfig
