@@ -26,6 +26,8 @@ from service.view.join import ReferenceRing, UnitJoin
 #: Events that mark a change of the stage itself.
 CHANGES = frozenset({"change", "stage_change", "stage_changed"})
 _LEVELS = {"ERROR": "ERROR", "WARN": "WARN", "WARNING": "WARN", "INFO": "INFO", "DEBUG": "DEBUG"}
+#: What is said of a sample may come so long before that sample, s of the stage's time: it has another key.
+_AHEAD_S = 1.0
 _FAILING = ("error", "fail")
 _ALARMING = (
     "change",
@@ -214,8 +216,8 @@ class Consumer:
         if _is_time(t_s):
             return float(t_s), seq
         ago_s = (self._seq - seq) * self._dt_s
-        # A number from another life of the stage says nothing about its time.
-        return (self._t_s - ago_s if 0.0 <= ago_s <= self._t_s else self._t_s), seq
+        # A number from another life of the stage says nothing about its time; one that is a little ahead does.
+        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), seq
 
 
 def _is_time(value: Any) -> TypeGuard[float]:

@@ -110,6 +110,10 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
             feed.send(BATCH)
             # Its last message is the diagnostics; what is under way at the close is not promised.
             wait_for(lambda: len(basket.of(Diagnostics)) == 51)
+            # Of a sample that has not come yet, and of one that comes in another life of the stage if at all.
+            feed.say("event", {"seq": 51 * BATCH + 100, "event": "gap", "detail": "ahead"})
+            feed.say("event", {"seq": 10**9, "event": "gap", "detail": "far"})
+            wait_for(lambda: len(basket.of(Event)) == 3)
         finally:
             consumer.close()
             consumer.close()
@@ -121,9 +125,11 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
         assert error == pytest.approx(np.full(51 * BATCH, error_um))
     assert len(basket.of(Diagnostics)) == 51
     assert [s.fields for s in basket.of(Status)] == [{"stage": "demo"}]
-    (event,) = basket.of(Event)
+    event, ahead, far = basket.of(Event)
     assert (event.seq, event.text, event.level) == (500, "drift: gain 0.94", "WARN")
     assert event.t_s == pytest.approx(0.5), "told by its sequence number"
+    assert ahead.t_s == pytest.approx((51 * BATCH + 100) * DT_S)
+    assert far.t_s == pytest.approx((51 * BATCH - 1) * DT_S)
     last = basket.of(Health)[-1].counts
     assert (last["samples"], last["malformed"], last.get("inbox_full", 0)) == (2 * 51 * BATCH, 5, 0)
 
