@@ -68,12 +68,8 @@ def bad_query(rng: np.random.Generator) -> bytes:
     """Malformed, truncated, oversized, foreign, or of a point or a model that there is not."""
     good = encode_query([40.0], [0.0], [0.0])
     choice = int(rng.integers(6))
-    if choice == 0:
-        return _noise(rng)
-    if choice == 1:
-        return good[: int(rng.integers(len(good)))]
-    if choice == 2:
-        return good + rng.bytes(int(rng.integers(1, 200_000)))
+    if choice < 3:
+        return _spoilt(good, choice, rng)
     if choice == 3:
         return encode_query([1e9], [0.0], [0.0])
     if choice == 4:
@@ -85,12 +81,8 @@ def bad_samples(rng: np.random.Generator) -> bytes:
     """No samples, whatever else: what could be read would be believed, as it would be of any stage."""
     good = encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
     choice = int(rng.integers(6))
-    if choice == 0:
-        return _noise(rng)
-    if choice == 1:
-        return good[: int(rng.integers(len(good)))]
-    if choice == 2:
-        return good + rng.bytes(int(rng.integers(1, 200_000)))
+    if choice < 3:
+        return _spoilt(good, choice, rng)
     if choice == 3:
         # Of another version of the wire.
         return bytes([int(rng.integers(2, 256))]) + good[1:]
@@ -112,6 +104,15 @@ def bad_request(rng: np.random.Generator) -> bytes:
     if choice == 3:
         return json.dumps({"verb": "freeze", "who": "rubbish", "as": "admin"}).encode()
     return b"[" * (MAX_BYTES + int(rng.integers(1, 100_000)))
+
+
+def _spoilt(good: bytes, how: int, rng: np.random.Generator) -> bytes:
+    """Something else altogether (0), ``good`` truncated (1), or with more behind it (2)."""
+    if how == 0:
+        return _noise(rng)
+    if how == 1:
+        return good[: int(rng.integers(len(good)))]
+    return good + rng.bytes(int(rng.integers(1, 200_000)))
 
 
 def _noise(rng: np.random.Generator) -> bytes:
