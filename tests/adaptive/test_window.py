@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,61 +13,7 @@ from adaptive.errors import InputError, NumericsError
 from adaptive.window import Window
 from adaptive.window_config import Backend, Form, WindowConfig
 from adaptive.window_state import Status
-
-KINDS: list[tuple[Form, Backend]] = [("inverse", "compiled"), ("cholesky", "compiled"), ("inverse", "plain")]
-LINEAR: list[tuple[int, ...]] = [(), (1,), (0, 2)]
-kinds = pytest.mark.parametrize(("form", "backend"), KINDS)
-GAMMA, WIDTHS, CAPACITY = 200.0, (0.6, 0.9, 1.5), 17
-
-
-def empty(
-    form: Form = "inverse", backend: Backend = "compiled", linear: tuple[int, ...] = (), n: int = CAPACITY
-) -> Window:
-    return Window(WindowConfig(n, WIDTHS, GAMMA, linear, form, backend))
-
-
-def sample(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
-    x = rng.random(3)
-    return x, float(np.sin(4 * x[0]) + x[1] * x[2] + 0.02 * rng.standard_normal()), float(rng.random() + 0.3)
-
-
-def filled(form: Form, backend: Backend, linear: tuple[int, ...] = (), n: int = CAPACITY, seed: int = 0) -> Window:
-    window, rng = empty(form, backend, linear), np.random.default_rng(seed)
-    for _ in range(n):
-        assert window.append(*sample(rng)) is Status.ACCEPTED
-    return window
-
-
-def assert_exact(window: Window, tolerance: float = 1e-8) -> None:
-    """Solution, variance, leave-one-out and residuals are those of the direct solver on the same samples."""
-    fit = lssvm.fit(window.X, window.y, WIDTHS, GAMMA, window.weights, window.config.linear)
-    size = np.max(np.abs(fit.model.alpha))
-    np.testing.assert_allclose(window.alpha, fit.model.alpha, atol=tolerance * size)
-    np.testing.assert_allclose(window.beta, fit.model.beta, atol=tolerance * 10)
-    points = np.random.default_rng(99).random((3, 3)) * 1.3
-    for x, mean, variance, noisy in zip(
-        points, fit.model.predict(points), fit.variance(points), fit.variance(points, include_noise=True), strict=True
-    ):
-        assert window.predict(x) == pytest.approx(mean, abs=tolerance * 10)
-        got = window.predict_with_variance(x)
-        assert got[0] == pytest.approx(mean, abs=tolerance * 10)
-        assert got[1] == pytest.approx(variance, rel=1e-5, abs=1e-9)
-        assert window.predict_with_variance(x, include_noise=True)[1] == pytest.approx(noisy, rel=1e-5, abs=1e-9)
-    np.testing.assert_allclose(window.leave_one_out(), fit.leave_one_out(), rtol=1e-5, atol=tolerance * 10)
-    assert window.worst_residual() < tolerance
-    assert window.scale == pytest.approx(fit.model.scale, rel=1e-6)
-
-
-Step = Callable[[Window, np.random.Generator], Status]
-STEPS: dict[str, Step] = {
-    "append": lambda w, r: w.append(*sample(r)),
-    "replace": lambda w, r: w.replace(int(r.integers(len(w))), *sample(r)),
-    "remove": lambda w, r: w.remove(int(r.integers(len(w)))),
-    "reweight": lambda w, r: w.reweight(int(r.integers(len(w))), float(r.random() * 3 + 0.1)),
-    "rescale": lambda w, r: w.rescale_targets(float(r.random() * 0.2 - 0.1), float(r.random() - 0.5)),
-    "shift": lambda w, r: w.shift_targets(r.standard_normal(len(w)) * 0.1),
-    "undo": lambda w, r: w.undo(),
-}
+from tests.adaptive.windows import CAPACITY, GAMMA, LINEAR, STEPS, WIDTHS, assert_exact, empty, filled, kinds, sample
 
 
 @kinds
@@ -294,105 +238,6 @@ def test_foreign_state_is_refused() -> None:
     del state["R"]
     with pytest.raises(InputError, match="R: got nothing"):
         Window.from_state(WindowConfig(CAPACITY, WIDTHS, GAMMA), state)
-
-
-@kinds
-def test_residuals_rotate_and_refinement_heals(form: Form, backend: Backend) -> None:
-    window, rng = filled(form, backend), np.random.default_rng(7)
-    exact, A = window.alpha, window.arrays
-    # Damage S and Sy as drift would: all rows but the one being replaced feel it.
-    A.S[:] *= 1 + 1e-4 * rng.standard_normal(A.S.shape)
-    A.V[ws.SY] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
-    assert window.resum() is True
-    np.testing.assert_allclose(window.alpha, exact, rtol=1e-7)
-    A.V[ws.SY] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
-    before = window.counters()
-    for _ in range(CAPACITY):
-        assert window.replace(5, *sample(rng)) is Status.ACCEPTED
-    after = window.counters()
-    assert after["residuals_exceeded"] > before["residuals_exceeded"]
-    assert after["refinements"] > before["refinements"]
-    assert after["residual_rounds"] == before["residual_rounds"] + 1
-    assert_exact(window)
-
-
-@kinds
-def test_each_row_is_looked_at_once_a_round(form: Form, backend: Backend) -> None:
-    """Row after row, each with the residual that it has then; the round's worst is published at its end."""
-    window, rng = filled(form, backend, (1,)), np.random.default_rng(7)
-    A = window.arrays
-    A.F[ws.TOLERANCE] = np.inf
-    A.V[ws.SY] *= 1 + 1e-3 * rng.standard_normal(CAPACITY)
-    while A.C[ws.CURSOR] != 0:
-        window.replace(5, *sample(rng))
-    worst = 0.0
-    for row in range(CAPACITY):
-        assert window.replace(int(rng.integers(CAPACITY)), *sample(rng)) is Status.ACCEPTED
-        residual = abs(A.V[ws.Y, row] - A.R[row] @ A.V[ws.ALPHA] - A.H[:, row] @ A.beta)
-        assert window.last_residual == pytest.approx(residual, rel=1e-6, abs=1e-12)
-        worst = max(worst, window.last_residual)
-    assert window.round_residual == worst > 1e-9
-    assert A.C[ws.CURSOR] == 0
-
-
-@kinds
-@pytest.mark.parametrize("linear", LINEAR)
-def test_leave_one_out_is_what_it_says_for_every_sample(form: Form, backend: Backend, linear: tuple[int, ...]) -> None:
-    """Against a fit without the sample, for all of them, at every step of a window at work."""
-    window, rng = filled(form, backend, linear), np.random.default_rng(11)
-    steps = ["replace", "replace", "append", "remove", "reweight", "append", "replace", "shift", "undo", "remove"]
-    for name in [*steps, *["replace"] * (CAPACITY + 2)]:
-        STEPS[name](window, rng)
-        X, y, w, n = window.X, window.y, window.weights, len(window)
-        found = window.leave_one_out()
-        for i in range(n):
-            rest = np.arange(n) != i
-            without = lssvm.fit(X[rest], y[rest], WIDTHS, GAMMA, w[rest], linear).model
-            assert found[i] == pytest.approx(y[i] - without.predict(X[i : i + 1])[0], rel=1e-7, abs=1e-9), (name, i)
-
-
-@kinds
-def test_leave_one_out_of_samples_that_determine_a_coefficient_alone_is_no_number(form: Form, backend: Backend) -> None:
-    window = empty(form, backend)
-    assert window.append(np.zeros(3), 2.0) is Status.ACCEPTED
-    assert np.isnan(window.leave_one_out()).all()
-
-
-def test_the_diagonal_is_carried_along_while_it_is_asked_for() -> None:
-    """A step with it costs O(N²) and no factor's whole inverse: the elements are those of the step before, moved."""
-    window, rng = filled("cholesky", "compiled", (1,)), np.random.default_rng(12)
-    A = window.arrays
-    assert A.C[ws.CARRIED] == 0
-    window.leave_one_out()
-    assert A.C[ws.CARRIED] == CAPACITY
-    # An element that is off stays off but for its own turn, which comes within a round: nothing is made anew at a call.
-    A.V[ws.DIAGONAL, 3] *= 1.5
-    A.C[ws.CURSOR] = 4
-    window.replace(0, *sample(rng))
-    exact = np.diag(np.linalg.inv(A.R))
-    window.leave_one_out()
-    off = np.abs(A.V[ws.DIAGONAL] / exact - 1.0) > 1e-9
-    np.testing.assert_array_equal(np.flatnonzero(off), [3])
-    for _ in range(CAPACITY):
-        window.replace(0, *sample(rng))
-    np.testing.assert_allclose(A.V[ws.DIAGONAL], np.diag(np.linalg.inv(A.R)), rtol=1e-9)
-    assert A.C[ws.CARRIED] == 0
-    window.replace(5, *sample(rng))
-    assert_exact(window)
-
-
-def test_the_carried_diagonal_does_not_drift_at_cond_1e8() -> None:
-    rng, n = np.random.default_rng(1), 60
-    X = rng.random((4000, 3))
-    y = np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(4000)
-    window = Window.from_samples(WindowConfig(n, (1.5,) * 3, 2e6, form="cholesky"), X[:n], y[:n])
-    for k in range(n, 4000):
-        assert window.replace(int(rng.integers(n)), X[k], y[k]) is Status.ACCEPTED
-        if k % 20 == 0:
-            window.leave_one_out()
-    assert window.arrays.C[ws.CARRIED] > 0
-    expected = lssvm.fit(window.X, window.y, 1.5, 2e6).leave_one_out()
-    assert np.linalg.norm(window.leave_one_out() - expected) < 1e-7 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize(("form", "gamma", "bound"), [("inverse", 1e3, 1e-8), ("cholesky", 1e6, 1e-7)])
