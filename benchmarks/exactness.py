@@ -24,6 +24,7 @@ from service.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpo
 from service.client import Client
 from service.config import AxisConfig, read_config
 from service.errors import ServiceError
+from service.handover import ask_for_state
 from service.models import load_axis
 from service.retuning.adoption import Retuned
 from service.wire import joined
@@ -136,8 +137,8 @@ def _live_state(client: Client) -> StateDict:
     """The state of the service as it hands it to a standby. Raises ServiceError where it does not."""
     until = time.monotonic() + READY_S
     while time.monotonic() < until:
-        for reply in client._session.get(client.keys.state, timeout=READY_S):
-            if reply.ok is not None:
-                return decode_checkpoint(reply.ok.payload.to_bytes())[1]
+        data = ask_for_state(client._session, client.keys.state, READY_S)
+        if data is not None:
+            return decode_checkpoint(data)[1]
         time.sleep(0.1)  # it refuses while its learner is busy for seconds
     raise ServiceError(f"{client.keys.state}: the service did not tell its state")

@@ -14,6 +14,7 @@ from adaptive.errors import DehystError
 from service.axis import Axis
 from service.checkpoint import encode_checkpoint
 from service.errors import FieldError, error_to_json
+from service.handover import send_state
 from service.keeper import Keeper
 from service.keys import Keys
 from service.latency import LatencyMeter
@@ -75,7 +76,7 @@ class Answers:
             time.sleep(_PASSED_ON_S)
             with query:
                 try:
-                    query.reply(self._keys.state, b"".join(encode_checkpoint(*self._keeper.state())))
+                    send_state(query, self._keys.state, encode_checkpoint(*self._keeper.state()))
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
 

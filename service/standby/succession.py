@@ -14,6 +14,7 @@ import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
 from service.axis_server import PRIMARY, STANDBY, AxisServer
+from service.handover import MOST_PAUSE_S, PAUSE_S, ask_for_state
 from service.standby.claims import Claims
 from service.standby.estate import Estate, inherit
 from service.standby.reach import Reach
@@ -45,6 +46,7 @@ class Succession:
         self._estate = estate
         self._reach = reach
         self._refused = ""
+        self._pause_s = PAUSE_S
         self._session = session
         self._patience_s = patience_s
         self._stopping = False
@@ -180,25 +182,25 @@ class Succession:
         self._stale = not self._taken() or self._stale
 
     def _taken(self) -> bool:
-        for reply in self._session.get(self.server.keys.state, timeout=_STATE_S):
-            if reply.ok is None:
-                continue
-            data = reply.ok.payload.to_bytes()
-            try:
-                self.server.intake.call(lambda data=data: self.shadow.take_state(data), 10.0)  # type: ignore[misc]
-            except DehystError as error:
-                if str(error) != self._refused:
-                    self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
-                self._refused = str(error)
-                if isinstance(error, ModelFileError):
-                    # Another configuration: it stays without, and says so, but records all the same.
-                    self.ready.set()
-                return False
-            self._refused = ""
-            self.server.synced = True
-            self.ready.set()
-            return True
-        return False
+        data = ask_for_state(self._session, self.server.keys.state, _STATE_S, self._pause_s)
+        # A machine that is too busy for it this time gets it more slowly the next.
+        self._pause_s = min(2.0 * self._pause_s, MOST_PAUSE_S)
+        if data is None:
+            return False
+        try:
+            self.server.intake.call(lambda: self.shadow.take_state(data), 10.0)
+        except DehystError as error:
+            if str(error) != self._refused:
+                self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
+            self._refused = str(error)
+            if isinstance(error, ModelFileError):
+                # Another configuration: it stays without, and says so, but records all the same.
+                self.ready.set()
+            return False
+        self._refused, self._pause_s = "", PAUSE_S
+        self.server.synced = True
+        self.ready.set()
+        return True
 
     def _drop_claim(self) -> None:
         if self._token is not None:

@@ -1,0 +1,59 @@
+"""The state of an axis on its way to a standby: megabytes that must not make anybody wait.
+
+A router passes the messages of a sender on in their order, and what it sends to one receiver at one priority too. One
+message of five megabytes keeps all that come behind it waiting, answers and samples of others included, until a standby
+that has no processor just then has read it. So it goes in parts of less than a packet of the network's, with pauses,
+behind everything else, and is given up, to be asked for again, rather than waited for.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterable
+from typing import Any, Final
+
+import zenoh
+
+#: Of one part; a packet holds 64 KiB.
+_PART_BYTES: Final = 56 * 1024
+#: With each part: its index, and how many there are.
+_PLACE: Final = struct.Struct("<II")
+#: Pauses between two parts, s: the first time that it is asked for, and at most.
+PAUSE_S, MOST_PAUSE_S = 0.001, 0.016
+
+
+def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
+    """Answer ``query`` with the bytes of ``buffers``; at the pace that its parameter ``pause_s`` asks for."""
+    try:
+        pause_s = float(query.parameters.get("pause_s") or PAUSE_S)
+    except ValueError:
+        pause_s = PAUSE_S
+    pause_s = min(MOST_PAUSE_S, max(0.0, pause_s)) if pause_s == pause_s else PAUSE_S
+    whole = memoryview(b"".join(buffers))
+    starts = range(0, len(whole), _PART_BYTES)
+    for i, start in enumerate(starts):
+        part = bytes(whole[start : start + _PART_BYTES])
+        query.reply(key, part, attachment=_PLACE.pack(i, len(starts)))
+        time.sleep(pause_s)
+
+
+def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
+    """The bytes that `send_state` answers with, or None where nobody does, or not all came: this end was too slow."""
+    parts, places = [], []
+    # Replies are of the kind of their query.
+    for reply in session.get(
+        f"{key}?pause_s={pause_s:g}",
+        timeout=timeout_s,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.DATA_LOW,
+    ):
+        if reply.ok is None:
+            return None
+        place = reply.ok.attachment
+        if place is None or len(place) != _PLACE.size:
+            return None
+        places.append(_PLACE.unpack(place.to_bytes()))
+        parts.append(reply.ok.payload.to_bytes())
+    return b"".join(parts) if places and places == [(i, places[0][1]) for i in range(places[0][1])] else None
