@@ -43,6 +43,8 @@ _OVER_S: Final = 16.0
 _BEFORE_S, _PAST_S = 35.0, 120.0
 #: Of these the number grows from stretch to stretch.
 _COUNTED: Final = ("voltages_finite", "answers_safe", "faults_told")
+#: Seconds of looks before one look in a hundred says anything: in fewer, the half second of a start is as much.
+_AGES_OF_S: Final = 60
 _AT_THE_END: Final = "told at the end"
 
 
@@ -151,7 +153,7 @@ class Interim:
         found["processes_alive"] = processes_alive(ledger)
         found["faults_happened"] = unjudged(0, "runs", _AT_THE_END)
         if ledger.mode != FAST:
-            found["follower_age"] = self._ages.invariant()
+            found["follower_age"] = self._ages.invariant(_AGES_OF_S)
             found["no_record_lost"] = unjudged(0, "samples", _AT_THE_END)
         sum_um, judged, seconds = self._error
         found["tracking"] = (

@@ -70,11 +70,13 @@ class Ages:
             over_s = np.clip(ages_s - machine.allowed_s(begin, end), 0.0, _OLDEST_S)
             np.add.at(self._looks, np.rint(over_s / _RESOLUTION_S).astype(np.int64), 1)
 
-    def invariant(self) -> Invariant:
-        """The age that one look in a hundred passes."""
+    def invariant(self, least: int = 0) -> Invariant:
+        """The age that one look in a hundred passes; not judged by fewer than ``least`` seconds."""
         text = "age of the snapshot in a client that follows, in 99 % of its looks, no fault on"
         if not self._of:
             return unjudged(FOLLOWED_S, "s", "no second without a fault", text)
+        if self._judged < least:
+            return unjudged(FOLLOWED_S, "s", f"{self._judged} seconds so far", text)
         passed = np.cumsum(self._looks)
         worst_s = _RESOLUTION_S * float(np.searchsorted(passed, _SHARE * passed[-1])) if passed[-1] else 0.0
         return _told(worst_s, self._judged, self._of, FOLLOWED_S, text, "seconds")

@@ -50,7 +50,9 @@ def test_every_minute_there_is_a_file_of_the_promised_form(tmp_path: Path) -> No
     assert found["verdict"] == "running"
     assert found["duration_s"] == 60.0
     assert found["faults"]["gap"] == end["faults"]["gap"]
-    assert set(found["not_judged"]) == {"faults_happened", "no_record_lost", "memory", "memory_resident"}
+    assert set(found["not_judged"]) == {
+        "faults_happened", "no_record_lost", "memory", "memory_resident", "follower_age"
+    }  # fmt: skip
     assert found["samples"] == {"seen": 1, "without_their_voltage_in_time": 0}
     assert run.until(125)["duration_s"] == 120.0
     assert run.said == []
@@ -134,6 +136,16 @@ def test_the_first_breach_is_told_when_it_shows_and_is_not_forgotten(tmp_path: P
     found = run.until(255)
     assert (found["duration_s"], found["verdict"]) == (240.0, "broken so far")
     assert len(run.said) == 1
+
+
+def test_a_slow_start_is_no_alarm(tmp_path: Path) -> None:
+    """A share of a hundredth is not told by the few looks of the first minute."""
+    run = Run(tmp_path, 200)
+    run.whole.probes[2].ages_s = [0.33, 0.33]
+    found = run.until(61)["invariants"]["follower_age"]
+    assert (found["held"], found["why"]) == (None, "48 seconds so far")
+    assert run.until(125)["invariants"]["follower_age"]["held"] is True
+    assert run.said == []
 
 
 def test_a_fault_that_is_still_open_is_not_settled(tmp_path: Path) -> None:
