@@ -29,9 +29,10 @@ from adaptive.admission import (
 )
 from adaptive.bridge import FAR_OUT, Bridging, Voltage
 from adaptive.features import FeatureMap
-from adaptive.learner_config import LearnerConfig, part_of
+from adaptive.learner_config import LearnerConfig
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.snapshot import LssvmInverse
+from adaptive.state import joined, under
 from adaptive.surprise import (
     MOST_BRIDGED,
     PROBATION,
@@ -61,7 +62,7 @@ class Front:
     doubt_V : deviation of the model's predictions, V, as far as it is known; the learner tells.
     """
 
-    def __init__(self, base: LssvmInverse, config: LearnerConfig, voltage: Voltage) -> None:
+    def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
         self.base = base
         self.dt_s = base.dt_s
         self.range_um = base.features.y_max_um - base.features.y_min_um
@@ -70,7 +71,6 @@ class Front:
         self.track: Track | None = None
         self.doubt_V = 0.0
         self.restarts = self.jumps = self.undone = 0
-        self._voltage = voltage
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
         self._hold: Hold | None = None
@@ -98,8 +98,8 @@ class Front:
 
     # ---- what a sample is
 
-    def take(self, sample: Sample) -> Taken:
-        """Judge one sample. Never raises on data."""
+    def take(self, sample: Sample, voltage: Voltage) -> Taken:
+        """Judge one sample; ``voltage``: what the learnt model asks for. Never raises on data."""
         c, gates, track = self._admission, self.gates, self.track
         refused = check_sample(c, gates, sample, self.dt_s)
         if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
@@ -119,7 +119,7 @@ class Front:
         if track is None or self._lost or gone or (missing and track.motion is None):
             return self._restart(sample, admission.GAP if missing else admission.SETTLING)
         for u in between:
-            self._keep(track, u, nan)
+            self._keep(track, voltage, u, nan)
         stuck = watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and not settling(c, gates)
@@ -128,7 +128,7 @@ class Front:
         if self._hold is None and not doubtful:
             watch_innovation(c, gates, innovation)
             return Taken("", (Step(sample.y_um, sample.u_V),))
-        return self._decide(sample, track, self._keep(track, sample.u_V, sample.y_um), limit, innovation)
+        return self._decide(sample, track, self._keep(track, voltage, sample.u_V, sample.y_um), limit, innovation)
 
     def _missed(self, sample: Sample, missing: int) -> tuple[list[float], bool]:
         """Voltages of the samples without a reading before ``sample``, and whether too many never came."""
@@ -153,9 +153,9 @@ class Front:
 
     # ---- readings held back
 
-    def _keep(self, track: Track, u_V: float, y_um: float) -> Hold:
+    def _keep(self, track: Track, voltage: Voltage, u_V: float, y_um: float) -> Hold:
         """Hold a sample back; begins a hold where there is none."""
-        hold, made = self._hold, Bridging(track.served, self._voltage, self.base.span_V / self.range_um)
+        hold, made = self._hold, Bridging(track.served, voltage, self.base.span_V / self.range_um)
         if hold is None:
             motion, past_V, past_um = track.since_motion()
             # Readings that were repeated before that was noticed are none, nor are they an anchor.
@@ -287,15 +287,15 @@ class Front:
         for name, part in (("track", self.track), ("hold", self._hold), ("before", self._before)):
             if part is not None:
                 parts[name] = part.state_dict()
-        state = {f"{part}.{key}": value for part, values in parts.items() for key, value in values.items()}
+        state = joined(parts)
         state |= {"heard": np.array(self._heard, dtype=np.float64).reshape(-1, 2), "lost": self._lost}
         counts = {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
         return state | counts | {"jump_um": self._jump_um}
 
     def restore(self, state: StateDict) -> None:
         """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        self.gates = AdmissionState.from_state(part_of(state, "gates"))
-        track, hold, before = (part_of(state, name) for name in ("track", "hold", "before"))
+        self.gates = AdmissionState.from_state(under("gates.", state))
+        track, hold, before = (under(f"{name}.", state) for name in ("track", "hold", "before"))
         made = (self.smoother, self.base.features)
         self.track = Track.from_state(*made, track) if track else None
         self._hold = Hold.from_state(*made, hold) if hold else None

@@ -86,7 +86,7 @@ class Learner:
     def _handle(self, sample: Sample) -> str:
         parts, front = self.parts, self.parts.front
         front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
-        taken = front.take(sample)
+        taken = front.take(sample, self.parts.voltage)
         if taken.undone:
             # What was learnt since the jump was learnt of a stage that never was.
             parts.filter.restore(parts.jump_mark)

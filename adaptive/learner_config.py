@@ -9,15 +9,10 @@ from adaptive.drift import DriftConfig
 from adaptive.errors import InputError
 from adaptive.residual import Eviction
 from adaptive.smoothing import SmootherConfig
+from adaptive.state import joined, under
 from adaptive.types import StateDict
 from adaptive.weights import WeightConfig
 from adaptive.window_config import SolverConfig
-
-
-def part_of(state: StateDict, name: str) -> StateDict:
-    """The entries under a prefix, without it."""
-    prefix = name + "."
-    return {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +69,7 @@ class LearnerConfig:
         """All fields under flat names."""
         names = ("admission", "drift", "weights", "solver")
         parts = {name: asdict(getattr(self, name)) for name in names}
-        flat = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
+        flat = joined(parts)
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
         return {**own, **flat}
 
@@ -84,10 +79,10 @@ class LearnerConfig:
         own = {name: value for name, value in values.items() if "." not in name}
         return cls(
             **own,
-            admission=AdmissionConfig(**part_of(values, "admission")),
-            drift=DriftConfig(**part_of(values, "drift")),
-            weights=WeightConfig(**part_of(values, "weights")),
-            solver=SolverConfig(**part_of(values, "solver")),
+            admission=AdmissionConfig(**under("admission.", values)),
+            drift=DriftConfig(**under("drift.", values)),
+            weights=WeightConfig(**under("weights.", values)),
+            solver=SolverConfig(**under("solver.", values)),
         )
 
     def smoother(self, dt_s: float) -> SmootherConfig:

@@ -9,10 +9,11 @@ from adaptive.drift import DriftFilter
 from adaptive.errors import ModelFileError
 from adaptive.front import Front
 from adaptive.judgement import Delay, Judgement
-from adaptive.learner_config import LearnerConfig, part_of
+from adaptive.learner_config import LearnerConfig
 from adaptive.residual import ResidualWindow
 from adaptive.rest import Rest
 from adaptive.snapshot import LssvmInverse
+from adaptive.state import joined, under
 from adaptive.types import FloatArray, StateDict
 
 #: Names of what is counted beside the samples.
@@ -40,7 +41,7 @@ class Parts:
 
     def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
         self.config = config
-        self.front = Front(base, config, self.voltage)
+        self.front = Front(base, config)
         p = base.features.basis_size
         covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
         step_s = config.filter_every * base.dt_s
@@ -135,7 +136,7 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
         "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
     }
-    state = {f"{group}.{key}": value for group, values in groups.items() for key, value in values.items()}
+    state = joined(groups)
     return state | {
         "domain": parts.domain.copy(),
         "point": parts.point.copy(),
@@ -147,21 +148,21 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
 def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool]:
     """Inverse of ``state_of``. Raises ModelFileError where entries are missing or do not fit together."""
     try:
-        base = LssvmInverse.from_state(part_of(state, "base"))
-        config = LearnerConfig.from_state(part_of(state, "config"))
+        base = LssvmInverse.from_state(under("base.", state))
+        config = LearnerConfig.from_state(under("config.", state))
         parts = Parts(base, config)
-        parts.front.restore(part_of(state, "front"))
-        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, part_of(state, "filter"))
-        parts.window.restore(part_of(state, "window"))
-        parts.rest = Rest.from_state(part_of(state, "rest"))
-        parts.judgement = Judgement.from_state(part_of(state, "judgement"))
-        parts.counters |= {key: int(value) for key, value in part_of(state, "counters").items()}
-        parts.events |= {key: int(value) for key, value in part_of(state, "events").items()}
+        parts.front.restore(under("front.", state))
+        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, under("filter.", state))
+        parts.window.restore(under("window.", state))
+        parts.rest = Rest.from_state(under("rest.", state))
+        parts.judgement = Judgement.from_state(under("judgement.", state))
+        parts.counters |= {key: int(value) for key, value in under("counters.", state).items()}
+        parts.events |= {key: int(value) for key, value in under("events.", state).items()}
         parts.domain = np.array(state["domain"], dtype=np.float64)
         parts.point = np.array(state["point"], dtype=np.float64)
         parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
-        parts.mark, parts.next_mark, parts.jump_mark = (_mark(part_of(state, name)) for name in names)
+        parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
         return base, config, parts, bool(state["frozen"])
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from adaptive.state import prefixed
+
 if TYPE_CHECKING:
     from adaptive.learner import Learner
 
@@ -25,7 +27,7 @@ def counters(learner: Learner) -> dict[str, int]:
         **events,
         "filter_updates": drift.updates,
         "bursts": drift.bursts,
-        **{f"window_{name}": value for name, value in parts.window.counters().items()},
+        **prefixed("window_", parts.window.counters()),
     }
 
 

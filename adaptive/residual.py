@@ -10,6 +10,7 @@ from adaptive import admission, kernels
 from adaptive import window_state as ws
 from adaptive.errors import InputError
 from adaptive.snapshot import LssvmInverse
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from adaptive.weights import WeightConfig
 from adaptive.window import Window
@@ -219,7 +220,7 @@ class ResidualWindow:
             "kernel_variance": self.kernel_variance,
         }
         hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
-        healing = {f"healing.{name}": value for name, value in self._healing.state_dict().items()}
+        healing = prefixed("healing.", self._healing.state_dict())
         return {**self._window.state_dict(), **own, **hyper, **healing}
 
     def restore(self, values: StateDict) -> None:
@@ -228,9 +229,7 @@ class ResidualWindow:
         widths = tuple(float(w) for w in values["widths"])
         self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.linear, c.form, c.backend, c.accuracy)
         self._window = Window.from_state(self._config, values)
-        prefix = "healing."
-        healing = {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
-        self._healing = Healing.from_state(self._window, healing)
+        self._healing = Healing.from_state(self._window, under("healing.", values))
         self._born = np.array(values["born"], dtype=np.int64)
         self._own = np.array(values["own_weights"], dtype=np.float64)
         self._clock = int(values["clock"])

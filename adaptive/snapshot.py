@@ -10,6 +10,7 @@ costs nothing on top of the mean. The learner calibrates its scale on its own pr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.snapshot_loops import evaluate_packed, mean_of, track_memory
+from adaptive.state import prefixed, under
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from adaptive.window_state import IntArray
 
@@ -72,6 +74,14 @@ class LssvmInverse:
                 raise InputError(f"{name}: got shape {value.shape}, expected {shape} finite numbers")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+        # What is stated as a deviation is the root of these.
+        for name, may_be_0 in (
+            ("noise_variance", True), ("kernel_variance", True), ("gamma", False), ("span_V", False)
+        ):  # fmt: skip
+            number = float(getattr(self, name))
+            if not (math.isfinite(number) and (number > 0.0 or (may_be_0 and number == 0.0))):
+                expected = "of at least" if may_be_0 else "above"
+                raise InputError(f"{name}: got {number}, expected a finite number {expected} 0")
         covariance = np.array(self.beta_covariance, dtype=np.float64)
         if covariance.shape not in ((0, 0), (p, p)):
             raise InputError(f"beta_covariance: got shape {covariance.shape}, expected ({p}, {p}) or (0, 0)")
@@ -166,7 +176,7 @@ class LssvmInverse:
     def state_dict(self) -> StateDict:
         """Flat names to arrays and JSON scalars; ``from_state`` builds an equal model."""
         state: StateDict = {"kind": "lssvm", "name": self.name, "gamma": self.gamma}
-        state |= {f"features.{key}": value for key, value in self.features.state_dict().items()}
+        state |= prefixed("features.", self.features.state_dict())
         for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance"):
             state[name] = getattr(self, name).copy()
         for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid"):
@@ -177,11 +187,9 @@ class LssvmInverse:
     def from_state(cls, state: StateDict) -> LssvmInverse:
         """Inverse of ``state_dict``. Raises ModelFileError on missing or misshapen entries."""
         try:
-            prefix = "features."
-            features = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
             return cls(
                 name=str(state["name"]),
-                features=FeatureMap.from_state(features),
+                features=FeatureMap.from_state(under("features.", state)),
                 gamma=float(state["gamma"]),
                 noise_variance=float(state["noise_variance"]),
                 kernel_variance=float(state["kernel_variance"]),

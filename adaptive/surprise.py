@@ -22,8 +22,8 @@ import numpy as np
 from adaptive.admission import REPEATED, AdmissionConfig
 from adaptive.bridge import SLOPES, Bridge
 from adaptive.features import FeatureMap
-from adaptive.learner_config import part_of
 from adaptive.smoothing import FixedLagSmoother
+from adaptive.state import prefixed, under
 from adaptive.track import Step, Track
 from adaptive.types import BoolArray, FloatArray, StateDict
 
@@ -86,8 +86,8 @@ class Hold:
 
     def state_dict(self) -> StateDict:
         """All of it under flat names."""
-        state: StateDict = {f"bridge.{key}": value for key, value in self.bridge.state_dict().items()}
-        state |= {f"track.{key}": value for key, value in self.track.state_dict().items()}
+        state: StateDict = prefixed("bridge.", self.bridge.state_dict())
+        state |= prefixed("track.", self.track.state_dict())
         for name in ("u_V", "y_um", "old_um"):
             state[name] = np.array(getattr(self, name), dtype=np.float64)
         names = ("level", "worst_um", "taken", "last_um", "same", "low_um", "high_um")
@@ -97,8 +97,8 @@ class Hold:
     def from_state(cls, smoother: FixedLagSmoother, base: FeatureMap, values: StateDict) -> Hold:
         """Inverse of ``state_dict``."""
         return cls(
-            Bridge.from_state(part_of(values, "bridge")),
-            Track.from_state(smoother, base, part_of(values, "track")),
+            Bridge.from_state(under("bridge.", values)),
+            Track.from_state(smoother, base, under("track.", values)),
             u_V=[float(x) for x in values["u_V"]],
             y_um=[float(x) for x in values["y_um"]],
             old_um=[float(x) for x in values["old_um"]],

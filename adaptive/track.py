@@ -9,9 +9,9 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap
-from adaptive.learner_config import part_of
 from adaptive.smoothing import FixedLagSmoother, SmootherState
 from adaptive.snapshot_loops import track_memory
+from adaptive.state import joined, under
 from adaptive.types import BoolArray, FloatArray, StateDict
 
 Motion = tuple[float, float, float]
@@ -191,7 +191,7 @@ class Track:
             "features": self.features.state_dict(),
             "served": self.served.state_dict(),
         }
-        state = {f"{part}.{key}": value for part, values in parts.items() for key, value in values.items()}
+        state = joined(parts)
         for name in ("u_V", "y_um", "good", "memory", "frozen_memory"):
             state[name] = getattr(self, name).copy()
         return state | {"motion": np.array(self.motion or (), dtype=np.float64), "switch": self.switch}
@@ -203,12 +203,12 @@ class Track:
         floats = {name: np.array(values[name], dtype=np.float64) for name in ("u_V", "y_um", "memory", "frozen_memory")}
         if floats["u_V"].shape != (slots,):
             raise InputError(f"u_V: got {floats['u_V'].shape[0]} slots, expected {slots}; the smoother's lag differs")
-        features, served = (FeatureMap.from_state(part_of(values, name)) for name in ("features", "served"))
+        features, served = (FeatureMap.from_state(under(f"{name}.", values)) for name in ("features", "served"))
         motion = [float(x) for x in values["motion"]]
         return cls(
             smoother=smoother,
             base=base,
-            state=smoother.from_state(part_of(values, "smoother")),
+            state=smoother.from_state(under("smoother.", values)),
             good=np.array(values["good"], dtype=np.bool_),
             features=served if features == served else features,
             served=served,

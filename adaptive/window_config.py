@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from adaptive import kernels, lssvm
 from adaptive import window_state as ws
@@ -14,6 +14,31 @@ from adaptive.errors import InputError
 
 Form = Literal["inverse", "cholesky", "auto"]
 Backend = Literal["compiled", "plain"]
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """How the window is solved: ``form``, ``backend``, ``accuracy`` as of `WindowConfig`.
+
+    Raises InputError where they are not known, not positive, or do not go together (plain has no Cholesky form).
+    """
+
+    form: Form = "auto"
+    backend: Backend = "compiled"
+    accuracy: float = 1e-8
+
+    def __post_init__(self) -> None:
+        if self.form not in ("inverse", "cholesky", "auto"):
+            raise InputError(f"form: got {self.form!r}, expected 'inverse', 'cholesky' or 'auto'")
+        if self.backend not in ("compiled", "plain"):
+            raise InputError(f"backend: got {self.backend!r}, expected 'compiled' or 'plain'")
+        if self.backend == "plain" and self.form == "cholesky":
+            raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
+        if not self.accuracy > 0:
+            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-8 say")
+
+
+_SOLVER: Final = SolverConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +63,9 @@ class WindowConfig:
     widths: tuple[float, ...]
     gamma: float
     linear: tuple[int, ...] = ()
-    form: Form = "auto"
-    backend: Backend = "compiled"
-    accuracy: float = 1e-8
+    form: Form = _SOLVER.form
+    backend: Backend = _SOLVER.backend
+    accuracy: float = _SOLVER.accuracy
 
     def __post_init__(self) -> None:
         if self.capacity < 1:
@@ -55,31 +80,9 @@ class WindowConfig:
                 "precision does not tell a sample's noise from the kernel"
             )
         object.__setattr__(self, "linear", lssvm.check_linear(self.linear, len(self.widths)))
-        if self.form not in ("inverse", "cholesky", "auto"):
-            raise InputError(f"form: got {self.form!r}, expected 'inverse', 'cholesky' or 'auto'")
-        if self.backend not in ("compiled", "plain"):
-            raise InputError(f"backend: got {self.backend!r}, expected 'compiled' or 'plain'")
-        if self.backend == "plain" and self.form == "cholesky":
-            raise InputError("form: the plain backend has the inverse form only; take backend='compiled'")
-        if not self.accuracy > 0:
-            raise InputError(f"accuracy: got {self.accuracy!r}, expected a positive number, 1e-8 say")
+        SolverConfig(self.form, self.backend, self.accuracy)  # which says what it does not take
 
     @property
     def dimension(self) -> int:
         """Number of features d."""
         return len(self.widths)
-
-
-@dataclass(frozen=True, slots=True)
-class SolverConfig:
-    """How the window is solved: ``form``, ``backend``, ``accuracy`` as of `WindowConfig`.
-
-    Raises InputError where they are not known, not positive, or do not go together (plain has no Cholesky form).
-    """
-
-    form: Form = "auto"
-    backend: Backend = "compiled"
-    accuracy: float = 1e-8
-
-    def __post_init__(self) -> None:
-        WindowConfig(1, (1.0,), 1.0, (), self.form, self.backend, self.accuracy)

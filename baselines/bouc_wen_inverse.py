@@ -18,7 +18,7 @@ from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from baselines.bouc_wen import BoucWenParameters
 from baselines.bouc_wen_step import crossing, hysteresis_step
 from baselines.points import memory_copy, model_fields, model_state, points, same_length
-from baselines.records import Domain, positive
+from baselines.records import Domain, deviation, positive
 
 _FLAT = 1e-7
 _NEWTON_LIMIT = 60
@@ -122,6 +122,7 @@ class BoucWenInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
+        deviation("voltage_std_V", self.voltage_std_V, "V")
         p, domain = self.parameters, self.domain
         ahead = 0.5 * self.dt_s if p.hold == "zero_order" else 0.0
         constants = [

@@ -20,6 +20,7 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.finite import all_finite
 from adaptive.snapshot import LssvmInverse
+from adaptive.state import prefixed, under
 from adaptive.types import BoolArray, Feedforward, FloatArray, InverseModel, StateDict
 from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.linear import LinearInverse
@@ -261,7 +262,7 @@ class ChampionInverse:
             "blend_s": self.blend_s,
         }
         for name, model in zip(self.names, self.models, strict=True):
-            state |= {f"{name}.{key}": value for key, value in model.state_dict().items()}
+            state |= prefixed(f"{name}.", model.state_dict())
         return state
 
     @classmethod
@@ -271,9 +272,7 @@ class ChampionInverse:
             names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
             models = []
             for name, kind in zip(names, kinds, strict=True):
-                prefix = f"{name}."
-                part = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
-                models.append(KINDS[kind].from_state(part))
+                models.append(KINDS[kind].from_state(under(f"{name}.", state)))
             return cls(tuple(names), tuple(models), int(state["champion"]), float(state["blend_s"]), str(state["name"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(

@@ -15,14 +15,14 @@ from typing import Any
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.learner import Hyperparameters, Learner
-from adaptive.learner_config import part_of
+from adaptive.state import under
 from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
 from baselines import competition_report
 from baselines.champion import ChampionInverse
 from baselines.competition_state import contestants_of, restore, to_state
 from baselines.contest import NOT_SCORED, Motion
 from baselines.contest_config import CompetitionConfig
-from baselines.contestants import Revive
+from baselines.contestants import Revive, stating
 from baselines.judging import Judging
 from baselines.succession import Succession
 
@@ -174,7 +174,7 @@ class Competition:
         self._judging.remember(self._seq, self._newest)
         if not self._frozen:
             self._choose(bad, float(rows[4].sum()) * self._dt_s)
-        self._serving = ChampionInverse(self.names, self._newest, self._succession.champion, self.config.blend_s)
+        self._serving = self._served()
         self._changed = False
 
     def _choose(self, bad: list[bool], scored_s: float) -> None:
@@ -220,9 +220,15 @@ class Competition:
         self._changed = False
         newest = tuple(self._snapshot(i) for i in range(len(self._models)))
         if any(new is not old for new, old in zip(newest, self._newest, strict=True)):
-            self._serving = ChampionInverse(self.names, newest, self._serving.champion, self.config.blend_s)
             self._newest = newest
+            self._serving = self._served()
         return self._serving
+
+    def _served(self) -> ChampionInverse:
+        """The newest snapshots as they are served; the champion states what it has been wrong by."""
+        champion, models = self._succession.champion, list(self._newest)
+        models[champion] = stating(models[champion], self._judging.rms_V(champion))
+        return ChampionInverse(self.names, tuple(models), champion, self.config.blend_s)
 
     def take_events(self) -> list[tuple[str, str]]:
         """(event, detail for people) since the last call, oldest first."""
@@ -255,7 +261,7 @@ class Competition:
         Raises ModelFileError where entries are missing or do not fit together.
         """
         try:
-            config = CompetitionConfig(**part_of(state, "config"))
+            config = CompetitionConfig(**under("config.", state))
             made = cls(contestants_of(state), float(state["range_um"]), float(state["span_V"]), config, revive)
             restore(made, state)
         except (KeyError, TypeError, ValueError) as error:

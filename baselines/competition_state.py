@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adaptive.errors import InputError
-from adaptive.learner_config import part_of
+from adaptive.state import prefixed, under
 from adaptive.types import OnlineModel, StateDict
 from baselines.champion import ChampionInverse
 from baselines.contestants import KINDS, fingerprint
@@ -34,21 +34,21 @@ def to_state(c: Competition) -> StateDict:
         "out": np.array(c._out, dtype=np.bool_),
         "past_seq": np.array([seq for seq, _ in c._judging.past], dtype=np.int64),
     }
-    state |= {f"config.{key}": value for key, value in c.config.state_dict().items()}
-    state |= {f"motion.{key}": value for key, value in c._motion.state_dict().items()}
+    state |= prefixed("config.", c.config.state_dict())
+    state |= prefixed("motion.", c._motion.state_dict())
     # Without names and champion of their own: only the models are wanted.
     snapshots = {"start": c._judging.start, "newest": c._newest} | {
         f"past{k}": kept for k, (_, kept) in enumerate(c._judging.past)
     }
     for where, models in snapshots.items():
-        state |= {f"{where}.{key}": value for key, value in ChampionInverse(c.names, models, 0).state_dict().items()}
+        state |= prefixed(f"{where}.", ChampionInverse(c.names, models, 0).state_dict())
     state["champion"] = c._succession.champion
     for name, model, score in zip(c.names, c._models, c._judging.scores, strict=True):
         # What it began from, so that the state of another identification can be told.
         state[f"base.{name}"] = fingerprint(getattr(model, "base", None))
         state |= {f"score.{name}.memory": score.memory.copy(), f"score.{name}.square_V2": score.square_V2}
         state[f"score.{name}.weight"] = score.weight
-        state |= {f"model.{name}.{key}": value for key, value in model.state_dict().items()}
+        state |= prefixed(f"model.{name}.", model.state_dict())
     return state
 
 
@@ -56,25 +56,25 @@ def contestants_of(state: StateDict) -> dict[str, OnlineModel]:
     """The contestants of a state, by name. Raises KeyError, ValueError or TypeError where it is none."""
     names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
     return {
-        name: KINDS[kind].from_state(part_of(state, f"model.{name}")) for name, kind in zip(names, kinds, strict=True)
+        name: KINDS[kind].from_state(under(f"model.{name}.", state)) for name, kind in zip(names, kinds, strict=True)
     }
 
 
 def restore(c: Competition, state: StateDict) -> None:
     """Let ``c``, made of the state's contestants, go on from it. Raises KeyError, ValueError or TypeError."""
-    c._motion.restore(part_of(state, "motion"))
-    c._judging.start = ChampionInverse.from_state(part_of(state, "start")).models
-    c._newest = ChampionInverse.from_state(part_of(state, "newest")).models
-    c._serving = ChampionInverse(c.names, c._newest, int(state["champion"]), c.config.blend_s)
-    c._succession.champion, c._succession.changes = c._serving.champion, int(state["changes"])
+    c._motion.restore(under("motion.", state))
+    c._judging.start = ChampionInverse.from_state(under("start.", state)).models
+    c._newest = ChampionInverse.from_state(under("newest.", state)).models
+    c._succession.champion, c._succession.changes = int(state["champion"]), int(state["changes"])
     c._succession.ahead_s = float(state["ahead_s"])
     c._judging.past.clear()
     for k, seq in enumerate(np.asarray(state["past_seq"]).tolist()):
-        c._judging.remember(int(seq), ChampionInverse.from_state(part_of(state, f"past{k}")).models)
+        c._judging.remember(int(seq), ChampionInverse.from_state(under(f"past{k}.", state)).models)
     for name, score in zip(c.names, c._judging.scores, strict=True):
-        kept = part_of(state, f"score.{name}")
+        kept = under(f"score.{name}.", state)
         score.memory = np.array(kept["memory"], dtype=np.float64)
         score.square_V2, score.weight = float(kept["square_V2"]), float(kept["weight"])
+    c._serving = c._served()
     c._out = [bool(out) for out in np.asarray(state["out"]).tolist()]
     c._frozen, c._failed_seq = bool(state["frozen"]), int(state["failed_seq"])
     c._seq = int(state["seq"])

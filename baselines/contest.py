@@ -15,6 +15,7 @@ import numpy as np
 
 from adaptive import admission
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, InverseModel, Sample, StateDict
 from baselines.contest_config import CompetitionConfig
 
@@ -107,7 +108,7 @@ class Motion:
             "anchor_um": self._anchor_um,
         }
         if self._state is not None:
-            state |= {f"smoother.{key}": value for key, value in self._smoother.state_dict(self._state).items()}
+            state |= prefixed("smoother.", self._smoother.state_dict(self._state))
         return state
 
     def restore(self, state: StateDict) -> None:
@@ -116,7 +117,7 @@ class Motion:
         self._rows = [tuple(float(x) for x in row) for row in np.asarray(state["rows"]).reshape(-1, 5)]  # type: ignore[misc]
         self._glitches, self._since_start = int(state["glitches"]), int(state["since_start"])
         self._since_left, self._anchor_um = int(state["since_left"]), float(state["anchor_um"])
-        smoother = {key[len("smoother.") :]: value for key, value in state.items() if key.startswith("smoother.")}
+        smoother = under("smoother.", state)
         self._state = self._smoother.from_state(smoother) if smoother else None
 
 

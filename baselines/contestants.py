@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -38,6 +40,17 @@ def challenger(model: InverseModel) -> OnlineModel | None:
     if isinstance(model, BoucWenInverse):
         return BoucWenOnline(model)
     return None
+
+
+def stating(model: InverseModel, rms_V: float) -> InverseModel:
+    """``model`` with a deviation of at least ``rms_V``, V, what its answers were judged to be wrong by.
+
+    A baseline knows the residuals of its own fit, which say little of an answer as old as callers' are. An LSSVM
+    is calibrated on its own predictions, and stays as it is.
+    """
+    if not isinstance(model, LinearInverse | MpiInverse | BoucWenInverse) or not math.isfinite(rms_V):
+        return model
+    return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
 
 
 def fingerprint(model: InverseModel | None) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, StateDict
 from baselines.points import memory_copy, model_fields, model_state, points
-from baselines.records import Domain, positive
+from baselines.records import Domain, deviation, positive
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class LinearInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
+        deviation("voltage_std_V", self.voltage_std_V, "V")
 
     @property
     def memory_size(self) -> int:

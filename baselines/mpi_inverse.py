@@ -19,7 +19,7 @@ from baselines.prandtl_ishlinskii import (
     states_from_inverse,
     states_to_inverse,
 )
-from baselines.records import Domain, positive
+from baselines.records import Domain, deviation, positive
 
 
 @compiled
@@ -85,6 +85,7 @@ class MpiInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
+        deviation("voltage_std_V", self.voltage_std_V, "V")
         p, domain = self.parameters, self.domain
         w_h, w_s = p.w_h_, p.w_s_
         plays = np.stack([w_h, np.cumsum(w_h), inverse_thresholds(w_h, p.r_), inverse_weights(w_h)])

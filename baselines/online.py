@@ -22,6 +22,7 @@ from adaptive.admission import (
     UNEXCITED,
 )
 from adaptive.errors import InputError
+from adaptive.state import prefixed
 from adaptive.types import Sample, StateDict
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
@@ -95,7 +96,7 @@ class OnlineBaseline:
         raise NotImplementedError
 
     def _common_state(self) -> StateDict:
-        counted = {f"count_{name}": value for name, value in self._counters.items()}
+        counted = prefixed("count_", self._counters)
         return {
             "seq": self._seq,
             "t_s": self._t_s,
@@ -116,13 +117,3 @@ def field_of(state: StateDict, name: str, kind: str) -> Any:
     if name not in state:
         raise InputError(f"{name}: missing in the state of a {kind} model; start from a model file instead")
     return state[name]
-
-
-def prefixed(prefix: str, state: StateDict) -> StateDict:
-    """The same state under prefixed names."""
-    return {f"{prefix}{name}": value for name, value in state.items()}
-
-
-def without_prefix(prefix: str, state: StateDict) -> StateDict:
-    """The part of a state under a prefix, by its own names."""
-    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}

@@ -19,10 +19,11 @@ from adaptive.admission import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEX
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.finite import all_finite
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.bouc_wen_step import hysteresis_step, settled, stage_output, stage_step
-from baselines.online import OnlineBaseline, field_of, prefixed, without_prefix
+from baselines.online import OnlineBaseline, field_of
 
 _NUDGE = 1e-3
 #: Bounds of the relative parameters.
@@ -209,10 +210,10 @@ class BoucWenOnline(OnlineBaseline):
     @classmethod
     def from_state(cls, state: StateDict) -> BoucWenOnline:
         """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
-        values = without_prefix("config_", state)
+        values = under("config_", state)
         for name in ("first_std", "walk_std"):
             values[name] = tuple(float(value) for value in field_of(values, name, "bouc_wen"))
-        made = cls(BoucWenInverse.from_state(without_prefix("base_", state)), TrackingConfig(**values))
+        made = cls(BoucWenInverse.from_state(under("base_", state)), TrackingConfig(**values))
         made._restore_common(state)
         made._x = np.array(field_of(state, "x", "bouc_wen"), dtype=np.float64)
         made._P = np.array(field_of(state, "P", "bouc_wen"), dtype=np.float64)

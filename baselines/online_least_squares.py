@@ -17,9 +17,10 @@ import numpy as np
 from adaptive.admission import LEARNT, NUMERICS, PASSED, SETTLING, UNEXCITED
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.bounded import bounded_minimum
-from baselines.online import OnlineBaseline, field_of, prefixed, without_prefix
+from baselines.online import OnlineBaseline, field_of
 
 #: The velocity is a difference over this many samples on each side.
 _HALF = 2
@@ -151,7 +152,7 @@ class LeastSquaresOnline(OnlineBaseline):
 
 def config_from(state: StateDict) -> LeastSquaresConfig:
     """The configuration in a stored state; raises InputError where a field is missing."""
-    values = without_prefix("config_", state)
+    values = under("config_", state)
     whole = {name: int(field_of(values, name, "online")) for name in ("learn_every", "solve_every", "settle")}
     real = {name: float(field_of(values, name, "online")) for name in ("remember", "trust", "excitation")}
     return LeastSquaresConfig(

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.identify_mpi import SLOPE_FLOOR
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.online import field_of, prefixed, without_prefix
+from baselines.online import field_of
 from baselines.online_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
 
 
@@ -63,7 +64,7 @@ class LinearOnline(LeastSquaresOnline):
     @classmethod
     def from_state(cls, state: StateDict) -> LinearOnline:
         """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
-        made = cls(LinearInverse.from_state(without_prefix("base_", state)), config_from(state))
+        made = cls(LinearInverse.from_state(under("base_", state)), config_from(state))
         made._restore_learning(state)
         made._gain = float(field_of(state, "gain_now", "linear"))
         made._offset = float(field_of(state, "offset_now", "linear"))

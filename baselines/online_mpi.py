@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from adaptive.errors import InputError
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.dead_zone import dead_zone_sum, ramps
 from baselines.gain_filter import GainFilter
 from baselines.identify_mpi import MpiGrid
 from baselines.mpi_inverse import MpiInverse
-from baselines.online import field_of, prefixed, without_prefix
+from baselines.online import field_of
 from baselines.online_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
 from baselines.play import play_run, play_start, play_step
 from baselines.prandtl_ishlinskii import inverse_thresholds, inverse_weights
@@ -130,10 +131,10 @@ class MpiOnline(LeastSquaresOnline):
     @classmethod
     def from_state(cls, state: StateDict) -> MpiOnline:
         """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
-        made = cls(MpiInverse.from_state(without_prefix("base_", state)), config_from(state))
+        made = cls(MpiInverse.from_state(under("base_", state)), config_from(state))
         made._restore_learning(state)
         made._unknowns = np.array(field_of(state, "unknowns", "mpi"), dtype=np.float64)
         made._states = np.array(field_of(state, "states_V", "mpi"), dtype=np.float64)
-        made._shape = made._shape.from_state(without_prefix("now_", state))
-        made._frame.restore(without_prefix("frame_", state))
+        made._shape = made._shape.from_state(under("now_", state))
+        made._frame.restore(under("frame_", state))
         return made

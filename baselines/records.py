@@ -19,6 +19,14 @@ def positive(field: str, value: float, unit: str) -> float:
     return number
 
 
+def deviation(field: str, value: float, unit: str) -> float:
+    """``value`` as a float; raises InputError unless it is a finite number of at least 0, or NaN for none."""
+    number = float(value)
+    if not (np.isnan(number) or 0.0 <= number < np.inf):
+        raise InputError(f"{field}: got {value!r}, expected a finite number of at least 0 {unit}, or NaN for none")
+    return number
+
+
 def series(field: str, values: ArrayLike, minimum: int = 1) -> FloatArray:
     """``values`` as a contiguous (n,) array of finite doubles; raises InputError naming ``field`` otherwise."""
     array = np.ascontiguousarray(values, dtype=np.float64)

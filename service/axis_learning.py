@@ -94,9 +94,14 @@ class AxisLearning(AxisOperations):
         return tracked | {name: own, AUTO: champion.with_memory(tracked[AUTO], name, own)}
 
     def _mark(self) -> None:
-        """Keep what the learner is now and then, to go back to: the older of two is from before any trouble."""
+        """Keep what the learner is now and then, to go back to: the older of two is from before any trouble.
+
+        At counts of samples and not by the time since the last: who has just taken over a state has the same marks as
+        the one that it is from before long, and goes back to the same.
+        """
         assert self.learner is not None
-        if not self._learner_dead and self.sequence.received - self._marked >= MARK_S / self.dt_s:
+        every = max(1, round(MARK_S / self.dt_s))
+        if not self._learner_dead and self.sequence.received // every != self._marked // every:
             self._marks, self._marked = (self._marks[-1], self.learner.state_dict()), self.sequence.received
 
     def _go_back(self) -> None:

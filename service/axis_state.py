@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
+from adaptive.state import prefixed, under
 from adaptive.types import FloatArray, InverseModel, OnlineModel, StateDict
 from service.answering import Served
 from service.clock import SampleClock
@@ -34,11 +35,6 @@ STATE_SCHEMA: Final = 3
 _FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")
 
 
-def under(prefix: str, state: StateDict) -> StateDict:
-    """The entries whose names begin with ``prefix``, without it."""
-    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
-
-
 def axis_state(axis: Axis) -> StateDict:
     """All that the samples have changed; copies. For the thread that handles samples."""
     served = axis.newest
@@ -54,20 +50,20 @@ def axis_state(axis: Axis) -> StateDict:
         "dead": axis._learner_dead,
         "adoptions": json.dumps([retuned.to_json() for retuned in axis.adoptions.pending]),
     }
-    state |= {f"sequence.{name}": value for name, value in axis.sequence.state_dict().items()}
-    state |= {f"clock.{name}": value for name, value in axis.clock.state_dict().items()}
-    state |= {f"tracker.{name}": value for name, value in axis.tracker.state_dict().items()}
-    state |= {f"gates.{name}": count for name, count in axis.gates.items()}
-    state |= {f"memory.{name}": memory for name, memory in served.memories.items()}
-    state |= {f"watch.{name}": value for name, value in axis.watch.state_dict().items()}
+    state |= prefixed("sequence.", axis.sequence.state_dict())
+    state |= prefixed("clock.", axis.clock.state_dict())
+    state |= prefixed("tracker.", axis.tracker.state_dict())
+    state |= prefixed("gates.", axis.gates)
+    state |= prefixed("memory.", served.memories)
+    state |= prefixed("watch.", axis.watch.state_dict())
     for role, model in axis.watch.models().items():
         state |= {f"model.{role}.kind": kind_of(model)}
-        state |= {f"model.{role}.{name}": value for name, value in model.state_dict().items()}
+        state |= prefixed(f"model.{role}.", model.state_dict())
     if served.trouble in POISON:
         # What the learner goes back to when the samples are good again.
-        state |= {f"mark.{name}": value for name, value in axis._marks[0].items()}
+        state |= prefixed("mark.", axis._marks[0])
     if axis.learner is not None:
-        state |= {f"learner.{name}": value for name, value in axis.learner.state_dict().items()}
+        state |= prefixed("learner.", axis.learner.state_dict())
     return state
 
 

@@ -19,8 +19,9 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.errors import ModelFileError
+from adaptive.state import under
 from adaptive.types import OnlineModel, StateDict
-from service.axis_state import STATE_SCHEMA, restored_learner, under
+from service.axis_state import STATE_SCHEMA, restored_learner
 from service.errors import FieldError
 from service.modelfile import UNITS, split_state
 

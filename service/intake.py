@@ -150,6 +150,9 @@ class Intake:
             raise ServiceError(
                 f"axis {self.axis.config.name}: the learner did not get to it within {timeout_s:g} s"
             ) from None
+        finally:
+            # What it raised knows this frame, and this frame would know it.
+            del done
 
     def close(self) -> None:
         """Handle what is queued, then end the thread."""
@@ -241,3 +244,5 @@ def _do(job: Callable[[], Any], done: Future[Any]) -> None:
         done.set_result(job())
     except Exception as error:
         done.set_exception(error)
+        # As above: a state of megabytes that was refused would stay until circles are looked for.
+        del job, done

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import sys
+from functools import cache
 from typing import Any, ClassVar, Final
 
 import psutil
@@ -27,8 +28,7 @@ def keep_little() -> bool:
     if not sys.platform.startswith("linux"):
         return False
     with contextlib.suppress(OSError, AttributeError):
-        library = ctypes.CDLL(None)
-        return all([library.mallopt(option, value) == 1 for option, value in _OPTIONS.items()])
+        return all([_library().mallopt(option, value) == 1 for option, value in _OPTIONS.items()])
     return False
 
 
@@ -37,7 +37,7 @@ def give_back() -> bool:
     if not sys.platform.startswith("linux"):
         return False
     with contextlib.suppress(OSError, AttributeError):
-        return bool(ctypes.CDLL(None).malloc_trim(0) >= 0)
+        return bool(_library().malloc_trim(0) >= 0)
     return False
 
 
@@ -69,8 +69,15 @@ def _malloc_bytes() -> int | None:
     if not sys.platform.startswith("linux"):
         return None
     with contextlib.suppress(OSError, AttributeError):
-        ask = ctypes.CDLL(None).mallinfo2
-        ask.restype = _Mallinfo2
-        told = ask()
+        told = _library().mallinfo2()
         return int(told.uordblks + told.hblkhd)
     return None
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    """The C library, opened once: each time anew leaves classes behind, in circles that are found late."""
+    library = ctypes.CDLL(None)
+    with contextlib.suppress(AttributeError):  # the C library is older than this function, or another one
+        library.mallinfo2.restype = _Mallinfo2
+    return library

@@ -24,6 +24,7 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from baselines.champion import ChampionInverse
 from baselines.competition_making import of_models
 from baselines.fit import fit_linear, fit_mpi
+from baselines.online_mpi import MpiOnline
 from sim.presets import preset
 from sim.signals import generalisation_input, multitone, training_input
 from sim.stage import Change, Stage
@@ -38,6 +39,7 @@ ONE, INTERVAL_95 = 1.0, 1.96
 Limits = tuple[tuple[float, float], tuple[float, float]]
 TEST_SIGNAL: Limits = ((0.57, 0.66), (0.92, 0.975))
 OTHER_BAND: Limits = ((0.69, 0.88), (0.94, 0.99))
+SERVED_BASELINE: Limits = ((0.62, 0.81), (0.9, 1.0))
 LEARNING: Limits = ((0.72, 0.86), (0.93, 0.985))
 #: Of the measured stack; its held-out end is so like what was learnt that the interval is nearly twice too wide there.
 HELD_OUT_END: Limits = ((0.85, 0.97), (0.97, 1.0))
@@ -165,6 +167,20 @@ def test_what_is_served_by_default_while_learning_a_stage_that_changes(seed: int
     assert (type(champion), champion.name) == (ChampionInverse, "auto")
     for part in (slice(2000, 6000), slice(8000, None)):
         assert_calibrated(error_V[part], std_V[part], LEARNING)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_baseline_that_is_served_states_what_it_is_wrong_by(seed: int) -> None:
+    """MPI as champion: not the residuals of its own fit but the errors of its answers, the gain step's too."""
+    training_V = training_input(DT_S, 10.0)[1]
+    mpi = fit_mpi(training_V, rich(seed, training_V), DT_S)[0]
+    model = model_of(seed)
+    competition = of_models("mpi", MpiOnline(mpi), model, {})
+    u_V = excitation(seed, 12.0)
+    error_V, std_V = foretold(competition, u_V, rich(seed, u_V, GAIN_STEP))
+    assert competition.champion == "mpi"
+    for part in (slice(2000, 6000), slice(8000, None)):
+        assert_calibrated(error_V[part], std_V[part], SERVED_BASELINE)
 
 
 @pytest.mark.parametrize("learning", [False, True])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable
 from typing import Any
@@ -26,6 +27,7 @@ from baselines.prandtl_ishlinskii import MpiParameters
 from baselines.records import Domain
 
 DT, N = 1e-3, 1500
+PACKAGES = ("adaptive", "baselines")
 Recording = tuple[np.ndarray, np.ndarray]
 Maker = Callable[[Recording, LssvmInverse], Any]
 
@@ -196,3 +198,22 @@ def test_memory_is_bounded(template: Any, recording: Recording) -> None:
     before = size()
     feed(online, recording, 1000, 4000)
     assert size() <= before * 1.01 + 256
+
+
+def test_what_is_let_go_is_freed_at_once(template: Any, recording: Recording) -> None:
+    """No circles of references: a service that goes back to a kept state lets a model of megabytes go each time."""
+    gc.collect()
+    gc.disable()
+    try:
+        online = clone(template)
+        feed(online, recording, 0, 700)
+        online.snapshot()
+        del online
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        found = {type(left).__qualname__ for left in gc.garbage if type(left).__module__.startswith(PACKAGES)}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert found == set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import FrozenInstanceError, replace
 
@@ -131,6 +132,19 @@ def test_bad_shapes_are_named(model: LssvmInverse) -> None:
         model.feedforward(y, v, a, np.zeros(3))
     with pytest.raises(InputError, match="alpha"):
         replace(model, alpha=np.full(model.alpha.shape, np.nan))
+
+
+@pytest.mark.parametrize("field", ["noise_variance", "kernel_variance", "gamma", "span_V"])
+@pytest.mark.parametrize("value", [-1e-9, math.nan, math.inf, 0.0])
+def test_a_model_that_could_not_state_a_deviation_is_refused(model: LssvmInverse, field: str, value: float) -> None:
+    if value == 0.0 and field.endswith("variance"):
+        told = replace(model, **{field: value}).feedforward(*points(), model.rest_memory(40.0))  # type: ignore[arg-type]
+        assert np.isfinite(told.std_V).all()
+        return
+    with pytest.raises(InputError, match=f"{field}: got"):
+        replace(model, **{field: value})  # type: ignore[arg-type]
+    with pytest.raises(ModelFileError, match=f"{field}: got"):
+        LssvmInverse.from_state(model.state_dict() | {field: value})
 
 
 def test_one_point_takes_some_ten_microseconds(model: LssvmInverse) -> None:

@@ -140,6 +140,23 @@ def test_errors_are_those_of_the_answers_for_the_motion() -> None:
     assert standing["two"]["rms_V"] < 2e-3
 
 
+def test_a_baseline_states_what_its_answers_were_wrong_by() -> None:
+    """Not less than its own fit says, and only as champion; a state goes on with it."""
+    model, one, _ = contest(1.1 * GAIN, 1.3 * GAIN)
+    assert [m.voltage_std_V for m in model.snapshot().models] == [0.1, 0.1]
+    feed(model, 4000, 0)
+    rms_V = model.standing()["contestants"]["one"]["rms_V"]
+    assert [m.voltage_std_V for m in model.snapshot().models] == [rms_V, 0.1]
+    assert rms_V > 0.2
+    at = np.array([40.0])
+    still = np.zeros(1)
+    served = model.snapshot()
+    assert served.feedforward(at, still, still, served.rest_memory(40.0)).std_V == rms_V
+    one.gain = GAIN
+    feed(model, 20_000, 4000)
+    assert [m.voltage_std_V for m in model.snapshot().models] == [0.1, 0.1]
+
+
 def test_rest_does_not_count() -> None:
     model, one, _ = contest(GAIN, 1.02 * GAIN)
     feed(model, 3000, 0)

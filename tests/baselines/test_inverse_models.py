@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,15 @@ def test_storage_round_trip(model: LinearInverse | MpiInverse | BoucWenInverse) 
         if name != "name":
             with pytest.raises(InputError, match=name):
                 type(model).from_state({key: value for key, value in state.items() if key != name})
+
+
+@every
+@pytest.mark.parametrize("std_V", [-0.01, np.inf])
+def test_a_deviation_that_is_none_is_refused(model: LinearInverse | MpiInverse | BoucWenInverse, std_V: float) -> None:
+    with pytest.raises(InputError, match=f"voltage_std_V: got {std_V}, expected"):
+        type(model).from_state(model.state_dict() | {"voltage_std_V": std_V})
+    none = replace(model, voltage_std_V=np.nan)
+    assert np.isnan(none.feedforward(Y, V, A, none.rest_memory(10.0)).std_V).all()
 
 
 @every

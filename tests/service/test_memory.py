@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import platform
 import subprocess
 import sys
 
 import pytest
+
+from service.memory import in_use
 
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
 
@@ -53,6 +56,20 @@ del large, small, objects
 after = in_use()
 print(*(now[name] - before[name] for now in (while_held, after) for name in ("malloc_bytes", "python_blocks")))
 """
+
+
+def test_asking_what_is_in_use_leaves_nothing_behind() -> None:
+    """A service asks once a second for months."""
+    in_use()
+    gc.collect()
+    before = sys.getallocatedblocks()
+    gc.disable()
+    try:
+        for _ in range(100):
+            in_use()
+        assert sys.getallocatedblocks() - before < 100
+    finally:
+        gc.enable()
 
 
 @glibc
