@@ -139,6 +139,11 @@ class AxisServer:
             for publisher in publishers.values():
                 publisher.undeclare()
 
+    def leave_tuning(self) -> None:
+        """Another one serves: what was being tuned is no longer. From the thread that handles samples."""
+        if self._retuner is not None:
+            self._retuner.leave()
+
     def declare(self) -> None:
         """Take samples and serve."""
         self.listen()

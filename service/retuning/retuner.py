@@ -114,6 +114,13 @@ class Retuner:
             else:
                 self._take_trial(axis, learner, result, now_s)
 
+    def leave(self) -> None:
+        """The axis stands by: let go of its learner. What was under way is dropped once it serves again.
+
+        From the thread that handles samples, as ``step``.
+        """
+        self._learner = self._before = None
+
     def close(self) -> None:
         """End what runs."""
         if self._job is not None:

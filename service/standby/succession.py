@@ -174,6 +174,7 @@ class Succession:
 
     def _hold(self) -> None:
         self.shadow.hold()
+        self.server.leave_tuning()
         self.server.intake.gate = self.shadow.gate
 
     def _take_state(self) -> None:
