@@ -223,3 +223,19 @@ def test_a_standby_that_begins_in_the_middle_of_it_decides_alike() -> None:
             assert (a.seq, a.trouble, a.trust) == (b.seq, b.trouble, b.trust)
             assert fingerprint(a.models[NAME]) == fingerprint(b.models[NAME])
     assert one.axis.newest.trouble == ""
+
+
+@pytest.mark.parametrize("at", [2000, 2340, 2999])
+def test_a_standby_goes_back_to_the_same_state(at: int) -> None:
+    """Whenever it took the state over: else it would differ after each lie, and take the state over once more."""
+    one, other = Bench(make_axis()), Bench(make_axis())
+    one.run(at)
+    restore_axis(other.axis, axis_state(one.axis))
+    other.k = one.k
+    for bench in (one, other):
+        bench.run(3511)
+        bench.run(700, frozen)
+        bench.run(1500)
+        assert "learner_went_back" in bench.events
+    assert one.axis.newest.seq == other.axis.newest.seq
+    assert fingerprint(one.axis.newest.models[NAME]) == fingerprint(other.axis.newest.models[NAME])
