@@ -75,12 +75,11 @@ class LssvmInverse:
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         # What is stated as a deviation is the root of these.
-        for name, may_be_0 in (
-            ("noise_variance", True), ("kernel_variance", True), ("gamma", False), ("span_V", False)
-        ):  # fmt: skip
+        positive = ("gamma", "span_V")
+        for name in (*positive, "noise_variance", "kernel_variance"):
             number = float(getattr(self, name))
-            if not (math.isfinite(number) and (number > 0.0 or (may_be_0 and number == 0.0))):
-                expected = "of at least" if may_be_0 else "above"
+            if not math.isfinite(number) or number < 0.0 or (number == 0.0 and name in positive):
+                expected = "above" if name in positive else "of at least"
                 raise InputError(f"{name}: got {number}, expected a finite number {expected} 0")
         covariance = np.array(self.beta_covariance, dtype=np.float64)
         if covariance.shape not in ((0, 0), (p, p)):

@@ -48,7 +48,8 @@ def stating(model: InverseModel, rms_V: float) -> InverseModel:
     A baseline knows the residuals of its own fit, which say little of an answer as old as callers' are. An LSSVM
     is calibrated on its own predictions, and stays as it is.
     """
-    if not isinstance(model, LinearInverse | MpiInverse | BoucWenInverse) or not math.isfinite(rms_V):
+    # Before any answer was judged nothing is known, which is not that nothing is wrong.
+    if not isinstance(model, LinearInverse | MpiInverse | BoucWenInverse) or not 0.0 < rms_V < math.inf:
         return model
     return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
 

@@ -19,8 +19,8 @@ T = TypeVar("T")
 MEMORY_WARM_S: Final = (180.0, 900.0)
 MEMORY_LEAST_S: Final = 300.0
 #: A process under faults has a few levels of memory in use: as the one that serves, as the one that stands by, with a
-#: state just handed over. Seen over half an hour of two processes that did not grow: 166.0 to 166.9 MB, and for minutes
-#: 171.5. A line from one of them to another is no growth.
+#: state just handed over. Seen over half an hour of two processes that did not grow: 166.0 to 166.9 MB, and with
+#: the learner of an unfinished re-tuning, which is let go now, 171.5. A line from one of them to another is no growth.
 LEVELS_KB: Final = 8_000.0
 _MINUTE_S: Final = 60.0
 #: Of a small object of Python's on average: its allocator's pools over their blocks, as measured in a service.

@@ -17,6 +17,7 @@ from baselines.bouc_wen import BoucWenParameters
 from baselines.bouc_wen_inverse import BoucWenInverse
 from baselines.champion import ChampionInverse
 from baselines.competition import Competition, CompetitionConfig
+from baselines.contestants import stating
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.mpi_inverse import MpiInverse
 from baselines.online_mpi import MpiOnline
@@ -155,6 +156,12 @@ def test_a_baseline_states_what_its_answers_were_wrong_by() -> None:
     one.gain = GAIN
     feed(model, 20_000, 4000)
     assert [m.voltage_std_V for m in model.snapshot().models] == [0.1, 0.1]
+
+
+def test_before_any_answer_was_judged_nothing_is_stated() -> None:
+    assert stating(line(), 0.0).voltage_std_V == 0.1
+    assert math.isnan(stating(replace(line(), voltage_std_V=math.nan), 0.0).voltage_std_V)
+    assert stating(replace(line(), voltage_std_V=math.nan), 0.2).voltage_std_V == 0.2
 
 
 def test_rest_does_not_count() -> None:
