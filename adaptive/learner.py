@@ -19,7 +19,6 @@ from adaptive.adoption import adopt
 from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig
 from adaptive.learner_parts import Parts, restored, state_of
-from adaptive.residual import ResidualWindow
 from adaptive.snapshot import LssvmInverse
 from adaptive.track import Pair
 from adaptive.types import FloatArray, Sample, StateDict
@@ -206,15 +205,23 @@ class Learner:
         """The feature map that is served."""
         return self.parts.front.served
 
-    def warm_window(self) -> None:
-        """Load (or compile) the window's steps on a copy: neither the first sample that teaches nor the first other
-        hyper-parameters must wait for them."""
-        capacity = self.config.window
-        window = ResidualWindow.from_model(self.base, capacity, self.config.eviction, self.config.solver)
+    def warm(self) -> None:
+        """Load (or compile) every step on a copy: no sample that teaches, no change of the stage and no other
+        hyper-parameters must wait for one, which takes seconds where it was never compiled before."""
+        parts, capacity = Parts(self.base, self.config), self.config.window
+        basis, kernel = self._frozen_basis.copy(), self._frozen_kernel.copy()
+        self.base.features.fill(0.0, 0.0, 0.0, self.base.rest_memory(0.0), basis, kernel)
+        self.base.mean(basis, kernel)
+        window = parts.window
         if len(window) < capacity:
-            window.learn(10.0 + np.zeros(self.base.features.kernel_size), 0.0)
+            window.learn(10.0 + np.zeros_like(kernel), 0.0)
         window.learn(window.arrays()[0][0], 0.0)
+        parts.voltage(basis, kernel)
         window.with_hyperparameters(window.hyper).newest_error_V(1)
+        for moving in (True, False):
+            parts.filter.update(basis, 0.0, moving)
+        parts.expect_change()
+        window.let_go(0.5)
 
     def freeze(self) -> None:
         """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""

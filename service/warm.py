@@ -43,7 +43,7 @@ def main() -> int:
         return 0
     forget(root)
     start = time.perf_counter()
-    print("compiling the loops, once (half a minute) ...", flush=True)
+    print("compiling the loops, once (a minute or two) ...", flush=True)
     children = [
         subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
         for group in GROUPS

@@ -139,7 +139,7 @@ model = LssvmInverse(
 learner = Learner(model, LearnerConfig(window=10))
 for k in range(200):
     learner.handle(Sample(k, k * 1e-3, 0.1 * np.sin(0.1 * k), 0.1 * np.sin(0.1 * k)))
-learner.warm_window()
+learner.warm()
 before = loaded()
 learner.adopt(Hyperparameters(20.0, (1.2,) * d))
 print(len(before), *sorted(loaded() - before))

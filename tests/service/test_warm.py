@@ -1,0 +1,36 @@
+"""Compiling: done at set-up, never while somebody waits for an answer."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+# Of all kinds of fault that reach a learner. A process of its own: in this one, other tests have compiled already.
+_SOAK = """
+import sys
+from numba.core import event
+from service.cli import main
+
+class Compiled(event.Listener):
+    def on_start(self, event):
+        print("compiled:", event.data["dispatcher"].py_func.__qualname__, file=sys.stderr)
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Compiled())
+sys.exit(main(["soak", "--fast", "--seed", "2", "--duration", "60s", "--out", sys.argv[1]]))
+"""
+
+
+def test_nothing_is_compiled_under_faults(tmp_path: Path) -> None:
+    """Ten seconds of compiling in the thread that learns are what the first jump of a new installation led to."""
+    run = subprocess.run(
+        [sys.executable, "-c", _SOAK, str(tmp_path)], capture_output=True, text=True, timeout=300, check=False
+    )
+    late = [line for line in run.stderr.splitlines() if line.startswith("compiled:")]
+    assert late == []
+    assert run.returncode == 0, run.stdout[-2000:]
+    faults = json.loads((tmp_path / "soak.json").read_text(encoding="utf-8"))["faults"]
+    assert {"freeze", "spike"} & {kind for kind, told in faults.items() if told["count"]}
