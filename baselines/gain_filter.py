@@ -1,13 +1,16 @@
-"""Gain and offset of a displacement against a model's, by filterpy's Kalman filter: the frame of a slower fit."""
+"""Gain and offset of a displacement against a model's, by a Kalman filter of two states: the frame of a slower fit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
+from adaptive.drift_step import joseph, walk
 from adaptive.types import FloatArray, StateDict
+
+#: Least and most that a gain may be: a stage whose gain has changed its sign or by more than this is another stage.
+_GAIN_MIN, _GAIN_MAX = 0.2, 5.0
 
 
 @dataclass(slots=True)
@@ -27,14 +30,6 @@ class GainFilter:
     covariance: FloatArray
     gain: float = 1.0
     offset_um: float = 0.0
-    _library: Any = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        # Here, because it takes a while to import, which who only evaluates models need not wait for.
-        from filterpy.kalman import KalmanFilter
-
-        self._library = KalmanFilter(dim_x=2, dim_z=1)
-        self._library.Q = np.diag(self.walk)
 
     @classmethod
     def start(cls, gain_walk: float, offset_walk_um: float, step_s: float) -> GainFilter:
@@ -44,17 +39,13 @@ class GainFilter:
 
     def update(self, y_um: float, model_um: float, noise_um2: float) -> None:
         """One pair; ``noise_um2`` is the variance of the model's error. What would not stay finite changes nothing."""
-        kf = self._library
-        kf.x, kf.P = np.array([[self.gain], [self.offset_um]]), self.covariance
-        with np.errstate(all="ignore"):
-            kf.predict()
-            kf.update(np.array([[y_um]]), R=noise_um2, H=np.array([[model_um, 1.0]]))
-        if np.isfinite(kf.x).all() and np.isfinite(kf.P).all():
-            # Rounding leaves a little asymmetry, which the recursion would keep.
-            self.covariance = 0.5 * (kf.P + kf.P.T)
-            gain, offset_um = kf.x[:, 0].tolist()
-            # A stage whose gain has changed its sign or by more than this is another stage.
-            self.gain, self.offset_um = min(max(gain, 0.2), 5.0), offset_um
+        x, P, h = np.array([self.gain, self.offset_um]), self.covariance.copy(), np.array([model_um, 1.0])
+        walk(x, P, self.walk, 0.0)
+        joseph(x, P, h, y_um, noise_um2, np.empty(2), np.empty(2))
+        if np.isfinite(x).all() and np.isfinite(P).all():
+            self.covariance = P
+            gain, offset_um = x.tolist()
+            self.gain, self.offset_um = min(max(gain, _GAIN_MIN), _GAIN_MAX), offset_um
 
     def undo(self, y_um: float) -> float:
         """The displacement as the model would have it."""

@@ -1,9 +1,10 @@
-"""Gain and offset by the library's filter: a random walk's own equations, nothing taken that is not finite."""
+"""Gain and offset of a frame: the Kalman filter of two random walks, and nothing taken that is not finite."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 
 from baselines.gain_filter import GainFilter
 
@@ -25,6 +26,21 @@ def test_it_is_the_kalman_filter_of_two_random_walks() -> None:
     np.testing.assert_allclose(made.covariance, P, rtol=1e-6)
     assert made.gain == pytest.approx(0.94, abs=0.01)
     assert made.undo(0.94 * 40.0 + 0.7) == pytest.approx(40.0, abs=0.3)
+
+
+def test_it_is_the_librarys_filter_step_by_step() -> None:
+    rng = np.random.default_rng(6)
+    made = GainFilter.start(0.02, 0.5, 0.01)
+    library = KalmanFilter(dim_x=2, dim_z=1)
+    library.x, library.P, library.Q = np.array([[1.0], [0.0]]), made.covariance.copy(), np.diag(made.walk)
+    for _ in range(500):
+        model = float(rng.uniform(0.0, 60.0))
+        y = 1.1 * model - 0.4 + 0.05 * float(rng.standard_normal())
+        made.update(y, model, 0.01)
+        library.predict()
+        library.update(np.array([[y]]), R=0.01, H=np.array([[model, 1.0]]))
+        np.testing.assert_allclose([made.gain, made.offset_um], library.x[:, 0], rtol=0.0, atol=1e-11)
+        np.testing.assert_allclose(made.covariance, library.P, rtol=1e-8, atol=1e-15)
 
 
 @pytest.mark.parametrize("pair", [(np.nan, 1.0), (1.0, np.inf), (np.inf, 1.0)])
