@@ -29,7 +29,7 @@ from typing import Any
 INSTRUMENTED = [
     "service.wire", "service.wire_flags", "service.wire_query", "service.wire_reply", "service.wire_model",
     "service.modelfile", "service.registry", "service.operating.request", "service.errors", "service.checkpoint",
-    "service.stage_faults",
+    "service.stage_faults", "service.handover",
 ]  # fmt: skip
 _MAX_BYTES = 4096
 _SLOW_S = 5

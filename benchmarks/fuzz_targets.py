@@ -22,6 +22,7 @@ from baselines.linear import LinearInverse, LinearParameters
 from baselines.points import Domain
 from service import checkpoint, wire, wire_model, wire_query, wire_reply
 from service.errors import error_from_json, error_to_json
+from service.handover import join
 from service.operating.request import Request, decode_request, encode_request
 from service.stage_faults import decode_fault
 
@@ -95,6 +96,14 @@ def _framed_checkpoint(data: bytes) -> None:
         checkpoint.decode_checkpoint(head + data[2:])
 
 
+def _parts(data: bytes) -> None:
+    """Parts of a state, each of up to three bytes behind its place: whole, or nothing."""
+    pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
+    whole = join((piece[:8], piece[8:]) for piece in pieces)
+    if whole is not None and whole != b"".join(piece[8:] for piece in pieces):
+        raise AssertionError("parts were taken for a whole that they do not make")
+
+
 #: Words that a mutation may put in: what the JSON of a payload is made of.
 WORDS = (
     '"name"', '"kind"', '"dt_s"', '"values"', '"arrays"', '"/memory"', '"lssvm"', '"linear"', '"<f8"', '"<i8"', '"|u1"',
@@ -112,6 +121,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "model": lambda: _refusing(wire_model.decode_model),
     "framed": lambda: _framed_model,
     "checkpoint": lambda: _framed_checkpoint,
+    "parts": lambda: _parts,
     "fault": lambda: _refusing(decode_fault),
     "operate": lambda: _refusing(decode_request),
     "error": lambda: _refusing(error_from_json),
@@ -145,6 +155,7 @@ def seeds(target: str) -> list[bytes]:
         "model": sent,
         "framed": framed,
         "checkpoint": [kept[8:10] + kept[32:], b""],
+        "parts": [b"".join(struct.pack("<II3s", i, 3, b"abc") for i in range(3))],
         "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],
         "operate": [
             encode_request(Request("rollback", "alice", {"checkpoint": 3})),

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import zenoh
 
 #: Of one part; a packet holds 64 KiB.
 _PART_BYTES: Final = 56 * 1024
+#: So many make no state of ours any more, 256 MB; whoever sends them is not to fill this end's memory.
+_MOST_PARTS: Final = 4681
 #: With each part: its index, and how many there are.
 _PLACE: Final = struct.Struct("<II")
 #: Pauses between two parts, s: the first time that it is asked for, and at most.
@@ -40,20 +42,32 @@ def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
 
 def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
     """The bytes that `send_state` answers with, or None where nobody does, or not all came: this end was too slow."""
-    parts, places = [], []
     # Replies are of the kind of their query.
-    for reply in session.get(
+    replies = session.get(
         f"{key}?pause_s={pause_s:g}",
         timeout=timeout_s,
         consolidation=zenoh.ConsolidationMode.NONE,
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
-    ):
-        if reply.ok is None:
+    )
+    return join(_parts(replies))
+
+
+def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
+    """The whole of its parts, each after its place; None at the first that is not the one that comes next."""
+    whole, taken, of = bytearray(), 0, 0
+    for place, part in parts:
+        if len(place) != _PLACE.size:
             return None
-        place = reply.ok.attachment
-        if place is None or len(place) != _PLACE.size:
+        i, n = _PLACE.unpack(place)
+        if i != taken or not taken < n <= _MOST_PARTS or (taken and n != of) or len(part) > _PART_BYTES:
             return None
-        places.append(_PLACE.unpack(place.to_bytes()))
-        parts.append(reply.ok.payload.to_bytes())
-    return b"".join(parts) if places and places == [(i, places[0][1]) for i in range(places[0][1])] else None
+        whole += part
+        taken, of = taken + 1, n
+    return bytes(whole) if taken and taken == of else None
+
+
+def _parts(replies: Iterable[zenoh.Reply]) -> Iterator[tuple[bytes, bytes]]:
+    for reply in replies:
+        place = reply.ok.attachment if reply.ok is not None else None
+        yield (b"", b"") if reply.ok is None or place is None else (place.to_bytes(), reply.ok.payload.to_bytes())

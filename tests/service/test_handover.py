@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -14,7 +15,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from service.handover import ask_for_state, send_state
+from service.handover import ask_for_state, join, send_state
 from service.session import open_client, open_router
 from tests.service.conftest import unused_port
 
@@ -39,6 +40,44 @@ def endpoint() -> Iterator[str]:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
     with open_router([endpoint]):
         yield endpoint
+
+
+def placed(*places: tuple[int, int]) -> list[tuple[bytes, bytes]]:
+    return [(struct.pack("<II", *place), b"x") for place in places]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [],
+        [(b"", b"x")],
+        [(b"\0" * 9, b"x")],
+        placed((0, 0)),
+        placed((0, 2)),
+        placed((1, 2)),
+        placed((0, 2), (0, 2)),
+        placed((0, 2), (1, 3), (2, 3)),
+        placed((0, 1), (1, 1)),
+        placed((0, 2), (1, 2), (2, 2)),
+        [(struct.pack("<II", 0, 1), b"x" * 60_000)],
+    ],
+)
+def test_parts_that_make_no_whole_are_refused(parts: list[tuple[bytes, bytes]]) -> None:
+    assert join(placed((0, 3), (1, 3), (2, 3))) == b"xxx"
+    assert join(parts) is None
+
+
+def test_nobody_fills_the_memory_of_the_one_that_asks() -> None:
+    taken = 0
+
+    def without_end() -> Iterator[tuple[bytes, bytes]]:
+        nonlocal taken
+        for i in itertools.count():
+            taken = i + 1
+            yield struct.pack("<II", i, 2**32 - 1), b"x"
+
+    assert join(without_end()) is None
+    assert taken == 1
 
 
 def in_a_thread(query: zenoh.Query) -> None:
