@@ -1,8 +1,7 @@
-"""The entities of one axis on the wire: subscriber, queryables, publishers and a liveliness token."""
+"""One axis on the wire: its subscriber, and what comes and goes with serving, down to the liveliness token."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable
@@ -12,12 +11,13 @@ import zenoh
 
 from service.answering import trust_by_age
 from service.axis import Axis
-from service.axis_answers import JSON, Answers, plain
+from service.axis_answers import Answers
+from service.axis_publications import Publications
 from service.axis_state import fingerprint
 from service.checkpoint import CheckpointFolder
 from service.intake import Intake, SampleSink, SampleWatcher
 from service.keeper import Keeper
-from service.keys import AUTO, Keys
+from service.keys import Keys
 from service.latency import LatencyMeter
 from service.operating.journal import Journal
 from service.operating.server import OperationsServer
@@ -26,7 +26,6 @@ from service.retuning.retuner import Retuner
 from service.status import axis_status
 from service.wire import decode_samples
 
-STATUS_PERIOD_S: Final = 1.0
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
 
@@ -34,7 +33,7 @@ STANDBY: Final = "standby"
 class AxisServer:
     """Puts one axis on the wire.
 
-    Samples are taken from :meth:`listen` on; queries are answered, and anything is
+    Samples are taken from :meth:`listen` on; queries are answered, and anything but the status of a standby is
     published, between :meth:`serve` and :meth:`stand_down`.
 
     Attributes
@@ -81,47 +80,34 @@ class AxisServer:
         axis.archive = self.keeper.folder
         self.answers = Answers(keys, axis, self.keeper, self.latency, self.status)
         self._session = session
-        self._published = axis.newest
-        self._published_at = 0.0
-        self._told: dict[str, Any] = {}
-        self._status_at = 0.0
+        self._publications = Publications(
+            session, keys, instance, axis, self.intake, self.latency, self.answers, self.status
+        )
         self._sample_at: float | None = None
         self._stale = False
         self._inputs: list[Any] = []
         self._queryables: list[Any] = []
-        self._publishers: dict[str, Any] = {}
-        self._standby_status: Any = None
         self._token: Any = None
         self._changing = threading.RLock()
 
     def listen(self) -> None:
         """Take samples from now on."""
         self.intake.start()
-        session, keys = self._session, self.keys
-        self._inputs = [session.declare_subscriber(keys.sample, self._on_sample)]
-        self._standby_status = session.declare_publisher(
-            keys.standby(self.instance), congestion_control=zenoh.CongestionControl.DROP, encoding=JSON
-        )
+        self._inputs = [self._session.declare_subscriber(self.keys.sample, self._on_sample)]
+        self._publications.listen()
 
     def serve(self) -> None:
         """Answer and publish from now on; the liveliness token comes last, because alive means callable."""
-        session, keys = self._session, self.keys
-        drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
+        session = self._session
         with self._changing:
             self.role = PRIMARY
             # A standby does not tune: it adopts what the one that serves announces.
             self.axis.retuner = self._retuner
             self._queryables = self.answers.declare(session)
-            self._publishers = {
-                "model": session.declare_publisher(keys.model, congestion_control=drop),
-                "champion": session.declare_publisher(keys.champion, congestion_control=drop),
-                "diagnostics": session.declare_publisher(keys.diagnostics, congestion_control=drop, encoding=JSON),
-                "status": session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON),
-                "event": session.declare_publisher(keys.event, congestion_control=block, encoding=JSON),
-            }
+            self._publications.serve()
             for declare in self.extra:
                 self._queryables += declare(session)
-            self._token = session.liveliness().declare_token(keys.alive(self.instance))
+            self._token = session.liveliness().declare_token(self.keys.alive(self.instance))
 
     def stand_down(self) -> None:
         """First no longer alive, then no longer callable; samples are still taken."""
@@ -134,10 +120,7 @@ class AxisServer:
             for entity in self._queryables:
                 entity.undeclare()
             self._queryables = []
-            self._publish_events()
-            publishers, self._publishers = self._publishers, {}
-            for publisher in publishers.values():
-                publisher.undeclare()
+            self._publications.stand_down()
 
     def leave_tuning(self) -> None:
         """Another one serves: what was being tuned is no longer. From the thread that handles samples."""
@@ -165,9 +148,7 @@ class AxisServer:
         if self.watcher is not None:
             self.watcher.close()
         self.stand_down()
-        if self._standby_status is not None:
-            self._standby_status.undeclare()
-            self._standby_status = None
+        self._publications.close()
 
     def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
         """Do what an operator wants between two batches of samples, and have the outcome kept; returns what it does.
@@ -197,7 +178,7 @@ class AxisServer:
         self.keeper.tick(now_s)
         self._look_at_age(now_s)
         with self._changing:
-            self._publish(now_s)
+            self._publications.tick(now_s)
 
     def _look_at_age(self, now_s: float) -> None:
         """Samples are expected from the first one on."""
@@ -211,33 +192,6 @@ class AxisServer:
                 self.axis.note("stale", f"no sample for {self.axis.age_s:.1f} s; answers are flagged as stale")
             else:
                 self.axis.note("fresh", "samples come again")
-
-    def _publish(self, now_s: float) -> None:
-        publishers = self._publishers
-        due = now_s - self._status_at >= STATUS_PERIOD_S
-        if due:
-            self._status_at = now_s
-        if not publishers:
-            if due and self._standby_status is not None:
-                self._standby_status.put(json.dumps(self.status(), default=plain))
-            return
-        newest = self.axis.newest
-        if newest is not self._published and now_s - self._published_at >= 1.0 / self.axis.config.model_hz:
-            if self.axis.config.learn and _is_followed(publishers["model"]):
-                publishers["model"].put(self.answers.encoded(self.axis.config.learn))
-            if AUTO in newest.models and _is_followed(publishers["champion"]):
-                publishers["champion"].put(self.answers.encoded(AUTO))
-            self._published, self._published_at = newest, now_s
-        told = self.intake.diagnostics
-        if told is not self._told:
-            self._told = told
-            latency = self.latency.summary()
-            extra = {"counters": self.intake.counters, "query_us": {"p50": latency["p50_us"], "p99": latency["p99_us"]}}
-            publishers["diagnostics"].put(json.dumps({**told, **extra}, default=plain))
-        if due:
-            self.intake.want_diagnostics = _is_followed(publishers["diagnostics"])
-            publishers["status"].put(json.dumps(self.status(), default=plain))
-        self._publish_events()
 
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
@@ -263,14 +217,6 @@ class AxisServer:
             "fingerprint": fingerprint(newest.models[learn]) if learn else "",
         }
 
-    def _publish_events(self) -> None:
-        # A standby keeps them until it serves, when they tell what has happened.
-        publisher = self._publishers.get("event")
-        if publisher is None:
-            return
-        for event in self.axis.take_events():
-            publisher.put(json.dumps({**event, "instance": self.instance, "time_unix_s": time.time()}))
-
     def _on_sample(self, sample: zenoh.Sample) -> None:
         try:
             batch = decode_samples(sample.payload.to_bytes())
@@ -281,10 +227,3 @@ class AxisServer:
             return
         self._sample_at = time.monotonic()
         self.intake.offer(batch)
-
-
-def _is_followed(publisher: Any) -> bool:
-    """Whether anybody subscribes to what ``publisher`` puts."""
-    status = publisher.matching_status
-    # An object that is always true in this release, a plain truth value by its own type stub.
-    return bool(getattr(status, "matching", status))

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -24,7 +24,8 @@ import zenoh
 from numpy.typing import ArrayLike, NDArray
 
 from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued, extended
-from service.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
+from service.client_asking import RETRY_S, Asking
+from service.errors import FieldError, NoReplyError
 from service.follower import Follower
 from service.guard import Limits, guard
 from service.keys import AUTO, Keys
@@ -32,15 +33,9 @@ from service.motion import derivatives
 from service.session import DEFAULT_ENDPOINT, open_client
 from service.wire import check_finite, check_seq, column, encode_command, encode_reference
 from service.wire_query import NEWEST, encode_query
-from service.wire_reply import FeedforwardReply, decode_reply
 
-_BEHIND_PAUSE_S: Final = 0.001
 #: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
 _SETTLE_S: Final = 0.5
-#: How long a query without an answer is repeated, and the pause before each time, s: a standby needs some hundredths
-#: of a second where the service has died, and a second where it only stopped.
-RETRY_S: Final = 2.0
-_RETRY_PAUSE_S: Final = 0.003
 
 
 __all__ = ["Client", "Point", "Trajectory"]
@@ -62,15 +57,11 @@ class Client:
         retry_s: float = RETRY_S,
     ) -> None:
         self.keys = keys
-        self.timeout_s = timeout_s
-        self.retry_s = retry_s
-        #: Queries that were repeated because there was no answer.
-        self.retries = 0
         self._commanded = (-1, math.nan)
         self._session = session
         self._owns = owns_session
         self._followers: list[Follower] = []
-        self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True)
+        self._asking = Asking(session, keys, timeout_s, retry_s)
         self._status: dict[str, Any] | None = None
 
     @classmethod
@@ -120,9 +111,14 @@ class Client:
         for follower in self._followers:
             follower.close()
         self._followers = []
-        self._querier.undeclare()  # type: ignore[no-untyped-call]
+        self._asking.close()
         if self._owns:
             self._session.close()  # type: ignore[no-untyped-call]
+
+    @property
+    def retries(self) -> int:
+        """Queries that were repeated because there was no answer."""
+        return self._asking.retries
 
     @property
     def dt_s(self) -> float:
@@ -136,7 +132,7 @@ class Client:
 
     def status(self) -> dict[str, Any]:
         """The status of the axis as the service tells it now (docs/protocol.md)."""
-        status = json.loads(self._one(self._session.get(self.keys.status, timeout=self.timeout_s)))
+        status = json.loads(self._asking.get(self.keys.status))
         if not isinstance(status, dict) or "dt_s" not in status:
             raise FieldError("status", repr(status)[:80], "a status of this wire version")
         self._status = status
@@ -158,7 +154,7 @@ class Client:
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
         query = continued(memory, model, u_before_V, after, begin)
-        reply = self._ask(lambda: encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
+        reply = self._asking.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
         if begin is None:
             return as_point(reply)
         return as_point(reply, extended(query["pending"], begin, np.array([y_um]), reply.u_V))
@@ -200,7 +196,7 @@ class Client:
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
-        reply = self._ask(lambda: encode_query(y, v, a, as_of=as_of, **query), wait_s)
+        reply = self._asking.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s)
         return as_trajectory(reply, None if begin is None else extended(query["pending"], begin, y, reply.u_V))
 
     def follow(self, model: str = "", memory: ArrayLike | None = None) -> Follower:
@@ -214,7 +210,7 @@ class Client:
 
         def fetch() -> bytes:
             # The selector's own syntax keeps the name from being taken for something else: names are plain chunks.
-            return self._one(self._session.get(f"{self.keys.model}?name={name}", timeout=self.timeout_s))
+            return self._asking.get(f"{self.keys.model}?name={name}")
 
         key = {str(status.get("learning")): self.keys.model, AUTO: self.keys.champion}.get(name)
         follower = Follower(self._session, key, name, fetch, self.limits, memory)
@@ -248,42 +244,3 @@ class Client:
 
     def _known(self) -> dict[str, Any]:
         return self._status or self.status()
-
-    def _ask(self, encode: Callable[[], bytes], wait_s: float) -> FeedforwardReply:
-        payload = encode()
-        start = time.monotonic()
-        until = start + wait_s
-        while True:
-            try:
-                reply = decode_reply(self._one(self._querier.get(payload=payload)))
-            except (NoReplyError, ReplyTimeoutError):
-                # It may have died while asked; another one takes over, or it comes back.
-                if time.monotonic() - start >= self.retry_s:
-                    raise
-                self.retries += 1
-                time.sleep(_RETRY_PAUSE_S)
-                continue
-            if not reply.behind:
-                return reply
-            if time.monotonic() >= until:
-                raise BehindError(
-                    f"{self.keys.feedforward}: the service has learnt up to sample {reply.snapshot_seq} only; "
-                    "ask for an earlier as_of, allow more wait_s, or see in the status whether samples arrive"
-                )
-            time.sleep(_BEHIND_PAUSE_S)
-
-    def _one(self, replies: Any) -> bytes:
-        """The payload of the one reply that is to come, or the exception that says why there is none."""
-        error: bytes | None = None
-        for reply in replies:
-            if reply.ok is not None:
-                return bytes(reply.ok.payload.to_bytes())
-            error = bytes(reply.err.payload.to_bytes())
-        if error is None:
-            raise NoReplyError(
-                f"{self.keys.base}: nobody answers; does a service with this stage and axis run, and may you ask it?"
-            )
-        failure = error_from_json(error)
-        if isinstance(failure, ReplyTimeoutError):
-            raise ReplyTimeoutError(f"{self.keys.base}: no answer within {self.timeout_s:g} s; ask again")
-        raise failure
