@@ -94,6 +94,8 @@ class BackgroundJob:
     def _work(self, folder: Path) -> dict[str, Any]:
         (folder / _ORDER).write_text(json.dumps(self._order), encoding="utf-8")
         np.savez(folder / _DATA, **self._arrays)  # type: ignore[arg-type]
+        # They are in the folder now. Who keeps a job for its result must not keep megabytes of samples with it.
+        self._order, self._arrays = {}, {}
         with self._lock:
             if self._cancelled:
                 return {"error": "cancelled"}

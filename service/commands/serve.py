@@ -7,11 +7,13 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from service.access.check import has_access_control
 from service.access.refusals import count_refusals
 from service.config import EXAMPLE, ServeConfig, read_config
 from service.errors import FieldError
+from service.memory import starting
 from service.session import check_endpoint, is_loopback
 
 
@@ -42,27 +44,22 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.config is None:
         raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints one to begin with")
-    config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
-    # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from service.server import Service, tune_process
-    from service.stopping import StopSignal
+    with starting() as started:
+        config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
+        # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        from service.server import Service, tune_process
+        from service.stopping import StopSignal
 
-    tune_process()
-    stop = StopSignal()
-    if has_access_control(config.zenoh_config):
-        count_refusals()
-    with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
-        ready = service.ready()
-        if args.json:
-            print(json.dumps(ready), flush=True)
-        else:
-            where = ", ".join((*ready["listen"], *ready["connect"]))
-            axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
-            role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the one that serves")
-            print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
-        reason = stop.wait(args.duration)
-        statuses = {axis.keys.axis: axis.status() for axis in service.axes}
+        tune_process()
+        stop = StopSignal()
+        if has_access_control(config.zenoh_config):
+            count_refusals()
+        with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
+            started()
+            _say_ready(service.ready(), args.json)
+            reason = stop.wait(args.duration)
+            statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
         print(json.dumps({"stopped": reason, "axes": statuses}, default=str), flush=True)
     else:
@@ -74,6 +71,16 @@ def run(args: argparse.Namespace) -> int:
             )
         print(f"stopped: {reason}", flush=True)
     return 0
+
+
+def _say_ready(ready: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(ready), flush=True)
+        return
+    where = ", ".join((*ready["listen"], *ready["connect"]))
+    axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
+    role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the one that serves")
+    print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
 
 
 def _with_listen(config: ServeConfig, listen: list[str] | None, standby: bool) -> ServeConfig:

@@ -24,8 +24,9 @@ from service.wire import SampleBatch
 
 #: How often the learner is asked for its figures, s of samples.
 _LOOK_S: Final = 0.25
-#: Verdicts kept for the status.
+#: Verdicts told in the status, of which only the last one whole.
 _KEPT: Final = 10
+_TOLD: Final = ("job", "seq", "why", "text")
 #: A reference must move through this share of the axis' range.
 _LEAST_MOTION: Final = 0.05
 _ARGUMENTS: Final = ("recent_s", "report")
@@ -56,7 +57,8 @@ class Watcher:
         self._job: Job | None = None
         self._lock = threading.Lock()
         self._counts = {"alarms": 0, "requests": 0, "started": 0, "finished": 0, "failed": 0, "skipped": 0}
-        self._verdicts: list[dict[str, Any]] = []
+        self._last: dict[str, Any] | None = None
+        self._history: list[dict[str, Any]] = []
         self._closed = False
 
     def take(self, batch: SampleBatch) -> None:
@@ -115,8 +117,8 @@ class Watcher:
                 "reference": self._reference is not None,
                 "armed": self._alarm.armed,
                 **self._counts,
-                "last": self._verdicts[0] if self._verdicts else None,
-                "history": [{k: v[k] for k in ("job", "seq", "why", "text")} for v in self._verdicts],
+                "last": self._last,
+                "history": list(self._history),
             }
 
     def close(self) -> None:
@@ -190,7 +192,8 @@ class Watcher:
         verdict = {**about, "seconds": round(seconds, 2), "text": text, **result}
         with self._lock:
             self._counts["failed" if failed else "finished"] += 1
-            self._verdicts = [verdict, *self._verdicts][:_KEPT]
+            self._last = verdict
+            self._history = [{key: verdict[key] for key in _TOLD}, *self._history][:_KEPT]
         self._axis.note("diagnosis_failed" if failed else "diagnosis", text)
         if about["cause"] == "alarm":
             # What comes next is told from how the stage is now, as soon as enough of that has been seen.

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -175,6 +176,18 @@ def test_a_job_names_the_change_in_a_process_of_its_own(model_file: Path) -> Non
     assert told[0]["effects"][0]["name"] == "gain_drift"
     assert told[0]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.003)
     assert "gain drift, -1." in told[0]["text"] or "gain drift, -2." in told[0]["text"]
+
+
+def test_a_job_does_not_keep_what_it_was_given(model_file: Path) -> None:
+    samples = [recorded(model_file, 3.0, 0.0) for _ in range(2)]
+    known = [weakref.ref(each) for each in samples]
+    told: list[dict[str, Any]] = []
+    job = Job(order(model_file, 0), *samples, 60.0, told.append)
+    samples.clear()
+    job.start()
+    eventually(lambda: not job.running, 60.0)
+    assert job.result == told[0]
+    assert all(each() is None for each in known)
 
 
 def test_a_job_that_cannot_be_done_says_why(model_file: Path, tmp_path: Path) -> None:

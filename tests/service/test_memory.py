@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from service.memory import in_use
+from service.memory import in_use, starting
 
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
 
@@ -80,3 +80,22 @@ def test_what_is_in_use_is_what_was_asked_for_and_not_given_back() -> None:
     assert blocks >= 10_000
     assert abs(left) < 100_000
     assert abs(blocks_left) < 1000
+
+
+def test_what_is_there_after_the_start_is_never_looked_through_again() -> None:
+    try:
+        with starting() as started:
+            assert not gc.isenabled()
+            started()
+            assert gc.isenabled()
+            assert gc.get_freeze_count() > 10_000
+            assert len(gc.get_objects(2)) < 0.01 * gc.get_freeze_count()
+    finally:
+        gc.unfreeze()
+
+
+def test_a_start_that_fails_leaves_collections_as_they_were() -> None:
+    with pytest.raises(RuntimeError), starting():
+        raise RuntimeError
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
