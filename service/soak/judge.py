@@ -8,7 +8,7 @@ from typing import Final
 from service.soak.invariant import Invariant, most, unjudged
 from service.soak.ledger import FAST, Ledger
 from service.soak.machine import Machine
-from service.soak.memory import Trend, memory_slope, resident_growth
+from service.soak.memory import Trend, memory_slopes, resident_growth
 from service.soak.safety import answers_safe, safe_voltages, takeover_continuous
 from service.soak.timing import answered_again, follower_age, queries_answered, recovers
 from service.soak.track import Second
@@ -43,7 +43,7 @@ def judge(ledger: Ledger, missing: int | None, tracking_pct: float = TRACKING_PC
     found["tracking"] = tracking(tracked(ledger, ledger.seconds), ledger.range_um, tracking_pct)
     # What a run in one process has in use is also the stage's and the controller's.
     short = "in one process" if ledger.mode == FAST else "too short a run"
-    found["memory"] = _memory(memory_slope(ledger), short)
+    found["memory"] = _memory(memory_slopes(ledger), short)
     found["memory_resident"] = _resident(resident_growth(ledger), short)
     return found
 
@@ -80,25 +80,32 @@ def mean_error(sum_um: float, judged: int, seconds: int, range_um: float, limit_
     return Invariant(error_pct <= limit_pct, error_pct, limit_pct, "% of range", text)
 
 
-def _memory(trend: Trend | None, short: str) -> Invariant:
-    """Broken where it grows beyond doubt, held where it does not; else this run cannot tell, and says so."""
-    text = "growth of what the longest-lived serving process has in use, after warm-up"
-    if trend is None:
+def _memory(trends: list[Trend], short: str) -> Invariant:
+    """Broken where one grows beyond doubt, held where none does; else this run cannot tell, and says so."""
+    text = "growth of what the longest-lived serving processes have in use, after warm-up"
+    if not trends:
         return unjudged(MEMORY_KB_PER_HOUR, "kB/hour", short, text)
-    held: bool | None = None
-    if trend.slope <= MEMORY_KB_PER_HOUR and trend.doubt <= MEMORY_KB_PER_HOUR:
-        held = True
-    elif trend.slope - trend.doubt > MEMORY_KB_PER_HOUR:
-        held = False
-    told, why = f"{text}, ± {trend.doubt:.0f}", ""
+    each = [_grows(trend) for trend in trends]
+    held = False if True in each else None if None in each else True
+    told, why = f"{text}, ± {trends[0].doubt:.0f}", ""
     if held is None:
         told += ": not judged, a run without faults (--faults none) or one of hours tells"
         why = "too short a run for its doubt"
-    return Invariant(held, trend.slope, MEMORY_KB_PER_HOUR, "kB/hour", told, why)
+    return Invariant(held, trends[0].slope, MEMORY_KB_PER_HOUR, "kB/hour", told, why)
+
+
+def _grows(trend: Trend) -> bool | None:
+    """Whether it grows by more than the limit; None where its doubt leaves that open."""
+    slope, doubt = trend.slope, trend.doubt
+    # Level to within the doubt, and below the limit even with it. One that fell tells little of what it hides.
+    level = abs(slope) <= doubt and slope + doubt <= MEMORY_KB_PER_HOUR
+    if level or (slope <= MEMORY_KB_PER_HOUR and doubt <= MEMORY_KB_PER_HOUR):
+        return False
+    return True if slope - doubt > MEMORY_KB_PER_HOUR else None
 
 
 def _resident(grown_mb: float | None, short: str) -> Invariant:
-    text = "resident memory of that process in its last five minutes above that of the first five after warm-up"
+    text = "resident memory of one of them in its last five minutes above that of the first five after warm-up"
     if grown_mb is None:
         return unjudged(RESIDENT_MB, "MB", short, text)
     return Invariant(grown_mb <= RESIDENT_MB, grown_mb, RESIDENT_MB, "MB", text)

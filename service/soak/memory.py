@@ -19,9 +19,9 @@ T = TypeVar("T")
 MEMORY_WARM_S: Final = (180.0, 900.0)
 MEMORY_LEAST_S: Final = 300.0
 #: A process under faults has a few levels of memory in use: as the one that serves, as the one that stands by, with a
-#: state just handed over. Seen over half an hour of two processes that did not grow: 166.0 to 166.9 MB, and with
-#: the learner of an unfinished re-tuning, which is let go now, 171.5. A line from one of them to another is no growth.
-LEVELS_KB: Final = 8_000.0
+#: state just handed over. Seen over half an hour of three processes that did not grow: 134.4 to 137.4 MB. A line from
+#: one of them to another is no growth.
+LEVELS_KB: Final = 4_000.0
 _MINUTE_S: Final = 60.0
 #: Of a small object of Python's on average: its allocator's pools over their blocks, as measured in a service.
 _BLOCK_BYTES: Final = 100.0
@@ -35,44 +35,46 @@ class Trend:
     doubt: float
 
 
-def memory_slope(ledger: Ledger) -> Trend | None:
-    """What the serving process that lived longest after its warm-up has in use; None where none lived long enough.
-    Where the allocator cannot tell what is in use, its resident memory.
+def memory_slopes(ledger: Ledger) -> list[Trend]:
+    """What the serving processes that lived longest after their warm-up have in use, the one that grows most surely
+    first; empty where none lived long enough. Where the allocator cannot tell what is in use, their resident memory.
 
     What is in use is what the learner, its snapshots and its marks hold: it goes up and down by megabytes when faults
     take samples from the window, change the model or the role. A slope of 1 MB an hour shows in half an hour without
     faults, and in hours with them; the doubt says so.
     """
     used, levels_kb = _in_use(ledger), LEVELS_KB if ledger.faults else 0.0
-    if used:
-        return _longest(used, lambda t, kb: _trend(*_minutes(t, kb, np.median), levels_kb))
-    return _longest(_resident(ledger), lambda t, kb: _trend(*_minutes(t, kb, np.min), levels_kb))
+    of = np.median if used else np.min
+    trends = _longest(used or _resident(ledger), lambda t, kb: _trend(*_minutes(t, kb, of), levels_kb))
+    return sorted(trends, key=lambda trend: trend.doubt - trend.slope)
 
 
 def resident_growth(ledger: Ledger) -> float | None:
-    """MB by which the resident memory of that process ended above where it was after its warm-up: the least of the
-    last five minutes less the least of the first five. None where none lived for ten."""
+    """MB by which the resident memory of those processes ended above where it was after their warm-up, at most: the
+    least of the last five minutes less the least of the first five. None where none lived for ten."""
 
     def growth(t_s: FloatArray, kb: FloatArray) -> float:
         first, last = t_s <= t_s[0] + MEMORY_LEAST_S, t_s >= t_s[-1] - MEMORY_LEAST_S
         return float(kb[last].min() - kb[first].min()) / 1024.0
 
-    return _longest(_resident(ledger), growth, 2.0 * MEMORY_LEAST_S)
+    return max(_longest(_resident(ledger), growth, 2.0 * MEMORY_LEAST_S), default=None)
 
 
 def _longest(
     rows: Mapping[str, list[tuple[float, float]]],
     what: Callable[[FloatArray, FloatArray], T],
     least_s: float = MEMORY_LEAST_S,
-) -> T | None:
-    best: tuple[float, T] | None = None
+) -> list[T]:
+    """Of each process that lived as long as the longest, to a minute; what is before its warm-up left out."""
+    found: list[tuple[float, T]] = []
     for taken in rows.values():
         t, kb = (np.array(column) for column in zip(*taken, strict=True))
         after = t >= t[0] + warm_up_s(float(np.ptp(t)))
         lived = float(np.ptp(t[after])) if after.any() else 0.0
-        if lived >= least_s and (best is None or lived > best[0]):
-            best = lived, what(t[after], kb[after])
-    return None if best is None else best[1]
+        if lived >= least_s:
+            found.append((lived, what(t[after], kb[after])))
+    longest = max((lived for lived, _ in found), default=0.0)
+    return [told for lived, told in found if lived >= longest - _MINUTE_S]
 
 
 def _resident(ledger: Ledger) -> dict[str, list[tuple[float, float]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from adaptive.types import FloatArray
 from service.soak.invariant import Invariant
 from service.soak.ledger import Happened, Ledger
-from service.soak.memory import memory_slope
+from service.soak.memory import memory_slopes
 
 #: Verdicts of a run that is over, and of one that goes on.
 HELD, BROKEN = "held", "broken"
@@ -33,7 +33,7 @@ def summary(
     def at(values: FloatArray, percent: float) -> float | None:
         return round(float(np.percentile(values, percent)), 1) if values.size else None
 
-    trend = memory_slope(ledger)
+    trends = memory_slopes(ledger)
     return {
         "verdict": (BROKEN if broken else HELD) if over else (BROKEN_SO_FAR if broken else RUNNING),
         "not_judged": [name for name, invariant in invariants.items() if invariant.held is None],
@@ -47,7 +47,7 @@ def summary(
             "echo_p50_us": at(echo, 50),
             "echo_p99_us": at(echo, 99),
         },
-        "memory_slope_kb_per_hour": None if trend is None else round(trend.slope, 1),
+        "memory_slope_kb_per_hour": round(trends[0].slope, 1) if trends else None,
         "samples": dict(samples),
     }
 

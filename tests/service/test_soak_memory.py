@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from service.soak.ledger import Ledger, Row
-from service.soak.memory import memory_slope, resident_growth
+from service.soak.memory import memory_slopes, resident_growth
 from tests.service.soaked import broken, healthy, verdict
 
 
 def slope_of(ledger: Ledger) -> float:
-    trend = memory_slope(ledger)
-    assert trend is not None
-    return trend.slope
+    return memory_slopes(ledger)[0].slope
 
 
 def test_memory_that_is_used_for_a_moment_is_no_growth() -> None:
@@ -27,7 +25,7 @@ def test_memory_that_is_used_for_a_moment_is_no_growth() -> None:
 
 def test_memory_is_that_of_one_process_after_its_warm_up() -> None:
     ledger = healthy()
-    assert memory_slope(ledger) is None
+    assert memory_slopes(ledger) == []
     t = np.arange(0.0, 1000.0, 1.0)
     # Start-up grows, then it is flat; a second life of the same service begins lower.
     ledger.memory["a"] = [(float(s), 200_000.0 + min(s, 150.0) * 50.0, 17) for s in t]
@@ -83,6 +81,40 @@ def test_a_growth_that_half_an_hour_cannot_tell_is_not_judged() -> None:
     # Without faults nothing but a sum of small things is left, and half an hour tells.
     ledger.counters = [in_use(float(s), 90_000.0 + 0.001 * float(up)) for s, up in zip(t, level, strict=True)]
     assert verdict(ledger)["invariants"]["memory"]["held"] is True
+
+
+def two(t_s: np.ndarray, first_kb: np.ndarray, second_kb: np.ndarray) -> Ledger:
+    ledger = healthy()
+    ledger.faults = []
+    for s, a, b in zip(t_s, first_kb, second_kb, strict=True):
+        ledger.counters += [in_use(float(s), float(a)), (float(s), "i18-cd", in_use(float(s), float(b))[2])]
+    return ledger
+
+
+def test_both_of_a_pair_that_lived_as_long_are_judged() -> None:
+    t = np.arange(0.0, 2100.0, 1.0)
+    level, grows = np.full(t.size, 90_000.0), 90_000.0 + 1.0 * t
+    assert verdict(two(t, level, level))["invariants"]["memory"]["held"] is True
+    for pair in ((level, grows), (grows, level)):
+        ledger = two(t, *pair)
+        assert slope_of(ledger) == pytest.approx(3600.0)
+        assert "memory" in broken(verdict(ledger))
+    # One of them cannot be told: neither can the pair.
+    steps = 90_000.0 + np.repeat(np.random.default_rng(3).uniform(0.0, 5_000.0, 35), 60)
+    assert verdict(two(t, level, steps))["invariants"]["memory"]["held"] is None
+
+
+def test_what_is_level_and_below_the_limit_for_sure_is_held() -> None:
+    t = np.arange(0.0, 2100.0, 1.0)
+    minute = t // 60.0
+    # As seen: a standby that ended half a megabyte lower, and whose minutes differ by as much.
+    falls = 139_500.0 + 300.0 * ((7.0 * minute) % 3.0 - 1.0) - np.where(minute > 27, 500.0, 0.0)
+    found = verdict(two(t, falls, falls))["invariants"]["memory"]
+    assert found["held"] is True
+    assert found["worst"] < 0.0
+    # Five megabytes less tell nothing of what grows meanwhile.
+    found = verdict(two(t, falls, falls - np.where(minute > 20, 5_000.0, 0.0)))["invariants"]["memory"]
+    assert found["held"] is None
 
 
 def test_resident_memory_is_judged_by_what_it_ends_at() -> None:
