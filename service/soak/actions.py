@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from service.soak.clocked import write_offset
+from service.soak.control import AXIS, STAGE
 from service.soak.controller import control_key
 from service.soak.monitor import Monitor
 from service.soak.plan import Planned
-from service.soak.setup import AXIS, STAGE
 from service.soak.world import World
 from service.stage_faults import DELIVERY, READING, fault_key
 

@@ -22,8 +22,8 @@ from service import wire
 from service.client import Client, Trajectory
 from service.errors import ServiceError
 from service.keys import Keys
+from service.soak.control import AXIS, STAGE, Control
 from service.soak.reference import SoakReference
-from service.soak.setup import AXIS, STAGE, Control
 from service.stage_node import status_key
 from service.stopping import StopSignal
 

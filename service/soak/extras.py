@@ -1,6 +1,7 @@
 """Small processes beside a soak: echo, slow subscriber, busy core, and a client that sends rubbish.
 
-``python -m service.soak.extras WHAT ENDPOINT [ARGUMENTS]``; each says ``ready`` and goes on until it is ended.
+``python -m service.soak.extras WHAT ENDPOINT [ARGUMENTS]``; each says ``ready`` and goes on until it is ended. A fault
+begins when it does, on cores that have no time: what takes long to import is imported by who needs it.
 """
 
 from __future__ import annotations
@@ -11,10 +12,8 @@ import time
 import zenoh
 
 from service.keys import Keys
-from service.server import tune_process
 from service.session import open_client
-from service.soak.rubbish import rubbish
-from service.soak.setup import AXIS, STAGE
+from service.soak.control import AXIS, STAGE
 from service.stopping import StopSignal
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.
@@ -23,6 +22,8 @@ ECHO_KEY = "soak_echo"
 
 def echo(endpoint: str) -> int:
     """Answer queries on ``soak_echo/BYTES`` with as many bytes: what the wire alone takes."""
+    from service.server import tune_process
+
     tune_process()
     stop = StopSignal()
 
@@ -66,5 +67,7 @@ def busy(_: str) -> int:
 if __name__ == "__main__":
     what, where = sys.argv[1], sys.argv[2]
     if what == "rubbish":
+        from service.soak.rubbish import rubbish
+
         sys.exit(rubbish(where, int(sys.argv[3])))
     sys.exit({"echo": echo, "slow": slow, "busy": busy}[what](where))

@@ -16,11 +16,11 @@ from service.client_answers import Commanded
 from service.config import AxisConfig
 from service.guard import Limits
 from service.models import load_axis
+from service.soak.control import AXIS, SERVED, STAGE, Control
 from service.soak.interim import Interim
 from service.soak.ledger import Happened, Ledger, Row, flat
 from service.soak.plan import Planned, SoakPlan
 from service.soak.reference import SoakReference
-from service.soak.setup import AXIS, SERVED, STAGE, Control
 from service.soak.track import Track
 from service.soak.world import SAMPLES_A_MESSAGE
 from service.stage_faults import CHANGE, Fault, Injector

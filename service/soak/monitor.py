@@ -14,7 +14,7 @@ from adaptive.errors import InputError
 from service import wire
 from service.keys import Keys
 from service.session import open_client
-from service.soak.setup import AXIS, STAGE, Control
+from service.soak.control import AXIS, STAGE, Control
 from service.soak.track import Second, Track
 from service.stage_node import status_key
 

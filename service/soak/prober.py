@@ -19,8 +19,8 @@ from adaptive.errors import DehystError, InputError
 from service.client import Client, Point
 from service.errors import ServiceError
 from service.session import open_client
+from service.soak.control import AXIS, STAGE, Control
 from service.soak.extras import ECHO_KEY
-from service.soak.setup import AXIS, STAGE, Control
 from service.stopping import StopSignal
 from service.wire_query import encode_query
 from service.wire_reply import FeedforwardReply, encode_reply

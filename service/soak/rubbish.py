@@ -13,7 +13,7 @@ import zenoh
 from service.keys import Keys
 from service.operating.request import MAX_BYTES
 from service.session import open_client
-from service.soak.setup import AXIS, STAGE
+from service.soak.control import AXIS, STAGE
 from service.stopping import StopSignal
 from service.wire import encode_reference, encode_samples
 from service.wire_query import encode_query

@@ -1,9 +1,9 @@
-"""What a soak needs before it starts: an identified stage, a task for its controller, the services' configurations."""
+"""What a soak needs before it starts: an identified stage, and the services' configurations."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,12 @@ from adaptive.errors import InputError, NumericsError
 from adaptive.types import InverseModel
 from service.identifying import identify_one
 from service.modelfile import BundleMeta, write_bundle
+from service.soak.control import AXIS, SERVED, STAGE, Control
 from sim.presets import preset
 from sim.signals import training_input
 from sim.stage import Stage, StageConfig
 from sim.stagefile import load_stage, save_stage
 
-STAGE, AXIS = "soak", "x"
-SERVED = "lssvm_adaptive"
 #: Models of the service: the default, what it falls back to, and the baseline that any stage has.
 MODELS = ("linear", "mpi", SERVED)
 IDENTIFY_S = 10.0
@@ -26,37 +25,6 @@ IDENTIFY_S = 10.0
 LOW_SHARE, HIGH_SHARE = 0.05, 0.10
 #: Share of the voltage range that may be passed in a millisecond.
 SLEW_SHARE_PER_MS = 1.0 / 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class Control:
-    """What the controller does.
-
-    Attributes
-    ----------
-    dt_s : sample time, s. low_um, high_um : range of the reference, µm. seed : of the reference.
-    block, lead : ticks a query, and ticks that it is asked ahead.
-    u_min_V, u_max_V, slew_V_per_s : the limits that every voltage is checked against.
-    """
-
-    dt_s: float
-    low_um: float
-    high_um: float
-    seed: int
-    u_min_V: float
-    u_max_V: float
-    slew_V_per_s: float
-    block: int = 20
-    lead: int = 60
-
-    @property
-    def range_um(self) -> float:
-        """Commanded range, to which all percentages refer."""
-        return self.high_um - self.low_um
-
-    def write(self, path: Path) -> None:
-        """For the controller's process."""
-        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
 
 
 def stage_of(file: Path | None, seed: int) -> StageConfig:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
 from service import wire
+from service.soak.control import Control
 from service.soak.intervals import Intervals
-from service.soak.setup import Control
 
 #: Samples for which the reference and the voltages sent are remembered.
 _RING = 16_384

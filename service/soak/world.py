@@ -12,7 +12,8 @@ from typing import Any
 from service.demo.processes import Child, Children, free_port
 from service.errors import ServiceError
 from service.soak.clocked import write_offset
-from service.soak.setup import AXIS, SERVED, STAGE, Control, write_service, write_stage
+from service.soak.control import AXIS, SERVED, STAGE, Control
+from service.soak.setup import write_service, write_stage
 from sim.stage import StageConfig
 
 CLI = ["-m", "service.cli"]

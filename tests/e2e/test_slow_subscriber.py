@@ -13,7 +13,7 @@ import zenoh
 
 from service.keys import Keys
 from service.session import LEASE_S, open_client
-from service.soak.setup import AXIS, STAGE
+from service.soak.control import AXIS, STAGE
 from tests.service.conftest import unused_port
 
 RATE_HZ, BYTES = 500.0, 2000

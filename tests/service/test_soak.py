@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from adaptive.errors import InputError
 from service.commands.soak import seconds
 from service.soak.catalogue import KINDS
+from service.soak.control import Control
 from service.soak.intervals import Intervals
 from service.soak.plan import TAIL_S, WARM_S, known_kinds, make_plan
 from service.soak.processor import Others
 from service.soak.reference import PERIOD_S, SoakReference
-from service.soak.setup import Control
 from service.stage_faults import Fault, Injector, decode_fault
 
 CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)

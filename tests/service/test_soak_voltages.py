@@ -12,9 +12,9 @@ import pytest
 
 from service import wire
 from service.session import open_router
+from service.soak.control import AXIS, STAGE, Control
 from service.soak.ledger import Happened, Ledger
 from service.soak.monitor import Monitor
-from service.soak.setup import AXIS, STAGE, Control
 from service.soak.track import Track
 from tests.service.soaked import broken, healthy, verdict
 
