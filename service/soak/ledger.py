@@ -34,6 +34,8 @@ class Happened:
     #: Seconds from its end until all was well in which the machine was too busy to tell.
     busy_s: float = 0.0
     told: str = ""
+    #: Until when somebody might have told of it.
+    look_until_s: float = 0.0
     value: float = 0.0
 
     @property

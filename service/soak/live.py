@@ -16,13 +16,14 @@ import psutil
 
 from service.errors import ServiceError
 from service.soak.actions import Actions
+from service.soak.control import Control
 from service.soak.interim import Interim
 from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
 from service.soak.monitor import Monitor
-from service.soak.plan import SoakPlan
+from service.soak.plan import Planned, SoakPlan
 from service.soak.processor import Others
+from service.soak.schedule import Schedule
 from service.soak.settling import WELL_PCT
-from service.soak.setup import Control
 from service.soak.world import World
 from sim.stage import StageConfig
 
@@ -88,41 +89,37 @@ class _Watch:
         monitor, ledger = self._monitor, self._ledger
         monitor.begin()
         self._thread.start()
-        waiting = list(enumerate(plan.faults))
-        under_way: list[tuple[int, float, Happened]] = []
-        waited_s = 0.0
+        schedule = Schedule(plan, self._actions.possible)
+        under_way: tuple[int, float, Happened] | None = None
         while monitor.now() < plan.duration_s and not stopped():
-            now = monitor.now()
-            if waiting and waiting[0][1].at_s + waited_s <= now and not under_way:
-                fault = waiting[0][1]
-                if fault.window_s[1] + waited_s > plan.duration_s:
-                    # What came before took longer than planned: there is no time left to recover from this one.
-                    self._actions.notes.append(f"{fault.kind} at {fault.at_s:.0f} s: left out, no time to recover")
-                    waiting.pop(0)
-                elif not self._actions.possible(fault):
-                    waited_s += _TICK_S
-                else:
-                    index, _ = waiting.pop(0)
-                    happened = Happened(fault.kind, now, value=fault.value)
-                    self._actions.begin(index, fault)
-                    ledger.faults.append(happened)
-                    under_way.append((index, monitor.now() + fault.duration_s, happened))
-            for index, end_s, happened in list(under_way):
-                if end_s <= monitor.now():
-                    self._actions.end(index)
-                    happened.end_s = monitor.now()
-                    under_way.remove((index, end_s, happened))
+            if under_way is None:
+                due = schedule.due(monitor.now())
+                if due is not None:
+                    under_way = self._begin(*due)
+            elif under_way[1] <= monitor.now():
+                self._end(under_way, schedule)
+                under_way = None
             self._actions.tick()
             self._progress(plan)
             self._interim.due(monitor.now(), self._samples)
             time.sleep(_TICK_S)
-        for _, fault in waiting:
-            # Such as one that waited to the end for the standby to be synced, and those behind it.
-            self._actions.notes.append(f"{fault.kind} at {fault.at_s:.0f} s: left out, it did not come to it")
-        for index, _, happened in under_way:
-            self._actions.end(index)
-            happened.end_s = monitor.now()
+        if under_way is not None:
+            self._end(under_way, schedule)
+        self._actions.notes += schedule.left_out()
         ledger.duration_s = monitor.now()
+
+    def _begin(self, index: int, fault: Planned) -> tuple[int, float, Happened]:
+        """Its number, when it is to end, and what is written down of it."""
+        happened = Happened(fault.kind, self._monitor.now(), value=fault.value)
+        self._actions.begin(index, fault)
+        self._ledger.faults.append(happened)
+        return index, self._monitor.now() + fault.duration_s, happened
+
+    def _end(self, under_way: tuple[int, float, Happened], schedule: Schedule) -> None:
+        index, _, happened = under_way
+        self._actions.end(index)
+        happened.end_s = self._monitor.now()
+        schedule.over(index, happened.end_s)
 
     def close(self) -> None:
         """Take back what is under way, and end the thread."""

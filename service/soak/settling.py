@@ -69,15 +69,15 @@ def settle(ledger: Ledger, count: int | None = None) -> None:
                 if mae.get(second, math.inf) <= WELL_PCT:
                     fault.recovered_s = float(second)
                     break
-        fault.told = _told(ledger, fault)
+        fault.told, fault.look_until_s = _told(ledger, fault, last), last
 
 
-def _told(ledger: Ledger, fault: Happened) -> str:
-    """Which counter or event told of a fault; "" for none, "-" where none is asked for."""
+def _told(ledger: Ledger, fault: Happened, end: float) -> str:
+    """Which counter or event told of a fault until ``end``, s; "" for none, "-" where none is asked for."""
     tellers = TELLERS.get(fault.kind)
     if tellers is None:
         return "-"
-    begin, end = fault.begin_s, fault.window_s[1] + 2.0
+    begin = fault.begin_s
     counters = ledger.counters_between(begin - 30.0, end)
     for teller in tellers:
         if teller == "event":

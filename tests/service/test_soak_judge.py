@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from service.soak.catalogue import KINDS
+from service.soak.control import Control
 from service.soak.judge import TRACKING_PCT
 from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
 from service.soak.outcome import verdict_line
@@ -18,7 +19,6 @@ from service.soak.plan import make_plan
 from service.soak.report import report
 from service.soak.run import _excused
 from service.soak.settling import settle
-from service.soak.setup import Control
 from service.soak.track import Track
 from service.wire import SampleBatch
 from tests.service.soaked import broken, healthy, verdict
@@ -118,6 +118,26 @@ def late_machine(ledger: Ledger, late_s: float, others: float = 0.0) -> Ledger:
     ledger.bare = [(k + 0.95, late_s) for k in range(int(ledger.duration_s))]
     ledger.others = [(k + 0.95, others) for k in range(int(ledger.duration_s))]
     return ledger
+
+
+def test_a_fault_of_which_there_was_no_time_to_tell_is_not_judged() -> None:
+    for duration_s, held in ((17.9, True), (18.1, False)):
+        ledger = healthy()
+        spoil(ledger, "faults_told")
+        ledger.duration_s = duration_s
+        told = verdict(ledger)["invariants"]["faults_told"]
+        assert told["held"] is held
+        assert ("1 of 1 not judged: the run was over" in told["text"]) is held
+
+
+@pytest.mark.parametrize(("late_s", "held"), [(0.001, False), (0.02, True)])
+def test_on_a_busy_machine_a_fault_is_told_of_later(late_s: float, held: bool) -> None:
+    ledger = late_machine(healthy(), late_s)
+    for _, _, counters in ledger.counters[:20]:
+        lost, counters["samples.lost"] = counters["samples.lost"], 0.0
+        counters["samples.received"] += lost
+        counters["samples.gates.learnt"] = counters["samples.received"]
+    assert verdict(ledger)["invariants"]["faults_told"]["held"] is held
 
 
 @pytest.mark.parametrize(("late_s", "silent_s", "held"), [(0.001, 0.3, False), (0.02, 0.3, True), (0.02, 0.5, False)])
