@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled, compiled_reassociating
+from adaptive.compiled import compiled_contracting, compiled_reassociating
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
@@ -65,7 +65,7 @@ def gram(X: FloatArray, other: FloatArray | None, widths: FloatArray) -> FloatAr
     return np.asarray(np.exp(squared, out=squared), dtype=np.float64)
 
 
-@compiled
+@compiled_contracting
 def exp_negative(t: FloatArray, bits: FloatArray) -> None:
     """exp(t) in place for t <= 0, to 2 units in the last place; below -708 exactly 0. ``bits`` (N,) is scratch.
 
@@ -100,23 +100,29 @@ def exp_negative(t: FloatArray, bits: FloatArray) -> None:
         t[j] = value
 
 
-@compiled
+@compiled_contracting
 def rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatArray, bits: FloatArray) -> None:
     """K of the first ``count`` samples with one point into ``out[:count]``.
 
     ``scaled`` (d, N) and ``x_scaled`` (d,) are features divided by their widths; ``bits`` (N,) is scratch.
     """
     target = out[:count]
-    first = scaled[0]
-    for j in range(count):
-        difference = first[j] - x_scaled[0]
-        target[j] = -difference * difference
-    for i in range(1, scaled.shape[0]):
-        row = scaled[i]
-        xi = x_scaled[i]
+    i = scaled.shape[0] % 2
+    if i == 1:
+        row, xi = scaled[0], x_scaled[0]
         for j in range(count):
             difference = row[j] - xi
-            target[j] -= difference * difference
+            target[j] = -(difference * difference)
+    else:
+        for j in range(count):
+            target[j] = 0.0
+    # Two features at a time: to go through the samples once more costs as much as what is worked out.
+    while i < scaled.shape[0]:
+        row, other, xi, yi = scaled[i], scaled[i + 1], x_scaled[i], x_scaled[i + 1]
+        for j in range(count):
+            difference, second = row[j] - xi, other[j] - yi
+            target[j] -= difference * difference + second * second
+        i += 2
     exp_negative(target, bits[:count])
 
 

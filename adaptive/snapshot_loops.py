@@ -30,6 +30,15 @@ def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no co
     return total
 
 
+@compiled_reassociating
+def linear_part(beta: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
+    """beta' basis, V: in order each sum would wait for the one before it."""
+    total = 0.0
+    for j in range(beta.shape[0]):
+        total += beta[j] * basis[j]
+    return total
+
+
 @compiled
 def evaluate(
     y: FloatArray,
@@ -61,11 +70,8 @@ def evaluate(
     for i in range(n):
         advance(y[i], memory, m)
         fill(y[i], v[i], a[i], memory, m, basis, x)
-        mean = 0.0
-        variance = noise_variance
-        for j in range(p):
-            mean += beta[j] * basis[j]
-        variance += spread(beta_covariance, basis)
+        mean = linear_part(beta, basis)
+        variance = noise_variance + spread(beta_covariance, basis)
         nearest = 0.0
         if count > 0:
             for j in range(d):
@@ -137,9 +143,7 @@ def mean_of(
 ) -> float:  # pragma: no cover - compiled
     """Mean at one point whose inputs are known."""
     count = alpha.shape[0]
-    mean = 0.0
-    for j in range(beta.shape[0]):
-        mean += beta[j] * basis[j]
+    mean = linear_part(beta, basis)
     if count > 0:
         k = np.empty(count)
         rbf_column(scaled, count, kernel * inverse_widths, k, np.empty(count))
