@@ -6,7 +6,6 @@ The process is ``python -m MODULE FOLDER``. It finds ``order.json`` and ``data.n
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import subprocess
@@ -20,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.types import FloatArray
+from service.priority import step_back
 
 _ORDER: Final = "order.json"
 _DATA: Final = "data.npz"
@@ -124,8 +124,7 @@ class BackgroundJob:
 def work(folder: Path, do: Callable[[dict[str, Any], dict[str, FloatArray]], dict[str, Any]]) -> int:
     """The process' side: ``do`` gets order and arrays, and its result is written whole or not at all. Returns 0."""
     # Before the heavy imports: whoever answers queries goes first, always.
-    with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
+    step_back()
     order = json.loads((folder / _ORDER).read_text(encoding="utf-8"))
     with np.load(folder / _DATA, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}

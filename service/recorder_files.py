@@ -20,6 +20,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from service.journal import INDEX_MODULUS, Rows, read_journal
+from service.priority import step_back
 
 OPEN, CLOSED, PART = ".journal", ".parquet", ".part"
 #: The name of the journal of a segment that is Parquet already.
@@ -223,6 +224,9 @@ def main() -> int:
     A recorder, which holds the directory, names second the journal that it writes; without it nobody may hold it.
     """
     directory, but = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
+    if but not in (None, _NONE):
+        # Samples go on coming; nobody waits for this.
+        step_back()
     try:
         if but is None:
             held = claim(directory)  # noqa: F841 - until the process ends

@@ -20,13 +20,16 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.queues import Queue
 from pathlib import Path
+from typing import Final
 
 from adaptive.errors import InputError
 from service.errors import ServiceError
+from service.priority import step_back
 from service.view.feed import Record, SceneConfig
 
 #: How long a child may take to start: Rerun and numpy are imported anew in it.
 START_S = 60.0
+_NICE: Final = 5
 _URL = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy\Z")
 
 
@@ -130,9 +133,10 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     """The child: draws batches until None comes or its parent is gone."""
     # An interrupt at the terminal reaches the whole group; the parent decides when to stop.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Drawing must never take the processor from those it watches.
+    # Drawing must never take the processor from those it watches: in a session of its own, which is nice as a whole.
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(5)
+        os.setsid()
+    step_back(_NICE)
     from service.view.rerun_sink import RerunSink
     from service.view.scene import Scene
 

@@ -162,6 +162,20 @@ def unit_piece(k: int) -> Tracking:
     return Tracking("linear", seq, seq * 1e-3, seq * 0.0, seq * 0.0, seq * 0.0 + 1.0)
 
 
+def test_drawing_steps_back_behind_those_it_watches(tmp_path: Path) -> None:
+    """By a session of its own: where sessions share the processor, what is nice within one is nobody else's gain."""
+    output = Output(OutputConfig(SceneConfig("demo/x", MODELS), rrd=tmp_path / "run.rrd"))
+    try:
+        pid = output.pid
+        assert pid is not None
+        assert os.getsid(pid) == pid != os.getsid(0)
+        assert os.getpriority(os.PRIO_PROCESS, pid) == min(os.nice(0) + 5, 19)
+        group = Path(f"/proc/{pid}/autogroup")
+        assert not group.exists() or group.read_text().strip()[-6:] in ("", "nice 5")
+    finally:
+        assert output.close(timeout_s=30.0) is True
+
+
 def test_a_viewer_that_does_not_answer_ends_within_its_time() -> None:
     listener, url = dead_url()
     with listener:
