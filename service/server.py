@@ -32,9 +32,10 @@ from service.standby.succession import Succession
 #: would be the latency of a query that meets the learner.
 _SWITCH_S: Final = 1e-4
 #: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, and any other
-#: that is connected to something; and how much longer it may take until that is settled.
+#: that may have company, which tries to connect five times a second; and how much longer it may take until that is
+#: settled.
 STANDBY_PATIENCE_S: Final = 3.0
-PATIENCE_S: Final = 0.3
+PATIENCE_S: Final = 0.6
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
@@ -141,10 +142,12 @@ class Service:
         config = self.config
         # Everything that can be refused is looked at before anything can be seen on the wire.
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
-        # The one that stands by and the one that serves each connect to where the other listens.
-        connect = config.connect if self.standby else (*config.connect, *config.standby_listen)
-        self._session = open_service(config.listen, connect, config.zenoh_config, config.lease_s)
-        patience_s = STANDBY_PATIENCE_S if self.standby else PATIENCE_S if connect else 0.0
+        # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
+        # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
+        # (1.10) left the two without half of what they had declared to each other, for good: both served.
+        self._session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
+        others = config.connect or config.standby_listen
+        patience_s = STANDBY_PATIENCE_S if self.standby else PATIENCE_S if others else 0.0
         try:
             for axis, estate in zip(loaded, self._estates, strict=True):
                 server = AxisServer(

@@ -161,7 +161,7 @@ def _open(
         "transport/unicast/open_timeout": round(1e3 * _OPEN_S),
         # Who takes nothing for so long is let go, so that samples on their way to others do not wait behind it, µs.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * _PATIENCE_S[mode]),
-        "connect/retry": {"period_init_ms": 20, "period_max_ms": 500, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2},
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

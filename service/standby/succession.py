@@ -15,7 +15,7 @@ import zenoh
 from adaptive.errors import DehystError, ModelFileError
 from service.axis_server import PRIMARY, STANDBY, AxisServer
 from service.handover import MOST_PAUSE_S, PAUSE_S, ask_for_state
-from service.standby.claims import Claims
+from service.standby.claims import Claim, Claims
 from service.standby.estate import Estate, inherit
 from service.standby.reach import Reach
 from service.standby.shadow import Shadow
@@ -25,6 +25,8 @@ OPERATIONS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "r
 #: Longest wait for the state of the serving instance, and pause before it is asked for again, s.
 _STATE_S: Final = 3.0
 _AGAIN_S: Final = 0.3
+#: One that serves and should not, and still does after so long, was not told of this instance's claim, s.
+_UNHEARD_S: Final = 2.0
 
 
 class Succession:
@@ -53,6 +55,7 @@ class Succession:
         self._stale = True
         self._token: Any = None
         self._mine = 0
+        self._rival_at: float | None = None
         self._subscribers: list[Any] = []
         self._thread = threading.Thread(target=self._run, name=f"succession-{server.keys.axis}", daemon=True)
         #: Set once it is known whether this instance serves.
@@ -126,6 +129,8 @@ class Succession:
         if self.server.role == PRIMARY:
             if first is not None and (first.epoch, first.instance) > (self._mine, self.server.instance):
                 self._yield_to(first.instance)
+            else:
+                self._look_at_rival(first)
             return
         if first is None:
             # Who has stood by knows that the one that served is gone; who has just begun looks around first. Who is
@@ -138,10 +143,34 @@ class Succession:
         if self._stale:
             self._take_state()
 
+    def _look_at_rival(self, rival: Claim | None) -> None:
+        """Claim anew where another one goes on serving that should have stood down.
+
+        It may be that the wire did not tell it: of a pair of which one had been stopped this was seen (zenoh 1.10). Of
+        a new claim it hears.
+        """
+        now = time.monotonic()
+        if rival is None:
+            self._rival_at = None
+        elif self._rival_at is None:
+            self._rival_at = now
+        elif now - self._rival_at >= _UNHEARD_S:
+            self._rival_at = now
+            self._claim()
+            told = f"as number {self._mine}: {rival.instance} serves as number {rival.epoch} and does not stand down"
+            self.server.axis.note("claimed_anew", told)
+
+    def _claim(self) -> None:
+        """Hold a token above all that are known; the one before, if any, goes after it has come."""
+        server, before = self.server, self._token
+        server.epoch = self._mine = max(self._mine + 1, self.claims.next_epoch())
+        self._token = self._session.liveliness().declare_token(server.keys.claim(self._mine, server.instance))
+        if before is not None:
+            before.undeclare()
+
     def _take_over(self) -> None:
         server = self.server
-        server.epoch = self._mine = self.claims.next_epoch()
-        self._token = self._session.liveliness().declare_token(server.keys.claim(self._mine, server.instance))
+        self._claim()
         server.serve()
         server.intake.call(self._release, 60.0)
         self._stale = False
@@ -156,6 +185,7 @@ class Succession:
         server.synced = False
         server.stand_down()
         self._drop_claim()
+        self._rival_at = None
         server.intake.call(self._hold, 60.0)
         self._stale = True
         self._take_state()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from service.client import Client
 from service.keys import Keys
@@ -136,6 +137,34 @@ def is_the_same(client: Client, standing: dict[str, dict[str, Any]], instance: s
             return True
         time.sleep(0.004)
     return False
+
+
+def test_who_serves_claims_anew_where_another_goes_on_serving(tmp_path: Path, processes: list[Process]) -> None:
+    """As after a stop, when the wire leaves the one that goes on without the claim of the one that took over."""
+    config, endpoints = pair_config(tmp_path)
+    processes.append(Process("serve", "--config", str(config)))
+    instance = processes[0].ready["instance"]
+    keys = Keys("demo", "x")
+    heard: list[tuple[int, bool]] = []
+
+    def on_claim(sample: zenoh.Sample) -> None:
+        claim = parse_claim(str(sample.key_expr))
+        if claim is not None and claim.instance == instance:
+            heard.append((claim.epoch, sample.kind == zenoh.SampleKind.PUT))
+
+    with open_client(endpoints, 20.0) as session, Client.connect(endpoints, wait_s=20.0) as client:
+        session.liveliness().declare_subscriber(keys.claim_any, on_claim, history=True)
+        eventually(lambda: heard == [(1, True)])
+        deaf = session.liveliness().declare_token(keys.claim(0, "i0-deaf"))
+        eventually(lambda: len(heard) >= 5)
+        deaf.undeclare()
+        # Never without one: whoever stands by would take over.
+        assert heard[:5] == [(1, True), (2, True), (1, False), (3, True), (2, False)]
+        time.sleep(3.5)
+        last = len(heard)
+        time.sleep(3.5)
+        assert len(heard) == last, "nobody is there any more who should hear of it"
+        assert client.status()["epoch"] == heard[-2][0]
 
 
 def test_a_router_that_is_started_again_is_found_again(tmp_path: Path, processes: list[Process]) -> None:
