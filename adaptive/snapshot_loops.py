@@ -8,6 +8,7 @@ from adaptive.compiled import compiled, compiled_reassociating
 from adaptive.features_loops import FeatureArrays, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, FloatArray
+from adaptive.window_common import dot
 from adaptive.window_state import IntArray
 
 
@@ -27,15 +28,6 @@ def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no co
         for i in range(p):
             total += row[i] * bj * basis[i]
         j += 1
-    return total
-
-
-@compiled_reassociating
-def linear_part(beta: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
-    """beta' basis, V: in order each sum would wait for the one before it."""
-    total = 0.0
-    for j in range(beta.shape[0]):
-        total += beta[j] * basis[j]
     return total
 
 
@@ -70,7 +62,7 @@ def evaluate(
     for i in range(n):
         advance(y[i], memory, m)
         fill(y[i], v[i], a[i], memory, m, basis, x)
-        mean = linear_part(beta, basis)
+        mean = dot(beta, basis, p)
         variance = noise_variance + spread(beta_covariance, basis)
         nearest = 0.0
         if count > 0:
@@ -143,7 +135,7 @@ def mean_of(
 ) -> float:  # pragma: no cover - compiled
     """Mean at one point whose inputs are known."""
     count = alpha.shape[0]
-    mean = linear_part(beta, basis)
+    mean = dot(beta, basis, beta.shape[0])
     if count > 0:
         k = np.empty(count)
         rbf_column(scaled, count, kernel * inverse_widths, k, np.empty(count))

@@ -8,9 +8,10 @@ import time
 from pathlib import Path
 from typing import Final
 
+#: The lowest priority there is.
 LAST: Final = 19
-#: The system takes one such wish in a tenth of a second, from all processes together.
 _AUTOGROUP: Final = Path("/proc/self/autogroup")
+#: The system takes one such wish in a tenth of a second, from all processes together.
 _TRIES, _PAUSE_S = 20, 0.11
 
 

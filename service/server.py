@@ -31,11 +31,12 @@ from service.standby.succession import Succession
 #: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
 #: would be the latency of a query that meets the learner.
 _SWITCH_S: Final = 1e-4
-#: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, and any other
-#: that may have company, which tries to connect five times a second; and how much longer it may take until that is
-#: settled.
+#: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, one that a
+#: standby may be about to connect to, which it tries five times a second, and any other that is connected to something;
+#: and how much longer it may take until that is settled.
 STANDBY_PATIENCE_S: Final = 3.0
-PATIENCE_S: Final = 0.6
+PAIR_PATIENCE_S: Final = 0.6
+PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
@@ -146,8 +147,8 @@ class Service:
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
         # (1.10) left the two without half of what they had declared to each other, for good: both served.
         self._session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
-        others = config.connect or config.standby_listen
-        patience_s = STANDBY_PATIENCE_S if self.standby else PATIENCE_S if others else 0.0
+        patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else 0.0
+        patience_s = max(patience_s, PATIENCE_S if config.connect else 0.0)
         try:
             for axis, estate in zip(loaded, self._estates, strict=True):
                 server = AxisServer(
