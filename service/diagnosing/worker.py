@@ -48,12 +48,17 @@ def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> 
 
 
 def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
-    """Samples (4, n) as a stretch for the comparison; what is before ``from_seq`` only settles the memory."""
+    """Samples (4, n) as a stretch for the comparison; what is before ``from_seq`` only settles the memory.
+
+    A stage that said nothing for long cuts them: then the part with most of what is from ``from_seq`` on.
+    """
     from adaptive.smoothing import SmootherConfig, smooth_recording
     from sim.changes.columns import Stretch
 
-    whole, valid = _repaired(samples, dt_s)
-    scored = valid & (whole.t_s + 0.5 * dt_s > _time_of(samples, from_seq))
+    first = int(np.searchsorted(samples[0], from_seq))
+    whole, valid = _repaired(samples, dt_s, first)
+    numbers = np.rint(whole.t_s / dt_s) + samples[0, 0]
+    scored = valid & (numbers >= from_seq)
     config = SmootherConfig.for_rate(dt_s)
     # Past its ends the smoother makes up what it has not seen.
     scored[: config.lag] = scored[-config.lag :] = False
@@ -61,19 +66,15 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
     return Stretch(dt_s, whole.t_s, np.ascontiguousarray(whole.u_V), motion, scored)
 
 
-def _time_of(samples: FloatArray, seq: int) -> float:
-    later = np.flatnonzero(samples[0] >= seq)
-    return float(samples[1, later[0]]) if later.size else float("inf")
-
-
-def _repaired(samples: FloatArray, dt_s: float) -> tuple[Any, BoolArray]:
+def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, BoolArray]:
     from sim.recordings import Recording, repaired
 
+    # As for what learns, the numbers say how much time has passed: the stage's clock may have been set meanwhile.
     recording = Recording(
-        t_s=samples[1], u_V=samples[2], y_um=samples[3], dt_s=dt_s, source="recent samples",
+        t_s=dt_s * (samples[0] - samples[0, :1]), u_V=samples[2], y_um=samples[3], dt_s=dt_s, source="recent samples",
         seq=samples[0].astype(np.int64),
     )  # fmt: skip
-    fixed = repaired(recording)
+    fixed = repaired(recording, since)
     return fixed.recording, fixed.valid
 
 

@@ -32,20 +32,22 @@ class Repaired:
     done: tuple[str, ...]
 
 
-def repaired(recording: Recording) -> Repaired:
-    """The longest usable stretch of a recording on its own time grid.
+def repaired(recording: Recording, since: int = 0) -> Repaired:
+    """The longest usable stretch of a recording on its own time grid; of what is from its row ``since`` on, and before.
 
     Samples that repeat a time or a step are dropped, exact zeros between far readings and not-finite values are
     interpolated, gaps of up to ``LONGEST_FILL`` samples too; a longer gap or a step back in time splits the
-    recording, and its longest part is taken. Raises InputError where fewer than two samples are left.
+    recording, and the part is taken that holds most of the rows from ``since`` on, with what comes before them.
+    Raises InputError where fewer than two samples are left.
     """
     done: list[str] = []
     n, dt = len(recording), recording.dt_s
     bad_time = ~np.isfinite(recording.t_s)
     if bad_time.any():
         recording = _pick(recording, ~bad_time)
+        since -= int(bad_time[:since].sum())
         done.append(f"{int(bad_time.sum())} samples without a time left out")
-    recording = _longest_stretch(recording, dt, done)
+    recording = _longest_stretch(recording, dt, since, done)
     if len(recording) < 2:
         raise InputError(f"{recording.source or 'recording'}: got {n} samples, none of them in a usable stretch")
     step = np.rint((recording.t_s - recording.t_s[0]) / dt).astype(np.int64)
@@ -87,16 +89,15 @@ def _pick(recording: Recording, keep: BoolArray) -> Recording:
     return replace(recording, **chosen)
 
 
-def _longest_stretch(recording: Recording, dt_s: float, done: list[str]) -> Recording:
+def _longest_stretch(recording: Recording, dt_s: float, since: int, done: list[str]) -> Recording:
     steps = np.diff(recording.t_s)
     # A clock that is set back a little inside a run of doubles is no new recording; half a step is the limit.
     cuts = np.flatnonzero((steps > (LONGEST_FILL + 0.5) * dt_s) | (steps < -0.5 * dt_s)) + 1
     if not len(cuts):
         return recording
     bounds = np.concatenate([[0], cuts, [len(recording)]])
-    longest = int(np.argmax(np.diff(bounds)))
+    longest = int(np.argmax(np.diff(np.maximum(bounds, since))))
     start, stop = int(bounds[longest]), int(bounds[longest + 1])
-    done.append(
-        f"cut into {len(cuts) + 1} parts by long gaps or steps back in time; the longest ({stop - start}) taken"
-    )
+    which = "the one with most of what is asked for" if since else "the longest"
+    done.append(f"cut into {len(cuts) + 1} parts by long gaps or steps back in time; {which} ({stop - start}) taken")
     return recording.part(start, stop)

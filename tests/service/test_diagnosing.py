@@ -26,6 +26,7 @@ from service.diagnosing.buffer import SampleBuffer
 from service.diagnosing.job import Job
 from service.diagnosing.settings import WatchConfig
 from service.diagnosing.watcher import Watcher
+from service.diagnosing.worker import diagnose
 from service.errors import FieldError
 from service.guard import Limits
 from service.identifying import identify_one
@@ -176,6 +177,18 @@ def test_a_job_names_the_change_in_a_process_of_its_own(model_file: Path) -> Non
     assert told[0]["effects"][0]["name"] == "gain_drift"
     assert told[0]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.019, abs=0.003)
     assert "gain drift, -1." in told[0]["text"] or "gain drift, -2." in told[0]["text"]
+
+
+@pytest.mark.parametrize("clock_s", [0.0, -3600.0])
+def test_what_is_recent_is_looked_at_though_a_longer_part_lies_before_a_gap(model_file: Path, clock_s: float) -> None:
+    samples = recorded(model_file, 18.0, 9.0, gain_drift__gain=-0.03)
+    # Nothing is heard for a second, and the stage's clock is set while the change is being looked at.
+    samples[1, 14000:] += clock_s
+    heard = np.r_[0:10500, 11500:18000]
+    told = diagnose(order(model_file, 10000), samples[:, :8500], samples[:, heard])
+    assert told["verdict"] == "changed"
+    assert told["effects"][0]["name"] == "gain_drift"
+    assert told["effects"][0]["parameters"]["gain"] == pytest.approx(-0.03, abs=0.004)
 
 
 def test_a_job_does_not_keep_what_it_was_given(model_file: Path) -> None:

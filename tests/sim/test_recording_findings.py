@@ -79,6 +79,13 @@ def test_a_long_gap_or_a_step_back_splits_and_the_longest_part_is_taken() -> Non
     assert len(repaired(joined).recording) == 2500
 
 
+@pytest.mark.parametrize(("since", "first_s"), [(0, 1.1), (900, 1.1), (3600, 1.1), (3650, 3.9), (3700, 3.9)])
+def test_of_several_parts_the_one_with_most_of_what_is_asked_for(since: int, first_s: float) -> None:
+    # Rows 0 to 999, 1000 to 3699 and 3700 to 3799: two hundred samples are missing.
+    whole = repaired(without(healthy(), np.r_[1000:1100, 3800:3900]), since)
+    assert whole.recording.t_s[0] == pytest.approx(first_s)
+
+
 def test_doubled_samples_by_time_and_by_value() -> None:
     base = healthy()
     again = np.sort(np.r_[np.arange(4000), 700, 1300])
