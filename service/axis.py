@@ -9,6 +9,7 @@ belong to the thread that handles samples, between two batches.
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -132,8 +133,9 @@ class Axis(AxisLearning):
         return events
 
     def note(self, event: str, detail: str, **more: Any) -> None:
-        """Keep an event for whoever publishes them."""
-        self._events.append({"seq": self.sequence.last, "event": event, "detail": detail, **more})
+        """Keep an event, with the time that it is now, for whoever publishes them: a standby may much later."""
+        now = {"seq": self.sequence.last, "time_unix_s": time.time()}
+        self._events.append({**now, "event": event, "detail": detail, **more})
 
     def handle(self, batch: SampleBatch) -> list[str]:
         """Take the samples of a message; returns what was made of each: "learnt", or the reason why not."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -121,7 +120,7 @@ class Publications:
         if publisher is None:
             return
         for event in self._axis.take_events():
-            publisher.put(json.dumps({**event, "instance": self._instance, "time_unix_s": time.time()}))
+            publisher.put(json.dumps({**event, "instance": self._instance}))
 
 
 def _is_followed(publisher: Any) -> bool:
