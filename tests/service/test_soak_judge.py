@@ -188,6 +188,12 @@ def test_a_snapshot_that_is_followed_may_be_old_during_a_fault_and_as_late_as_th
         probe.ages_s = [0.4, 0.01]
     assert verdict(ledger)["invariants"]["follower_age"]["worst"] == pytest.approx(0.4)
     assert "follower_age" in broken(verdict(ledger))
+    # A second that began before the run, when no samples came yet, says nothing of it.
+    early = late_machine(healthy(), 0.0)
+    early.probes[0].ages_s = [0.6] * 100
+    assert verdict(early)["invariants"]["follower_age"]["held"] is True
+    early.probes[2].ages_s = [0.6] * 100
+    assert "follower_age" in broken(verdict(early))
     # Where others have the processor a learner waits for it, though a loop that only wakes up does not.
     assert "follower_age" in verdict(late_machine(ledger, 0.001, 0.3))["not_judged"]
 
