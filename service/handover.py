@@ -23,6 +23,10 @@ _MOST_PARTS: Final = 4681
 _PLACE: Final = struct.Struct("<II")
 #: Pauses between two parts, s: the first time that it is asked for, and at most.
 PAUSE_S, MOST_PAUSE_S = 0.001, 0.016
+#: Silence after which a part, the end, or the question is taken for lost, s, and pauses on top of it: who asks again
+#: asks for longer ones, and is patient with a machine that is busy.
+_SILENT_S, _SILENT_PAUSES = 0.5, 100
+_LOOK_S: Final = 0.002
 
 
 def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
@@ -50,11 +54,11 @@ def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: f
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    return join(_parts(replies))
+    return join(_parts(replies, timeout_s, _SILENT_S + _SILENT_PAUSES * pause_s))
 
 
 def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
-    """The whole of its parts, each after its place; None at the first that is not the one that comes next."""
+    """The whole of its parts, each after its place, as soon as it is whole; None at the first that is not the next."""
     whole, taken, of = bytearray(), 0, 0
     for place, part in parts:
         if len(place) != _PLACE.size:
@@ -64,10 +68,22 @@ def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
             return None
         whole += part
         taken, of = taken + 1, n
-    return bytes(whole) if taken and taken == of else None
+        if taken == of:
+            return bytes(whole)
+    return None
 
 
-def _parts(replies: Iterable[zenoh.Reply]) -> Iterator[tuple[bytes, bytes]]:
-    for reply in replies:
+def _parts(replies: zenoh.Handler[zenoh.Reply], timeout_s: float, silent_s: float) -> Iterator[tuple[bytes, bytes]]:
+    """Places and parts as they come, until there are no more: the end may be lost like any part of them."""
+    begin = heard = time.monotonic()
+    while time.monotonic() < min(begin + timeout_s, heard + silent_s):
+        try:
+            reply = replies.try_recv()
+        except zenoh.ZError:
+            return  # that was all
+        if reply is None:
+            time.sleep(_LOOK_S)
+            continue
+        heard = time.monotonic()
         place = reply.ok.attachment if reply.ok is not None else None
         yield (b"", b"") if reply.ok is None or place is None else (place.to_bytes(), reply.ok.payload.to_bytes())

@@ -44,6 +44,9 @@ _STUCK_S: Final = 0.3
 #: By mode, s. A client has one other end only: nobody waits behind it. At a router it must be shorter than the lease,
 #: because everybody's signs of life wait behind one slow subscriber when another one comes or goes.
 _PATIENCE_S: Final = {"peer": _STUCK_S, "router": _STUCK_S, "client": 5.0}
+#: Packets of 64 KiB that may wait at the priority of a state on its way to a standby; zenoh's default of two is full,
+#: and the next part lost, where the thread that sends waits for a processor for a few milliseconds.
+_STATE_PACKETS: Final = 16
 #: The longest message that is put together from its parts, bytes: the largest model, and some. Zenoh's own default of
 #: 1 GiB would let any sender ask for that much memory.
 MAX_MESSAGE_BYTES: Final = 72 * 2**20
@@ -161,6 +164,7 @@ def _open(
         "transport/unicast/open_timeout": round(1e3 * _OPEN_S),
         # Who takes nothing for so long is let go, so that samples on their way to others do not wait behind it, µs.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * _PATIENCE_S[mode]),
+        "transport/link/tx/queue/size/data_low": _STATE_PACKETS,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2},
     }
     for key, value in settings.items():

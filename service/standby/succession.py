@@ -53,6 +53,7 @@ class Succession:
         self._patience_s = patience_s
         self._stopping = False
         self._stale = True
+        self._taking = False
         self._token: Any = None
         self._mine = 0
         self._rival_at: float | None = None
@@ -100,6 +101,8 @@ class Succession:
         server = self.server
         if server.role == PRIMARY or not server.synced or told.get("instance") == server.instance:
             return
+        if self._stale or self._taking:
+            return  # what it has now is to be replaced, and that it differs says nothing of what comes
         seq, theirs = told.get("snapshot_seq"), told.get("fingerprint")
         if isinstance(seq, int) and isinstance(theirs, str) and server.axis.differs(seq, theirs):
             server.axis.note("standby_differed", f"at sample {seq}; the state is taken over anew")
@@ -209,8 +212,13 @@ class Succession:
 
     def _take_state(self) -> None:
         """Take over the state of the one that serves; where it does not come, once more after a while."""
-        self._stale = False  # what makes it stale again may happen while it is taken
-        self._stale = not self._taken() or self._stale
+        self._taking, self._stale = True, False  # what makes it stale again may happen while it is taken
+        taken = False
+        try:
+            taken = self._taken()
+        finally:
+            self._taking = False
+            self._stale = self._stale or not taken
 
     def _taken(self) -> bool:
         data = ask_for_state(self._session, self.server.keys.state, _STATE_S, self._pause_s)

@@ -225,6 +225,38 @@ def test_a_standby_that_loses_its_router_does_not_take_itself_for_the_successor(
         assert (status["instance"], status["epoch"], status["role"]) == (second, 2, "primary")
 
 
+def test_a_standby_that_is_told_it_differs_takes_the_state_once_at_a_time(
+    tmp_path: Path, processes: list[Process]
+) -> None:
+    """What it is told meanwhile is of a state that it is about to replace."""
+    config, endpoints = pair_config(tmp_path)
+    processes.append(Process("serve", "--config", str(config)))
+    processes.append(Process("serve", "--config", str(config), "--standby"))
+    second = processes[1].ready["instance"]
+    events: list[dict[str, Any]] = []
+    told: list[dict[str, Any]] = []
+    with (
+        Client.connect(endpoints, wait_s=20.0, retry_s=20.0) as client,
+        Stage(endpoints),
+        open_client(endpoints[1], 20.0) as session,
+    ):
+        keys = client.keys
+        session.declare_subscriber(keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
+        session.declare_subscriber(keys.standby(second), lambda s: told.append(json.loads(s.payload.to_bytes())))
+        eventually(lambda: told and told[-1]["synced"] and told[-1]["samples"]["learnt"] > 500)
+        for _ in range(150):
+            seq = client.status()["snapshot_seq"]
+            session.put(keys.status, json.dumps({"instance": "i0-no", "snapshot_seq": seq, "fingerprint": "?"}))
+            time.sleep(0.01)
+        heard = len(told)
+        eventually(lambda: len(told) > heard + 2 and told[-1]["synced"])
+        processes[0].process.kill()
+        eventually(lambda: any(event["event"] == "took_over" for event in events))
+    (took,) = (event for event in events if event["event"] == "took_over")
+    assert took["synced"]
+    assert 1 <= sum(event["event"] == "standby_differed" for event in events) <= 12
+
+
 def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processes: list[Process]) -> None:
     config = write_config(tmp_path, port := unused_port())
     endpoint = f"tcp/127.0.0.1:{port}"
