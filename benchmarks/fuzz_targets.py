@@ -97,10 +97,13 @@ def _framed_checkpoint(data: bytes) -> None:
 
 
 def _parts(data: bytes) -> None:
-    """Parts of a state, each of up to three bytes behind its place: whole, or nothing."""
+    """Parts of a state, each of up to three bytes behind its place: as many as the first says, or nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
     whole = join((piece[:8], piece[8:]) for piece in pieces)
-    if whole is not None and whole != b"".join(piece[8:] for piece in pieces):
+    if whole is None:
+        return
+    of = int.from_bytes(pieces[0][4:8], "little")
+    if len(pieces) < of or whole != b"".join(piece[8:] for piece in pieces[:of]):
         raise AssertionError("parts were taken for a whole that they do not make")
 
 
