@@ -54,7 +54,7 @@ def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: f
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    return join(_parts(replies, timeout_s, _SILENT_S + _SILENT_PAUSES * pause_s))
+    return join(_parts(replies, _SILENT_S + _SILENT_PAUSES * pause_s))
 
 
 def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
@@ -73,14 +73,14 @@ def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
     return None
 
 
-def _parts(replies: zenoh.Handler[zenoh.Reply], timeout_s: float, silent_s: float) -> Iterator[tuple[bytes, bytes]]:
+def _parts(replies: zenoh.Handler[zenoh.Reply], silent_s: float) -> Iterator[tuple[bytes, bytes]]:
     """Places and parts as they come, until there are no more: the end may be lost like any part of them."""
-    begin = heard = time.monotonic()
-    while time.monotonic() < min(begin + timeout_s, heard + silent_s):
+    heard = time.monotonic()
+    while time.monotonic() < heard + silent_s:
         try:
             reply = replies.try_recv()
         except zenoh.ZError:
-            return  # that was all
+            return  # that was all, or the question's time is over
         if reply is None:
             time.sleep(_LOOK_S)
             continue

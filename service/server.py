@@ -147,8 +147,8 @@ class Service:
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
         # (1.10) left the two without half of what they had declared to each other, for good: both served.
         self._session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
-        patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else 0.0
-        patience_s = max(patience_s, PATIENCE_S if config.connect else 0.0)
+        alone_s = PATIENCE_S if config.connect else 0.0
+        patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else alone_s
         try:
             for axis, estate in zip(loaded, self._estates, strict=True):
                 server = AxisServer(

@@ -33,7 +33,7 @@ class Repaired:
 
 
 def repaired(recording: Recording, since: int = 0) -> Repaired:
-    """The longest usable stretch of a recording on its own time grid; of what is from its row ``since`` on, and before.
+    """The longest usable stretch of a recording on its own time grid, or that with most of its rows from ``since`` on.
 
     Samples that repeat a time or a step are dropped, exact zeros between far readings and not-finite values are
     interpolated, gaps of up to ``LONGEST_FILL`` samples too; a longer gap or a step back in time splits the
