@@ -134,8 +134,8 @@ class Axis(AxisLearning):
 
     def note(self, event: str, detail: str, **more: Any) -> None:
         """Keep an event, with the time that it is now, for whoever publishes them: a standby may much later."""
-        seq, now_s = self.sequence.last, time.time()
-        self._events.append({"seq": seq, "event": event, "detail": detail, "time_unix_s": now_s, **more})
+        told = {"seq": self.sequence.last, "event": event, "detail": detail, "time_unix_s": time.time()}
+        self._events.append({**told, **more})
 
     def handle(self, batch: SampleBatch) -> list[str]:
         """Take the samples of a message; returns what was made of each: "learnt", or the reason why not."""
