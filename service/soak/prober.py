@@ -10,77 +10,79 @@ import json
 import math
 import sys
 import time
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zenoh
 
 from adaptive.errors import DehystError, InputError
 from service.client import Client, Point
-from service.errors import ServiceError
+from service.errors import NoReplyError
 from service.session import open_client
 from service.soak.control import AXIS, STAGE, Control
 from service.soak.extras import ECHO_KEY
+from service.soak.patience import MOST, Outcome, Patience
 from service.stopping import StopSignal
 from service.wire_query import encode_query
 from service.wire_reply import FeedforwardReply, encode_reply
 
-#: Pause between two rounds of one query and one echo, s; and the time-out of both.
-PAUSE_S, TIMEOUT_S = 0.01, 0.1
+#: Pause between two rounds of one query and one echo; how long an answer is waited for before another is asked for
+#: beside it; and the time-out of both, s.
+PAUSE_S, AGAIN_S, TIMEOUT_S = 0.01, 0.1, 1.0
+
+Told = Outcome[Point | None, Point]
 
 
 class Prober:
-    """What is counted in a second, and the questions."""
+    """What is counted in a second, and the questions.
 
-    def __init__(self, control: Control, client: Client, echo: Any, payload: bytes) -> None:
-        self._control, self._client, self._echo, self._payload = control, client, echo, payload
+    ``points`` asks for a point after another one; ``echoes`` sends so many bytes there and back.
+    """
+
+    def __init__(self, control: Control, points: Patience[Point | None, Point], echoes: Patience[bytes, int]) -> None:
+        self._control, self._points, self._echoes = control, points, echoes
         self._last: Point | None = None
         self._answered_s = time.monotonic()
         self._clear()
 
     def _clear(self) -> None:
         self.told: dict[str, Any] = {
-            "service_us": [], "echo_us": [], "failed": 0, "refused": 0, "unsafe": 0, "silent_s": 0.0,
-            "fallback": 0, "error": "", "ages_s": [],
+            "service_us": [], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.0, "error": "", "ages_s": [],
         }  # fmt: skip
 
     def ask(self) -> None:
-        """One point; what is wrong with the answer is counted."""
-        c, told = self._control, self.told
-        y_um = 0.5 * (c.low_um + c.high_um)
-        before = self._last
-        begin = time.perf_counter()
-        try:
-            point = self._client.point(y_um, after=before)
-        except InputError as error:
-            told["unsafe"] += 1
-            told["error"] = str(error)
-            return
-        except ServiceError as error:
-            told["failed"] += 1
-            told["error"] = str(error)
+        """One point; what is wrong with the answer is counted, as with one that comes late."""
+        for outcome in self._points.ask(self._last):
+            self._take(outcome)
+
+    def _take(self, outcome: Told) -> None:
+        told = self.told
+        if outcome.answer is None:
+            # What could be read, but not as an answer, is worse than none.
+            told["unsafe" if isinstance(outcome.error, InputError) else "failed"] += 1
+            told["error"] = str(outcome.error)
             # A memory that no longer fits is asked for anew.
             self._last = None
             return
-        told["service_us"].append(round(1e6 * (time.perf_counter() - begin), 1))
-        now = time.monotonic()
-        told["silent_s"] = max(told["silent_s"], now - self._answered_s)
-        self._answered_s = now
-        told["fallback"] += point.fallback
-        step_V = c.slew_V_per_s * c.dt_s
-        safe = math.isfinite(point.u_V) and c.u_min_V <= point.u_V <= c.u_max_V
-        if before is not None:
-            safe = safe and abs(point.u_V - before.u_V) <= step_V * (1.0 + 1e-9)
-        told["unsafe"] += not safe
-        self._last = point
+        told["service_us"].append(round(outcome.took_us, 1))
+        told["silent_s"] = max(told["silent_s"], outcome.at_s - self._answered_s)
+        self._answered_s = max(self._answered_s, outcome.at_s)
+        told["unsafe"] += not self._safe(outcome.asked, outcome.answer)
+        self._last = outcome.answer
 
-    def echo(self) -> None:
+    def _safe(self, before: Point | None, point: Point) -> bool:
+        c = self._control
+        safe = math.isfinite(point.u_V) and c.u_min_V <= point.u_V <= c.u_max_V
+        if before is None:
+            return safe
+        return safe and abs(point.u_V - before.u_V) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
+
+    def echo(self, payload: bytes) -> None:
         """The bare round trip of as many bytes there and back."""
-        begin = time.perf_counter()
-        for reply in self._echo.get(payload=self._payload):
-            if reply.ok is not None:
-                reply.ok.payload.to_bytes()
-                self.told["echo_us"].append(round(1e6 * (time.perf_counter() - begin), 1))
+        self.told["echo_us"] += [round(o.took_us, 1) for o in self._echoes.ask(payload) if o.answer is not None]
 
     def look(self, age_s: float) -> None:
         """At the age of the followed model, s."""
@@ -95,34 +97,52 @@ class Prober:
         return line
 
 
+def _echo(querier: zenoh.Querier, payload: bytes) -> int:
+    """Send ``payload`` to the echo and return how many bytes came back. Raises NoReplyError."""
+    for reply in querier.get(payload=payload):
+        if reply.ok is not None:
+            return len(reply.ok.payload.to_bytes())
+    raise NoReplyError("soak: no echo")
+
+
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
     stop = StopSignal()
     sys.setswitchinterval(5e-5)
     control = Control(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
+    y_um = 0.5 * (control.low_um + control.high_um)
+
+    def point(client: Client, before: Point | None) -> Point:
+        return client.point(y_um, after=before)
+
     try:
         with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
-            first = client.point(0.5 * (control.low_um + control.high_um))
+            first = client.point(y_um)
             payload = encode_query([0.0], [0.0], [0.0], memory=first.memory, model=first.model)
             nothing = FeedforwardReply(
                 np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model
             )
-            size = len(encode_reply(nothing))
-            with open_client(argv[1], 10.0) as session:
-                echo = session.declare_querier(f"{ECHO_KEY}/{size}", timeout=TIMEOUT_S, express=True)
-                prober = Prober(control, client, echo, payload)
+            key = f"{ECHO_KEY}/{len(encode_reply(nothing))}"
+            with open_client(argv[1], 10.0) as session, ExitStack() as stack:
+                # A client is not for several threads at once.
+                clients = [
+                    stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)
+                ]
+                queriers = [session.declare_querier(key, timeout=TIMEOUT_S, express=True) for _ in range(MOST)]
+                points = stack.enter_context(Patience([partial(point, each) for each in clients], AGAIN_S))
+                echoes = stack.enter_context(Patience([partial(_echo, each) for each in queriers], AGAIN_S))
+                prober = Prober(control, points, echoes)
                 follower = client.follow()
                 print("ready", flush=True)
                 next_s = time.monotonic() + 1.0
                 while not stop.reason:
                     prober.ask()
-                    prober.echo()
+                    prober.echo(payload)
                     time.sleep(PAUSE_S)
                     prober.look(follower.age_s)
                     if time.monotonic() >= next_s:
                         next_s += 1.0
                         print(prober.report(), flush=True)
-                echo.undeclare()  # type: ignore[no-untyped-call]
     except DehystError as error:
         print(json.dumps({"fatal": str(error)}), flush=True)
         return 2

@@ -8,6 +8,7 @@ from service.soak.catalogue import KINDS
 from service.soak.ledger import REAL_TIME, Ledger
 from service.soak.outcome import verdict_line
 from service.soak.plan import SoakPlan
+from service.soak.seconds import SECONDS
 
 
 def report(found: dict[str, Any], ledger: Ledger, plan: SoakPlan, pictures: list[str], interrupted: bool) -> str:
@@ -58,6 +59,7 @@ def report(found: dict[str, Any], ledger: Ledger, plan: SoakPlan, pictures: list
     lines += ["", "## Memory", "", "Not judged." if slope is None else f"{slope:.0f} kB an hour."]
     samples = ", ".join(f"{name} {value}" for name, value in found["samples"].items())
     lines += ["", "## Samples", "", f"{samples}.", ""]
+    lines += [f"Second by second in `{SECONDS}`.", ""]
     lines += [f"![{name}]({name})" for name in pictures]
     return "\n".join(lines) + "\n"
 

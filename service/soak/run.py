@@ -19,13 +19,14 @@ from service.soak.outcome import PART, summary, write_found
 from service.soak.plan import SoakPlan
 from service.soak.recorded import recorded
 from service.soak.report import report
+from service.soak.seconds import SECONDS, write_seconds
 from service.soak.settling import settle
 from service.soak.setup import identify, stage_of
 from service.soak.track import OTHER_LIFE
 
 #: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
-OURS = ("soak.json", f"soak.json{PART}", "report.md", "plan.json", "error.png", "latency.png", "memory.png", "soak.rrd",
-        "model.npz", "a", "b", "logs")  # fmt: skip
+OURS = ("soak.json", f"soak.json{PART}", "report.md", "plan.json", SECONDS, "error.png", "latency.png", "memory.png",
+        "soak.rrd", "model.npz", "a", "b", "logs")  # fmt: skip
 #: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
 OWN_STAGE_RATIO = 2.0
 #: What waits to be written when the disk is full, or to be passed on when the router dies, is lost too, s; and a second
@@ -80,6 +81,7 @@ def run(
     ledger.notes += _machine(ledger)
     interrupted = ledger.duration_s < plan.duration_s - 1.0
     write_found(out / "soak.json", found)
+    write_seconds(out / SECONDS, ledger)
     pictures = _draw(out, ledger)
     text = report(found, ledger, plan, pictures, interrupted)
     (out / "report.md").write_text(text, encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import signal
 import subprocess
@@ -55,6 +56,12 @@ def test_a_killed_primary_and_poisoned_samples_in_real_processes(tmp_path: Path)
         assert (tmp_path / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         assert name in report
     assert [f["kind"] for f in json.loads((tmp_path / "plan.json").read_text())["faults"]] == ["kill_primary", "nan"]
+    with (tmp_path / "seconds.csv").open(encoding="utf-8") as file:
+        seconds = list(csv.DictReader(file))
+    assert len(seconds) in (26, 27)
+    assert {row["fault"] for row in seconds} == {"", "kill_primary", "nan"}
+    assert sum(int(row["samples"]) for row in seconds) <= found["samples"]["received_by_monitor"]
+    assert sum(int(row["answers"] or 0) for row in seconds) > 100
 
 
 #: What a soak does to processes and to the machine, but for what the test above does.
