@@ -1,6 +1,6 @@
 """The processes beside a latency benchmark: a bare zenoh echo, and a stage that sends samples at a steady rate.
 
-``python -m benchmarks.latency_processes echo ENDPOINT`` and ``... feed ENDPOINT FILE.npz RATE_HZ BATCH``.
+``python -m benchmarks.latency_processes echo ENDPOINT`` and ``... feed ENDPOINT FILE.npz RATE_HZ BATCH MESSAGE``.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ def sent(u_V: FloatArray, y_um: FloatArray, rate_hz: float, batch: int, message:
     return SampleBatch(seq, seq / rate_hz, u_V[at : at + batch], y_um[at : at + batch])
 
 
-def feed(endpoint: str, path: Path, rate_hz: float, batch: int) -> int:
-    """Publish the samples in ``path`` (arrays u_V and y_um) at ``rate_hz``, over and over, ``batch`` a message.
+def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> int:
+    """Publish the samples in ``path`` (arrays u_V and y_um) at ``rate_hz``, over and over, ``batch`` a message, from
+    message number ``first`` on.
 
     Begins when it is heard, so that the first sample that it counts is the first that arrives.
     """
@@ -81,7 +82,7 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int) -> int:
             elif -rest > batch / rate_hz:
                 late += 1
             worst_s = max(worst_s, -rest)
-            made = sent(u_V, y_um, rate_hz, batch, k)
+            made = sent(u_V, y_um, rate_hz, batch, first + k)
             publisher.put(wire.encode_samples(made.seq, made.t_s, made.u_V, made.y_um))
             k += 1
         taken_s = time.perf_counter() - start
@@ -107,4 +108,4 @@ def _heard(publisher: Any) -> bool:
 if __name__ == "__main__":
     if sys.argv[1] == "echo":
         sys.exit(echo(sys.argv[2]))
-    sys.exit(feed(sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5])))
+    sys.exit(feed(sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5]), int(sys.argv[6])))

@@ -1,0 +1,115 @@
+"""What it takes to start a service again that was killed without a standby, and what is lost by it.
+
+A stage sends samples; service and stage are killed in the middle of it, the service is started again and asked, then
+the stage. Beside each start, in turns, the same interpreter imports the libraries alone: the ratio travels, the times
+do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.latency_processes import AXIS, STAGE
+from benchmarks.latency_world import READY_S, prepare, start_feed, start_service
+from service.client import Client
+from service.demo.processes import Children
+from sim.recordings import read
+
+#: What a service cannot do without, and what a start therefore costs at least.
+LIBRARIES = "import numpy, numba, scipy.linalg.cython_lapack, pyarrow.parquet, zenoh"
+RATE_HZ, BATCH = 1000.0, 5
+
+
+def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
+    """Kill and start ``rounds`` times, after ``learn_s`` seconds of samples each.
+
+    Returns
+    -------
+    ``ready_s``: from the start until it says that it is ready; ``answered_s``: from the kill until a client that asks
+    all the time has its answer; ``libraries_s``; ``ready_over_libraries``; each as a list. ``unlearnt_ms``: of the
+    samples that its status had told to be handled, how many milliseconds are not in what it goes on from.
+    ``records_lost``: of those, how many are in no recording.
+    """
+    rows: dict[str, list[float]] = {"ready_s": [], "answered_s": [], "libraries_s": [], "unlearnt_ms": []}
+    told: list[tuple[int, int]] = []
+    keeps = 'recorder = "rec"\ncheckpoints = "kept"\n'
+    with tempfile.TemporaryDirectory() as folder, Children(Path(folder)) as children:
+        files = prepare(Path(folder), RATE_HZ, BATCH, False, keeps)
+        service = start_service(children, files)
+        with Client.connect(files.serve_at, STAGE, AXIS, wait_s=READY_S, retry_s=READY_S) as client:
+            first = 0
+            for _ in range(rounds):
+                rows["libraries_s"].append(_libraries_s())
+                feed = start_feed(children, files, first)
+                time.sleep(learn_s)
+                before = int(client.status()["seq"])
+                killed = time.monotonic()
+                service.kill()
+                feed.kill()
+                begun = time.monotonic()
+                service = start_service(children, files)
+                rows["ready_s"].append(time.monotonic() - begun)
+                client.point(40.0)
+                rows["answered_s"].append(time.monotonic() - killed)
+                after = int(client.status()["seq"])
+                rows["unlearnt_ms"].append(1e3 * max(0, before - after) / RATE_HZ)
+                told.append((first, before))
+                # What was under way to it has numbers too; and messages begin at a multiple of their size.
+                first = (max(before, after) // BATCH + int(RATE_HZ)) * BATCH
+        service.stop()
+        recorded = read(Path(folder) / "rec").seq
+    kept = set() if recorded is None else set(recorded.tolist())
+    lost = sum(1 for begin, end in told for seq in range(begin, end + 1) if seq not in kept)
+    ratio = [ready / bare for ready, bare in zip(rows["ready_s"], rows["libraries_s"], strict=True)]
+    return {"rounds": rounds, **rows, "ready_over_libraries": ratio, "records_lost": lost}
+
+
+def _libraries_s() -> float:
+    begin = time.monotonic()
+    subprocess.run([sys.executable, "-c", LIBRARIES], check=True)
+    return time.monotonic() - begin
+
+
+def page(report: dict[str, Any]) -> str:
+    """The same to read."""
+    lines = [f"A service killed and started again {report['rounds']} times, samples at {RATE_HZ:g} Hz", ""]
+    for name, text in (
+        ("ready_s", "from the start until it is ready, s"),
+        ("libraries_s", "the libraries alone, s"),
+        ("ready_over_libraries", "the first over the second"),
+        ("answered_s", "from the kill until a client is answered, s"),
+        ("unlearnt_ms", "learning lost, ms of samples"),
+    ):
+        values = np.asarray(report[name])
+        lines.append(f"{text:>46}: median {np.median(values):.2f}, at most {values.max():.2f}")
+    lines.append(f"{'samples told as handled that are in no recording':>46}: {report['records_lost']}")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """``python -m benchmarks.restart``."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.restart", description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=10, help="how often it is killed (10)")
+    parser.add_argument("--learn", type=float, default=3.0, metavar="S", help="samples before each kill, s (3)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    args = parser.parse_args()
+    if args.rounds < 1 or not 0.5 <= args.learn <= 3600.0:
+        parser.error(
+            f"--rounds: got {args.rounds}, expected 1 or more; --learn: got {args.learn:g}, expected 0.5 to 3600 s"
+        )
+    report = restart(args.rounds, args.learn)
+    print(json.dumps(report) if args.json else page(report))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
