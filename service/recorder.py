@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.journal import Journal, Rows, Syncer
 from service.recorder_config import RecorderConfig
-from service.recorder_files import Closer, claim, journal_of, make_room, next_number
+from service.recorder_files import HIDDEN, OPEN, Closer, claim, journal_of, make_room, next_number
 
 __all__ = ["Recorder", "RecorderConfig"]
 
@@ -241,10 +241,21 @@ class Recorder:
         """At the end: wait for what is being closed, then close the rest."""
         if self._closer is not None:
             self._take_result(self._closer)
-        if self._claim is None:
+        if self._claim is None and not self._claimed_what_a_crash_left():
             return
         self._own = self._own or self._segment is not None
         try:
             self._take_result(Closer(self.config.directory, None))
         except OSError as error:
             self._failed(error)
+
+    def _claimed_what_a_crash_left(self) -> bool:
+        """Whether journals lie there, though no sample came by which the folder would have become this recorder's."""
+        directory = self.config.directory
+        if not any(directory.glob(f"{HIDDEN}segment-*{OPEN}")):
+            return False
+        try:
+            self._claim = claim(directory)
+        except OSError:
+            return False  # another's, or of a disk that nothing can be written to
+        return True
