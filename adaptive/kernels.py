@@ -20,6 +20,8 @@ _LN2_LOW = 1.90821492927058770002e-10
 _ROUND = 6755399441055744.0
 #: Below this the result is set to zero: exp(-708) is 3e-308, the smallest normal double is near.
 _UNDERFLOW = -708.0
+#: Elements of a Gram matrix that are worked out at a time: 256 KiB, and as much scratch.
+_GRAM_BLOCK = 32768
 
 
 def as_widths(widths: object, dimension: int) -> FloatArray:
@@ -57,12 +59,23 @@ def gram(X: FloatArray, other: FloatArray | None, widths: FloatArray) -> FloatAr
     all their digits to cancellation there.
     """
     right = X if other is None else other
-    squared = np.zeros((X.shape[0], right.shape[0]))
-    for j in range(X.shape[1]):
-        difference = (X[:, j, None] - right[None, :, j]) / widths[j]
-        squared += difference * difference
-    np.negative(squared, out=squared)
-    return np.asarray(np.exp(squared, out=squared), dtype=np.float64)
+    count, columns = right.shape[0], np.ascontiguousarray(right.T)
+    K = np.empty((X.shape[0], count))
+    # Some rows at a time, with one scratch for all: they stay in the cache, and no large piece of memory is asked for.
+    block = max(1, _GRAM_BLOCK // max(count, 1))
+    scratch = np.empty((min(block, X.shape[0]), count))
+    for start in range(0, X.shape[0], block):
+        squared = K[start : start + block]
+        part = scratch[: squared.shape[0]]
+        squared[...] = 0.0
+        for j in range(X.shape[1]):
+            np.subtract(X[start : start + block, j, None], columns[j], out=part)
+            part /= widths[j]
+            part *= part
+            squared += part
+        np.negative(squared, out=squared)
+        np.exp(squared, out=squared)
+    return K
 
 
 @compiled_contracting

@@ -1,11 +1,13 @@
 """Compile every compiled loop once, so that no process pays for it at its start: ``python -m service.warm``.
 
-What was compiled is kept on disk beside the sources. That cache looks at the file of a function only, not at the
-files of what it calls; so the sources are compared as a whole here, and one changed file makes all anew.
+The sources become bytecode as well, also where Python was told to write none: a fifth of a second of each start. What
+was compiled is kept on disk beside the sources. That cache looks at the file of a function only, not at the files of
+what it calls; so the sources are compared as a whole here, and one changed file makes all anew.
 """
 
 from __future__ import annotations
 
+import compileall
 import hashlib
 import subprocess
 import sys
@@ -34,6 +36,11 @@ def forget(root: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def make_bytecode(root: Path) -> list[str]:
+    """Of all modules of the packages; returns the packages of which not all could be made."""
+    return [name for name in PACKAGES if not compileall.compile_dir(root / name, quiet=1)]
+
+
 def main() -> int:
     """Call each ``warm()``, unless nothing has changed since the last time."""
     root = Path(__file__).resolve().parents[1]
@@ -48,7 +55,7 @@ def main() -> int:
         subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
         for group in GROUPS
     ]
-    failed = [child.args for child in children if child.wait() != 0]
+    failed: list[object] = [*make_bytecode(root), *(child.args for child in children if child.wait() != 0)]
     if failed:
         print(f"service.warm: compiling failed: {failed}", file=sys.stderr)
         return 1

@@ -26,6 +26,16 @@ def test_column_and_gram_are_made_of_pairs() -> None:
     np.testing.assert_allclose(kernels.column(X, other[2], widths), K[:, 2], rtol=1e-14)
 
 
+@pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (70, 1000), (65, 512), (2, 40_000)])
+def test_gram_is_the_same_however_it_is_cut_into_blocks(n: int, m: int) -> None:
+    rng = np.random.default_rng(2)
+    X, other, widths = rng.random((n, 3)), rng.random((m, 3)), np.array([0.3, 1.0, 5.0])
+    whole = np.zeros((n, m))
+    for j in range(3):
+        whole += ((X[:, j, None] - other[None, :, j]) / widths[j]) ** 2
+    np.testing.assert_array_equal(kernels.gram(X, other, widths), np.exp(-whole))
+
+
 def test_gram_keeps_the_digits_of_near_duplicates() -> None:
     X = np.array([[1e3, 1.0], [1e3 + 1e-9, 1.0]])
     distance = X[1, 0] - X[0, 0]

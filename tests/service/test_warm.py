@@ -5,7 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.util import cache_from_source
 from pathlib import Path
+
+import pytest
+
+from service.warm import PACKAGES, make_bytecode
 
 # Of all kinds of fault that reach a learner. A process of its own: in this one, other tests have compiled already.
 _SOAK = """
@@ -34,3 +39,15 @@ def test_nothing_is_compiled_under_faults(tmp_path: Path) -> None:
     assert run.returncode == 0, run.stdout[-2000:]
     faults = json.loads((tmp_path / "soak.json").read_text(encoding="utf-8"))["faults"]
     assert {"freeze", "spike"} & {kind for kind, told in faults.items() if told["count"]}
+
+
+def test_bytecode_is_made_of_every_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    modules = [tmp_path / package / name for package in PACKAGES for name in ("__init__.py", "inner/module.py")]
+    for path in modules:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("VALUE = 1\n", encoding="utf-8")
+    assert make_bytecode(tmp_path) == []
+    assert [path for path in modules if not Path(cache_from_source(str(path))).exists()] == []
+    (tmp_path / PACKAGES[1] / "broken.py").write_text("def", encoding="utf-8")
+    assert make_bytecode(tmp_path) == [PACKAGES[1]]
