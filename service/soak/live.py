@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -21,7 +20,7 @@ from service.soak.interim import Interim
 from service.soak.ledger import Happened, Ledger, Row, flat, probe_of
 from service.soak.monitor import Monitor
 from service.soak.plan import Planned, SoakPlan
-from service.soak.processor import Others
+from service.soak.processor import Others, taken_s
 from service.soak.schedule import Schedule
 from service.soak.settling import WELL_PCT
 from service.soak.world import World
@@ -185,12 +184,10 @@ class _Watch:
                 self._ledger.bare.append((told["t_s"] - self._monitor.start_s, told["late_s"]))
 
     def _look_at_others(self) -> None:
-        own_s = {os.getpid(): sum(psutil.Process().cpu_times()[:2])}
-        for name, child in list(self._world.children.items()):
-            # What is to take the processor away is not the soak's own.
-            with contextlib.suppress(psutil.Error):
-                if not name.startswith("busy"):
-                    own_s[child.pid] = sum(psutil.Process(child.pid).cpu_times()[:4])
+        names = {child.pid: name for name, child in list(self._world.children.items())}
+        own_s = taken_s([os.getpid(), *names])
+        # What is to take the processor away is not the soak's own.
+        own_s = {pid: taken for pid, taken in own_s.items() if not names.get(pid, "").startswith("busy")}
         share = self._others.share(own_s)
         if share is not None:
             self._ledger.others.append((self._monitor.now(), share))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import psutil
 
@@ -22,8 +23,8 @@ class Others:
     def share(self, own_s: Mapping[int, float]) -> float | None:
         """Share of all cores that others had since the last call, 0 to 1; None where that was a moment ago.
 
-        ``own_s``: by number of the process, its seconds of processor time so far; one that was not there before counts
-        from its beginning.
+        ``own_s``: by number of the process, its seconds of processor time so far (:func:`taken_s`); one that was not
+        there before counts from its beginning.
         """
         now_s, busy_s = time.monotonic(), _busy_s()
         passed_s = now_s - self._at_s
@@ -35,6 +36,27 @@ class Others:
         self._at_s, self._busy_s, self._own = now_s, busy_s, dict(own_s)
         # What the processes had before the first look is not known.
         return None if first else min(1.0, max(0.0, others_s / (passed_s * self._cores)))
+
+
+def taken_s(roots: Iterable[int]) -> dict[int, float]:
+    """By number of the process, seconds of processor time so far of each root that lives and of all that it has begun.
+
+    Of a tree each process counts, and those that it has outlived, so that it only grows; a root within the tree of
+    another counts for itself only. Of one's own process those that it has outlived are not counted: they were roots.
+    """
+    parent, taken = {}, {}
+    for process in psutil.process_iter(["ppid", "cpu_times"]):
+        parent[process.pid], times = process.info["ppid"], process.info["cpu_times"]
+        if times is not None:
+            taken[process.pid] = float(sum(times[: 2 if process.pid == os.getpid() else 4]))
+    total = {pid: 0.0 for pid in roots if pid in taken}
+    for pid, seconds in taken.items():
+        at = pid
+        while at not in total and parent.get(at):
+            at = parent[at]
+        if at in total:
+            total[at] += seconds
+    return total
 
 
 def _busy_s() -> float:

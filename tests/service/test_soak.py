@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +23,7 @@ from service.soak.catalogue import KINDS
 from service.soak.control import Control
 from service.soak.intervals import Intervals
 from service.soak.plan import TAIL_S, WARM_S, known_kinds, make_plan
-from service.soak.processor import Others
+from service.soak.processor import Others, taken_s
 from service.soak.reference import PERIOD_S, SoakReference
 from service.stage_faults import Fault, Injector, decode_fault
 
@@ -209,6 +213,48 @@ def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> Non
     share = others.share({1: 1e6})
     assert share is not None
     assert 0.0 < share <= 1.0, "this very loop is none of them"
+
+
+#: Uses up 0.4 s of processor (told in hundredths), tells when it has, and ends when told to.
+CHILD = """
+import sys, time
+while time.process_time() < 0.4:
+    pass
+print("burnt", flush=True)
+sys.stdin.readline()
+"""
+#: Has such a child, and reaps it when told to.
+PARENT = f"""
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", {CHILD!r}], stdin=subprocess.PIPE, text=True, start_new_session=True)
+sys.stdin.readline()
+child.communicate("")
+print("reaped", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_what_a_process_has_begun_is_its_own_while_it_lives_and_after() -> None:
+    """A service diagnoses and draws in processes of their own: taken for others, its own work would excuse it."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdin=pipe, stdout=pipe, text=True) as parent:
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "burnt\n"
+        living = taken_s([parent.pid, os.getpid()])
+        assert living[parent.pid] >= 0.3
+        (child,) = psutil.Process(parent.pid).children()
+        apart = taken_s([parent.pid, child.pid])
+        assert apart[child.pid] >= 0.3
+        assert apart[parent.pid] < living[parent.pid], "one that is a root itself is not counted twice"
+        parent.stdin.write("\n")
+        parent.stdin.flush()
+        assert parent.stdout.readline() == "reaped\n"
+        reaped = taken_s([parent.pid])
+        assert living[parent.pid] <= reaped[parent.pid] < living[parent.pid] + 0.3
+    before = taken_s([os.getpid()])[os.getpid()]
+    assert before == pytest.approx(sum(psutil.Process().cpu_times()[:2]), abs=0.2), "none that it has outlived"
+    assert parent.pid not in taken_s([parent.pid])
 
 
 def test_control_goes_through_its_file(tmp_path: Path) -> None:
