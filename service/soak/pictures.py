@@ -52,7 +52,8 @@ def draw_latency(path: Path, ledger: Ledger) -> None:
         top.semilogy(t, p99, color=colour, lw=0.7, alpha=0.6, label=f"{title}, its 99 %")
     top.set_ylabel("round trip, µs")
     t = np.array([p.t_s for p in ledger.probes])
-    bottom.semilogy(t, np.maximum([p.silent_s for p in ledger.probes], 1e-3), color="#d55e00", lw=1.0)
+    silent_s = np.maximum([p.silent_s for p in ledger.probes], 1e-3)
+    bottom.semilogy(t, silent_s, color="#d55e00", lw=1.0, label="longest time without an answer")
     late = np.array(ledger.bare).reshape(-1, 2)
     if len(late):
         bottom.semilogy(late[:, 0], np.maximum(late[:, 1], 1e-5), color="#999999", lw=0.8, label="a bare loop's delay")
@@ -100,9 +101,12 @@ def _finish(figure: Any, path: Path, ledger: Ledger, panels: tuple[Any, ...]) ->
                 color=COLOURS.get(KINDS[fault.kind].where, _REST), ha="left", va="bottom",
             )  # fmt: skip
     panels[-1].set_xlabel(
-        "time, s (marked: faults, until all was well again; red: processes, blue: samples, pink: machine)"
+        "time, s (marked: faults, until all was well again; "
+        "red: processes, blue: samples, pink: machine, grey: reference)"
     )
-    if panels[0].get_legend_handles_labels()[0]:
-        figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncol=8, loc="outside lower center")
+    named = [pair for panel in panels for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    if named:
+        handles, labels = zip(*named, strict=True)
+        figure.legend(handles, labels, fontsize=8, ncol=9, loc="outside lower center")
     figure.savefig(path, dpi=120)
     plt.close(figure)
