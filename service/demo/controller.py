@@ -75,6 +75,10 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     durations: list[float] = []
     late = 0  # answers that came after their block was due, or not from the snapshot they should have come from
     answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
+    # Answers that are to know of no sample have no snapshot to name, and the first commands start the stage's clock:
+    # these wait until all such answers are there.
+    blind = sum(plan.as_of(block) < 0 for block in range(n // size))
+    held: list[tuple[zenoh.Publisher, bytes]] = []
     # Two sessions, so that an answer never waits behind the samples of five twins.
     with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
@@ -99,7 +103,11 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
                     std_V[name][part] = answer.std_V
-                    commands[name].put(wire.encode_command(part.start, answer.u_V))
+                    held.append((commands[name], wire.encode_command(part.start, answer.u_V)))
+                    if block >= blind or len(held) == blind * len(MODELS):
+                        for publisher, command in held:
+                            publisher.put(command)
+                        held.clear()
                 late += twins.seen[TEACHER] > part.start
                 if part.start <= plan.change_tick < part.stop:
                     # Told to the viewer only: the service has to find out by itself.
