@@ -93,7 +93,8 @@ class Plan:
         return self.high_um - self.low_um
 
     def as_of(self, block: int) -> int:
-        """Last sequence number that the answer for ``block`` may have learnt from; -1: none."""
+        """Last sequence number that the answer for ``block`` may have learnt from; -1: there is none to name, and the
+        newest snapshot answers. It knows of no sample only where none has been sent yet."""
         return max(-1, block * self.block - self.lead - self.margin)
 
     def phases(self) -> dict[str, slice]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -35,16 +36,26 @@ def write_seconds(path: Path, ledger: Ledger) -> None:
     seconds = _by_second(ledger.seconds, lambda second: second.t_s)
     probes = _by_second(ledger.probes, lambda probe: probe.t_s)
     bare, others = (_by_second(rows, lambda row: row[0]) for rows in (ledger.bare, ledger.others))
+    faults = _faults_by_second(ledger)
     with path.open("w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(COLUMNS)
         for k in range(math.ceil(ledger.duration_s)):
-            on = [f.kind for f in ledger.faults if f.begin_s < k + 1.0 and not f.end_s < k]
             lines.writerow([
-                k, int(ledger.quiet(float(k)) and ledger.quiet(k + 1.0)), " ".join(on),
+                k, int(ledger.quiet(float(k)) and ledger.quiet(k + 1.0)), " ".join(faults[k]),
                 *_of_stage(seconds.get(k, ()), ledger.range_um), *_of_prober(probes.get(k, ())),
                 *(_number(max((row[1] for row in rows.get(k, ())), default=math.nan), 5) for rows in (bare, others)),
             ])  # fmt: skip
+
+
+def _faults_by_second(ledger: Ledger) -> defaultdict[int, list[str]]:
+    """Kinds of the faults that were on in each whole second; one that has not ended is on until the end of the run."""
+    on: defaultdict[int, list[str]] = defaultdict(list)
+    for fault in ledger.faults:
+        end_s = fault.end_s if fault.ended else ledger.duration_s
+        for k in range(math.floor(fault.begin_s), math.floor(end_s) + 1):
+            on[k].append(fault.kind)
+    return on
 
 
 def _of_stage(rows: Sequence[Second], range_um: float) -> list[object]:
