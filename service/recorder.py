@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.journal import Journal, Rows, Syncer
 from service.recorder_config import RecorderConfig
-from service.recorder_files import HIDDEN, OPEN, Closer, claim, journal_of, make_room, next_number
+from service.recorder_files import Closer, claim, journal_of, left_open, make_room, next_number
 
 __all__ = ["Recorder", "RecorderConfig"]
 
@@ -251,11 +251,10 @@ class Recorder:
 
     def _claimed_what_a_crash_left(self) -> bool:
         """Whether journals lie there, though no sample came by which the folder would have become this recorder's."""
-        directory = self.config.directory
-        if not any(directory.glob(f"{HIDDEN}segment-*{OPEN}")):
+        if not left_open(self.config.directory):
             return False
         try:
-            self._claim = claim(directory)
+            self._claim = claim(self.config.directory)
         except OSError:
             return False  # another's, or of a disk that nothing can be written to
         return True

@@ -80,7 +80,7 @@ def close_left_open(directory: Path, but: Path | None = None) -> list[Path]:
     """
     for part in directory.glob(f"*segment-*{PART}"):
         part.unlink(missing_ok=True)
-    left = [path for path in _sorted(directory, OPEN) if but is None or number_of(path) < number_of(but)]
+    left = [path for path in left_open(directory) if but is None or number_of(path) < number_of(but)]
     made = [path for path in map(convert, left) if path is not None]
     # The newest one that is done is what a restart may need.
     for done in _sorted(directory, DONE)[:-1]:
@@ -177,6 +177,11 @@ def number_of(path: Path) -> int:
 def segments(directory: Path) -> list[Path]:
     """Closed segments, oldest first."""
     return _sorted(directory, CLOSED)
+
+
+def left_open(directory: Path) -> list[Path]:
+    """Journals there, oldest first: of who records into it now, or of who was killed."""
+    return _sorted(directory, OPEN)
 
 
 def journal_of(directory: Path, number: int) -> Path:
