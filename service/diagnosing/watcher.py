@@ -53,10 +53,12 @@ class Watcher:
         self._next_look_s = 0.0
         self._alarm_seq: int | None = None
         self._alarm_why = ""
+        #: An alarm is looked into once this sample is there.
+        self._due_seq = 0
         self._not_before_s = 0.0
         self._job: Job | None = None
         self._lock = threading.Lock()
-        self._counts = {"alarms": 0, "requests": 0, "started": 0, "finished": 0, "failed": 0, "skipped": 0}
+        self._counts = {"alarms": 0, "requests": 0, "started": 0, "finished": 0, "failed": 0, "waited": 0, "skipped": 0}
         self._last: dict[str, Any] | None = None
         self._history: list[dict[str, Any]] = []
         self._closed = False
@@ -76,7 +78,7 @@ class Watcher:
     def tick(self, now_s: float) -> None:
         """Start what is due. Call from the publishing thread, with a clock that never goes back."""
         seq = self._alarm_seq
-        if seq is None or self._buffer.last_seq - seq < self._samples(self.config.collect_s):
+        if seq is None or self._buffer.last_seq < self._due_seq:
             return
         if self._job is not None and self._job.running:
             return
@@ -148,7 +150,8 @@ class Watcher:
         why = self._alarm.check(t_s, levels)
         if why:
             # From here on is after: what raised the alarm had been there for hold_s.
-            self._alarm_why, self._alarm_seq = why, self._buffer.last_seq
+            seq = self._buffer.last_seq
+            self._alarm_why, self._due_seq, self._alarm_seq = why, seq + self._samples(self.config.collect_s), seq
             self._not_before_s = t_s + self.config.cooldown_s
             with self._lock:
                 self._counts["alarms"] += 1
@@ -188,6 +191,9 @@ class Watcher:
 
     def _finish(self, about: dict[str, Any], result: dict[str, Any], seconds: float) -> None:
         failed = "error" in result
+        if result.pop("wait", False) and about["cause"] == "alarm" and self._wait(about):
+            self._axis.note("diagnosis_waits", f"{result['error']}; once more in {self.config.collect_s:g} s")
+            return
         text = f"no verdict: {result['error']}" if failed else str(result.get("text", ""))
         verdict = {**about, "seconds": round(seconds, 2), "text": text, **result}
         with self._lock:
@@ -199,6 +205,21 @@ class Watcher:
             # What comes next is told from how the stage is now, as soon as enough of that has been seen.
             self._alarm.arm(None)
             self._since_reference, self._renew = 0, True
+
+    def _wait(self, about: dict[str, Any]) -> bool:
+        """Whether an alarm is looked into again, with more samples: as long as some from before it are still kept."""
+        more = self._samples(self.config.collect_s)
+        newest, first = self._buffer.last_seq, int(about["from_seq"])
+        # A stage that counts anew since, or another alarm: what was asked is over.
+        over = self._closed or newest < about["seq"] or self._alarm_seq is not None
+        if over or newest + 2 * more - first > self._samples(self.config.history_s):
+            return False
+        with self._lock:
+            self._counts["waited"] += 1
+        # What raised it is still there and would raise another one while this is looked into.
+        self._not_before_s = (newest + more) * self._dt_s + self.config.cooldown_s
+        self._due_seq, self._alarm_seq = newest + more, first
+        return True
 
 
 def _span_V(axis: Axis) -> float:

@@ -22,8 +22,13 @@ def main(arguments: list[str]) -> int:
 
 
 def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
+    from sim.changes.regression import TooFewSamples
+
     try:
         return diagnose(job, arrays["reference"], arrays["recent"])
+    except TooFewSamples as error:
+        # Of what is recent there will be more; of the reference there will not.
+        return {"error": str(error), "wait": error.stretch == "recent"}
     except DehystError as error:
         return {"error": str(error)}
 

@@ -27,7 +27,7 @@ MOST_CAUSES = 3
 def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Comparison:
     """What has changed from ``reference`` to ``recent``, seen by ``model`` frozen.
 
-    Raises InputError where a stretch is too short or does not move.
+    Raises TooFewSamples where a stretch is too short, InputError where the reference does not move.
     """
     for name, stretch in (("reference", reference), ("recent", recent)):
         enough(name, int(stretch.scored.sum()), stretch.dt_s)

@@ -61,17 +61,26 @@ def _solve(x: FloatArray, r: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(gram + 1e-5 * np.eye(gram.shape[0]), x.T @ r))
 
 
+class TooFewSamples(InputError):
+    """A stretch holds too few usable samples; ``stretch`` is its name. More of it may be enough."""
+
+    def __init__(self, stretch: str, message: str) -> None:
+        super().__init__(message)
+        self.stretch = stretch
+
+
 def enough(name: str, n: int, dt_s: float) -> None:
-    """InputError where ``n`` usable samples of the stretch ``name`` are not enough to judge by."""
+    """TooFewSamples where ``n`` usable samples of the stretch ``name`` are not enough to judge by."""
     if n * dt_s < FOLDS * BLOCK_S or n < 200:
-        raise InputError(
+        raise TooFewSamples(
+            name,
             f"{name}: got {n} usable samples ({n * dt_s:.3g} s) after what only settles the loop's memory, expected at "
-            f"least {FOLDS * BLOCK_S:g} s and 200: wait for more, or move further"
+            f"least {FOLDS * BLOCK_S:g} s and 200: wait for more, or move further",
         )
 
 
 def problem_of(model: InverseModel, reference: Stretch, recent: Stretch, scales: Scales) -> tuple[Problem, FloatArray]:
-    """The regression of both stretches, and its common columns (n, k). InputError where either is too short."""
+    """The regression of both stretches, and its common columns (n, k). TooFewSamples where either is too short."""
     rows, targets, shared, marks, blocks = [], [], [], [], []
     found: list[Candidate] = []
     kept = np.empty(0, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""The diagnosis in the background: buffer, alarm, job, watcher, and a real service whose stage changes its gain."""
+"""The diagnosis in the background: job, watcher, and a real service whose stage changes its gain."""
 
 from __future__ import annotations
 
@@ -20,14 +20,11 @@ from adaptive.types import Sample
 from service import wire
 from service.axis import Axis
 from service.client import Client
-from service.config import AxisConfig, parse_config
-from service.diagnosing.alarm import Alarm, Levels
-from service.diagnosing.buffer import SampleBuffer
+from service.config import AxisConfig
 from service.diagnosing.job import Job
 from service.diagnosing.settings import WatchConfig
 from service.diagnosing.watcher import Watcher
 from service.diagnosing.worker import diagnose
-from service.errors import FieldError
 from service.guard import Limits
 from service.identifying import identify_one
 from service.modelfile import BundleMeta, read_bundle, write_bundle
@@ -37,14 +34,9 @@ from sim.presets import preset
 from sim.reference import demo_reference
 from sim.signals import training_input
 from sim.stage import Stage
+from tests.service.test_diagnosing_parts import DT_S, batch
 
-DT_S = 1e-3
 QUICK = WatchConfig(history_s=8.0, reference_s=4.0, recent_s=3.0, collect_s=2.0, cooldown_s=5.0, timeout_s=60.0)
-
-
-def batch(first: int, n: int, y_um: float = 1.0) -> SampleBatch:
-    k = np.arange(first, first + n)
-    return SampleBatch(k, k * DT_S, 0.1 * k, np.full(n, y_um))
 
 
 def eventually(condition: Callable[[], Any], within_s: float) -> Any:
@@ -53,79 +45,6 @@ def eventually(condition: Callable[[], Any], within_s: float) -> Any:
         assert time.monotonic() < until, "did not come true in time"
         time.sleep(0.05)
     return value
-
-
-# ---- buffer
-
-
-@pytest.mark.parametrize("sizes", [(3, 4, 5), (1,) * 20, (50,), (9, 10, 11)])
-def test_the_buffer_keeps_the_newest_in_order(sizes: tuple[int, ...]) -> None:
-    buffer, first = SampleBuffer(10), 0
-    for n in sizes:
-        assert buffer.add(batch(first, n))
-        first += n
-    kept = buffer.copy()
-    assert kept[0].tolist() == list(range(max(0, first - 10), first))
-    assert kept[2].tolist() == pytest.approx((0.1 * kept[0]).tolist())
-    assert buffer.copy(4)[0].tolist() == kept[0, -4:].tolist()
-    assert (buffer.size, buffer.last_seq) == (min(10, first), first - 1)
-
-
-def test_doubles_are_left_out_and_a_restart_begins_anew() -> None:
-    buffer = SampleBuffer(1000)
-    buffer.add(batch(0, 500))
-    assert buffer.add(batch(490, 20))
-    assert buffer.copy()[0].tolist() == list(range(510))
-    assert buffer.add(batch(0, 150))
-    assert buffer.size == 510
-    assert not buffer.add(batch(150, 150))
-    assert buffer.copy()[0].tolist() == list(range(150, 300))
-
-
-# ---- alarm
-
-NORMAL = Levels(1.0, 0.0, 0.05, True)
-
-
-@pytest.mark.parametrize(
-    ("now", "word"),
-    [
-        (replace(NORMAL, gain=0.985), "gain"),
-        (replace(NORMAL, offset_V=0.3), "offset"),
-        (replace(NORMAL, error_pct=1.0), "error"),
-        (replace(NORMAL, valid=False), "validity"),
-    ],
-)
-def test_an_alarm_needs_to_last(now: Levels, word: str) -> None:
-    alarm = Alarm(WatchConfig(), 10.0)
-    assert alarm.check(0.0, now) == ""
-    alarm.arm(NORMAL)
-    assert alarm.check(1.0, now) == ""
-    assert alarm.check(1.4, NORMAL) == ""
-    assert alarm.check(1.6, now) == ""
-    assert word in alarm.check(2.1, now)
-
-
-def test_what_stays_within_its_bounds_raises_none() -> None:
-    alarm = Alarm(WatchConfig(), 10.0)
-    alarm.arm(NORMAL)
-    assert all(alarm.check(0.1 * k, Levels(1.009, 0.19, 0.19, True)) == "" for k in range(100))
-    assert Levels.of({"gain": float("nan"), "offset_V": 0.0, "recent_rms_error_pct": 1.0}) is None
-    assert Levels.of({"gain": 1.0}) is None
-
-
-# ---- configuration
-
-
-def test_the_configuration_is_read_strictly() -> None:
-    text = 'stage = "demo"\n[[axis]]\nname = "x"\nmodel = "x.npz"\nu_min_V = 0\nu_max_V = 9\nslew_V_per_s = 1\n'
-    read = parse_config(text + '[axis.diagnosis]\ncollect_s = 3\nreports = "r"\n', "here", Path("/a"))
-    assert read.axes[0].diagnosis.collect_s == 3.0
-    assert read.axes[0].diagnosis.reports == "/a/r"
-    assert parse_config(text, "here", Path()).axes[0].diagnosis == WatchConfig()
-    for line, word in (("colect_s = 3", "colect_s"), ("timeout_s = 0", "timeout_s"), ("history_s = 3", "history_s")):
-        with pytest.raises(FieldError, match=word):
-            parse_config(text + f"[axis.diagnosis]\n{line}\n", "here", Path())
 
 
 # ---- jobs and the watcher, on the stage that stands in for hardware
@@ -288,6 +207,55 @@ def test_an_alarm_leads_to_a_verdict_and_a_new_reference(model_file: Path) -> No
     feed(watcher, samples, 11000, 17000)
     assert watcher.status()["armed"]
     assert watcher.status()["alarms"] == 1
+    watcher.close()
+
+
+def alarmed(model_file: Path, samples: Any) -> tuple[Watcher, Axis]:
+    """A watcher with a reference, and an alarm some 0.7 s after sample 6000."""
+    watcher, axis, learner = watched(model_file)
+    feed(watcher, samples, 0, 6000)
+    learner.gain = 0.972
+    feed(watcher, samples, 6000, 7000)
+    assert [e["event"] for e in axis.take_events()] == ["diagnosis_alarm"]
+    return watcher, axis
+
+
+def test_an_alarm_with_too_few_samples_after_it_waits_for_more(model_file: Path) -> None:
+    samples = recorded(model_file, 14.0, 6.0, gain_drift__gain=-0.03)
+    watcher, axis = alarmed(model_file, samples)
+    # The stage says nothing for a second and a half, most of what is waited for.
+    feed(watcher, samples, 8500, 9000)
+    eventually(lambda: not watcher.status()["running"], 60.0)
+    (event,) = axis.take_events()
+    assert event["event"] == "diagnosis_waits"
+    assert event["detail"].startswith("recent: got ")
+    assert event["detail"].endswith("once more in 2 s")
+    feed(watcher, samples, 9000, 10900)
+    assert watcher.status()["started"] == 1
+    feed(watcher, samples, 10900, 12000)
+    eventually(lambda: not watcher.status()["running"], 60.0)
+    (event,) = axis.take_events()
+    assert event["detail"].startswith("the model's error grew: gain drift, -")
+    status = watcher.status()
+    assert status["last"]["effects"][0]["parameters"]["gain"] == pytest.approx(-0.03, abs=0.004)
+    counted = {"alarms": 1, "started": 2, "waited": 1, "finished": 1, "failed": 0}
+    assert {name: status[name] for name in counted} == counted
+    watcher.close()
+
+
+def test_waiting_for_samples_ends_when_what_was_before_the_alarm_is_pushed_out(model_file: Path) -> None:
+    samples = recorded(model_file, 18.0, 6.0, gain_drift__gain=-0.03)
+    watcher, axis = alarmed(model_file, samples)
+    # From now on the stage says something for a tenth of a second in each.
+    events: list[str] = []
+    for first in range(7900, 17000, 1000):
+        feed(watcher, samples, first, first + 100)
+        eventually(lambda: not watcher.status()["running"], 60.0)
+        events += [e["event"] for e in axis.take_events()]
+    assert events == ["diagnosis_waits", "diagnosis_failed"]
+    status = watcher.status()
+    assert (status["started"], status["waited"], status["failed"], status["running"]) == (2, 1, 1, False)
+    assert status["last"]["text"].startswith("no verdict: recent: got ")
     watcher.close()
 
 
