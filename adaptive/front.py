@@ -8,49 +8,23 @@ of the reading that no voltage made moves the frame of the features, and with it
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from math import nan
 
-import numpy as np
-
-from adaptive import admission
-from adaptive.admission import (
-    REPEATED,
-    AdmissionState,
-    at_rest,
-    check_sample,
-    settling,
-    stuck_share,
-    surprise,
-    watch_innovation,
-    watch_reading,
-    watch_voltage,
-)
+from adaptive import admission, surprise
 from adaptive.bridge import FAR_OUT, Bridging, Voltage
 from adaptive.features import FeatureMap
+from adaptive.front_state import parts_of, parts_to_state
+from adaptive.heard import Heard
 from adaptive.learner_config import LearnerConfig
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.snapshot import LssvmInverse
-from adaptive.state import joined, under
-from adaptive.surprise import (
-    MOST_BRIDGED,
-    PROBATION,
-    Hold,
-    Verdict,
-    bridged,
-    frame_after,
-    judge,
-    jump_of,
-    steps_of,
-)
+from adaptive.surprise import Hold, Verdict
 from adaptive.track import Pair, Step, Taken, Track
 from adaptive.types import FloatArray, Sample, StateDict
 
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
-#: Samples without a reading whose voltages are kept.
-MOST_HEARD = MOST_BRIDGED
 
 
 class Front:
@@ -67,7 +41,7 @@ class Front:
         self.dt_s = base.dt_s
         self.range_um = base.features.y_max_um - base.features.y_min_um
         self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
-        self.gates = AdmissionState()
+        self.gates = admission.AdmissionState()
         self.track: Track | None = None
         self.doubt_V = 0.0
         self.restarts = self.jumps = self.undone = 0
@@ -75,8 +49,7 @@ class Front:
         self._admission = config.admission.at(self.dt_s)
         self._hold: Hold | None = None
         self._lost = True  # The smoother has to start again.
-        # (seq, voltage) of samples whose readings were none, since the last one taken.
-        self._heard: deque[tuple[int, float]] = deque(maxlen=MOST_HEARD)
+        self._heard = Heard()
         self._before: FeatureMap | None = None  # The frame before the last jump.
         self._jump_um = 0.0
 
@@ -92,7 +65,7 @@ class Front:
 
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number."""
-        self.gates = AdmissionState()
+        self.gates = admission.AdmissionState()
         self._hold, self._lost = None, True
         self._heard.clear()
 
@@ -101,43 +74,33 @@ class Front:
     def take(self, sample: Sample, voltage: Voltage) -> Taken:
         """Judge one sample; ``voltage``: what the learnt model asks for. Never raises on data."""
         c, gates, track = self._admission, self.gates, self.track
-        refused = check_sample(c, gates, sample, self.dt_s)
+        refused = admission.check_sample(c, gates, sample, self.dt_s)
         if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
             refused = admission.OUT_OF_RANGE
         if refused:
-            if gates.seq >= 0 and not check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
-                # No reading, but a voltage: the stage goes on.
-                self._heard.append((sample.seq, sample.u_V))
+            if gates.seq >= 0 and not admission.check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
+                self._heard.put(sample)
             return Taken(refused)
         missing = sample.seq - gates.seq - 1 if gates.seq >= 0 else 0
-        between, gone = self._missed(sample, missing) if missing else ([], False)
+        between, gone = self._heard.missed(gates, sample, c.max_gap) if missing else ([], False)
         self._heard.clear()
         for u in (*between, sample.u_V):
-            watch_voltage(c, gates, u, self.base.span_V)
+            admission.watch_voltage(c, gates, u, self.base.span_V)
         gates.seq, gates.t_s = sample.seq, sample.t_s
         gates.since_glitch += 1 + missing
         if track is None or self._lost or gone or (missing and track.motion is None):
             return self._restart(sample, admission.GAP if missing else admission.SETTLING)
         for u in between:
             self._keep(track, voltage, u, nan)
-        stuck = watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
+        stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
-        known = track.motion is not None and not settling(c, gates)
-        limit = surprise(c, gates, self.base.span_V)
+        known = track.motion is not None and not admission.settling(c, gates)
+        limit = admission.surprise(c, gates, self.base.span_V)
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
         if self._hold is None and not doubtful:
-            watch_innovation(c, gates, innovation)
+            admission.watch_innovation(c, gates, innovation)
             return Taken("", (Step(sample.y_um, sample.u_V),))
         return self._decide(sample, track, self._keep(track, voltage, sample.u_V, sample.y_um), limit, innovation)
-
-    def _missed(self, sample: Sample, missing: int) -> tuple[list[float], bool]:
-        """Voltages of the samples without a reading before ``sample``, and whether too many never came."""
-        gates, first = self.gates, self.gates.seq + 1
-        heard = {seq: u for seq, u in self._heard if seq < sample.seq}
-        # Nobody knows the voltages of samples that never came; a straight line between is the best guess.
-        slope_V = (sample.u_V - gates.u_V) / (missing + 1)
-        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_HEARD))]
-        return between, missing > MOST_HEARD or missing - len(heard) > self._admission.max_gap
 
     def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
@@ -155,17 +118,10 @@ class Front:
 
     def _keep(self, track: Track, voltage: Voltage, u_V: float, y_um: float) -> Hold:
         """Hold a sample back; begins a hold where there is none."""
-        hold, made = self._hold, Bridging(track.served, voltage, self.base.span_V / self.range_um)
-        if hold is None:
-            motion, past_V, past_um = track.since_motion()
-            # Readings that were repeated before that was noticed are none, nor are they an anchor.
-            repeated = self.gates.same - 1 if self.gates.same >= REPEATED else 0
-            track.doubt(repeated)
-            bridge = made.begin(motion, past_V, past_um[: max(past_um.size - repeated, 0)], track.memory)
-            hold = self._hold = Hold(bridge, track.copy())
-            if self.gates.same > 1:
-                hold.last_um, hold.same = self.gates.y_um, self.gates.same - 1
-                hold.low_um = hold.high_um = self.gates.y_um
+        made = Bridging(track.served, voltage, self.base.span_V / self.range_um)
+        if self._hold is None:
+            self._hold = surprise.begin_hold(made, track, self.gates)
+        hold = self._hold
         old = replace(made, features=hold.track.served)
         hold.put(u_V, y_um, old.advance(hold.bridge, u_V))
         return hold
@@ -175,9 +131,9 @@ class Front:
         c, gates = self._admission, self.gates
         undone = False
         if hold.taken:
-            if abs(innovation) <= limit or settling(c, gates):
-                watch_innovation(c, gates, innovation)
-                if len(hold.y_um) >= PROBATION:
+            if abs(innovation) <= limit or admission.settling(c, gates):
+                admission.watch_innovation(c, gates, innovation)
+                if len(hold.y_um) >= surprise.PROBATION:
                     self._hold = None
                 return Taken("", (Step(sample.y_um, sample.u_V),))
             # At another level again within the probation: the sensor can't be trusted, and all is open once more.
@@ -187,8 +143,8 @@ class Front:
             self.undone += 1
         tolerance = limit + min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
         trusted = gates.since_glitch * self.dt_s > c.doubt_s
-        stuck_um = stuck_share(gates) * self.range_um
-        verdict = judge(c, hold, tolerance * self.range_um, stuck_um, self.range_um, trusted)
+        stuck_um = admission.stuck_share(gates) * self.range_um
+        verdict = surprise.judge(c, hold, tolerance * self.range_um, stuck_um, self.range_um, trusted)
         if verdict is Verdict.WAIT:
             return Taken(admission.GLITCH, undone=undone)
         if verdict is Verdict.LOST:
@@ -198,15 +154,10 @@ class Front:
             return replace(self._restart(sample, admission.GAP), undone=undone)
         if verdict is Verdict.JUMP:
             return self._take_jump(track, hold, undone)
-        self._hold = None
-        y_um = np.array(hold.y_um)
-        bad = np.isnan(y_um)
-        if verdict is Verdict.BACK:
-            if hold.worst_um > c.glitch_share * self.range_um:
-                gates.since_glitch = 0
-            y_um[:-1] = bridged(hold, len(hold.y_um) - 1)
-            bad[:-1] = True
-        return Taken("", steps_of(hold, y_um, bad), undone=undone)
+        self._hold, back = None, verdict is Verdict.BACK
+        if back and hold.worst_um > c.glitch_share * self.range_um:
+            gates.since_glitch = 0
+        return Taken("", surprise.steps_of_glitch(hold) if back else surprise.steps_of_motion(hold), undone=undone)
 
     def _take_jump(self, track: Track, hold: Hold, undone: bool) -> Taken:
         """The reading has jumped for good: place and frame move from the first sample held back on.
@@ -214,23 +165,19 @@ class Front:
         No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
         """
         before, f = self._before, hold.track.served
-        away_um, ratio = jump_of(hold)
+        away_um, ratio = surprise.jump_of(hold)
         if before is not None and self.on_probation and abs(away_um + self._jump_um) <= BACK_SHARE * abs(away_um):
             ratio, shift_um, frame = before.gain / f.gain, before.offset_um - f.offset_um, before
             self._before, self.gates.since_glitch, undone = None, 0, True
             self.undone += 1
         else:
-            ratio, shift_um, frame = frame_after(f, away_um, ratio)
+            ratio, shift_um, frame = surprise.frame_after(f, away_um, ratio)
             self._before, self._jump_um = f, away_um
             self.jumps += 1
         hold.taken, self.gates.since_jump = True, 0
         if self.track is not None:
             self.track.move(frame, ratio, shift_um)
-        y_um = np.array(hold.y_um)
-        bad = np.isnan(y_um)
-        bad[: hold.level] = True
-        y_um[bad] = f.offset_um + ratio * (np.array(hold.old_um)[bad] - f.offset_um) + shift_um
-        return Taken("", steps_of(hold, y_um, bad), away_um, undone)
+        return Taken("", surprise.steps_of_jump(hold, ratio, shift_um), away_um, undone)
 
     @property
     def holds(self) -> bool:
@@ -277,30 +224,19 @@ class Front:
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0
-        return at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
+        return admission.at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
 
     # ---- keeping
 
     def state_dict(self) -> StateDict:
         """All of the state under flat names."""
-        parts = {"gates": self.gates.state_dict()}
-        for name, part in (("track", self.track), ("hold", self._hold), ("before", self._before)):
-            if part is not None:
-                parts[name] = part.state_dict()
-        state = joined(parts)
-        state |= {"heard": np.array(self._heard, dtype=np.float64).reshape(-1, 2), "lost": self._lost}
-        counts = {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
-        return state | counts | {"jump_um": self._jump_um}
+        state = parts_to_state(self.gates, self.track, self._hold, self._before)
+        state |= {"heard": self._heard.array(), "lost": self._lost, "jump_um": self._jump_um}
+        return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
 
     def restore(self, state: StateDict) -> None:
         """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        self.gates = AdmissionState.from_state(under("gates.", state))
-        track, hold, before = (under(f"{name}.", state) for name in ("track", "hold", "before"))
-        made = (self.smoother, self.base.features)
-        self.track = Track.from_state(*made, track) if track else None
-        self._hold = Hold.from_state(*made, hold) if hold else None
-        self._before = FeatureMap.from_state(before) if before else None
-        self._heard.clear()
-        self._heard.extend((int(seq), float(u)) for seq, u in state["heard"])
+        self.gates, self.track, self._hold, self._before = parts_of(self.smoother, self.base.features, state)
+        self._heard.restore(state["heard"])
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))

@@ -8,7 +8,6 @@ minus the other's part as its target, so a change is taken up once, and the wind
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,16 +17,13 @@ from adaptive.admission import check_pair
 from adaptive.adoption import adopt
 from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig
-from adaptive.learner_parts import Parts, restored, state_of
+from adaptive.learner_parts import Parts, model_of, restored, state_of, warm
 from adaptive.snapshot import LssvmInverse
 from adaptive.track import Pair
 from adaptive.types import FloatArray, Sample, StateDict
 from adaptive.window_data import Hyperparameters, WindowData
 
 __all__ = ["Hyperparameters", "Learner", "LearnerConfig", "WindowData"]
-
-#: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
-JUMP_DOUBT = 0.3
 
 
 class Learner:
@@ -87,14 +83,10 @@ class Learner:
         front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
         taken = front.take(sample, self.parts.voltage)
         if taken.undone:
-            # What was learnt since the jump was learnt of a stage that never was.
-            parts.filter.restore(parts.jump_mark)
-            parts.window.keep()
-            self._cache = None
+            parts.undo_jump()
         if taken.jump_um:
-            parts.judgement.doubt_V2 += (JUMP_DOUBT * taken.jump_um / front.range_um * self.base.span_V) ** 2
-            if not taken.undone:
-                parts.jump_mark = parts.filter.mark()
+            parts.take_jump(taken.jump_um, fresh=not taken.undone)
+        if taken.undone or taken.jump_um:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
@@ -142,9 +134,7 @@ class Learner:
         if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis @ parts.filter.beta), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
-            for i, x in enumerate(motion):
-                parts.domain[2 * i] = min(parts.domain[2 * i], x)
-                parts.domain[2 * i + 1] = max(parts.domain[2 * i + 1], x)
+            parts.widen_domain(motion)
         self._cache = None
         return outcome
 
@@ -152,28 +142,8 @@ class Learner:
 
     def snapshot(self) -> LssvmInverse:
         """The model as it stands, immutable. The same object while nothing new was learnt."""
-        j, window = self.parts.judgement, self.parts.window
-        if self._cache is None and j.fallback:
-            self._cache = replace(self.base, noise_variance=j.frozen_short_V2, seq=self.seq, valid=j.valid)
-        elif self._cache is None:
-            support, alpha, bias = window.arrays()
-            beta = self.parts.filter.beta
-            beta[0] += bias
-            self._cache = replace(
-                self.base,
-                features=self.parts.front.served,
-                beta=beta,
-                support=support,
-                alpha=alpha,
-                widths=np.array(window.hyper.widths),
-                gamma=window.hyper.gamma,
-                domain=self.parts.domain,
-                noise_variance=j.variance_V2,
-                kernel_variance=window.kernel_variance,
-                beta_covariance=np.empty((0, 0)),
-                seq=self.seq,
-                valid=j.valid,
-            )
+        if self._cache is None:
+            self._cache = model_of(self.base, self.parts)
         return self._cache
 
     def memory(self) -> FloatArray:
@@ -208,20 +178,7 @@ class Learner:
     def warm(self) -> None:
         """Load (or compile) every step on a copy: no sample that teaches, no change of the stage and no other
         hyper-parameters must wait for one, which takes seconds where it was never compiled before."""
-        parts, capacity = Parts(self.base, self.config), self.config.window
-        basis, kernel = self._frozen_basis.copy(), self._frozen_kernel.copy()
-        self.base.features.fill(0.0, 0.0, 0.0, self.base.rest_memory(0.0), basis, kernel)
-        self.base.mean(basis, kernel)
-        window = parts.window
-        if len(window) < capacity:
-            window.learn(10.0 + np.zeros_like(kernel), 0.0)
-        window.learn(window.arrays()[0][0], 0.0)
-        parts.voltage(basis, kernel)
-        window.with_hyperparameters(window.hyper).newest_error_V(1)
-        for moving in (True, False):
-            parts.filter.update(basis, 0.0, moving)
-        parts.expect_change()
-        window.let_go(0.5)
+        warm(self.base, self.config)
 
     def freeze(self) -> None:
         """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""

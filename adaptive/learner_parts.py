@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from adaptive.admission import new_counters
@@ -22,6 +24,9 @@ EVENTS = ("fallbacks", "rollbacks", "adoptions", "adoptions_refused")
 #: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
 #: well, its estimate is marked this often, s.
 ROLLBACK_S, MARK_S = 0.5, 1.0
+
+#: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
+JUMP_DOUBT = 0.3
 
 Mark = tuple[FloatArray, FloatArray]
 
@@ -112,12 +117,73 @@ class Parts:
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
 
+    def take_jump(self, jump_um: float, fresh: bool) -> None:
+        """The reading has jumped by so much, µm; ``fresh`` : and did not only undo a jump."""
+        front = self.front
+        self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / front.range_um * front.base.span_V) ** 2
+        if fresh:
+            self.jump_mark = self.filter.mark()
+
+    def undo_jump(self) -> None:
+        """Forget what was learnt since the jump: it was learnt of a stage that never was."""
+        self.filter.restore(self.jump_mark)
+        self.window.keep()
+
+    def widen_domain(self, motion: tuple[float, float, float]) -> None:
+        """Take a learnt instant (µm, µm/s, µm/s²) into the domain."""
+        for i, x in enumerate(motion):
+            self.domain[2 * i] = min(self.domain[2 * i], x)
+            self.domain[2 * i + 1] = max(self.domain[2 * i + 1], x)
+
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part, now, in its marks, and as it was served."""
         self.filter.shift_constant(by_V)
         for beta, _ in {id(m): m for m in (self.mark, self.next_mark, self.jump_mark)}.values():
             beta[0] += by_V
         self.delay.shift(by_V)
+
+
+def model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
+    """What is learnt, as an immutable model; the identified one while learning is worse than it."""
+    j, window, seq = parts.judgement, parts.window, parts.front.gates.seq
+    if j.fallback:
+        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=j.valid)
+    support, alpha, bias = window.arrays()
+    beta = parts.filter.beta
+    beta[0] += bias
+    return replace(
+        base,
+        features=parts.front.served,
+        beta=beta,
+        support=support,
+        alpha=alpha,
+        widths=np.array(window.hyper.widths),
+        gamma=window.hyper.gamma,
+        domain=parts.domain,
+        noise_variance=j.variance_V2,
+        kernel_variance=window.kernel_variance,
+        beta_covariance=np.empty((0, 0)),
+        seq=seq,
+        valid=j.valid,
+    )
+
+
+def warm(base: LssvmInverse, config: LearnerConfig) -> None:
+    """Load, or compile, every step of a learner, on parts that nobody keeps."""
+    parts = Parts(base, config)
+    basis, kernel = np.empty(base.features.basis_size), np.empty(base.features.kernel_size)
+    base.features.fill(0.0, 0.0, 0.0, base.rest_memory(0.0), basis, kernel)
+    base.mean(basis, kernel)
+    window = parts.window
+    if len(window) < config.window:
+        window.learn(10.0 + np.zeros_like(kernel), 0.0)
+    window.learn(window.arrays()[0][0], 0.0)
+    parts.voltage(basis, kernel)
+    window.with_hyperparameters(window.hyper).newest_error_V(1)
+    for moving in (True, False):
+        parts.filter.update(basis, 0.0, moving)
+    parts.expect_change()
+    window.let_go(0.5)
 
 
 def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:

@@ -17,9 +17,9 @@ import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
-from adaptive.snapshot_loops import evaluate_packed, mean_of, track_memory
+from adaptive.snapshot_loops import evaluate_packed, evaluate_point, mean_of, track_memory
 from adaptive.state import prefixed, under
-from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from adaptive.types import Feedforward, FloatArray, StateDict
 from adaptive.window_state import IntArray
 
 #: Share of the learnt range by which a point may lie outside and still count as inside.
@@ -120,18 +120,23 @@ class LssvmInverse:
         after = self._memory(memory)
         n = y.size
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        self.evaluate_into(y, v, a, after, u, std, inside)
+        evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
         return Feedforward(u, std, inside, after)
 
-    def evaluate_into(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
-        std_V: FloatArray, inside: BoolArray,
-    ) -> None:  # fmt: skip
-        """As ``feedforward``, without its checks and its new arrays: (n,) contiguous doubles in, (n,) results out.
+    @property
+    def packed(self) -> tuple[FloatArray, IntArray]:
+        """The whole model as two arrays, as `snapshot_loops.evaluate_point` takes it; not to be changed."""
+        return self._constants, self._counts
 
-        ``memory`` (m,) is advanced in place. For callers that ask point by point at the rate of a controller.
+    def evaluate_point(
+        self, y_um: float, v_um_per_s: float, a_um_per_s2: float, memory: FloatArray
+    ) -> tuple[float, float, bool]:
+        """``feedforward`` of one point, (voltage, deviation, inside), without its checks: three floats and no others.
+
+        ``memory`` (m,), contiguous doubles, is advanced in place. For who asks point by point at a controller's rate.
         """
-        evaluate_packed(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts, u_V, std_V, inside)
+        u_V, std_V, inside = evaluate_point(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts)
+        return u_V, std_V, inside
 
     def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""

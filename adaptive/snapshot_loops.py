@@ -8,7 +8,7 @@ from adaptive.compiled import compiled, compiled_reassociating
 from adaptive.features_loops import FeatureArrays, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.types import BoolArray, FloatArray
-from adaptive.window_common import dot
+from adaptive.window_small import dot
 from adaptive.window_state import IntArray
 
 
@@ -115,6 +115,17 @@ def evaluate_packed(
         y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
         u, std, inside,
     )  # fmt: skip
+
+
+@compiled
+def evaluate_point(
+    y: float, v: float, a: float, memory: FloatArray, constants: FloatArray, counts: IntArray
+) -> tuple[float, float, bool]:  # pragma: no cover - compiled
+    """`evaluate_packed` of one point, numbers to numbers: to hand over an array costs as much as five of them."""
+    five, inside = np.empty(5), np.empty(1, dtype=np.bool_)
+    five[0], five[1], five[2] = y, v, a
+    evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
+    return five[3], five[4], inside[0]
 
 
 @compiled

@@ -19,8 +19,8 @@ from enum import Enum
 
 import numpy as np
 
-from adaptive.admission import REPEATED, AdmissionConfig
-from adaptive.bridge import SLOPES, Bridge
+from adaptive.admission import REPEATED, AdmissionConfig, AdmissionState
+from adaptive.bridge import SLOPES, Bridge, Bridging
 from adaptive.features import FeatureMap
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.state import prefixed, under
@@ -112,6 +112,19 @@ class Hold:
         )
 
 
+def begin_hold(made: Bridging, track: Track, gates: AdmissionState) -> Hold:
+    """A hold of what comes: the old level goes on from where ``track`` last was by readings that were believed."""
+    motion, past_V, past_um = track.since_motion()
+    # Readings that were repeated before that was noticed are none, nor are they an anchor.
+    repeated = gates.same - 1 if gates.same >= REPEATED else 0
+    track.doubt(repeated)
+    hold = Hold(made.begin(motion, past_V, past_um[: max(past_um.size - repeated, 0)], track.memory), track.copy())
+    if gates.same > 1:
+        hold.last_um, hold.same = gates.y_um, gates.same - 1
+        hold.low_um = hold.high_um = gates.y_um
+    return hold
+
+
 def near_old(hold: Hold, tolerance_um: float) -> bool:
     """Whether the last reading is at the old level."""
     return abs(hold.y_um[-1] - hold.old_um[-1]) <= tolerance_um + WAY_SHARE * hold.bridge.path_um
@@ -193,13 +206,32 @@ def frame_after(frame: FeatureMap, away_um: float, ratio: float) -> tuple[float,
     return 1.0, away_um, replace(frame, offset_um=frame.offset_um + away_um)
 
 
-def bridged(hold: Hold, upto: int) -> FloatArray:
-    """(upto,) places for the samples before the reading ``upto`` that is good again, ending where that one is."""
+def steps_of_motion(hold: Hold) -> tuple[Step, ...]:
+    """The samples held back, which were the stage's motion after all."""
+    y_um = np.array(hold.y_um)
+    return _steps_of(hold, y_um, np.isnan(y_um))
+
+
+def steps_of_glitch(hold: Hold) -> tuple[Step, ...]:
+    """The samples held back with the last reading, good again; those before are bridged, ending where it is."""
+    y_um, upto = np.array(hold.y_um), len(hold.y_um) - 1
+    bad = np.isnan(y_um)
     off = hold.y_um[upto] - hold.old_um[upto]
-    return np.asarray(np.array(hold.old_um[:upto]) + off * np.arange(1, upto + 1) / (upto + 1), dtype=np.float64)
+    y_um[:upto] = np.array(hold.old_um[:upto]) + off * np.arange(1, upto + 1) / (upto + 1)
+    bad[:upto] = True
+    return _steps_of(hold, y_um, bad)
 
 
-def steps_of(hold: Hold, y_um: FloatArray, bad: BoolArray) -> tuple[Step, ...]:
+def steps_of_jump(hold: Hold, ratio: float, shift_um: float) -> tuple[Step, ...]:
+    """The samples held back with those before the new level moved there; ``ratio``, ``shift_um`` of `frame_after`."""
+    f, y_um = hold.track.served, np.array(hold.y_um)
+    bad = np.isnan(y_um)
+    bad[: hold.level] = True
+    y_um[bad] = f.offset_um + ratio * (np.array(hold.old_um)[bad] - f.offset_um) + shift_um
+    return _steps_of(hold, y_um, bad)
+
+
+def _steps_of(hold: Hold, y_um: FloatArray, bad: BoolArray) -> tuple[Step, ...]:
     """The samples held back as steps of the track, with (n,) places; a bad one without a place is at the old level."""
     places = np.where(np.isnan(y_um), hold.old_um, y_um)
     return tuple(Step(float(y), u, not no) for y, u, no in zip(places, hold.u_V, bad, strict=True))

@@ -35,6 +35,7 @@ def warm() -> None:
     snapshot = learner.snapshot()
     still = np.zeros(2)
     memory = snapshot.feedforward(still, still, still, learner.memory()).memory
+    snapshot.evaluate_point(0.0, 0.0, 0.0, memory)
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
     all_finite(still)

@@ -17,22 +17,20 @@ import numpy as np
 from adaptive import window_diagonal as diagonal
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
-from adaptive.window_common import (
-    add_scaled,
-    dot,
-    factor_small,
-    finite,
-    half_norm_small,
-    keep_for_undo,
-    left_out,
-    move_sample,
-    restore_sample,
-    restore_solution,
-    row_residual,
-    solve_small,
-    write_sample,
+from adaptive.window_cholesky_factor import (
+    add,
+    backward,
+    delete,
+    factor_design,
+    finish,
+    forward,
+    gather,
+    keep_factor,
+    position_of,
+    take_back,
 )
-from adaptive.window_pass import backward_columns, forward_columns, rotate_column, shift_columns
+from adaptive.window_common import keep_for_undo, move_sample, restore_solution, row_residual, write_sample
+from adaptive.window_small import add_scaled, dot, finite, half_norm_small, left_out, solve_small
 from adaptive.window_state import (
     ACCEPTED,
     ALPHA,
@@ -43,8 +41,7 @@ from adaptive.window_state import (
     GAMMA,
     ILL_CONDITIONED,
     MINUS,
-    PK,
-    PLUS,
+    SCHUR_SHARE,
     SY,
     TRIAL,
     UNDO,
@@ -52,162 +49,18 @@ from adaptive.window_state import (
     UNDO_NOTHING,
     UNDO_PLACE,
     UNDO_REPLACE,
-    UNDO_SLOT,
     WindowArrays,
     Y,
-    Z,
 )
-
-_SCHUR_SHARE = 0.5
-
-
-@compiled_reassociating
-def position_of(A: WindowArrays, slot: int) -> int:
-    """Where in the factor a slot stands."""
-    for i in range(A.C[COUNT]):
-        if A.order[i] == slot:
-            return i
-    return -1
-
-
-@compiled_reassociating
-def gather(A: WindowArrays, by_slot: FloatArray, by_position: FloatArray) -> None:
-    """Reorder a vector from slots to positions."""
-    for i in range(A.C[COUNT]):
-        by_position[i] = by_slot[A.order[i]]
-
-
-@compiled_reassociating
-def forward(A: WindowArrays, b: FloatArray) -> None:
-    """b <- L^-1 b in place, by position."""
-    forward_columns(A.P, A.C[COUNT], b)
-
-
-@compiled_reassociating
-def backward(A: WindowArrays, b: FloatArray) -> None:
-    """b <- L'^-1 b in place, by position."""
-    backward_columns(A.P, A.C[COUNT], b)
-
-
-@compiled_reassociating
-def _delete(A: WindowArrays, position: int, b: FloatArray) -> None:
-    """Take the sample at ``position`` out of the factor, and b <- L^-1 b with the new factor in the same pass.
-
-    ``b`` is by position without the one that leaves. COUNT is one less afterwards.
-    """
-    n, p = A.C[COUNT], A.H.shape[0]
-    x, tau = A.V[PLUS], A.small[2]
-    row = A.P[position]
-    for i in range(position + 1, n):
-        x[i] = row[i]
-    shift_columns(A.P, n, position, b)
-    for c in range(p):
-        tau[c] = A.S[c, position]
-    tau_y = A.V[SY, position]
-    for k in range(position + 1, n):
-        old, new = A.P[k], A.P[k - 1]
-        r = np.sqrt(old[k] * old[k] + x[k] * x[k])
-        cosine, sine = old[k] / r, x[k] / r
-        new[k - 1] = r
-        t = b[k - 1] / r
-        b[k - 1] = t
-        rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
-        for c in range(p):
-            value = A.S[c, k]
-            A.S[c, k - 1] = cosine * value + sine * tau[c]
-            tau[c] = cosine * tau[c] - sine * value
-        value = A.V[SY, k]
-        A.V[SY, k - 1] = cosine * value + sine * tau_y
-        tau_y = cosine * tau_y - sine * value
-        A.order[k - 1] = A.order[k]
-    A.C[COUNT] = n - 1
-
-
-@compiled_reassociating
-def _add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
-    """Put the sample of ``slot``, already written, at the end; ``half`` is L^-1 of its column. COUNT is one more."""
-    n = A.C[COUNT]
-    for k in range(n):
-        A.P[k, n] = half[k]
-    A.P[n, n] = diagonal
-    for c in range(A.H.shape[0]):
-        A.S[c, n] = (A.H[c, slot] - dot(half, A.S[c], n)) / diagonal
-    A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
-    A.order[n] = slot
-    A.C[COUNT] = n + 1
-
-
-@compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G <- the factor of T_H'T_H. False where that is not finite."""
-    p, n, good = A.H.shape[0], A.C[COUNT], True
-    for c in range(p):
-        for r in range(c, p):
-            A.G[r, c] = dot(A.S[r], A.S[c], n)
-            good = good and np.isfinite(A.G[r, c])
-    factor_small(A.G)
-    return good
-
-
-@compiled_reassociating
-def finish(A: WindowArrays) -> bool:
-    """beta and alpha from T = L^-1 [H y]. False, with both spoilt, where they are not finite."""
-    p, n = A.H.shape[0], A.C[COUNT]
-    sy, t = A.V[SY], A.V[Z]
-    good = factor_design(A)
-    for c in range(p):
-        A.beta[c] = dot(A.S[c], sy, n)
-    solve_small(A.G, A.beta)
-    for j in range(n):
-        t[j] = sy[j]
-    for c in range(p):
-        add_scaled(t, -A.beta[c], A.S[c], n)
-    backward(A, t)
-    for i in range(n):
-        A.V[ALPHA, A.order[i]] = t[i]
-    return good and finite(A.beta, p) and finite(t, n)
-
-
-@compiled_reassociating
-def _keep_factor(A: WindowArrays) -> None:
-    """Copy the factor into the strictly lower triangle of P, last row first, and its diagonal into PK."""
-    n = A.C[COUNT]
-    for i in range(n):
-        A.V[PK, i] = A.P[i, i]
-        source, target = A.P[i, i + 1 : n], A.P[n - 1 - i]
-        for j in range(source.shape[0]):
-            target[j] = source[j]
-
-
-@compiled_reassociating
-def _take_back(A: WindowArrays) -> None:
-    """The window as it was before the sample of UNDO_SLOT was taken out of the factor, to the last bit.
-
-    COUNT is what it was then.
-    """
-    n, place = A.C[COUNT], A.C[UNDO_PLACE]
-    for i in range(n):
-        source, target = A.P[n - 1 - i], A.P[i, i + 1 : n]
-        for j in range(target.shape[0]):
-            target[j] = source[j]
-    for i in range(n):
-        A.P[i, i] = A.V[PK, i]
-    for r in range(n - 1 - place):
-        A.order[n - 1 - r] = A.order[n - 2 - r]
-    A.order[place] = A.C[UNDO_SLOT]
-    restore_solution(A)
-    restore_sample(A)
-    factor_design(A)
-    A.C[UNDO] = UNDO_NOTHING
 
 
 @compiled_reassociating
 def _begin_to_take_out(A: WindowArrays, slot: int) -> int:
-    """Keep all that `_take_back` needs. Returns the position of ``slot``."""
+    """Keep all that `take_back` needs. Returns the position of ``slot``."""
     place = position_of(A, slot)
     keep_for_undo(A, slot, UNDO_REPLACE)
     A.C[UNDO_PLACE] = place
-    _keep_factor(A)
+    keep_factor(A)
     diagonal.prepare(A, place)
     return place
 
@@ -222,19 +75,19 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
         half[i] = column[A.order[i]]
     for i in range(place + 1, n):
         half[i - 1] = column[A.order[i]]
-    _delete(A, place, half)
+    delete(A, place, half)
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n - 1)
-    good = s > _SCHUR_SHARE * noise
+    good = s > SCHUR_SHARE * noise
     if good:
         A.C[COUNT] = n
         write_sample(A, slot, x, y, w)
         A.C[COUNT] = n - 1
-        _add(A, slot, half, np.sqrt(s))
+        add(A, slot, half, np.sqrt(s))
         good = finish(A)
     if not good:
         A.C[COUNT] = n
-        _take_back(A)
+        take_back(A)
         return ILL_CONDITIONED
     diagonal.leave(A, slot, n)
     diagonal.come(A, slot)
@@ -245,7 +98,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
 def undo(A: WindowArrays) -> None:
     """Take back the last replace or append, to the last bit; the caller has seen that there is one."""
     if A.C[UNDO] == UNDO_REPLACE:
-        _take_back(A)
+        take_back(A)
     else:
         A.C[COUNT] -= 1
         restore_solution(A)
@@ -263,11 +116,11 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     forward(A, half)
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(half, half, n)
-    if not s > _SCHUR_SHARE * noise:
+    if not s > SCHUR_SHARE * noise:
         return ILL_CONDITIONED
     keep_for_undo(A, n, UNDO_APPEND)
     write_sample(A, n, x, y, w)
-    _add(A, n, half, np.sqrt(s))
+    add(A, n, half, np.sqrt(s))
     if not finish(A):
         undo(A)
         return ILL_CONDITIONED
@@ -283,10 +136,10 @@ def remove(A: WindowArrays, slot: int) -> int:
     place = _begin_to_take_out(A, slot)
     for i in range(last + 1):
         scratch[i] = 0.0
-    _delete(A, place, scratch)
+    delete(A, place, scratch)
     if not finish(A):
         A.C[COUNT] = last + 1
-        _take_back(A)
+        take_back(A)
         return ILL_CONDITIONED
     diagonal.leave(A, slot, last + 1)
     if slot != last:
@@ -330,15 +183,6 @@ def refine(A: WindowArrays) -> bool:
     for i in range(n):
         A.V[ALPHA, A.order[i]] += t[i]
     return good and finite(A.beta, p) and finite(A.V[ALPHA], n)
-
-
-@compiled_reassociating
-def shift_targets(A: WindowArrays, delta: FloatArray) -> None:
-    """T_y gains L^-1 delta; ``delta`` is by slot."""
-    t = A.V[TRIAL]
-    gather(A, delta, t)
-    forward(A, t)
-    add_scaled(A.V[SY], 1.0, t, A.C[COUNT])
 
 
 @compiled_reassociating

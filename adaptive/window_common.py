@@ -1,4 +1,4 @@
-"""What both forms of the window share: small solves, taking a sample in, keeping and restoring, residuals."""
+"""What both forms of the window share: taking a sample in, the linear part, keeping and restoring, residuals."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from adaptive.compiled import compiled_reassociating
 from adaptive.kernels import rbf_column
 from adaptive.types import FloatArray
+from adaptive.window_small import add_scaled, bounded, dot, factor_small, finite, solve_small
 from adaptive.window_state import (
     ALPHA,
     BITS,
@@ -20,6 +21,7 @@ from adaptive.window_state import (
     MOST_PRECISION,
     RESIDUAL,
     RESIDUALS_EXCEEDED,
+    ROUND_OFF,
     ROUND_WORST,
     ROUNDS,
     SY,
@@ -32,86 +34,6 @@ from adaptive.window_state import (
     WindowArrays,
     Y,
 )
-
-#: An unpenalised column whose pivot falls below this share is not told apart by the samples: its coefficient is 0.
-_PIVOT_SHARE = 1e-11
-#: A sample without which the unpenalised part is not determined leaves nothing of its diagonal but rounding.
-_UNDETERMINED = 1e-13
-#: A few units in the last place of the terms of a row's residual.
-_ROUND_OFF = 1e-15
-
-
-@compiled_reassociating
-def dot(a: FloatArray, b: FloatArray, n: int) -> float:
-    """Scalar product of the first n elements."""
-    total = 0.0
-    for j in range(n):
-        total += a[j] * b[j]
-    return total
-
-
-@compiled_reassociating
-def add_scaled(a: FloatArray, factor: float, b: FloatArray, n: int) -> None:
-    """a <- a + factor b over the first n elements."""
-    for j in range(n):
-        a[j] += factor * b[j]
-
-
-@compiled_reassociating
-def factor_small(G: FloatArray) -> None:
-    """Cholesky factor of a small matrix in place (lower); pivots that vanish are set to 0 with their column."""
-    p = G.shape[0]
-    for j in range(p):
-        whole = G[j, j]
-        t = whole
-        for k in range(j):
-            t -= G[j, k] * G[j, k]
-        pivot = np.sqrt(t) if t > _PIVOT_SHARE * whole else 0.0
-        G[j, j] = pivot
-        for i in range(j + 1, p):
-            t = G[i, j]
-            for k in range(j):
-                t -= G[i, k] * G[j, k]
-            G[i, j] = t / pivot if pivot > 0.0 else 0.0
-
-
-@compiled_reassociating
-def solve_small(G: FloatArray, rhs: FloatArray) -> None:
-    """rhs <- (G G')^-1 rhs in place; coefficients of columns with a zero pivot become 0."""
-    p = rhs.shape[0]
-    for i in range(p):
-        t = rhs[i]
-        for j in range(i):
-            t -= G[i, j] * rhs[j]
-        rhs[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
-    for r in range(p):
-        i = p - 1 - r
-        t = rhs[i]
-        for j in range(i + 1, p):
-            t -= G[j, i] * rhs[j]
-        rhs[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
-
-
-@compiled_reassociating
-def half_norm_small(G: FloatArray, u: FloatArray) -> float:
-    """u' (G G')^-1 u; ``u`` is overwritten."""
-    total = 0.0
-    for i in range(u.shape[0]):
-        t = u[i]
-        for j in range(i):
-            t -= G[i, j] * u[j]
-        u[i] = t / G[i, i] if G[i, i] > 0.0 else 0.0
-        total += u[i] * u[i]
-    return total
-
-
-@compiled_reassociating
-def bounded(a: FloatArray, n: int, most: float) -> bool:
-    """True where the first n elements are numbers of at most this size."""
-    good = True
-    for j in range(n):
-        good = good and abs(a[j]) <= most
-    return good
 
 
 @compiled_reassociating
@@ -212,6 +134,35 @@ def restore_sample(A: WindowArrays) -> None:
 
 
 @compiled_reassociating
+def factor_gram(A: WindowArrays, left: FloatArray) -> bool:
+    """G <- the factor of ``left`` S', (p, N) both. False where that is not finite."""
+    p, n, good = A.H.shape[0], A.C[COUNT], True
+    for c in range(p):
+        for r in range(c, p):
+            A.G[r, c] = dot(left[r], A.S[c], n)
+            good = good and np.isfinite(A.G[r, c])
+    factor_small(A.G)
+    return good
+
+
+@compiled_reassociating
+def solve_linear(A: WindowArrays, left: FloatArray, rest: FloatArray) -> bool:
+    """G anew, beta <- G^-1 ``left`` Sy and ``rest`` (N,) <- Sy - beta S. False where something is not finite."""
+    p, n, sy = A.H.shape[0], A.C[COUNT], A.V[SY]
+    good = factor_gram(A, left)
+    for c in range(p):
+        A.beta[c] = dot(left[c], sy, n)
+    # Before it is solved for: a pivot of zero would hide it.
+    good = good and finite(A.beta, p)
+    solve_small(A.G, A.beta)
+    for j in range(n):
+        rest[j] = sy[j]
+    for c in range(p):
+        add_scaled(rest, -A.beta[c], A.S[c], n)
+    return good and finite(A.beta, p) and finite(rest, n)
+
+
+@compiled_reassociating
 def row_residual(A: WindowArrays, i: int) -> float:
     """y_i - h_i'beta - R_i alpha: zero but for the error of the recursion. In units of the target."""
     fitted = dot(A.R[i], A.V[ALPHA], A.C[COUNT]) + dot(A.H[:, i], A.beta, A.beta.shape[0])
@@ -245,19 +196,10 @@ def rotate_residual(A: WindowArrays) -> bool:
     A.C[CURSOR] = i
     length = np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
     allowed = A.F[TOLERANCE] * length / (np.sqrt(n) * A.F[GAMMA])
-    good: bool = residual <= allowed + _ROUND_OFF * (abs(A.V[Y, i]) + abs(A.beta[0]) + length)
+    good: bool = residual <= allowed + ROUND_OFF * (abs(A.V[Y, i]) + abs(A.beta[0]) + length)
     if not good:
         A.C[RESIDUALS_EXCEEDED] += 1
     return good
-
-
-@compiled_reassociating
-def finite(a: FloatArray, n: int) -> bool:
-    """True where the first n elements are all finite."""
-    total = 0.0
-    for j in range(n):
-        total += a[j] * 0.0
-    return total == 0.0
 
 
 @compiled_reassociating
@@ -277,9 +219,3 @@ def move_sample(A: WindowArrays, source: int, target: int) -> None:
             A.R[target, j] = A.R[source, j]
             A.R[j, target] = A.R[source, j]
     A.R[target, target] = own
-
-
-@compiled_reassociating
-def left_out(alpha: float, diagonal: float, without: float) -> float:
-    """The leave-one-out residual alpha/without; NaN where the others do not determine the unpenalised part."""
-    return alpha / without if without > _UNDETERMINED * diagonal else np.nan

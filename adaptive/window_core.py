@@ -14,19 +14,9 @@ from adaptive import window_cholesky as cholesky
 from adaptive import window_inverse as inverse
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
-from adaptive.window_common import (
-    acceptable,
-    acceptable_weight,
-    add_scaled,
-    bounded,
-    design_value,
-    dot,
-    keep_for_undo,
-    kernel_column,
-    restore_solution,
-    rotate_residual,
-    row_residual,
-)
+from adaptive.window_answers import leave_one_out, predict, predict_with_variance, scale, worst_residual
+from adaptive.window_common import acceptable, acceptable_weight, kernel_column, rotate_residual, row_residual
+from adaptive.window_small import dot
 from adaptive.window_state import (
     ACCEPTED,
     ALPHA,
@@ -41,9 +31,6 @@ from adaptive.window_state import (
     ILL_STEPS,
     INVERSE_FORM,
     LAST_WORST,
-    LEAST_FACTOR,
-    MOST,
-    MOST_FACTOR,
     NEGLIGIBLE,
     NO_SLOT,
     NOTHING_TO_UNDO,
@@ -52,15 +39,18 @@ from adaptive.window_state import (
     ROUND_WORST,
     ROUNDS,
     STEPS,
-    SY,
     UNDO,
     UNDO_NOTHING,
     UNDONE,
-    K,
     WindowArrays,
     Y,
-    Z,
 )
+from adaptive.window_targets import rescale_targets, shift_targets
+
+__all__ = [
+    "append", "leave_one_out", "predict", "predict_with_variance", "refine", "remove", "replace", "rescale_targets",
+    "resum", "reweight", "scale", "shift_targets", "undo", "worst_residual",
+]  # fmt: skip
 
 
 @compiled_reassociating
@@ -199,130 +189,8 @@ def reweight(A: WindowArrays, slot: int, w: float) -> int:
 
 
 @compiled_reassociating
-def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
-    """All targets y <- (1 + gain) y + offset, in O(N p): the offset lies in the span of the unpenalised part."""
-    n, y, sy, alpha, first = A.C[COUNT], A.V[Y], A.V[SY], A.V[ALPHA], A.S[0]
-    factor, most, total = 1.0 + gain, abs(offset), 0.0
-    if factor >= LEAST_FACTOR and factor <= MOST_FACTOR and most <= MOST:
-        for j in range(n):
-            most = max(most, abs(factor * y[j] + offset))
-            total += (factor * sy[j] + offset * first[j]) * 0.0 + factor * alpha[j] * 0.0
-    else:
-        most = np.inf
-    if not most <= MOST:
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    for c in range(A.beta.shape[0]):
-        total += factor * A.beta[c] * 0.0
-    if total != 0.0:
-        A.C[ILL_STEPS] += 1
-        return ILL_CONDITIONED
-    for j in range(n):
-        y[j] = factor * y[j] + offset
-        sy[j] = factor * sy[j] + offset * first[j]
-        alpha[j] *= factor
-    for c in range(A.beta.shape[0]):
-        A.beta[c] *= factor
-    A.beta[0] += offset
-    A.C[UNDO] = UNDO_NOTHING
-    return ACCEPTED
-
-
-@compiled_reassociating
-def shift_targets(A: WindowArrays, delta: FloatArray) -> int:
-    """All targets y <- y + delta, (N,) by slot. O(N²): one product."""
-    n, shifted = A.C[COUNT], A.V[COLUMN]
-    for j in range(n):
-        shifted[j] = A.V[Y, j] + delta[j]
-    if not bounded(shifted, n, MOST):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    keep_for_undo(A, 0, UNDO_NOTHING)
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.solve(A, delta, A.V[Z])
-        add_scaled(A.V[SY], 1.0, A.V[Z], n)
-        good = inverse.finish(A)
-    else:
-        cholesky.shift_targets(A, delta)
-        good = cholesky.finish(A)
-    if not good:
-        restore_solution(A)
-        factor_design(A)
-        A.C[ILL_STEPS] += 1
-        return ILL_CONDITIONED
-    for j in range(n):
-        A.V[Y, j] = shifted[j]
-    return ACCEPTED
-
-
-@compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G anew from S."""
-    if A.C[FORM] == INVERSE_FORM:
-        return inverse.factor_design(A)
-    return cholesky.factor_design(A)
-
-
-@compiled_reassociating
 def resum(A: WindowArrays) -> bool:
     """S, Sy, beta and alpha anew from the inverse or factor as it stands. O(N² p)."""
     if A.C[FORM] == INVERSE_FORM:
         return inverse.resum(A)
     return cholesky.resum(A)
-
-
-@compiled_reassociating
-def predict(A: WindowArrays, x: FloatArray) -> float:
-    """Mean at one point. O(N d). Its scratch is the window's: one thread at a time."""
-    k = A.V[K]
-    kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
-    for c in range(A.beta.shape[0]):
-        mean += A.beta[c] * design_value(A, x, c)
-    return mean
-
-
-@compiled_reassociating
-def scale(A: WindowArrays) -> float:
-    """Variance of the kernel process by its likelihood, y'alpha/(N - p): the unit of variances; 0 while N <= p."""
-    n, p = A.C[COUNT], A.beta.shape[0]
-    if n <= p:
-        return 0.0
-    total: float = max(dot(A.V[Y], A.V[ALPHA], n), 0.0)
-    degrees: float = n - p
-    return total / degrees
-
-
-@compiled_reassociating
-def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float, float]:
-    """Mean, variance of the function in units of `scale`, and `scale`, at one point: one call for all. O(N²)."""
-    k, p = A.V[K], A.beta.shape[0]
-    kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
-    u = A.small[1, :p]
-    for c in range(p):
-        u[c] = design_value(A, x, c)
-        mean += A.beta[c] * u[c]
-    if A.C[FORM] == INVERSE_FORM:
-        return mean, inverse.variance(A, k, u), scale(A)
-    return mean, cholesky.variance(A, k, u), scale(A)
-
-
-@compiled_reassociating
-def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """Exact leave-one-out residuals into ``out`` (N,). O(N p²); in the Cholesky form as `window_diagonal` says."""
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.leave_one_out(A, out)
-    else:
-        cholesky.leave_one_out(A, out)
-
-
-@compiled_reassociating
-def worst_residual(A: WindowArrays) -> float:
-    """Largest residual of all rows, in units of the target. O(N²)."""
-    n, worst = A.C[COUNT], 0.0
-    for i in range(n):
-        residual = abs(row_residual(A, i))
-        if not residual <= worst:
-            worst = residual
-    return worst

@@ -17,21 +17,21 @@ import numpy as np
 
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
-from adaptive.window_common import (
-    add_scaled,
-    dot,
-    factor_small,
-    finite,
-    half_norm_small,
-    keep_for_undo,
-    left_out,
-    move_sample,
-    restore_sample,
-    restore_solution,
-    solve_small,
-    write_sample,
+from adaptive.window_common import keep_for_undo, move_sample, restore_sample, restore_solution, write_sample
+from adaptive.window_inverse_parts import (
+    factor_design,
+    finish,
+    flush,
+    lift_column,
+    lower_column,
+    multiply,
+    pend,
+    solve,
+    take_in,
+    take_out,
 )
-from adaptive.window_pass import advance, product, quadratic
+from adaptive.window_pass import quadratic
+from adaptive.window_small import add_scaled, dot, half_norm_small, left_out
 from adaptive.window_state import (
     ACCEPTED,
     ALPHA,
@@ -43,6 +43,7 @@ from adaptive.window_state import (
     PENDING,
     PK,
     PLUS,
+    SCHUR_SHARE,
     SY,
     TRIAL,
     UNDO,
@@ -55,124 +56,6 @@ from adaptive.window_state import (
     Z,
 )
 
-#: The Schur complement of a new sample is at least its noise variance 1/(gamma w); below this share of it, P is wrong.
-_SCHUR_SHARE = 0.5
-
-
-@compiled_reassociating
-def multiply(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
-    """Apply what is pending, and z <- P b over the slots in use. The last step can't be undone after this."""
-    n = A.C[COUNT]
-    minus, plus = A.V[MINUS], A.V[PLUS]
-    if A.C[PENDING] != 0:
-        advance(A.P, n, minus, plus, b, z)
-        for j in range(n):
-            minus[j] = 0.0
-            plus[j] = 0.0
-        A.C[PENDING] = 0
-    else:
-        product(A.P, n, b, z)
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
-def flush(A: WindowArrays) -> None:
-    """Apply what is pending; P is then R^-1 itself."""
-    if A.C[PENDING] != 0:
-        trial = A.V[TRIAL]
-        for j in range(A.C[COUNT]):
-            trial[j] = 0.0
-        multiply(A, trial, A.V[Z])
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
-def solve(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
-    """z <- R^-1 b without applying what is pending."""
-    n = A.C[COUNT]
-    product(A.P, n, b, z)
-    if A.C[PENDING] != 0:
-        minus, plus = A.V[MINUS], A.V[PLUS]
-        add_scaled(z, -dot(minus, b, n), minus, n)
-        add_scaled(z, dot(plus, b, n), plus, n)
-
-
-@compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G <- the factor of H'PH. False where that is not finite."""
-    p, n = A.H.shape[0], A.C[COUNT]
-    good = True
-    for c in range(p):
-        for r in range(c, p):
-            A.G[r, c] = dot(A.H[r], A.S[c], n)
-            good = good and np.isfinite(A.G[r, c])
-    factor_small(A.G)
-    return good
-
-
-@compiled_reassociating
-def finish(A: WindowArrays) -> bool:
-    """beta and alpha from S and Sy, (2.29). False, with both spoilt, where they are not finite."""
-    p, n = A.H.shape[0], A.C[COUNT]
-    sy, alpha = A.V[SY], A.V[ALPHA]
-    good = factor_design(A)
-    for c in range(p):
-        A.beta[c] = dot(A.H[c], sy, n)
-    good = good and finite(A.beta, p)
-    solve_small(A.G, A.beta)
-    for j in range(n):
-        alpha[j] = sy[j]
-    for c in range(p):
-        add_scaled(alpha, -A.beta[c], A.S[c], n)
-    return good and finite(alpha, n)
-
-
-@compiled_reassociating
-def _lift_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """p <- P e_slot, and zero that row and column: the pass then writes the new ones exactly."""
-    n, row = A.C[COUNT], A.P[slot]
-    for j in range(slot + 1):
-        p[j] = row[j]
-        row[j] = 0.0
-    for i in range(slot + 1, n):
-        p[i] = A.P[i, slot]
-        A.P[i, slot] = 0.0
-
-
-@compiled_reassociating
-def _lower_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """Write a lifted column back."""
-    for j in range(slot + 1):
-        A.P[slot, j] = p[j]
-    for i in range(slot + 1, A.C[COUNT]):
-        A.P[i, slot] = p[i]
-
-
-@compiled_reassociating
-def _take_out(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
-    n = A.C[COUNT]
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], -A.S[c, slot] / p[slot], p, n)
-        A.S[c, slot] = 0.0
-    add_scaled(A.V[SY], -A.V[SY, slot] / p[slot], p, n)
-    A.V[SY, slot] = 0.0
-
-
-@compiled_reassociating
-def _take_in(A: WindowArrays, slot: int, q: FloatArray, s: float) -> None:
-    """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
-    n = A.C[COUNT]
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], dot(q, A.H[c], n) / s, q, n)
-    add_scaled(A.V[SY], dot(q, A.V[Y], n) / s, q, n)
-
-
-@compiled_reassociating
-def _pend(target: FloatArray, source: FloatArray, scale: float, n: int) -> None:
-    for j in range(n):
-        target[j] = source[j] * scale
-
 
 @compiled_reassociating
 def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
@@ -182,7 +65,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
     b[slot] = 0.0
     multiply(A, b, z)
     keep_for_undo(A, slot, UNDO_REPLACE)
-    _lift_column(A, slot, p)
+    lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
     for j in range(n):
@@ -191,24 +74,24 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
     # What P gains and loses on its diagonal bounds what it does elsewhere.
-    good = pkk > 0.0 and s > _SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
+    good = pkk > 0.0 and s > SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
     if good:
         q[slot] = -1.0
-        _take_out(A, slot, p)
+        take_out(A, slot, p)
         write_sample(A, slot, x, y, w)
-        _take_in(A, slot, q, s)
+        take_in(A, slot, q, s)
         good = finish(A)
     if not good:
         # write_sample may not have run: restoring writes the same values again.
         restore_solution(A)
         restore_sample(A)
         factor_design(A)
-        _lower_column(A, slot, p)
+        lower_column(A, slot, p)
         A.C[UNDO] = UNDO_NOTHING
         return ILL_CONDITIONED
-    _pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
+    pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[MINUS, slot] = 0.0
-    _pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n)
+    pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n)
     A.C[PENDING] = 1
     return ACCEPTED
 
@@ -222,7 +105,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
     keep_for_undo(A, n, UNDO_APPEND)
-    good = s > _SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
+    good = s > SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
     if good:
         q[n] = -1.0
         for c in range(A.H.shape[0]):
@@ -232,7 +115,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
             A.P[n, j] = 0.0
         write_sample(A, n, x, y, w)
         A.C[COUNT] = n + 1
-        _take_in(A, n, q, s)
+        take_in(A, n, q, s)
         good = finish(A)
         A.C[COUNT] = n
     if not good:
@@ -243,7 +126,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     A.C[COUNT] = n + 1
     for j in range(n + 1):
         A.V[MINUS, j] = 0.0
-    _pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n + 1)
+    pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n + 1)
     A.C[PENDING] = 1
     return ACCEPTED
 
@@ -257,7 +140,7 @@ def undo(A: WindowArrays) -> None:
     restore_solution(A)
     if kind == UNDO_REPLACE:
         restore_sample(A)
-        _lower_column(A, slot, A.V[PK])
+        lower_column(A, slot, A.V[PK])
     factor_design(A)
     for j in range(A.C[COUNT]):
         A.V[MINUS, j] = 0.0
@@ -272,18 +155,18 @@ def remove(A: WindowArrays, slot: int) -> int:
     flush(A)
     n, p = A.C[COUNT], A.V[PK]
     keep_for_undo(A, slot, UNDO_NOTHING)
-    _lift_column(A, slot, p)
+    lift_column(A, slot, p)
     pkk = p[slot]
     good = pkk > 0.0 and np.isfinite(dot(p, p, n) / pkk)
     if good:
-        _take_out(A, slot, p)
+        take_out(A, slot, p)
         good = finish(A)
     if not good:
         restore_solution(A)
         factor_design(A)
-        _lower_column(A, slot, p)
+        lower_column(A, slot, p)
         return ILL_CONDITIONED
-    _pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
+    pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
     A.V[MINUS, slot] = 0.0
     A.C[PENDING] = 1
     flush(A)

@@ -98,6 +98,14 @@ CONTRACTION = 0.5
 #: ... unless it is this small beside target and weights: where hardly more samples than linear terms are held, alpha is
 #: nearly nothing, and what is left is rounding.
 NEGLIGIBLE = 1e-13
+#: The Schur complement of a new sample is at least its noise variance 1/(gamma w); below this share of it, P is wrong.
+SCHUR_SHARE = 0.5
+#: An unpenalised column whose pivot falls below this share is not told apart by the samples: its coefficient is 0.
+PIVOT_SHARE = 1e-11
+#: A sample without which the unpenalised part is not determined leaves nothing of its diagonal but rounding.
+UNDETERMINED = 1e-13
+#: A few units in the last place of the terms of a row's residual.
+ROUND_OFF = 1e-15
 
 # Values of C[UNDO].
 UNDO_NOTHING, UNDO_REPLACE, UNDO_APPEND = range(3)

@@ -11,55 +11,18 @@ would follow those of the stage: that costs next to nothing, where its own answe
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
 
 import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
-from adaptive.finite import all_finite
+from adaptive.finite import DOUBLE, all_finite, all_finite_doubles
 from adaptive.snapshot import LssvmInverse
+from adaptive.snapshot_loops import evaluate_point
 from adaptive.state import prefixed, under
-from adaptive.types import BoolArray, Feedforward, FloatArray, InverseModel, StateDict
-from baselines.bouc_wen_inverse import BoucWenInverse
-from baselines.linear import LinearInverse
-from baselines.mpi_inverse import MpiInverse
-
-#: Kinds of contestants that a state can be read back into.
-KINDS: Final[dict[str, Any]] = {
-    "lssvm": LssvmInverse,
-    "linear": LinearInverse,
-    "bouc_wen": BoucWenInverse,
-    "mpi": MpiInverse,
-}
-
-
-#: Takes (n,) motion, µm, the voltages answered for it, V, and a memory that it advances in place.
-Carry = Callable[[FloatArray, FloatArray, FloatArray], None]
-
-
-def _carry_of(model: InverseModel) -> Carry:
-    """How the memory of a contestant follows what others answer."""
-    carry: Carry | None = getattr(model, "carry", None)
-    if carry is not None:
-        return carry
-
-    def track(y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        still = np.zeros(np.asarray(y_um).size)
-        memory[:] = model.track(y_um, still, still, u_V, memory)
-
-    return track
-
-
-def kind_of(model: InverseModel) -> str:
-    """Kind of a contestant; raises InputError where its class is none of them."""
-    for kind, known in KINDS.items():
-        if type(model) is known:
-            return kind
-    raise InputError(
-        f"model {model.name!r}: got a {type(model).__name__}, expected one of the kinds {', '.join(KINDS)}"
-    )
+from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
+from adaptive.window_state import IntArray
+from baselines.kinds import KINDS, Carry, carries, carry_of, kind_of
 
 
 @dataclass(frozen=True)
@@ -81,7 +44,10 @@ class ChampionInverse:
     _cuts: tuple[int, ...] = field(init=False, repr=False, compare=False)
     #: The shares of a stream that is wholly the champion's, as bytes; and of the others what carries their memories.
     _alone: bytes = field(init=False, repr=False, compare=False)
-    _others: tuple[tuple[Carry, int, int], ...] = field(init=False, repr=False, compare=False)
+    _others: tuple[tuple[Carry, slice], ...] = field(init=False, repr=False, compare=False)
+    #: The champion's part of a memory, and the champion itself as compiled code takes it; None for another kind.
+    _own: slice = field(init=False, repr=False, compare=False)
+    _packed: tuple[FloatArray, IntArray] | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.models or len(self.names) != len(self.models) or not 0 <= self.champion < len(self.models):
@@ -95,13 +61,11 @@ class ChampionInverse:
         cuts = tuple(int(cut) for cut in np.cumsum(sizes))
         object.__setattr__(self, "_cuts", cuts)
         object.__setattr__(self, "_alone", self._settled().tobytes())
-        spans = zip(self.models, cuts, cuts[1:], strict=False)
-        others = [
-            (_carry_of(model), begin, end)
-            for i, (model, begin, end) in enumerate(spans)
-            if end > begin and i != self.champion
-        ]
-        object.__setattr__(self, "_others", tuple(others))
+        parts = [slice(begin, end) for begin, end in itertools.pairwise(cuts)]
+        object.__setattr__(self, "_others", carries(self.models, parts, self.champion))
+        object.__setattr__(self, "_own", parts[self.champion])
+        served = self.served
+        object.__setattr__(self, "_packed", served.packed if type(served) is LssvmInverse else None)
 
     @property
     def dt_s(self) -> float:
@@ -156,7 +120,7 @@ class ChampionInverse:
         for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
             end = answers[i].memory if i in answers else part.copy()
             if i not in answers and part.size:
-                _carry_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+                carry_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
             ends.append(end if np.isfinite(end).all() else part)
         return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 
@@ -181,7 +145,7 @@ class ChampionInverse:
 
     def _is_settled(self, memory: FloatArray) -> bool:
         """Whether a caller's stream of points is wholly the champion's: almost always."""
-        if type(memory) is not np.ndarray or memory.shape != (self._cuts[-1],) or memory.dtype != np.float64:
+        if type(memory) is not np.ndarray or memory.dtype is not DOUBLE or memory.shape != self._cuts[-1:]:
             return False
         # As it leaves this class; anything else goes the long way, where it is judged.
         return memory[: len(self.models)].tobytes() == self._alone
@@ -190,12 +154,11 @@ class ChampionInverse:
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
         """The champion's answer, and all memories after it."""
-        begin, end = self._cuts[self.champion], self._cuts[self.champion + 1]
-        answer = self.models[self.champion].feedforward(y_um, v_um_per_s, a_um_per_s2, memory[begin:end])
+        answer = self.models[self.champion].feedforward(y_um, v_um_per_s, a_um_per_s2, memory[self._own])
         after = memory.copy()
-        after[begin:end] = answer.memory
-        for carry, first, stop in self._others:
-            carry(y_um, answer.u_V, after[first:stop])
+        after[self._own] = answer.memory
+        for carry, part in self._others:
+            carry(y_um, answer.u_V, after[part])
         if not all_finite(after):
             # One that cannot go on stays where it was; it is no reason for the others to.
             for first, stop in itertools.pairwise(self._cuts):
@@ -203,24 +166,26 @@ class ChampionInverse:
                     after[first:stop] = memory[first:stop]
         return Feedforward(answer.u_V, answer.std_V, answer.inside, after)
 
-    def evaluate_into(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray,
-        std_V: FloatArray, inside: BoolArray,
-    ) -> bool:  # fmt: skip
-        """As ``feedforward``, without its checks and its new arrays: (n,) contiguous doubles in, (n,) results out.
+    def evaluate_point(
+        self, y_um: float, v_um_per_s: float, a_um_per_s2: float, memory: FloatArray, one: tuple[FloatArray, FloatArray]
+    ) -> tuple[float, float, bool] | None:
+        """``feedforward`` of one point, (voltage, deviation, inside), without its checks: three floats and no others.
 
-        ``memory`` (m,) is advanced in place. False where this is not for the quick way (another kind of champion, a
-        stream that is not wholly its own, a memory that does not stay finite): ask ``feedforward`` with the memory
-        from before. For callers that ask point by point at the rate of a controller.
+        ``memory`` (m,) is advanced in place; ``one``: two arrays (1,) that are overwritten. None for another kind of
+        champion, a stream that is not wholly its own, a memory that does not stay finite: ask ``feedforward`` with the
+        memory from before. For who asks point by point at a controller's rate.
         """
-        champion = self.models[self.champion]
-        if type(champion) is not LssvmInverse or not self._is_settled(memory):
-            return False
-        begin, end = self._cuts[self.champion], self._cuts[self.champion + 1]
-        champion.evaluate_into(y_um, v_um_per_s, a_um_per_s2, memory[begin:end], u_V, std_V, inside)
-        for carry, first, stop in self._others:
-            carry(y_um, u_V, memory[first:stop])
-        return bool(all_finite(memory))
+        packed = self._packed
+        if packed is None or not self._is_settled(memory):
+            return None
+        answer: tuple[float, float, bool] = evaluate_point(
+            y_um, v_um_per_s, a_um_per_s2, memory[self._own], packed[0], packed[1]
+        )
+        motion, voltage = one
+        motion[0], voltage[0] = y_um, answer[0]
+        for carry, part in self._others:
+            carry(motion, voltage, memory[part])
+        return answer if all_finite_doubles(memory) else None
 
     def _settled(self) -> FloatArray:
         shares = np.zeros(len(self.models))

@@ -13,16 +13,15 @@ import math
 from collections import deque
 from typing import Any
 
-from adaptive.errors import InputError, ModelFileError
-from adaptive.learner import Hyperparameters, Learner
-from adaptive.state import under
+from adaptive.errors import InputError
+from adaptive.learner import Hyperparameters
 from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
 from baselines import competition_report
 from baselines.champion import ChampionInverse
-from baselines.competition_state import contestants_of, restore, to_state
+from baselines.competition_state import made_of, to_state
 from baselines.contest import NOT_SCORED, Motion
 from baselines.contest_config import CompetitionConfig
-from baselines.contestants import Revive, stating
+from baselines.contestants import Revive, stating, take_place
 from baselines.judging import Judging
 from baselines.succession import Succession
 
@@ -145,11 +144,8 @@ class Competition:
 
     def take_place_of(self, other: Competition) -> None:
         """Go on where ``other`` is, with what this one knows; see :meth:`adaptive.learner.Learner.take_place_of`."""
-        for i, (mine, its) in enumerate(zip(self._models, other._models, strict=True)):
-            if isinstance(mine, Learner) and isinstance(its, Learner) and not other._out[i]:
-                mine.take_place_of(its)
-            else:
-                getattr(mine, "resync", lambda: None)()
+        for mine, its, out in zip(self._models, other._models, other._out, strict=True):
+            take_place(mine, None if out else its)
 
     def _exclude(self, i: int, error: Exception) -> None:
         self._out[i] = True
@@ -166,11 +162,7 @@ class Competition:
         self._begin_anew()
         self._newest = tuple(self._snapshot(i) for i in range(len(self._models)))
         bad = self._judging.judge(self._seq, rows, self._out)
-        for model, newest, score in zip(self._models, self._newest, self._judging.scores, strict=True):
-            # Where one knows its own memory it is judged by that: over lost readings ours is a guess.
-            own = getattr(model, "memory_for", lambda *_: None)(newest, True)
-            if own is not None:
-                score.memory = own
+        self._judging.correct(self._models, self._newest)
         self._judging.remember(self._seq, self._newest)
         if not self._frozen:
             self._choose(bad, float(rows[4].sum()) * self._dt_s)
@@ -182,10 +174,7 @@ class Competition:
         before = self._succession.champion
         why = self._succession.choose(errors_V, scored_s)
         if why:
-            after, old = (
-                f"{self.names[i]} ({errors_V[i] / self._span_V:.3%} rms)" for i in (self._succession.champion, before)
-            )
-            self._events.append(("champion_changed", f"{after} is served in place of {old}: {why}"))
+            self._events.append(("champion_changed", competition_report.change(self, errors_V, before, why)))
 
     def _snapshot(self, i: int) -> InverseModel:
         if not self._out[i]:
@@ -256,14 +245,5 @@ class Competition:
 
     @classmethod
     def from_state(cls, state: StateDict, revive: Revive | None = None) -> Competition:
-        """Inverse of ``state_dict``; ``revive`` as at construction.
-
-        Raises ModelFileError where entries are missing or do not fit together.
-        """
-        try:
-            config = CompetitionConfig(**under("config.", state))
-            made = cls(contestants_of(state), float(state["range_um"]), float(state["span_V"]), config, revive)
-            restore(made, state)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error
-        return made
+        """Inverse of ``state_dict``; ``revive`` as at construction. Raises ModelFileError where it does not fit."""
+        return made_of(cls, state, revive)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,6 +21,12 @@ def standing(c: Competition) -> dict[str, Any]:
         for i, name in enumerate(c.names)
     }
     return {"champion": c.champion, "changes": c._succession.changes, "contestants": table}
+
+
+def change(c: Competition, errors_V: Sequence[float], before: int, why: str) -> str:
+    """That the champion is another than ``before``, with the rms errors (k,), V, by which it was chosen, and why."""
+    after, old = (f"{c.names[i]} ({errors_V[i] / c._span_V:.3%} rms)" for i in (c._succession.champion, before))
+    return f"{after} is served in place of {old}: {why}"
 
 
 def counters(c: Competition) -> dict[str, int]:

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptive.errors import InputError
+from adaptive.errors import InputError, ModelFileError
 from adaptive.state import prefixed, under
 from adaptive.types import OnlineModel, StateDict
 from baselines.champion import ChampionInverse
-from baselines.contestants import KINDS, fingerprint
+from baselines.contest_config import CompetitionConfig
+from baselines.contestants import KINDS, Revive, fingerprint
 
 if TYPE_CHECKING:
     from baselines.competition import Competition
@@ -58,6 +59,17 @@ def contestants_of(state: StateDict) -> dict[str, OnlineModel]:
     return {
         name: KINDS[kind].from_state(under(f"model.{name}.", state)) for name, kind in zip(names, kinds, strict=True)
     }
+
+
+def made_of(kind: type[Competition], state: StateDict, revive: Revive | None) -> Competition:
+    """A competition that goes on from a state. Raises ModelFileError where entries are missing or do not fit."""
+    try:
+        config = CompetitionConfig(**under("config.", state))
+        made = kind(contestants_of(state), float(state["range_um"]), float(state["span_V"]), config, revive)
+        restore(made, state)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error
+    return made
 
 
 def restore(c: Competition, state: StateDict) -> None:

@@ -42,6 +42,14 @@ def challenger(model: InverseModel) -> OnlineModel | None:
     return None
 
 
+def take_place(mine: OnlineModel, its: OnlineModel | None) -> None:
+    """Let ``mine`` go on where ``its`` is, with what it knows itself; where it cannot, it takes whatever comes next."""
+    if isinstance(mine, Learner) and isinstance(its, Learner):
+        mine.take_place_of(its)
+    else:
+        getattr(mine, "resync", lambda: None)()
+
+
 def stating(model: InverseModel, rms_V: float) -> InverseModel:
     """``model`` with a deviation of at least ``rms_V``, V, what its answers were judged to be wrong by.
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
-from adaptive.types import FloatArray, InverseModel
+from adaptive.types import FloatArray, InverseModel, OnlineModel
 from baselines.contest import Score
 from baselines.contest_config import CompetitionConfig
 
@@ -51,6 +52,13 @@ class Judging:
                 score.memory = model.rest_memory(float(rows[0, 0]))
             bad[i] = not score.take(model, rows, share, self._span_V)
         return bad
+
+    def correct(self, models: Sequence[OnlineModel], newest: Models) -> None:
+        """Go on from a contestant's own memory where it knows one: over lost readings ours is a guess."""
+        for model, snapshot, score in zip(models, newest, self.scores, strict=True):
+            own = getattr(model, "memory_for", lambda *_: None)(snapshot, True)
+            if own is not None:
+                score.memory = own
 
     def remember(self, seq: int, models: Models) -> None:
         """Keep what callers have from the sample ``seq`` on."""

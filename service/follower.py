@@ -83,8 +83,7 @@ class Follower:
         #: Who gave the last answer: the model itself, and the name of what stood in for it where the flags say so.
         self._answered: InverseModel | None = None
         self._stand_in = ""
-        self._one = (np.empty(1), np.empty(1), np.empty(1))
-        self._result = (np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_))
+        self._one = np.empty(1), np.empty(1)
 
     @property
     def model(self) -> InverseModel:
@@ -111,21 +110,22 @@ class Follower:
                 f"finite numbers, y_um from {limits.y_min_um:g} to {limits.y_max_um:g}",
             )
         message = self._newest[0]
-        model = message.model
-        y, v, a = self._one
-        y[0], v[0], a[0] = y_um, v_um_per_s, a_um_per_s2
-        after = self.memory.copy()
-        u_V, std_V, inside = self._result
-        if type(model) is LssvmInverse and after.size == model.memory_size:
-            model.evaluate_into(y, v, a, after, u_V, std_V, inside)
-        elif not (type(model) is ChampionInverse and model.evaluate_into(y, v, a, after, u_V, std_V, inside)):
-            forward = model.feedforward(y, v, a, self.memory)
-            u_V, std_V, inside, after = forward
-        u = u_V.item(0)
-        within = inside.item(0)
+        model, after = message.model, self.memory.copy()
+        # Compiled for floats: another kind of number would be compiled for, which takes seconds.
+        motion = float(y_um), float(v_um_per_s), float(a_um_per_s2)
+        if type(model) is ChampionInverse:
+            answer = model.evaluate_point(*motion, after, self._one)
+        elif type(model) is LssvmInverse and after.size == model.memory_size:
+            answer = model.evaluate_point(*motion, after)
+        else:
+            answer = None
+        if answer is None:
+            u_V, std_V, inside, after = model.feedforward(*_arrays(motion), self.memory)
+            answer = u_V.item(0), std_V.item(0), inside.item(0)
+        u, std, within = answer
         trust, stale = self._standing()
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
-            return float(self._safely((y, v, a)).u_V[0])
+            return float(self._safely(_arrays(motion)).u_V[0])
         # The guard of one point without its arrays: the same order, the same numbers, the same flags.
         self.memory = after
         flags = (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
@@ -145,7 +145,7 @@ class Follower:
                 u = before - step
                 flags |= LIMITED_SLEW
         self._u_before_V, self._answered, self._stand_in = u, model, ""
-        self.last_flags, self.last_std_V = flags, std_V.item(0)
+        self.last_flags, self.last_std_V = flags, std
         return u
 
     def trajectory(
@@ -225,3 +225,8 @@ class Follower:
         with self._lock:
             self._newest = (message, time.monotonic())
             self.received += 1
+
+
+def _arrays(motion: tuple[float, float, float]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    y, v, a = (np.array([value]) for value in motion)
+    return y, v, a

@@ -12,6 +12,7 @@ import contextlib
 import os
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -53,6 +54,15 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.seq)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """All rows of some, one behind the other; at least one part."""
+        if len(parts) == 1:  # nearly always
+            return parts[0]
+        seq = np.concatenate([part.seq for part in parts])
+        t_s, u_V, y_um = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t_s", "u_V", "y_um"))
+        return cls(seq, t_s, u_V, y_um, [word for part in parts for word in part.reason])
 
     def part(self, start: int, stop: int) -> Rows:
         """Rows ``start`` up to ``stop``."""

@@ -96,9 +96,7 @@ class Recorder:
 
     def counters(self) -> dict[str, Any]:
         """Samples offered, written, dropped (queue full) and lost (disk); segments closed and removed; the last error;
-        samples written ``aside``.
-
-        ``degraded`` is True from a failure of the disk until the next batch is written.
+        samples written ``aside``. ``degraded`` is True from a failure of the disk until the next batch is written.
         """
         with self._lock:
             return {
@@ -151,16 +149,8 @@ class Recorder:
             self._waiting = 0
         if not parts:
             return None
-        if len(parts) == 1:  # nearly always
-            return parts[0][1], parts[0][0] + np.arange(len(parts[0][1]))
-        rows = Rows(
-            np.concatenate([p.seq for _, p in parts]),
-            np.concatenate([p.t_s for _, p in parts]),
-            np.concatenate([p.u_V for _, p in parts]),
-            np.concatenate([p.y_um for _, p in parts]),
-            [word for _, p in parts for word in p.reason],
-        )
-        return rows, np.concatenate([first + np.arange(len(p)) for first, p in parts])
+        index = np.concatenate([first + np.arange(len(rows)) for first, rows in parts])
+        return Rows.joined([rows for _, rows in parts]), index
 
     def _count(self, **more: int) -> None:
         with self._lock:
@@ -173,11 +163,13 @@ class Recorder:
             self._counts["errors"] += 1
             self._error = f"{error.strerror or error}"
 
-    def _prepare(self) -> None:
-        self.config.directory.mkdir(parents=True, exist_ok=True)
+    def _begin_segment(self) -> Journal:
+        directory = self.config.directory
+        directory.mkdir(parents=True, exist_ok=True)
         if self._claim is None:
-            self._claim = claim(self.config.directory)
-        self._count(removed=make_room(self.config.directory, self.config.max_bytes))
+            self._claim = claim(directory)
+        self._count(removed=make_room(directory, self.config.max_bytes))
+        return Journal(journal_of(directory, next_number(directory)))
 
     def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
         # After a failure nothing is tried for a while, except at the end: a last chance costs nobody anything.
@@ -188,9 +180,7 @@ class Recorder:
         try:
             while done < len(rows):
                 if self._segment is None:
-                    self._prepare()
-                    number = next_number(self.config.directory)
-                    self._segment = Journal(journal_of(self.config.directory, number))
+                    self._segment = self._begin_segment()
                 stop = min(len(rows), done + self.config.segment_rows - self._segment.rows)
                 self._segment.write(rows.part(done, stop), index[done:stop])
                 self._count(written=stop - done)

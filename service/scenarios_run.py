@@ -27,7 +27,8 @@ from service.wire import SampleBatch
 from service.wire_query import FeedforwardQuery
 from sim.scenarios import Scenario
 from sim.signals import training_input
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 ADAPTIVE: Final = "lssvm_adaptive"
 FROZEN: Final = "lssvm_memory"

@@ -15,7 +15,7 @@ from service.stage_commands import CommandBuffer
 from service.stage_faults import Injector, fault_key
 from service.stage_sender import SampleRing
 from service.wire import check_seq
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 
 def status_key(stage: str, axis: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from adaptive.errors import InputError
 from sim.effects import Chain, effect
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 
 def rich_chain() -> Chain:

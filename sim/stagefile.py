@@ -14,7 +14,7 @@ from typing import Any
 
 from adaptive.errors import InputError, ModelFileError
 from sim.effects import Chain, effect
-from sim.stage import Change, StageConfig
+from sim.stage_config import Change, StageConfig
 
 SCHEMA = 1
 _KEYS = ("schema", "name", "dt_s", "seed", "u_min_V", "u_max_V", "effects", "second_axis", "changes")

@@ -12,7 +12,7 @@ from pathlib import Path
 from service.errors import FieldError
 from service.session import DEFAULT_ENDPOINT, check_endpoint
 from service.stopping import StopSignal
-from sim.stage import Change, StageConfig
+from sim.stage_config import Change, StageConfig
 
 EPILOG = """\
 The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.

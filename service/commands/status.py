@@ -18,6 +18,7 @@ from service.operating.remote import Standbys, in_order, statuses
 from service.operating.table import screen, table
 from service.session import DEFAULT_ENDPOINT, open_client
 from service.stopping import StopSignal
+from service.told import fields_of
 
 #: A standby tells of itself this often, and a little more, s.
 _STANDBY_PERIOD_S = 1.2
@@ -106,8 +107,8 @@ def _settled(session: zenoh.Session, args: argparse.Namespace) -> list[dict[str,
 
 
 def _event(sample: zenoh.Sample) -> str:
+    data = fields_of(sample.payload.to_bytes())
     try:
-        data = json.loads(sample.payload.to_bytes())
         when = time.strftime("%H:%M:%S", time.localtime(float(data["time_unix_s"])))
         return f"{when} {sample.key_expr} {data['event']}: {data['detail']}"
     except (ValueError, KeyError, TypeError, OverflowError, OSError):

@@ -11,7 +11,8 @@ from adaptive.errors import InputError
 from service.demo.plan import Plan
 from sim.diagnosis.library import OFFSET
 from sim.effects import effect
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 from sim.stagefile import load_stage, save_stage
 
 #: Share of the voltage limits that identification uses, and what the reference commands of the range found by it.

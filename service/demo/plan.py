@@ -20,7 +20,7 @@ from adaptive.types import FloatArray
 from sim.presets import preset
 from sim.reference import demo_reference
 from sim.signals import training_input
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 from sim.stagefile import load_stage
 
 #: Served models in the order of the table, with what the table calls them.

@@ -12,6 +12,7 @@ import zenoh
 from service.errors import FieldError, NoReplyError, ReplyTimeoutError, ServiceError, error_from_json
 from service.keys import ROOT, Keys
 from service.operating.request import Request, encode_request
+from service.told import fields_of
 
 #: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
 _SETTLE_S: Final = 0.5
@@ -68,12 +69,9 @@ def statuses(session: zenoh.Session, stage: str = "*", axis: str = "*", timeout_
     ):
         if reply.ok is None:
             continue
-        try:
-            status = json.loads(reply.ok.payload.to_bytes())
-            key = (str(status["stage"]), str(status["axis"]), str(status["instance"]))
-        except (ValueError, KeyError, TypeError):
-            continue
-        found[key] = status
+        status = fields_of(reply.ok.payload.to_bytes())
+        if all(name in status for name in ("stage", "axis", "instance")):
+            found[str(status["stage"]), str(status["axis"]), str(status["instance"])] = status
     return in_order(found.values())
 
 
@@ -99,11 +97,8 @@ class Standbys:
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        try:
-            status = json.loads(sample.payload.to_bytes())
-        except (ValueError, RecursionError):
-            return
-        if isinstance(status, dict) and "instance" in status and len(self._heard) < _MOST_STANDBYS:
+        status = fields_of(sample.payload.to_bytes())
+        if "instance" in status and len(self._heard) < _MOST_STANDBYS:
             self._heard[str(sample.key_expr)] = (time.monotonic(), status)
 
 

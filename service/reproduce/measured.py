@@ -18,12 +18,8 @@ from adaptive.errors import InputError
 from adaptive.learner import Learner, LearnerConfig
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray
-from baselines.mechanical_bouc_wen import (
-    MechanicalBoucWen,
-    MechanicalReport,
-    PeriodicRecord,
-    identify_mechanical,
-)
+from baselines.mechanical_bouc_wen import MechanicalBoucWen, MechanicalReport, identify_mechanical
+from baselines.periodic_record import PeriodicRecord
 from service.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
 from sim.chapter.adaptive_loop import BlockConfig, replay
 from sim.chapter.control import learner_of

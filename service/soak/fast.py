@@ -26,7 +26,8 @@ from service.soak.world import SAMPLES_A_MESSAGE
 from service.stage_faults import CHANGE, Fault, Injector
 from service.wire import SampleBatch
 from service.wire_query import FeedforwardQuery
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 _PROGRESS_S = 5.0
 

@@ -24,7 +24,7 @@ from service.soak.processor import Others, taken_s
 from service.soak.schedule import Schedule
 from service.soak.settling import WELL_PCT
 from service.soak.world import World
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 Say = Callable[[str], None]
 _TICK_S = 0.02

@@ -15,7 +15,8 @@ from service.modelfile import BundleMeta, write_bundle
 from service.soak.control import AXIS, SERVED, STAGE, Control
 from sim.presets import preset
 from sim.signals import training_input
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 from sim.stagefile import load_stage, save_stage
 
 #: Models of the service: the default, what it falls back to, and the baseline that any stage has.

@@ -14,7 +14,7 @@ from service.errors import ServiceError
 from service.soak.clocked import write_offset
 from service.soak.control import AXIS, SERVED, STAGE, Control
 from service.soak.setup import write_service, write_stage
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 CLI = ["-m", "service.cli"]
 #: As a converter's driver hands them over.

@@ -5,7 +5,6 @@ A thread of its own, woken by the claims of others: nothing is decided in a call
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from typing import Any, Final
@@ -19,6 +18,7 @@ from service.standby.claims import Claim, Claims
 from service.standby.estate import Estate, inherit
 from service.standby.reach import Reach
 from service.standby.shadow import Shadow
+from service.told import fields_of
 
 #: Events of the serving instance after which its model is another than the samples alone would make it.
 OPERATIONS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
@@ -91,13 +91,13 @@ class Succession:
         self.claims.hear(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def _on_event(self, sample: zenoh.Sample) -> None:
-        told = _json(sample)
+        told = fields_of(sample.payload.to_bytes())
         if told.get("instance") != self.server.instance and told.get("event") in OPERATIONS:
             self._differs()
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         """Once a second the serving instance tells a digest of its model: ours of the same sample must be the same."""
-        told = _json(sample)
+        told = fields_of(sample.payload.to_bytes())
         server = self.server
         if server.role == PRIMARY or not server.synced or told.get("instance") == server.instance:
             return
@@ -245,11 +245,3 @@ class Succession:
         if self._token is not None:
             self._token.undeclare()
             self._token = None
-
-
-def _json(sample: zenoh.Sample) -> dict[str, Any]:
-    try:
-        told = json.loads(sample.payload.to_bytes())
-    except (ValueError, RecursionError):
-        return {}
-    return told if isinstance(told, dict) else {}

@@ -20,29 +20,12 @@ import zenoh
 from adaptive.errors import InputError
 from service import wire
 from service.keys import Keys
+from service.view.event_record import event_record
 from service.view.feed import Diagnostics, Event, Health, Record, Status
 from service.view.join import ReferenceRing, UnitJoin
 
-#: Events that mark a change of the stage itself.
-CHANGES = frozenset({"change", "stage_change", "stage_changed"})
-_LEVELS = {"ERROR": "ERROR", "WARN": "WARN", "WARNING": "WARN", "INFO": "INFO", "DEBUG": "DEBUG"}
 #: What is said of a sample may come so long before that sample, s of the stage's time: it has another key.
 _AHEAD_S = 1.0
-_FAILING = ("error", "fail")
-_ALARMING = (
-    "change",
-    "drift",
-    "drop",
-    "full",
-    "gap",
-    "late",
-    "lost",
-    "malformed",
-    "refus",
-    "restart",
-    "rolled",
-    "stall",
-)
 
 
 class Taker(Protocol):
@@ -223,23 +206,6 @@ class Consumer:
 def _is_time(value: Any) -> TypeGuard[float]:
     """Whether this can be drawn as a time: Rerun holds nanoseconds in 64 bits."""
     return isinstance(value, (int, float)) and -9e9 < value < 9e9
-
-
-def event_record(t_s: float, seq: int, fields: Mapping[str, Any]) -> Event:
-    """An event of the wire as a line of text; ``event`` and ``detail`` where they are given, else all fields."""
-    kind = str(fields.get("event", fields.get("kind", "")))
-    detail = fields.get("detail", fields.get("message", fields.get("text")))
-    if detail is None:
-        detail = ", ".join(f"{k} {v}" for k, v in fields.items() if k not in ("event", "kind", "seq", "t_s", "level"))
-    level = _LEVELS.get(str(fields.get("level", "")).upper())
-    if level is None:
-        level = "INFO"
-        if any(word in kind.lower() for word in _ALARMING):
-            level = "WARN"
-        if any(word in kind.lower() for word in _FAILING):
-            level = "ERROR"
-    text = f"{kind}: {detail}" if kind and detail else kind or str(detail)
-    return Event(t_s, seq, text, level, change=kind in CHANGES)
 
 
 def _subscriptions(config: ConsumerConfig) -> list[tuple[str, str, str]]:

@@ -23,7 +23,8 @@ from sim.chapter.references import control_references
 from sim.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
 from sim.effects import effect
 from sim.reference import Reference
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 Progress = Callable[[str], None]
 Clock = Callable[[], float]

@@ -13,7 +13,8 @@ import numpy as np
 from adaptive.types import FloatArray
 from sim import signals
 from sim.presets import preset
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 #: Control period of the chapter, s, and how many of them lie between two of its 500 samples.
 DT_S = 1e-3

@@ -22,7 +22,7 @@ from sim.diagnosis.rules import Rules
 from sim.diagnosis.search import Progress, Search
 from sim.diagnosis.second import second_error
 from sim.diagnosis.setting import Setting
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 
 def _silent(stage: str, share: float) -> None:

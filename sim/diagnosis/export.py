@@ -16,7 +16,7 @@ from sim.diagnosis.nominal import Linear
 from sim.diagnosis.result import Diagnosis
 from sim.diagnosis.setting import At, Setting
 from sim.effects import Chain, Effect, effect, simulate
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 
 @dataclass(frozen=True)

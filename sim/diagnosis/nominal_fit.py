@@ -14,7 +14,7 @@ from sim.diagnosis.forms import Form
 from sim.diagnosis.nominal import BoucWen, Linear, Nominal
 from sim.diagnosis.nominal_stage import stage_nominal
 from sim.diagnosis.setting import Setting
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 #: Nominal stages that go by a name.
 NAMED = ("bouc_wen", "linear")

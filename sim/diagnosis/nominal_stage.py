@@ -14,7 +14,7 @@ from sim.diagnosis.nominal import common_slots
 from sim.diagnosis.setting import At, Setting, Slot
 from sim.effects import Chain, Effect, effect, simulate
 from sim.effects.base import Place
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 #: Modes of one type of stage differ by about this much from piece to piece; more is a payload.
 MODE_SPREAD = 0.015

@@ -11,7 +11,7 @@ from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.nominal_fit import NAMED
 from sim.diagnosis.setting import Setting
 from sim.recordings import Finding, Recording, check, repaired, require_usable
-from sim.stage import StageConfig
+from sim.stage_config import StageConfig
 
 #: Longer records are diagnosed on their longest head of this many samples: memory stays below 1 GB.
 MOST_SAMPLES = 200_000

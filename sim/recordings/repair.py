@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
-from sim.recordings.findings import dropout_mask, repeat_mask
+from sim.recordings.masks import dropout_mask, repeat_mask
 from sim.recordings.recording import OPTIONAL, Recording
 
 #: A hole longer than this ends the usable stretch: hysteresis has memory, and what went on in it is unknown.

@@ -17,7 +17,7 @@ from sim.presets import preset
 from sim.scenarios.motion import Parts, Shifted, Tones, demo_motion, in_band, strokes
 from sim.scenarios.readings import glitch_burst
 from sim.scenarios.scenario import Scenario
-from sim.stage import Change, StageConfig
+from sim.stage_config import Change, StageConfig
 
 LOW_UM, HIGH_UM = 4.0, 80.0
 CHANGE_S, RUN_S = 15.0, 40.0

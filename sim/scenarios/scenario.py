@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from sim.reference import Reference
 from sim.scenarios.motion import Motion
 from sim.scenarios.readings import Readings
-from sim.stage import Change, StageConfig
+from sim.stage_config import Change, StageConfig
 from sim.timebase import times
 
 

@@ -27,7 +27,8 @@ from baselines.fit import fit_linear, fit_mpi
 from baselines.online_mpi import MpiOnline
 from sim.presets import preset
 from sim.signals import generalisation_input, multitone, training_input
-from sim.stage import Change, Stage
+from sim.stage import Stage
+from sim.stage_config import Change
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))

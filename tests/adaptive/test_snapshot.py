@@ -59,6 +59,14 @@ def test_the_packed_model_is_the_model(model: LssvmInverse) -> None:
             np.testing.assert_array_equal(got, expected)
 
 
+def test_a_point_by_itself_is_that_of_the_trajectory(model: LssvmInverse) -> None:
+    y, v, a = points()
+    whole, memory = model.feedforward(y, v, a, model.rest_memory(40.0)), model.rest_memory(40.0)
+    answers = [model.evaluate_point(*map(float, point), memory) for point in zip(y, v, a, strict=True)]
+    assert [tuple(answer) for answer in zip(whole.u_V, whole.std_V, whole.inside, strict=True)] == answers
+    np.testing.assert_array_equal(memory, whole.memory)
+
+
 def test_a_trajectory_in_pieces_is_the_same_to_the_last_bit(model: LssvmInverse) -> None:
     y, v, a = points()
     whole = model.feedforward(y, v, a, model.rest_memory(40.0))

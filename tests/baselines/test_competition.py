@@ -425,26 +425,25 @@ def test_the_quick_way_of_one_point_is_the_long_one() -> None:
     mpi, bouc_wen = MpiInverse(MPI, DT, SEEN, 0.01), BoucWenInverse(BOUC_WEN, DT, SEEN, 0.01)
     auto = ChampionInverse(("lssvm", "mpi", "bouc_wen"), (lssvm(), mpi, bouc_wen), 0)
     long = quick = auto.rest_memory(5.0)
-    out = np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_)
+    one = np.empty(1), np.empty(1)
     for y_um in 20.0 + 15.0 * np.sin(np.arange(80) * 0.2):
         point = np.array([y_um]), np.array([30.0]), np.zeros(1)
         slow = auto.feedforward(*point, long)
         after = quick.copy()
-        assert auto.evaluate_into(*point, after, *out)
-        assert (slow.u_V[0], slow.std_V[0], slow.inside[0]) == tuple(values[0] for values in out)
+        answer = auto.evaluate_point(float(y_um), 30.0, 0.0, after, one)
+        assert answer == (slow.u_V[0], slow.std_V[0], slow.inside[0])
         np.testing.assert_array_equal(after, slow.memory)
         long, quick = slow.memory, after
 
 
 def test_the_quick_way_is_refused_where_it_is_not_the_champions_alone() -> None:
     mpi = MpiInverse(MPI, DT, SEEN, 0.01)
-    out = np.empty(1), np.empty(1), np.empty(1, dtype=np.bool_)
-    point = np.array([20.0]), np.zeros(1), np.zeros(1)
+    one, point = (np.empty(1), np.empty(1)), (20.0, 0.0, 0.0)
     by_mpi = ChampionInverse(("lssvm", "mpi"), (lssvm(), mpi), 1)
-    assert not by_mpi.evaluate_into(*point, by_mpi.rest_memory(5.0), *out), "another kind of champion"
+    assert by_mpi.evaluate_point(*point, by_mpi.rest_memory(5.0), one) is None, "another kind of champion"
     auto = ChampionInverse(("lssvm", "mpi"), (lssvm(), mpi), 0)
-    assert not auto.evaluate_into(*point, by_mpi.rest_memory(5.0), *out), "a stream that goes over from another"
+    assert auto.evaluate_point(*point, by_mpi.rest_memory(5.0), one) is None, "a stream that goes over from another"
     auto = ChampionInverse(("lssvm", "bouc_wen"), (lssvm(), BoucWenInverse(BOUC_WEN, DT, SEEN, 0.01)), 0)
     broken = auto.rest_memory(5.0)
     broken[2 + lssvm().memory_size :] = np.nan
-    assert not auto.evaluate_into(*point, broken, *out), "a memory that is not finite"
+    assert auto.evaluate_point(*point, broken, one) is None, "a memory that is not finite"

@@ -20,7 +20,8 @@ from service import wire
 from service.commands.view import twins
 from service.keys import Keys
 from service.session import open_service
-from service.view.consumer import Consumer, ConsumerConfig, event_record
+from service.view.consumer import Consumer, ConsumerConfig
+from service.view.event_record import event_record
 from service.view.feed import Diagnostics, Event, Health, Record, Status, Tracking
 
 DT_S = 1e-3

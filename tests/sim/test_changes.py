@@ -16,7 +16,8 @@ from sim.changes.compare import compare
 from sim.changes.comparison import Comparison
 from sim.presets import preset
 from sim.signals import training_input
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 DT_S = 1e-3
 CHANGE_S = 11.0

@@ -13,7 +13,8 @@ from sim.closed_loop import CHAPTER_GAINS, PID, track, ultimate_gain
 from sim.effects import Chain, effect
 from sim.presets import preset
 from sim.reference import demo_reference
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 DT = 1e-3
 

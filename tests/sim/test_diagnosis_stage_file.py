@@ -17,7 +17,8 @@ from sim.diagnosis.result import TEST, Diagnosis
 from sim.diagnosis.slip_dates import slips_of
 from sim.effects import Chain, effect
 from sim.recordings import Recording, read
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 
 DT = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).parents[3] / "shared" / "data"))

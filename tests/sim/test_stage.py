@@ -15,7 +15,8 @@ from adaptive.errors import InputError, ModelFileError
 from sim.effects import KINDS, Chain
 from sim.presets import PRESETS, preset, rich_chain
 from sim.signals import growing_triangles, training_input, triangle
-from sim.stage import Stage, StageConfig
+from sim.stage import Stage
+from sim.stage_config import StageConfig
 from sim.stagefile import from_dict, load_stage, save_stage, to_dict
 
 DT = 1e-3
