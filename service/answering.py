@@ -66,8 +66,8 @@ def answer(
     """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
 
     ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
-    ``age_s``: time since the last sample, s, 0 where none is expected. An ``as_of`` names its snapshot: age does not
-    change what it answers, or a replay could not repeat it.
+    ``age_s``: time since the newest sample that was handled came, s, 0 where none is expected. An ``as_of`` names its
+    snapshot: age does not change what it answers, or a replay could not repeat it.
     """
     served, behind, trust, stale = ring[-1], False, 1.0, False
     if query.as_of == NEWEST:

@@ -101,7 +101,7 @@ class Axis(AxisLearning):
         self.handled_seq = -1
         #: What has been counted up to the last message; replaced whole, for whoever tells of it meanwhile.
         self.tally = Tally(-1, self.sequence.counters(), {})
-        #: Time since the last sample, s, where samples are expected; set by whoever has a clock.
+        #: Time since the newest sample that was handled came, s, where samples are expected; set by who has a clock.
         self.age_s = 0.0
         #: Called once, right after the next snapshot, by the thread that handles samples; then None again.
         self.at_snapshot: Callable[[], None] | None = None

@@ -15,7 +15,7 @@ from service.axis_answers import Answers
 from service.axis_publications import Publications
 from service.axis_state import fingerprint
 from service.checkpoint import CheckpointFolder
-from service.intake import Intake, SampleSink, SampleWatcher
+from service.intake import Intake
 from service.keeper import Keeper
 from service.keys import Keys
 from service.latency import LatencyMeter
@@ -23,6 +23,7 @@ from service.operating.journal import Journal
 from service.operating.server import OperationsServer
 from service.operating.verbs import Background, Verbs
 from service.retuning.retuner import Retuner
+from service.sinks import SampleSink, SampleWatcher
 from service.status import axis_status
 from service.wire import decode_samples
 
@@ -83,7 +84,6 @@ class AxisServer:
         self._publications = Publications(
             session, keys, instance, axis, self.intake, self.latency, self.answers, self.status
         )
-        self._sample_at: float | None = None
         self._stale = False
         self._inputs: list[Any] = []
         self._queryables: list[Any] = []
@@ -182,20 +182,23 @@ class AxisServer:
 
     def _look_at_age(self, now_s: float) -> None:
         """Samples are expected from the first one on."""
-        at = self._sample_at
-        self.axis.age_s = 0.0 if at is None else max(0.0, now_s - at)
+        at_s = self.intake.handled_at_s
+        self.axis.age_s = 0.0 if at_s is None else max(0.0, now_s - at_s)
         config = self.axis.config
         stale = trust_by_age(self.axis.age_s, config.stale_s, config.last_good_s)[1]
         if stale != self._stale:
             self._stale = stale
             if stale:
-                self.axis.note("stale", f"no sample for {self.axis.age_s:.1f} s; answers are flagged as stale")
+                known = f"nothing is known of the last {self.axis.age_s:.1f} s"
+                why = f"{waiting} samples wait to be learnt" if (waiting := self.intake.waiting) else "no samples come"
+                self.axis.note("stale", f"{known}: {why}; answers are flagged as stale")
             else:
-                self.axis.note("fresh", "samples come again")
+                self.axis.note("fresh", "samples come and are learnt again")
 
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
-        age_s = None if self._sample_at is None else time.monotonic() - self._sample_at
+        at_s = self.intake.handled_at_s
+        age_s = None if at_s is None else max(0.0, time.monotonic() - at_s)
         synced = self.synced
         newest = self.axis.newest
         told = axis_status(self.keys, self.instance, self.axis, self.intake, self.latency, age_s)
@@ -225,5 +228,4 @@ class AxisServer:
             if self.intake.malformed == 1:
                 self.axis.note("malformed_samples", f"{error}; later ones are only counted")
             return
-        self._sample_at = time.monotonic()
         self.intake.offer(batch)

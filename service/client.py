@@ -88,7 +88,7 @@ class Client:
             client = cls(session, keys, timeout_s, owns_session=True, retry_s=retry_s)
             while True:
                 try:
-                    client.status()
+                    client._take_status(client._asking.once(keys.status))
                     return client
                 except NoReplyError:
                     if time.monotonic() >= until:
@@ -132,7 +132,10 @@ class Client:
 
     def status(self) -> dict[str, Any]:
         """The status of the axis as the service tells it now (docs/protocol.md)."""
-        status = json.loads(self._asking.get(self.keys.status))
+        return self._take_status(self._asking.get(self.keys.status))
+
+    def _take_status(self, payload: bytes) -> dict[str, Any]:
+        status = json.loads(payload)
         if not isinstance(status, dict) or "dt_s" not in status:
             raise FieldError("status", repr(status)[:80], "a status of this wire version")
         self._status = status

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import zenoh
@@ -41,9 +41,13 @@ class Asking:
         """Undeclare."""
         self._querier.undeclare()  # type: ignore[no-untyped-call]
 
-    def get(self, selector: str) -> bytes:
+    def once(self, selector: str) -> bytes:
         """The payload of the one reply; asked once. Raises NoReplyError, ReplyTimeoutError, RefusedError."""
         return self._one(self._session.get(selector, timeout=self.timeout_s))
+
+    def get(self, selector: str) -> bytes:
+        """As :meth:`once`, but repeated while there is no answer, for ``retry_s``."""
+        return self._repeated(lambda: self.once(selector))
 
     def feedforward(self, payload: bytes, wait_s: float) -> FeedforwardReply:
         """The answer to an encoded query, which is repeated while there is none, for ``retry_s``.
@@ -52,15 +56,7 @@ class Asking:
         """
         start = time.monotonic()
         while True:
-            try:
-                reply = decode_reply(self._one(self._querier.get(payload=payload)))
-            except (NoReplyError, ReplyTimeoutError):
-                # It may have died while asked; another one takes over, or it comes back.
-                if time.monotonic() - start >= self.retry_s:
-                    raise
-                self.retries += 1
-                time.sleep(_RETRY_PAUSE_S)
-                continue
+            reply = decode_reply(self._repeated(lambda: self._one(self._querier.get(payload=payload))))
             if not reply.behind:
                 return reply
             if time.monotonic() - start >= wait_s:
@@ -69,6 +65,19 @@ class Asking:
                     "ask for an earlier as_of, allow more wait_s, or see in the status whether samples arrive"
                 )
             time.sleep(_BEHIND_PAUSE_S)
+
+    def _repeated(self, ask: Callable[[], bytes]) -> bytes:
+        """What ``ask`` returns, the first time that it is answered at all."""
+        start = time.monotonic()
+        while True:
+            try:
+                return ask()
+            except (NoReplyError, ReplyTimeoutError):
+                # It may have died while asked; another one takes over, or it comes back.
+                if time.monotonic() - start >= self.retry_s:
+                    raise
+                self.retries += 1
+                time.sleep(_RETRY_PAUSE_S)
 
     def _one(self, replies: Iterable[zenoh.Reply]) -> bytes:
         error: bytes | None = None

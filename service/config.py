@@ -57,7 +57,7 @@ slew_V_per_s = 2000.0
 # checkpoints_kept = 32             # the newest, and older ones further and further apart
 # stand_in = "mpi"                  # the baseline that answers where the model is not to be trusted; default: the best
 # blend_share = 0.5                 # distance outside the learnt domain, in learnt spans, where it answers alone
-# stale_s = 2.0                     # time without a sample after which answers are flagged as stale, s; 0: never
+# stale_s = 2.0                     # age of the newest sample learnt at which answers are flagged as stale, s; 0: never
 # last_good_s = 60.0                # time after which a model that is no longer renewed gives way to the stand-in, s
 
 # [axis.learner]                    # settings of the learner, see docs/learner.md

@@ -12,12 +12,11 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
-from typing import Any, Final, Protocol, TypeVar
-
-from numpy.typing import ArrayLike
+from typing import Any, Final, NamedTuple, TypeVar
 
 from service.axis import Axis
 from service.errors import ServiceError
+from service.sinks import SampleSink, SampleWatcher
 from service.wire import SampleBatch, joined
 
 T = TypeVar("T")
@@ -33,44 +32,16 @@ _WINDOW_EVERY: Final = 20
 _WINDOW_FIELDS: Final = ("window_y_um", "window_v_um_per_s", "window_u_V")
 
 
-class SampleSink(Protocol):
-    """What keeps samples: the recorder. None of these may block or raise."""
+class _Arrived(NamedTuple):
+    """Samples of a message, and when they came by a clock that never goes back, s."""
 
-    def put(self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]) -> bool:
-        """Take n samples with what the learner said of each; False if they were dropped."""
-        ...
-
-    def counters(self) -> dict[str, Any]:
-        """For the status."""
-        ...
-
-    def close(self, timeout_s: float = ...) -> bool:
-        """Write what waits and end."""
-        ...
+    batch: SampleBatch
+    at_s: float
 
 
-class SampleWatcher(Protocol):
-    """What watches an axis and finds out what has changed: the diagnosis in the background. Nothing here may block."""
-
-    def take(self, batch: SampleBatch) -> None:
-        """Samples that were handled; from the thread that handles them."""
-        ...
-
-    def tick(self, now_s: float) -> None:
-        """Start what is due; from the thread that publishes."""
-        ...
-
-    def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Begin to diagnose now; from any thread."""
-        ...
-
-    def status(self) -> dict[str, Any]:
-        """For the status."""
-        ...
-
-    def close(self) -> None:
-        """End what runs."""
-        ...
+class _Work(NamedTuple):
+    job: Callable[[], Any]
+    done: Future[Any]
 
 
 class Intake:
@@ -91,6 +62,9 @@ class Intake:
         self.dropped = 0
         self.malformed = 0
         self.waiting = 0
+        #: When what was handled last came, by ``time.monotonic``; of the first, until it has been. None: none came.
+        #: A learner that is behind, or hangs, is no newer for what it has not seen.
+        self.handled_at_s: float | None = None
         #: Newest values of the learner's own, replaced whole; and whether anybody wants the diagnostics.
         self.counters: dict[str, int] = {}
         #: Who is champion and how good each contestant is; None without a competition.
@@ -99,7 +73,7 @@ class Intake:
         self.want_diagnostics = False
         self._changed = changed
         #: Samples, and work that is to be done behind those that came before it.
-        self._queue: deque[SampleBatch | tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._queue: deque[_Arrived | _Work] = deque()
         #: What of a batch is to be handled now, None for nothing: a standby keeps its samples back until it may.
         self.gate: Callable[[SampleBatch], SampleBatch | None] | None = None
         self._ready = threading.Condition()
@@ -114,10 +88,13 @@ class Intake:
 
     def offer(self, batch: SampleBatch) -> bool:
         """Queue samples for the learner; False if they were dropped because it is too far behind."""
+        at_s = time.monotonic()
         with self._ready:
+            if self.handled_at_s is None:
+                self.handled_at_s = at_s
             fits = not self._closing and self.waiting + len(batch) <= self.axis.config.queue_samples
             if fits:
-                self._queue.append(batch)
+                self._queue.append(_Arrived(batch, at_s))
                 self.waiting += len(batch)
                 self._ready.notify()
             else:
@@ -139,7 +116,7 @@ class Intake:
         with self._ready:
             if self._closing or not self._thread.is_alive():
                 raise ServiceError(f"axis {self.axis.config.name}: no samples are handled; the service begins or ends")
-            self._queue.append((work, done))
+            self._queue.append(_Work(work, done))
             self._ready.notify()
         try:
             return done.result(timeout_s)
@@ -170,7 +147,7 @@ class Intake:
                 if not self._queue:
                     return
                 first = self._queue[0]
-                work = first if isinstance(first, tuple) else None
+                work = first if isinstance(first, _Work) else None
                 if work is not None:
                     self._queue.popleft()
             if work is not None:
@@ -179,28 +156,30 @@ class Intake:
                 continue
             if not self._closing:
                 time.sleep(GATHER_S)
-            arrived = self._gathered()
+            arrived, at_s = self._gathered()
             try:
                 batch = arrived if self.gate is None else self.gate(arrived)
                 if batch is not None:
                     self.handle(batch)
+                self.handled_at_s = at_s
             except Exception as error:
                 # The samples after it are as good as ever, and somebody waits for their snapshots.
                 self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
             with self._ready:
                 self.waiting -= len(arrived)
 
-    def _gathered(self) -> SampleBatch:
-        """The samples at the head of the queue, up to the next piece of work, as one batch."""
-        batches = []
+    def _gathered(self) -> _Arrived:
+        """The samples at the head of the queue, up to the next piece of work, as one batch that came with its last."""
+        batches, at_s = [], 0.0
         with self._ready:
             while self._queue:
                 first = self._queue[0]
-                if isinstance(first, tuple):
+                if isinstance(first, _Work):
                     break
-                batches.append(first)
+                batches.append(first.batch)
+                at_s = first.at_s
                 self._queue.popleft()
-        return batches[0] if len(batches) == 1 else joined(batches)
+        return _Arrived(batches[0] if len(batches) == 1 else joined(batches), at_s)
 
     def handle(self, batch: SampleBatch) -> None:
         """Learn and record samples; in the thread that handles samples, or before it has started."""

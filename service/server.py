@@ -18,12 +18,12 @@ from service.axis import Axis
 from service.axis_server import PRIMARY, STANDBY, AxisServer
 from service.config import AxisConfig, ServeConfig
 from service.errors import FieldError, SessionError
-from service.intake import SampleSink, SampleWatcher
 from service.keeper import learn_again, restore_newest
 from service.keys import Keys
 from service.memory import TRIM_S, give_back, keep_little
 from service.models import LearnerFactory, load_axis, make_learner
 from service.session import open_service
+from service.sinks import SampleSink, SampleWatcher
 from service.standby.estate import Estate, of_standby
 from service.standby.reach import Reach
 from service.standby.succession import Succession

@@ -412,3 +412,52 @@ def test_samples_through_the_wire_are_those_that_were_sent() -> None:
     batch = recording(5)
     got = decode_samples(encode_samples(batch.seq, batch.t_s, batch.u_V, batch.y_um))
     np.testing.assert_array_equal(got.y_um, batch.y_um)
+
+
+def test_what_has_come_is_no_newer_before_it_is_handled(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    intake = Intake(axis, lambda: None)  # not started: nobody takes
+    assert intake.handled_at_s is None
+    first, second = parts(recording(40), 20)
+    intake.offer(first)
+    came_s = intake.handled_at_s
+    assert came_s is not None
+    time.sleep(0.01)
+    intake.offer(second)
+    assert intake.handled_at_s == came_s
+    before_s = time.monotonic()
+    intake.start()
+    intake.close()
+    assert came_s + 0.01 <= intake.handled_at_s < before_s, "when the last one came, not when it was handled"
+
+
+def test_what_a_standby_holds_back_is_as_new_as_what_is_learnt(models: dict[str, InverseModel]) -> None:
+    intake = Intake(make_axis(models), lambda: None)
+    intake.gate = lambda batch: None
+    intake.offer(recording(20))
+    came_s = intake.handled_at_s
+    time.sleep(0.01)
+    intake.offer(recording(20))
+    intake.start()
+    intake.close()
+    assert came_s is not None
+    assert intake.handled_at_s is not None
+    assert intake.handled_at_s >= came_s + 0.01
+
+
+def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+
+    def broken(batch: SampleBatch) -> list[str]:
+        raise RuntimeError("for once")
+
+    axis.handle = broken  # type: ignore[method-assign]
+    intake = Intake(axis, lambda: None)
+    intake.offer(recording(20))
+    came_s = intake.handled_at_s
+    time.sleep(0.01)
+    intake.offer(recording(20))
+    intake.start()
+    intake.close()
+    assert intake.handled_at_s == came_s
+    assert [event["event"] for event in axis.take_events()] == ["internal_error"]

@@ -231,6 +231,37 @@ def test_a_service_that_answers_nothing_is_no_service(free_port: int) -> None:
         Client.connect(endpoint, timeout_s=2.0)
 
 
+def ask_until_unanswered(client: Client) -> None:
+    for _ in range(1000):
+        client.status()
+
+
+def test_every_question_is_repeated_while_another_service_takes_over(free_port: int) -> None:
+    endpoint, keys = f"tcp/127.0.0.1:{free_port}", Keys("demo", "x")
+
+    def tell(query: zenoh.Query) -> None:
+        with query:
+            query.reply(keys.status, json.dumps({"dt_s": DT_S, "instance": "a"}))
+
+    with open_service([endpoint]) as server:
+        first = server.declare_queryable(keys.status, tell)
+        with (
+            Client.connect(endpoint, timeout_s=2.0, wait_s=5.0, retry_s=20.0) as patient,
+            Client.connect(endpoint, timeout_s=2.0, wait_s=5.0, retry_s=0.0) as hasty,
+        ):
+            assert patient.status()["instance"] == "a"
+            assert patient.retries == 0
+            first.undeclare()  # type: ignore[no-untyped-call]
+            with pytest.raises(NoReplyError):
+                ask_until_unanswered(hasty)  # its session has to hear of it
+            again = threading.Timer(0.3, lambda: server.declare_queryable(keys.status, tell))
+            again.start()
+            assert patient.status()["instance"] == "a"
+            again.join()
+            assert patient.retries > 0
+            assert hasty.retries == 0
+
+
 def test_errors_keep_the_words_of_the_service() -> None:
     refused = error_from_json(error_to_json(ValueError("no")))
     assert isinstance(refused, RefusedError)
