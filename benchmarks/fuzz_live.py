@@ -23,6 +23,7 @@ from adaptive.errors import DehystError
 from benchmarks.fuzz_targets import models, seeds
 from benchmarks.mutations import mutated
 from service.client import Client
+from service.delivery import SURELY
 from service.keys import Keys
 from service.modelfile import BundleMeta, write_bundle
 from service.session import open_client
@@ -182,7 +183,7 @@ def fire(endpoint: str, duration_s: float, rate_hz: float, seed: int, bad: bool)
                     payload = payload[:8] + bytes(2**20)
             fired += 1
             if what == "sample":
-                session.put(keys.sample, payload)
+                session.put(keys.sample, payload, congestion_control=SURELY)
                 continue
             replies = list(session.get(f"{keys.base}/{what}", payload=payload, timeout=10.0))
             unanswered += len(replies) != 1

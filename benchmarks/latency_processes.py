@@ -9,13 +9,13 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zenoh
 
 from adaptive.types import FloatArray
 from service import wire
+from service.delivery import SURELY, wait_followed
 from service.keys import Keys
 from service.server import tune_process
 from service.session import open_client, open_service
@@ -67,9 +67,8 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
     with np.load(path) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
     with open_client(endpoint, 10.0) as session:
-        block = zenoh.CongestionControl.BLOCK
-        publisher = session.declare_publisher(Keys(STAGE, AXIS).sample, congestion_control=block, express=True)
-        if not _heard(publisher):
+        publisher = session.declare_publisher(Keys(STAGE, AXIS).sample, congestion_control=SURELY, express=True)
+        if not wait_followed(publisher, _HEARD_S):
             print("nobody listens to the samples", file=sys.stderr)
             return 1
         print("ready", flush=True)
@@ -91,18 +90,6 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
     told = {"sent": k * batch, "rate_hz": k * batch / taken_s, "late": late, "worst_late_ms": 1e3 * worst_s}
     print(json.dumps(told), flush=True)
     return 0
-
-
-def _heard(publisher: Any) -> bool:
-    """Whether somebody subscribes to what ``publisher`` puts, waited for."""
-    until = time.monotonic() + _HEARD_S
-    while time.monotonic() < until:
-        status = publisher.matching_status
-        # An object that is always true in this release, a plain truth value by its own type stub.
-        if getattr(status, "matching", status):
-            return True
-        time.sleep(0.01)
-    return False
 
 
 if __name__ == "__main__":

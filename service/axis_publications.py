@@ -10,6 +10,7 @@ import zenoh
 
 from service.axis import Axis
 from service.axis_answers import JSON, Answers, plain
+from service.delivery import SURELY, is_followed
 from service.intake import Intake
 from service.keys import AUTO, Keys
 from service.latency import LatencyMeter
@@ -58,13 +59,13 @@ class Publications:
     def serve(self) -> None:
         """Tell everything from now on."""
         session, keys = self._session, self._keys
-        drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
+        drop = zenoh.CongestionControl.DROP
         self._publishers = {
             "model": session.declare_publisher(keys.model, congestion_control=drop),
             "champion": session.declare_publisher(keys.champion, congestion_control=drop),
             "diagnostics": session.declare_publisher(keys.diagnostics, congestion_control=drop, encoding=JSON),
             "status": session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON),
-            "event": session.declare_publisher(keys.event, congestion_control=block, encoding=JSON),
+            "event": session.declare_publisher(keys.event, congestion_control=SURELY, encoding=JSON),
         }
 
     def stand_down(self) -> None:
@@ -89,7 +90,7 @@ class Publications:
             self._tell_models(now_s)
             self._tell_diagnostics()
             if due:
-                self._intake.want_diagnostics = _is_followed(self._publishers["diagnostics"])
+                self._intake.want_diagnostics = is_followed(self._publishers["diagnostics"])
                 self._publishers["status"].put(json.dumps(self._status(), default=plain))
             self._tell_events()
         elif due and self._standby is not None:
@@ -99,9 +100,9 @@ class Publications:
         newest, config, publishers = self._axis.newest, self._axis.config, self._publishers
         if newest is self._published or now_s - self._published_at < 1.0 / config.model_hz:
             return
-        if config.learn and _is_followed(publishers["model"]):
+        if config.learn and is_followed(publishers["model"]):
             publishers["model"].put(self._answers.encoded(config.learn))
-        if AUTO in newest.models and _is_followed(publishers["champion"]):
+        if AUTO in newest.models and is_followed(publishers["champion"]):
             publishers["champion"].put(self._answers.encoded(AUTO))
         self._published, self._published_at = newest, now_s
 
@@ -121,10 +122,3 @@ class Publications:
             return
         for event in self._axis.take_events():
             publisher.put(json.dumps({**event, "instance": self._instance}))
-
-
-def _is_followed(publisher: Any) -> bool:
-    """Whether anybody subscribes to what ``publisher`` puts."""
-    status = publisher.matching_status
-    # An object that is always true in this release, a plain truth value by its own type stub.
-    return bool(getattr(status, "matching", status))

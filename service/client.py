@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued, extended
 from service.client_asking import RETRY_S, Asking
+from service.delivery import SURELY
 from service.errors import FieldError, NoReplyError
 from service.follower import Follower
 from service.guard import Limits, guard
@@ -237,13 +238,14 @@ class Client:
             reach = gap * limits.slew_V_per_s * self.dt_s
             before = min(max(float(wanted[0]), before - reach), before + reach)
         safe, flags = guard(wanted, np.ones(wanted.size, dtype=np.bool_), self.dt_s, limits, before)
-        self._session.put(self.keys.command, encode_command(seq, safe), express=True)
+        self._session.put(self.keys.command, encode_command(seq, safe), express=True, congestion_control=SURELY)
         self._commanded = (seq + safe.size, float(safe[-1]))
         return flags
 
     def reference(self, seq: int, y_um: ArrayLike) -> None:
         """Publish what is wanted, (n,) µm, at the stage's samples ``seq``, ``seq + 1``, …; for diagnostics only."""
-        self._session.put(self.keys.reference, encode_reference(check_seq("seq", seq), y_um))
+        payload = encode_reference(check_seq("seq", seq), y_um)
+        self._session.put(self.keys.reference, payload, congestion_control=SURELY)
 
     def _known(self) -> dict[str, Any]:
         return self._status or self.status()

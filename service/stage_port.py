@@ -9,6 +9,7 @@ from typing import Any
 
 import zenoh
 
+from service.delivery import SURELY
 from service.errors import FieldError
 from service.keys import Keys
 from service.stage_commands import CommandBuffer
@@ -87,8 +88,7 @@ class Port:
         self.commands = CommandBuffer(begin=config.first)
         self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
         # Samples must not be lost: a full channel holds the sender up, not the loop, and drops nothing.
-        block = zenoh.CongestionControl.BLOCK
-        self._publisher = session.declare_publisher(keys.sample, congestion_control=block, express=True)
+        self._publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
         self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first)
         self.status = session.declare_publisher(status_key(config.name, axis))
         self._subscribers = [session.declare_subscriber(keys.command, self._received)]

@@ -20,9 +20,10 @@ from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from service import wire
 from service.client import Client, Trajectory
+from service.delivery import SURELY, wait_followed
 from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from service.demo.run import empty
-from service.errors import BehindError, RefusedError, ReplyTimeoutError
+from service.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
 from service.keys import Keys
 from service.session import open_client
 from service.wire_query import NEWEST
@@ -82,11 +83,17 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     # Two sessions, so that an answer never waits behind the samples of five twins.
     with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
-        commands = {name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, express=True) for name in MODELS}
-        event = session.declare_publisher(Keys(STAGE, AXIS).event)
+        commands = {
+            name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, congestion_control=SURELY, express=True)
+            for name in MODELS
+        }
+        event = session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
         # The subscriptions must have reached the stage before the first commands start its clock.
         time.sleep(0.3)
         try:
+            for name, publisher in commands.items():
+                if not wait_followed(publisher, STALL_S):
+                    raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
             for block in range(n // size):
                 part = slice(block * size, (block + 1) * size)
                 if not twins.wait(part.start - plan.lead):

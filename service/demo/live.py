@@ -12,6 +12,7 @@ import numpy as np
 
 from service import wire
 from service.client import Client
+from service.delivery import SURELY, wait_followed
 from service.demo.fast import Progress
 from service.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from service.demo.processes import Child, Children, free_port
@@ -48,17 +49,21 @@ def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: 
         stage.wait_line("ready", _READY_S)
         with open_client(endpoint, _READY_S) as session:
             subscriber = session.declare_subscriber(keys.sample, take)
+            commands = session.declare_publisher(keys.command, congestion_control=SURELY)
             # The subscription must have reached the stage before its clock starts.
             time.sleep(0.3)
+            if not wait_followed(commands, _READY_S):
+                raise ServiceError(f"identification: no stage takes commands within {_READY_S:g} s: {stage.words()}")
             for first in range(0, len(u_V), 1000):
-                session.put(keys.command, wire.encode_command(first, u_V[first : first + 1000]))
+                commands.put(wire.encode_command(first, u_V[first : first + 1000]))
             until = time.monotonic() + plan.identify_s + _OVERTIME_S
             while received < len(u_V) and stage.running and time.monotonic() < until:
                 progress(received)
                 time.sleep(0.2)
             if stage.wait(_OVERTIME_S) != 0 or received < len(u_V):
                 raise ServiceError(f"identification: got {received} of {len(u_V)} samples; stage: {stage.words()}")
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+            for entity in (subscriber, commands):
+                entity.undeclare()  # type: ignore[no-untyped-call]
 
 
 def run_live(

@@ -20,6 +20,7 @@ import zenoh
 from adaptive.errors import DehystError, InputError
 from service import wire
 from service.client import Client, Trajectory
+from service.delivery import SURELY
 from service.errors import ServiceError
 from service.keys import Keys
 from service.soak.control import AXIS, STAGE, Control
@@ -101,7 +102,8 @@ class Controller:
         self._client = client
         self._session = session
         self._dwells = session.declare_subscriber(control_key(), self._rest)
-        self._commands = session.declare_publisher(Keys(STAGE, AXIS).command, express=True)
+        key = Keys(STAGE, AXIS).command
+        self._commands = session.declare_publisher(key, congestion_control=SURELY, express=True)
         self._last_V = math.nan
         self._error = ""
 

@@ -12,6 +12,7 @@ import zenoh
 
 from adaptive.errors import InputError
 from service import wire
+from service.delivery import SURELY
 from service.keys import Keys
 from service.session import open_client
 from service.soak.control import AXIS, STAGE, Control
@@ -120,7 +121,7 @@ class Monitor:
 
     def put(self, key: str, value: dict[str, Any]) -> None:
         """Publish JSON, to the stage or the controller."""
-        self._session.put(key, json.dumps(value))
+        self._session.put(key, json.dumps(value), congestion_control=SURELY)
 
     def samples(self) -> dict[str, int]:
         """How many samples have been seen so far, and how many came."""

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import zenoh
 
+from service.delivery import SURELY
 from service.keys import Keys
 from service.operating.request import MAX_BYTES
 from service.session import open_client
@@ -41,7 +42,7 @@ def rubbish(endpoint: str, seed: int) -> int:
             count += 1
             payload = PAYLOADS[what](rng)
             if what == "sample":
-                session.put(keys.sample, payload)
+                session.put(keys.sample, payload, congestion_control=SURELY)
                 got["published"] += 1
             else:
                 got[_asked(session, f"{keys.base}/{what}{_parameters(what, rng)}", payload)] += 1

@@ -21,6 +21,7 @@ from service import wire
 from service.axis import Axis
 from service.client import Client
 from service.config import AxisConfig
+from service.delivery import SURELY
 from service.diagnosing.job import Job
 from service.diagnosing.settings import WatchConfig
 from service.diagnosing.watcher import Watcher
@@ -333,7 +334,9 @@ def test_a_real_service_names_the_gain_step_of_a_real_stage(model_file: Path, tm
             events: list[dict[str, Any]] = []
             session.declare_subscriber(client.keys.event, lambda s: events.append(json.loads(s.payload.to_bytes())))
             for first in range(0, u_V.size, 500):
-                session.put(client.keys.command, wire.encode_command(first, u_V[first : first + 500]))
+                session.put(
+                    client.keys.command, wire.encode_command(first, u_V[first : first + 500]), congestion_control=SURELY
+                )
             # Beside it an operator has the model tuned, by the same real wire.
             eventually(lambda: client.status()["seq"] > 1000, 30.0)
             tune = [*cli, "retune", "--endpoint", endpoint, "--who", "alice", "--json"]

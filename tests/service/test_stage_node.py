@@ -19,6 +19,7 @@ import pytest
 from adaptive.errors import InputError
 from service import wire
 from service.commands.stage import parse_change
+from service.delivery import SURELY
 from service.keys import Keys
 from service.session import open_client
 from service.stage_commands import CommandBuffer
@@ -94,7 +95,11 @@ def test_no_sample_is_lost_and_commands_are_honoured_in_order() -> None:
             sent = 0
             while sent < n:
                 for axis, values in voltages.items():
-                    session.put(Keys("t", axis).command, wire.encode_command(sent, values[sent : sent + block]))
+                    session.put(
+                        Keys("t", axis).command,
+                        wire.encode_command(sent, values[sent : sent + block]),
+                        congestion_control=SURELY,
+                    )
                 sent += block
                 if sent >= 500:
                     assert started.wait(5.0)
@@ -139,10 +144,12 @@ def test_free_run_holds_missing_commands_and_stops_cleanly_on_interrupt() -> Non
             while not collector.batches and time.monotonic() < deadline:
                 time.sleep(0.01)
             now = int(collector.batches[-1].seq[-1])
-            session.put(Keys("t", "x").command, wire.encode_command(0, np.full(10, 9.0)))
-            session.put(Keys("t", "x").command, wire.encode_command(now + 400, np.full(5, 3.0)))
-            session.put(Keys("t", "x").command, b"nonsense")
-            session.put(Keys("t", "x").command, wire.encode_command(now + 10_000_000, [1.0]))
+            session.put(Keys("t", "x").command, wire.encode_command(0, np.full(10, 9.0)), congestion_control=SURELY)
+            session.put(
+                Keys("t", "x").command, wire.encode_command(now + 400, np.full(5, 3.0)), congestion_control=SURELY
+            )
+            session.put(Keys("t", "x").command, b"nonsense", congestion_control=SURELY)
+            session.put(Keys("t", "x").command, wire.encode_command(now + 10_000_000, [1.0]), congestion_control=SURELY)
             while not states and time.monotonic() < deadline:
                 time.sleep(0.01)
             while collector.batches[-1].seq[-1] < now + 600 and time.monotonic() < deadline:
@@ -176,11 +183,11 @@ def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told
         try:
             collectors = {axis: Collector(session, axis) for axis in voltages}
             time.sleep(0.3)
-            session.put(fault_key("t", "y"), b'{"fault": "gap", "duration_s": 0.1}')
-            session.put(fault_key("t", "y"), b'{"fault": "fire"}')
+            session.put(fault_key("t", "y"), b'{"fault": "gap", "duration_s": 0.1}', congestion_control=SURELY)
+            session.put(fault_key("t", "y"), b'{"fault": "fire"}', congestion_control=SURELY)
             time.sleep(0.1)
             for axis, values in voltages.items():
-                session.put(Keys("t", axis).command, wire.encode_command(first, values))
+                session.put(Keys("t", axis).command, wire.encode_command(first, values), congestion_control=SURELY)
             summary = summary_of(process)
             received = {axis: collector.columns() for axis, collector in collectors.items()}
         finally:
