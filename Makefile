@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
+# Tests of mathematics alone, which may share the cores; the others time real processes and have them for themselves.
+PURE   := tests/adaptive tests/baselines tests/sim tests/hidden
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
 
@@ -37,7 +39,8 @@ demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
 	$(BIN)/dehyst demo --out $(OUT)
 
 test: setup-test check ## lint, types, import contract, and all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PURE)
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE))
 
 check: setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff check .
