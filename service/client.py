@@ -11,7 +11,6 @@ while, by the client itself. Given the endpoints of a service and of its standby
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Sequence
@@ -26,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from service.client_answers import Point, Trajectory, as_point, as_trajectory, continued, extended
 from service.client_asking import RETRY_S, Asking
 from service.delivery import SURELY
-from service.errors import FieldError, NoReplyError
+from service.errors import NoReplyError
 from service.follower import Follower
 from service.guard import Limits, guard
 from service.keys import AUTO, Keys
@@ -89,7 +88,7 @@ class Client:
             client = cls(session, keys, timeout_s, owns_session=True, retry_s=retry_s)
             while True:
                 try:
-                    client._take_status(client._asking.once(keys.status))
+                    client._status = client._asking.status(once=True)
                     return client
                 except NoReplyError:
                     if time.monotonic() >= until:
@@ -133,14 +132,8 @@ class Client:
 
     def status(self) -> dict[str, Any]:
         """The status of the axis as the service tells it now (docs/protocol.md)."""
-        return self._take_status(self._asking.get(self.keys.status))
-
-    def _take_status(self, payload: bytes) -> dict[str, Any]:
-        status = json.loads(payload)
-        if not isinstance(status, dict) or "dt_s" not in status:
-            raise FieldError("status", repr(status)[:80], "a status of this wire version")
-        self._status = status
-        return status
+        self._status = self._asking.status()
+        return self._status
 
     def point(
         self,

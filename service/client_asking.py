@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
-from service.errors import BehindError, NoReplyError, ReplyTimeoutError, error_from_json
+from service.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.keys import Keys
 from service.wire_reply import FeedforwardReply, decode_reply
 
@@ -48,6 +49,13 @@ class Asking:
     def get(self, selector: str) -> bytes:
         """As :meth:`once`, but repeated while there is no answer, for ``retry_s``."""
         return self._repeated(lambda: self.once(selector))
+
+    def status(self, once: bool = False) -> dict[str, Any]:
+        """The status of the axis as the service tells it now; ``once`` : not repeated."""
+        status = json.loads((self.once if once else self.get)(self._keys.status))
+        if not isinstance(status, dict) or "dt_s" not in status:
+            raise FieldError("status", repr(status)[:80], "a status of this wire version")
+        return status
 
     def feedforward(self, payload: bytes, wait_s: float) -> FeedforwardReply:
         """The answer to an encoded query, which is repeated while there is none, for ``retry_s``.
