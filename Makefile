@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
-# Tests of mathematics alone, which may share the cores; the others time real processes and have them for themselves.
-PURE   := tests/adaptive tests/baselines tests/sim tests/hidden
+# Tests that only compute, which may share the cores; the others time real processes and have them for themselves.
+PURE   := tests/adaptive tests/baselines tests/sim tests/hidden \
+          $(addprefix tests/service/test_,diagnose_command.py identify.py reproduce.py scenarios.py warm.py watch.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
 
@@ -38,11 +39,13 @@ $(BIN)/python:
 demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
 	$(BIN)/dehyst demo --out $(OUT)
 
-test: setup-test check ## lint, types, import contract, and all tests
+test: ## lint, types, import contract, and all tests
+	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
+	@$(MAKE) --no-print-directory -j2 setup-test check
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PURE)
 	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE))
 
-check: setup-test ## ruff, mypy --strict, the import contract
+check: .setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -96,7 +96,7 @@ class Session:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def put(self, key: str, payload: bytes) -> None:
+    def put(self, key: str, payload: bytes, congestion_control: object) -> None:
         self.sent.append(key)
 
     def get(self, key: str, payload: bytes, timeout: float) -> list[Any]:
