@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
-    from service.demo.score import table
+    from service.demo.score import clock_missed, table
 
     queries, samples, ticks = summary["queries"], summary["samples"], summary["ticks"]
     files = {
@@ -97,6 +97,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         f"{queries['late']} too late",
         f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
         f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
+        *filter(None, [clock_missed(ticks)]),
         f"done in {seconds:.0f} s; in {out}/:",
         *(f"  {name:<16}{what}" for name, what in files.items()),
     ]
