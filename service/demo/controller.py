@@ -94,23 +94,27 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
             for name, publisher in commands.items():
                 if not wait_followed(publisher, STALL_S):
                     raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
-            for block in range(n // size):
-                part = slice(block * size, (block + 1) * size)
-                if not twins.wait(part.start - plan.lead):
-                    print(json.dumps({"stalled": part.start}), flush=True)
+            stop = 0
+            while stop < n // size:
+                block = stop
+                if not twins.wait(block * size - plan.lead):
+                    print(json.dumps({"stalled": block * size}), flush=True)
                     return 1
+                fresh, stop = blocks_now(plan, block, twins.seen[TEACHER])
+                part = slice(block * size, stop * size)
                 client.reference(part.start, wanted[0][part])
                 for name in MODELS:
                     begin = time.perf_counter()
-                    motion = (wanted[0][part], wanted[1][part], wanted[2][part])
-                    # The service tracks the teacher's stage; the memory of the others travels.
-                    due = part.start if name == TEACHER else None
-                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(block), due)
+                    # The service tracks the teacher's stage; the memory of the others travels, over all of the way.
+                    due = fresh * size if name == TEACHER else None
+                    asked = slice(part.start if due is None else due, part.stop)
+                    motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), due)
                     late += waited
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
-                    std_V[name][part] = answer.std_V
-                    held.append((commands[name], wire.encode_command(part.start, answer.u_V)))
+                    std_V[name][asked] = answer.std_V
+                    held.append((commands[name], wire.encode_command(asked.start, answer.u_V)))
                     if block >= blind or len(held) == blind * len(MODELS):
                         for publisher, command in held:
                             publisher.put(command)
@@ -121,7 +125,7 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                     event.put(
                         json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text})
                     )
-                if part.stop % 1000 == 0:
+                if part.stop // 1000 > part.start // 1000:
                     _report(plan, wanted[0], twins, max(0, part.start - plan.lead))
             complete = twins.wait(n)
         finally:
@@ -132,6 +136,19 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     np.savez(out, query_s=np.asarray(durations), late=late, **arrays)
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
+
+
+def blocks_now(plan: Plan, block: int, seen: int) -> tuple[int, int]:
+    """(fresh, stop): what to ask for after ``seen`` samples in place of ``block``: the blocks before ``stop``.
+
+    One, where it is in time. Else all up to the one that would be asked for now if it were, or a controller that was
+    late for once would be late until the end; what came before block ``fresh`` is due already and of no use.
+    """
+    size = plan.block
+    if seen <= block * size:
+        return block, block + 1
+    last = plan.ticks // size
+    return min(-(-seen // size), last - 1), min((seen + plan.lead) // size + 1, last)
 
 
 def ask(
