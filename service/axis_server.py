@@ -182,8 +182,7 @@ class AxisServer:
 
     def _look_at_age(self, now_s: float) -> None:
         """Samples are expected from the first one on."""
-        at_s = self.intake.handled_at_s
-        self.axis.age_s = 0.0 if at_s is None else max(0.0, now_s - at_s)
+        self.axis.age_s = self.intake.age_s(now_s) or 0.0
         config = self.axis.config
         stale = trust_by_age(self.axis.age_s, config.stale_s, config.last_good_s)[1]
         if stale != self._stale:
@@ -197,8 +196,7 @@ class AxisServer:
 
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
-        at_s = self.intake.handled_at_s
-        age_s = None if at_s is None else max(0.0, time.monotonic() - at_s)
+        age_s = self.intake.age_s(time.monotonic())
         synced = self.synced
         newest = self.axis.newest
         told = axis_status(self.keys, self.instance, self.axis, self.intake, self.latency, age_s)

@@ -107,6 +107,11 @@ class Intake:
             put_aside(batch.seq, batch.t_s, batch.u_V, batch.y_um, DROPPED)
         return fits
 
+    def age_s(self, now_s: float) -> float | None:
+        """How long before ``now_s``, by ``time.monotonic``, what was handled last came, s; None: nothing came."""
+        at_s = self.handled_at_s
+        return None if at_s is None else max(0.0, now_s - at_s)
+
     def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
         """Do ``work`` in the thread that handles samples, after those that have come; what it returns or raises.
 

@@ -347,43 +347,6 @@ def test_queries_are_answered_while_samples_are_handled(models: dict[str, Invers
     assert count > 20
 
 
-def test_messages_that_wait_are_handled_together_and_work_in_its_place(models: dict[str, InverseModel]) -> None:
-    """Forty messages of a sample each, and something to be done behind the twentieth."""
-    axis = make_axis(models)
-    intake = Intake(axis, lambda: None)
-    sizes: list[int] = []
-
-    class Watcher:
-        def take(self, batch: SampleBatch) -> None:
-            sizes.append(len(batch))
-
-        def tick(self, now_s: float) -> None: ...
-        def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
-            return {}
-
-        def status(self) -> dict[str, Any]:
-            return {}
-
-        def close(self) -> None: ...
-
-    intake.watcher = Watcher()
-    messages = parts(recording(40), 1)
-    for part in messages[:20]:
-        assert intake.offer(part)
-    intake.start()
-    try:
-        seen = intake.call(lambda: axis.handled_seq)
-        for part in messages[20:]:
-            assert intake.offer(part)
-    finally:
-        intake.close()
-    assert seen == 19, "what came before the work was handled before it"
-    assert axis.handled_seq == 39
-    assert sum(sizes) == 40
-    assert len(sizes) < 20, "several messages at a time"
-    assert intake.waiting == 0
-
-
 def test_the_model_does_not_depend_on_how_samples_were_gathered(models: dict[str, InverseModel]) -> None:
     one, many = make_axis(models), make_axis(models)
     whole = recording(600)
@@ -396,66 +359,7 @@ def test_the_model_does_not_depend_on_how_samples_were_gathered(models: dict[str
     np.testing.assert_array_equal(ask(one, n=5).u_V, ask(many, n=5).u_V)
 
 
-def test_a_full_queue_drops_and_counts(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models, queue_samples=100)
-    intake = Intake(axis, lambda: None)  # not started: nobody takes
-    offered = [intake.offer(part) for part in parts(recording(150), 30)]
-    assert offered == [True, True, True, False, False]
-    assert (intake.dropped, intake.waiting) == (60, 90)
-    assert [e["event"] for e in axis.take_events()] == ["samples_dropped"]
-    intake.start()
-    intake.close()
-    assert axis.handled_seq == 89
-
-
 def test_samples_through_the_wire_are_those_that_were_sent() -> None:
     batch = recording(5)
     got = decode_samples(encode_samples(batch.seq, batch.t_s, batch.u_V, batch.y_um))
     np.testing.assert_array_equal(got.y_um, batch.y_um)
-
-
-def offered_twice(intake: Intake) -> float:
-    """Two messages that came 10 ms apart, before anybody takes them; when the first one did, s."""
-    assert intake.handled_at_s is None
-    first, second = parts(recording(40), 20)
-    intake.offer(first)
-    came_s = intake.handled_at_s
-    assert came_s is not None
-    time.sleep(0.01)
-    intake.offer(second)
-    assert intake.handled_at_s == came_s
-    return came_s
-
-
-def test_what_has_come_is_no_newer_before_it_is_handled(models: dict[str, InverseModel]) -> None:
-    intake = Intake(make_axis(models), lambda: None)
-    came_s, before_s = offered_twice(intake), time.monotonic()
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s is not None
-    assert came_s + 0.01 <= intake.handled_at_s <= before_s, "when the last one came, not when it was handled"
-
-
-def test_what_a_standby_holds_back_is_as_new_as_what_is_learnt(models: dict[str, InverseModel]) -> None:
-    intake = Intake(make_axis(models), lambda: None)
-    intake.gate = lambda batch: None
-    came_s = offered_twice(intake)
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s is not None
-    assert intake.handled_at_s >= came_s + 0.01
-
-
-def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, InverseModel]) -> None:
-    axis = make_axis(models)
-
-    def broken(batch: SampleBatch) -> list[str]:
-        raise RuntimeError("for once")
-
-    axis.handle = broken  # type: ignore[method-assign]
-    intake = Intake(axis, lambda: None)
-    came_s = offered_twice(intake)
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s == came_s
-    assert [event["event"] for event in axis.take_events()] == ["internal_error"]
