@@ -17,14 +17,14 @@ from typing import Any, Final, NamedTuple
 
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answering import Served, answer, blends, learns
-from service.axis_learning import AxisLearning
+from service.axis_counting import AxisCounting
 from service.clock import SampleClock
 from service.config import LEARN, AxisConfig
 from service.errors import FieldError
 from service.guard import Limits
 from service.keys import AUTO
 from service.retuning.adoption import Adoptions
-from service.sequence import LATE, RESTARTED, SequenceTracker
+from service.sequence import ANEW, REFUSED, Seldom, SequenceTracker
 from service.tracking import MemoryTracker
 from service.watch import Watch, WatchConfig
 from service.wire import SampleBatch
@@ -48,7 +48,7 @@ class Tally(NamedTuple):
     gates: dict[str, int]
 
 
-class Axis(AxisLearning):
+class Axis(AxisCounting):
     """The models of one axis.
 
     Parameters
@@ -81,7 +81,8 @@ class Axis(AxisLearning):
         self.limits = limits
         self.learner = learner
         self.dt_s = steps.pop()
-        self.sequence = SequenceTracker()
+        self.sequence = SequenceTracker(self.dt_s)
+        self._seldom = Seldom(calm=round(1.0 / self.dt_s))
         self.tracker = MemoryTracker(self.dt_s)
         self.watch = Watch(WatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
         self._revive = revive
@@ -143,19 +144,20 @@ class Axis(AxisLearning):
         every = self.config.snapshot_every
         rows = zip(batch.seq.tolist(), batch.t_s.tolist(), batch.u_V.tolist(), batch.y_um.tolist(), strict=True)
         for seq, t_s, u_V, y_um in rows:
-            order = self.sequence.take(seq)
+            before = self.sequence.last
+            order = self.sequence.take(seq, t_s)
+            if self.sequence.refuted >= 0:
+                self._tell_refuted(before)
+            if order in REFUSED:
+                verdicts.append(self._counted(self._refused(order, seq)))
+                continue
+            if order in ANEW:
+                self._begin_count(order, seq, before)
             number = self.sequence.number(seq)
-            if order == RESTARTED:
-                self._restart(seq)
-            # One that is late is refused whatever its time.
-            t_going_on_s = t_s if order == LATE else self._time(number, t_s, order == RESTARTED)
-            verdict = self._learn(Sample(number, t_going_on_s, u_V, y_um))
-            self._gates[verdict] = self._gates.get(verdict, 0) + 1
+            verdict = self._counted(self._taught(Sample(number, self._time(number, t_s, order in ANEW), u_V, y_um)))
             verdicts.append(verdict)
             if self.adoptions:
                 self.adopt_due(number)
-            if order == LATE:
-                continue
             self.watch.take(u_V, y_um, verdict)
             self.tracker.add(seq, u_V, y_um)
             if seq // every > self.newest.seq // every:
@@ -215,17 +217,3 @@ class Axis(AxisLearning):
             trust=self.watch.trust, trouble=self.watch.trouble,
         )  # fmt: skip
         self._ring = (*self._ring, served)[-self.config.snapshots_kept :]
-
-    def _time(self, number: int, t_s: float, restarted: bool) -> float:
-        """The time of a sample for what learns."""
-        sets = self.clock.sets
-        t_going_on_s = self.clock.take(number, t_s, restarted)
-        if self.clock.sets != sets:
-            self.note("stage_clock_set", "the stage's clock has been set; time goes on by the numbers of the samples")
-        return t_going_on_s
-
-    def _restart(self, seq: int) -> None:
-        """The stage counts from the beginning again: snapshots of the old count can no longer be named."""
-        self.tracker.forget()
-        self._ring = (replace(self.newest, seq=-1),)
-        self.note("stage_restarted", f"the stage's numbers went back to {seq}; the model is kept")

@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from service.axis import Axis
 from service.errors import ServiceError
+from service.sequence import AHEAD
 from service.sinks import SampleSink, SampleWatcher
 from service.wire import SampleBatch, joined
 
@@ -193,7 +194,10 @@ class Intake:
         if self.sink is not None:
             self.sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
         if self.watcher is not None:
-            self.watcher.take(batch)
+            # Behind a number far ahead all that follow would be old.
+            near = [verdict != AHEAD for verdict in verdicts]
+            if any(near):
+                self.watcher.take(batch if all(near) else batch.where(near))
         if self.axis.retuner is not None:
             self.axis.retuner.step(self.axis)
         if self.axis.newest is not before:

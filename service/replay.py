@@ -21,7 +21,7 @@ from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from service.axis import Axis
 from service.identifying import motion_of
-from service.wire import SampleBatch
+from service.wire import MAX_SEQ, SampleBatch
 from sim.recordings import Recording, repaired
 
 #: Age of the snapshot when the first point that it answers for takes effect, s: asked ahead, plus the samples' way.
@@ -70,8 +70,9 @@ def sequence(recording: Recording) -> NDArray[np.int64]:
     if recording.seq is not None:
         return recording.seq
     step = (recording.t_s - recording.t_s[np.isfinite(recording.t_s)][0]) / recording.dt_s
-    # A sample without a time keeps its place; the gate for time steps sees that it has none.
-    return np.where(np.isfinite(step), np.rint(step), np.arange(len(recording))).astype(np.int64)
+    # A sample without a time keeps its place, as does one of a time that no number reaches; the gate for time steps
+    # sees that it has none.
+    return np.where(np.abs(step) < MAX_SEQ, np.rint(step), np.arange(len(recording))).astype(np.int64)
 
 
 def feed(axis: Axis, recording: Recording, seq: NDArray[np.int64], start: int, stop: int) -> list[str]:

@@ -60,6 +60,11 @@ class SampleBatch:
     def __len__(self) -> int:
         return int(self.seq.size)
 
+    def where(self, kept: ArrayLike) -> SampleBatch:
+        """The samples for which ``kept``, (n,) truth values, is true."""
+        rows = np.asarray(kept, dtype=np.bool_)
+        return SampleBatch(self.seq[rows], self.t_s[rows], self.u_V[rows], self.y_um[rows])
+
 
 def joined(batches: Sequence[SampleBatch]) -> SampleBatch:
     """The samples of several messages, in their order, as those of one."""
