@@ -34,6 +34,10 @@ OUT_OF_ORDER = "out_of_order"
 TIMING = "timing"
 GAP = "gap"
 GLITCH = "glitch"
+#: Held back: the stage rings, after a knock or a jump.
+RINGING = "ringing"
+#: The sensor has lost its trust, and has to follow the drive again first.
+UNTRUSTED = "untrusted"
 SETTLING = "settling"
 SATURATED = "saturated"
 OUT_OF_RANGE = "out_of_range"
@@ -43,8 +47,8 @@ REDUNDANT = "redundant"
 FROZEN = "frozen"
 NUMERICS = "numerics"
 REASONS = (
-    NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, SETTLING, SATURATED, OUT_OF_RANGE, UNEXCITED, OUTLIER,
-    REDUNDANT, FROZEN, NUMERICS,
+    NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, GLITCH, RINGING, UNTRUSTED, SETTLING, SATURATED, OUT_OF_RANGE,
+    UNEXCITED, OUTLIER, REDUNDANT, FROZEN, NUMERICS,
 )  # fmt: skip
 
 

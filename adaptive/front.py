@@ -1,39 +1,61 @@
 """From readings to motion: what each sample is, and which steps of the track (``adaptive.track``) it leads to.
 
 Samples go in by ``take``, which says what each is and which steps are to be made for it; ``advance`` makes them and
-returns the pair of smoothed motion and voltage, ``lag`` samples old, that may teach. Readings that surprise are held
-back (``adaptive.surprise``): nothing is taught until they turn out to be a glitch, which is bridged, or a jump. A jump
-of the reading that no voltage made moves the frame of the features, and with it everything that was learnt.
+returns the pair of smoothed motion and voltage, ``lag`` samples old, that may teach.
+
+A reading is in one of three hands. Trusted, it goes to the smoother. One that surprises is held back with those that
+follow (``adaptive.hypotheses``) until they turn out to be a glitch, ringing, or a jump; a jump of the reading that no
+voltage made moves the frame of the features, and with it everything that was learnt. Readings that stay undecided, or
+that do not follow the drive, are on trial (``adaptive.trial``). While readings are held or on trial nothing is taught,
+and dead reckoning carries the hysteresis memory on.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import nan
 
-from adaptive import admission, surprise
-from adaptive.bridge import FAR_OUT, Bridging, Voltage
+from adaptive import admission, hypotheses
 from adaptive.features import FeatureMap
+from adaptive.following import CONFIRMED, Following
 from adaptive.front_state import parts_of, parts_to_state
 from adaptive.heard import Heard
+from adaptive.hypotheses import Circumstances, Hold, Verdict
 from adaptive.learner_config import LearnerConfig
+from adaptive.reckoning import Reckoning, answers, drive_V, mean_slope
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.snapshot import LssvmInverse
-from adaptive.surprise import Hold, Verdict
-from adaptive.track import Pair, Step, Taken, Track
+from adaptive.state import prefixed, under
+from adaptive.track import Pair, Past, Step, Taken, Track
+from adaptive.trial import OUT_OF_ENVELOPE, Outcome, Trial
 from adaptive.types import FloatArray, Sample, StateDict
 
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
+#: A place further from the middle of the range than this many ranges is none, and a reading no reading.
+FAR_OUT = 1.5
+#: Over the smoother's lag, between what shares of what the mean slope makes of the voltage a reading moves, where that
+#: is more than this share of the range and so many deviations. Turning points, lag and hysteresis included.
+LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
+#: Time between two looks at that, s.
+LOOK_S = 0.002
+#: Share of the identified range beyond its ends up to which the model is known.
+KNOWN = 0.05
+#: Age at which a place is from before anything that is noticed now, s.
+CLEAN_S = 0.06
+
+Model = Callable[[], LssvmInverse]
 
 
 class Front:
-    """The front end of a learner; ``base`` is the model that it starts from, ``voltage`` the one it has learnt.
+    """The front end of a learner; ``base`` is the model that it starts from.
 
     Attributes
     ----------
     track : where the stage is and has been, None before the first reading. gates : of the admission.
     doubt_V : deviation of the model's predictions, V, as far as it is known; the learner tells.
+    following : whether the readings follow the drive; confirmed : whether they were found to just now.
     """
 
     def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
@@ -44,14 +66,26 @@ class Front:
         self.gates = admission.AdmissionState()
         self.track: Track | None = None
         self.doubt_V = 0.0
-        self.restarts = self.jumps = self.undone = 0
+        self.restarts = self.jumps = self.undone = self.trials = 0
+        self.following = Following()
+        self.confirmed = False
+        self._look_every = max(1, round(LOOK_S / self.dt_s))
+        self._least_um = LAGS_SHARE * self.range_um
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
+        self._envelope = config.envelope
         self._hold: Hold | None = None
+        self._trial: Trial | None = None
         self._lost = True  # The smoother has to start again.
         self._heard = Heard()
-        self._before: FeatureMap | None = None  # The frame before the last jump.
+        self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
+        self._calm = 1_000_000  # Samples since readings were last held back.
+        # A model that does not answer to the displacement cannot tell whether a sensor does.
+        self._tells = answers(base)
+        self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
+        # Places from before the last steps in which the readings followed the drive, the older one first.
+        self._pasts: list[Past] = []
 
     @property
     def served(self) -> FeatureMap:
@@ -66,13 +100,27 @@ class Front:
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number."""
         self.gates = admission.AdmissionState()
-        self._hold, self._lost = None, True
+        self._hold, self._trial, self._lost = None, None, True
         self._heard.clear()
+        self._forget()
+
+    def _forget(self) -> None:
+        """What the readings did so far says nothing about what comes."""
+        self.following.forget()
+        self._pasts.clear()
+
+    @property
+    def fault(self) -> str:
+        """Name of what is wrong with the sensor, "" while nothing is known to be."""
+        return "" if self._trial is None else self._trial.fault
 
     # ---- what a sample is
 
-    def take(self, sample: Sample, voltage: Voltage) -> Taken:
-        """Judge one sample; ``voltage``: what the learnt model asks for. Never raises on data."""
+    def take(self, sample: Sample, model: Model) -> Taken:
+        """Judge one sample; ``model`` gives what is served, should the place have to be reckoned by it.
+
+        Never raises on data.
+        """
         c, gates, track = self._admission, self.gates, self.track
         refused = admission.check_sample(c, gates, sample, self.dt_s)
         if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
@@ -88,25 +136,35 @@ class Front:
             admission.watch_voltage(c, gates, u, self.base.span_V)
         gates.seq, gates.t_s = sample.seq, sample.t_s
         gates.since_glitch += 1 + missing
+        if self._trial is not None:
+            # What never came is taken for no motion: the reckoning is off by it, and the readings will say so.
+            for u in between:
+                self._trial.put(u, nan, self._circumstances(0.0))
+            return self._try(self._trial, sample)
         if track is None or self._lost or gone or (missing and track.motion is None):
             return self._restart(sample, admission.GAP if missing else admission.SETTLING)
         for u in between:
-            self._keep(track, voltage, u, nan)
+            self._keep(track, model, u, nan)
         stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
-        known = track.motion is not None and not admission.settling(c, gates)
+        known = track.motion is not None and gates.since_start > c.settle
         limit = admission.surprise(c, gates, self.base.span_V)
+        if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
+            self._hold = self._begin_hold(track, model(), past=True)
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
         if self._hold is None and not doubtful:
             admission.watch_innovation(c, gates, innovation)
             return Taken("", (Step(sample.y_um, sample.u_V),))
-        return self._decide(sample, track, self._keep(track, voltage, sample.u_V, sample.y_um), limit, innovation)
+        # What a kink of the voltage makes of the motion is reckoned; it was a surprise to the smoother alone.
+        limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
+        return self._decide(sample, track, self._keep(track, model, sample.u_V, sample.y_um), limit)
 
     def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
-        self._hold, self._lost = None, False
+        self._hold, self._trial, self._lost = None, None, False
         self.gates.since_start = self.gates.since_jump = 0
         self.gates.moved = 0
+        self._forget()
         if self.track is None:
             self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
         else:
@@ -116,73 +174,195 @@ class Front:
 
     # ---- readings held back
 
-    def _keep(self, track: Track, voltage: Voltage, u_V: float, y_um: float) -> Hold:
+    def _keep(self, track: Track, model: Model, u_V: float, y_um: float) -> Hold:
         """Hold a sample back; begins a hold where there is none."""
-        made = Bridging(track.served, voltage, self.base.span_V / self.range_um)
         if self._hold is None:
-            self._hold = surprise.begin_hold(made, track, self.gates)
-        hold = self._hold
-        old = replace(made, features=hold.track.served)
-        hold.put(u_V, y_um, old.advance(hold.bridge, u_V))
+            # Soon after another one its readings are no anchor: some of them may have rung.
+            self._hold = self._begin_hold(track, model(), past=self._calm <= 2 * self.smoother.config.lag)
+        self._hold.put(u_V, y_um)
+        return self._hold
+
+    def _lags(self, track: Track, y_um: float) -> bool:
+        """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
+
+        A sensor that stops gently surprises no smoother.
+        """
+        if not self._tells or not self._pasts:
+            return False
+        du_V, dy_um = track.steps_over_lag(y_um)
+        x_um = du_V / self._slope_V_per_um
+        if abs(x_um) <= self._least_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
+            return False
+        return bool(abs(x_um) > LAGS_SIGMA * self.gates.innovation2**0.5 * self.range_um)
+
+    def _begin_hold(self, track: Track, model: LssvmInverse, past: bool = False) -> Hold:
+        """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed.
+
+        ``past`` : or from where it was when the readings had followed the drive, where the last ones are in doubt too.
+        """
+        gates = self.gates
+        if past and self._pasts:
+            reckoning = self._from_past(track, model)
+            return Hold(reckoning, reckoning.y_um)
+        motion, u_before_V, past_V, past_um = track.since_motion()
+        # Readings that were repeated before that was noticed are none, nor are they an anchor.
+        repeated = gates.same - 1 if gates.same >= admission.REPEATED else 0
+        track.doubt(repeated)
+        past_um = past_um[: max(past_um.size - repeated, 0)]
+        reckoning = Reckoning.begin(self._of_track(track, model), motion, u_before_V, past_V, past_um, track.memory)
+        hold = Hold(reckoning, float(past_um[-1]) if past_um.size else motion[0])
+        if gates.same > 1:
+            hold.same_um, hold.same = gates.y_um, gates.same - 1
+            hold.low_um = hold.high_um = gates.y_um
         return hold
 
-    def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float, innovation: float) -> Taken:
-        """What the last sample held back decides."""
-        c, gates = self._admission, self.gates
-        undone = False
-        if hold.taken:
-            if abs(innovation) <= limit or admission.settling(c, gates):
-                admission.watch_innovation(c, gates, innovation)
-                if len(hold.y_um) >= surprise.PROBATION:
-                    self._hold = None
-                return Taken("", (Step(sample.y_um, sample.u_V),))
-            # At another level again within the probation: the sensor can't be trusted, and all is open once more.
-            self.track, self._before, undone = hold.track.copy(), None, True
-            gates.since_jump, gates.since_glitch = c.settle + 1, 0
-            hold.taken, hold.level = False, -1
-            self.undone += 1
-        tolerance = limit + min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
-        trusted = gates.since_glitch * self.dt_s > c.doubt_s
-        stuck_um = admission.stuck_share(gates) * self.range_um
-        verdict = surprise.judge(c, hold, tolerance * self.range_um, stuck_um, self.range_um, trusted)
-        if verdict is Verdict.WAIT:
-            return Taken(admission.GLITCH, undone=undone)
-        if verdict is Verdict.LOST:
-            # Where the stage is is open, where it has turned the bridge knows best.
-            assert self.track is not None
-            self.track.remember(hold.bridge.memory)
-            return replace(self._restart(sample, admission.GAP), undone=undone)
-        if verdict is Verdict.JUMP:
-            return self._take_jump(track, hold, undone)
-        self._hold, back = None, verdict is Verdict.BACK
-        if back and hold.worst_um > c.glitch_share * self.range_um:
-            gates.since_glitch = 0
-        return Taken("", surprise.steps_of_glitch(hold) if back else surprise.steps_of_motion(hold), undone=undone)
+    def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
+        """From the last place that readings have confirmed, over the voltages since."""
+        newest = self._pasts[-1]
+        past = newest if len(newest.u_V) * self.dt_s > CLEAN_S else self._pasts[0]
+        frame = self._of_track(track, model)
+        reckoning = Reckoning.begin(frame, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
+        for u in past.u_V:
+            reckoning.advance(u)
+        return reckoning
 
-    def _take_jump(self, track: Track, hold: Hold, undone: bool) -> Taken:
-        """The reading has jumped for good: place and frame move from the first sample held back on.
+    def _of_track(self, track: Track, model: LssvmInverse) -> LssvmInverse:
+        """A model in the frame of the track: the identified one is served in its own, with a memory of its own."""
+        return model if model.features == track.served else replace(model, features=track.served)
+
+    def _circumstances(self, limit: float) -> Circumstances:
+        """What readings are judged by; ``limit`` : distance, in ranges, up to which one is no surprise."""
+        c, gates, served = self._admission, self.gates, self.served
+        usual = max(limit, c.surprise_share)
+        usual += min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
+        return Circumstances(
+            config=c,
+            envelope=self._envelope,
+            dt_s=self.dt_s,
+            range_um=self.range_um,
+            noise_um=max(gates.innovation2**0.5, c.surprise_share / c.surprise_sigma) * self.range_um,
+            usual_um=usual * self.range_um,
+            stuck_um=admission.stuck_share(gates) * self.range_um,
+            rest_um=served.offset_um + served.gain * served.y_rest_um,
+            low_um=served.offset_um + served.gain * (served.y_min_um - KNOWN * self.range_um),
+            high_um=served.offset_um + served.gain * (served.y_max_um + KNOWN * self.range_um),
+            trusted=gates.since_glitch * self.dt_s > c.doubt_s,
+        )
+
+    def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float) -> Taken:
+        """What the last sample held back decides."""
+        now = self._circumstances(limit)
+        verdict = hypotheses.judge(hold, now)
+        if verdict is Verdict.JUMP:
+            return self._take_jump(track, hold, now)
+        if verdict is Verdict.WAIT:
+            return Taken(admission.RINGING if hold.rang or hold.taken else admission.GLITCH)
+        if verdict is Verdict.LOST:
+            return self._begin_trial(hold.reckoning)
+        self._hold = None
+        if verdict is Verdict.MOTION:
+            return Taken("", hypotheses.steps_of_motion(hold))
+        if hold.seen_um > self._admission.glitch_share * self.range_um and not (hold.taken or hold.rang):
+            self.gates.since_glitch = 0
+        self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
+
+    def _take_jump(self, track: Track, hold: Hold, now: Circumstances) -> Taken:
+        """The readings have settled elsewhere: frame and place move.
 
         No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
         """
-        before, f = self._before, hold.track.served
-        away_um, ratio = surprise.jump_of(hold)
-        if before is not None and self.on_probation and abs(away_um + self._jump_um) <= BACK_SHARE * abs(away_um):
-            ratio, shift_um, frame = before.gain / f.gain, before.offset_um - f.offset_um, before
-            self._before, self.gates.since_glitch, undone = None, 0, True
+        before, f, away_um = self._before, track.served, hold.away_um
+        undone = False
+        level_um = hold.expected_um + away_um
+        slope, shift_um = hypotheses.jump_after(f, hold.expected_um, away_um)
+        if before is not None and self.on_probation:
+            back = before.gain / f.gain
+            back_um = before.offset_um - back * f.offset_um
+            least = min(
+                abs(back * hold.expected_um + back_um - hold.expected_um - away_um), abs(away_um + self._jump_um)
+            )
+            if least <= max(BACK_SHARE * abs(away_um), now.usual_um):
+                slope, shift_um, undone = back, back_um, True
+        frame = before if undone and before is not None else hypotheses.frame_after(f, slope, shift_um)
+        if self._envelope.refuses(self.base.features, frame):
+            return self._begin_trial(hold.reckoning)
+        if undone:
+            self._before, self.gates.since_glitch = None, 0
             self.undone += 1
         else:
-            ratio, shift_um, frame = surprise.frame_after(f, away_um, ratio)
             self._before, self._jump_um = f, away_um
             self.jumps += 1
-        hold.taken, self.gates.since_jump = True, 0
-        if self.track is not None:
-            self.track.move(frame, ratio, shift_um)
-        return Taken("", surprise.steps_of_jump(hold, ratio, shift_um), away_um, undone)
+        self.gates.since_jump = 0
+        track.move(frame, slope, shift_um)
+        hold.take(slope, shift_um)
+        self._forget()
+        if undone:
+            # What was reckoned since then was reckoned in a frame that never was.
+            hold.shift_um += level_um - hold.expected_um
+        if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
+            # It rings about the new level: the frame is right already, the readings are awaited.
+            return Taken(admission.RINGING, (), away_um, undone)
+        self._hold = None
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone)
+
+    # ---- readings on trial
+
+    def distrust(self, model: Model) -> None:
+        """The readings do not follow the drive: from the next sample on they are on trial.
+
+        Where the stage is follows from a place at which they still did, and the voltages since.
+        """
+        track = self.track
+        if track is None or track.motion is None or self._trial is not None:
+            return
+        if self._hold is not None:
+            reckoning = self._hold.reckoning
+        else:
+            reckoning = self._begin_hold(track, model(), past=True).reckoning
+        self._begin_trial(reckoning)
+
+    def _begin_trial(self, reckoning: Reckoning) -> Taken:
+        undone, track = self.on_probation, self.track
+        if undone and self._before is not None and track is not None:
+            # A jump that was taken just now is in doubt with the readings that it was taken from.
+            reckoning = reckoning.in_frame(self._before)
+            track.features = track.served = self._before
+            self.undone += 1
+        self._hold, self._before = None, None
+        assert track is not None
+        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True))
+        self.trials += 1
+        self._forget()
+        return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
+
+    def _try(self, trial: Trial, sample: Sample) -> Taken:
+        """One sample of a sensor that has to earn its trust."""
+        fault = trial.fault
+        decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
+        if decision.outcome is Outcome.OPEN:
+            return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+        track = self.track
+        assert track is not None
+        frame, away_um = track.served, 0.0
+        if decision.outcome is Outcome.CHANGED:
+            frame = hypotheses.frame_after(frame, decision.slope, decision.shift_um)
+            if self._envelope.refuses(self.base.features, frame):
+                trial.refuse(OUT_OF_ENVELOPE)
+                return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+            away_um = sample.y_um - trial.reckoning.y_um
+            self.jumps += 1
+        track.served = track.features = frame
+        track.remember(trial.reckoning.memory)
+        self.gates.since_glitch = 0
+        return replace(self._restart(sample, admission.SETTLING), jump_um=away_um, renamed=True)
+
+    # ---- where the stage is
 
     @property
     def holds(self) -> bool:
-        """Whether readings are held back."""
-        return self._hold is not None and not self._hold.taken
+        """Whether readings are held back, or on trial."""
+        return self._hold is not None or self._trial is not None
 
     def memory_now(self, frozen: bool = False) -> FloatArray:
         """(m,) hysteresis memory of a stage that is where the last sample saw it, or must be by its voltage.
@@ -190,8 +370,11 @@ class Front:
         ``frozen`` : for a model in the frame that learning began with.
         """
         assert self.track is not None
-        if self._hold is not None and self.holds and not frozen:
-            return self._hold.bridge.memory.copy()
+        reckoned = self._hold or self._trial
+        # The model of the beginning, in a frame of its own, has a memory of its own; while readings are in doubt the
+        # reckoned one is the better.
+        if reckoned is not None and (not frozen or self._trial is not None):
+            return reckoned.reckoning.memory.copy()
         return self.track.memory_now(frozen)
 
     # ---- what it teaches
@@ -201,6 +384,12 @@ class Front:
         assert self.track is not None
         self.gates.since_start += 1
         self.gates.since_jump += 1
+        self._calm += 1
+        for past in self._pasts:
+            past.u_V.append(step.u_V)
+        if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
+            # A stage at rest shows nothing: the place is as good as it was.
+            self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
         return self.track.advance(step)
 
     def to_base_frame(self) -> None:
@@ -221,6 +410,27 @@ class Front:
         if self.track is not None and not self.on_probation:
             self.track.creep(by_um)
 
+    def follow(self, pair: Pair, p_V: float, since_s: float) -> bool:
+        """Ask of one pair whether the readings follow the drive.
+
+        ``p_V`` : what the identified model asks for there. ``since_s`` : time since the last that was asked, s.
+        Returns whether they do not; they are to be distrusted then.
+        """
+        track, self.confirmed = self.track, False
+        assert track is not None
+        if not self._tells:
+            return False
+        if track.features is not track.served:
+            # Motion from before a jump, and from after it: together they follow nothing.
+            self._forget()
+            return False
+        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
+        self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
+        if self.confirmed:
+            self.following.good = 0
+            self._pasts = [*self._pasts[-1:], Past.of(track)]
+        return fault
+
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0
@@ -230,13 +440,25 @@ class Front:
 
     def state_dict(self) -> StateDict:
         """All of the state under flat names."""
-        state = parts_to_state(self.gates, self.track, self._hold, self._before)
-        state |= {"heard": self._heard.array(), "lost": self._lost, "jump_um": self._jump_um}
+        state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
+        for i, past in enumerate(self._pasts):
+            state |= prefixed(f"past{i}.", past.state_dict())
+        state |= {
+            "heard": self._heard.array(),
+            "lost": self._lost,
+            "jump_um": self._jump_um,
+            "calm": self._calm,
+            "trials": self.trials,
+        }
         return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
 
     def restore(self, state: StateDict) -> None:
         """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        self.gates, self.track, self._hold, self._before = parts_of(self.smoother, self.base.features, state)
+        parts = parts_of(self.smoother, self.base, state)
+        self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
+        pasts = (under(f"past{i}.", state) for i in range(2))
+        self._pasts = [Past.from_state(values) for values in pasts if values]
         self._heard.restore(state["heard"])
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
+        self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from adaptive.admission import AdmissionState
-from adaptive.surprise import MOST_BRIDGED
+from adaptive.hypotheses import MOST_BRIDGED
 from adaptive.types import FloatArray, Sample
 
 #: Samples without a reading whose voltages are kept.

@@ -23,6 +23,9 @@ from adaptive.track import Pair
 from adaptive.types import FloatArray, Sample, StateDict
 from adaptive.window_data import Hyperparameters, WindowData
 
+#: Troubles of the model, after which the identified one is served.
+RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
+
 __all__ = ["Hyperparameters", "Learner", "LearnerConfig", "WindowData"]
 
 
@@ -70,10 +73,10 @@ class Learner:
     def take_place_of(self, other: Learner) -> None:
         """Go on where ``other`` is, with what this one knows: after samples that ``other`` should not have believed.
 
-        Where the stage is and has been ``other`` knows still, unless it lost it or took a jump that this one has not.
+        Where the stage is and has been ``other`` knows still, and in what frame its readings are.
         """
         mine, its = self.parts.front, other.parts.front
-        if its.track is None or (its.restarts, its.jumps, its.undone) != (mine.restarts, mine.jumps, mine.undone):
+        if its.track is None:
             self.resync()
             return
         mine.restore(its.state_dict())
@@ -81,12 +84,14 @@ class Learner:
     def _handle(self, sample: Sample) -> str:
         parts, front = self.parts, self.parts.front
         front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
-        taken = front.take(sample, self.parts.voltage)
+        taken = front.take(sample, self.snapshot)
         if taken.undone:
             parts.undo_jump()
+        elif taken.distrusted:
+            parts.go_back()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, fresh=not taken.undone)
-        if taken.undone or taken.jump_um:
+        if taken.undone or taken.jump_um or taken.distrusted or taken.renamed:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
@@ -107,36 +112,72 @@ class Learner:
         if not pair.good:
             return admission.GLITCH
         refused = check_pair(c.admission, pair.u_V, pair.u_before_V, pair.y_um)
-        if refused:
+        # A saturated sample teaches nothing, but it tells where the stage is, and so whether the model is right.
+        if refused and refused != admission.SATURATED:
             return refused
         filter_due, window_due = pair.now % c.filter_every == 0, pair.now % c.learn_every == 0
         if not (filter_due or window_due):
-            return admission.PASSED
+            return refused or admission.PASSED
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
         track.features.fill(*motion, track.memory, self._basis, parts.point)
         rest = front.rests(pair.y_um)
         a_share = pair.a_um_per_s2 / self.base.features.a_scale_um_per_s2
         weight = c.weights.of(pair.near_bad, front.on_probation, a_share)
-        outcome = admission.PASSED
+        outcome = refused or admission.PASSED
         if filter_due:
             target = pair.u_V - parts.window.mean(parts.point)
             beta = parts.filter.beta
             if not np.isfinite(target):
                 return admission.NUMERICS
             self.base.features.fill(*motion, track.frozen_memory, self._frozen_basis, self._frozen_kernel)
-            frozen_error_V = pair.u_V - self.base.mean(self._frozen_basis, self._frozen_kernel)
-            parts.judge(target - float(self._basis @ parts.delay.push(beta)), frozen_error_V)
+            frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
+            served_V = float(self._basis @ parts.delay.push(beta))
+            parts.judge(target - served_V, pair.u_V - frozen_V)
+            if pair.now % parts.check_every == 0:
+                found = self._check(pair, beta, target, frozen_V, bool(refused))
+                if found:
+                    return found
+            if refused:
+                self._cache = None
+                return refused
             if self._frozen:
                 return admission.FROZEN
             if not parts.follow(self._basis, target, pair.u_V, weight, rest):
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
+        if refused:
+            return refused
         if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis @ parts.filter.beta), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
             parts.widen_domain(motion)
         self._cache = None
         return outcome
+
+    def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
+        """Now and then: is the model inside its envelope, does the sensor follow? Returns why nothing may be taught."""
+        parts, front = self.parts, self.parts.front
+        parts.watch_shape(pair.u_V - target_V + float(self._basis @ beta) - float(self._basis @ self.base.beta))
+        parts.watch_rail(saturated)
+        if saturated or not front.follow(pair, frozen_V, parts.check_s):
+            if front.confirmed:
+                parts.confirm()
+            return ""
+        parts.go_back()
+        self._cache = None
+        front.distrust(self.snapshot)
+        return admission.UNTRUSTED
+
+    @property
+    def trouble(self) -> str:
+        """Name of what keeps the learner from learning, "" while nothing does.
+
+        Of the sensor: ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope``.
+        ``rail`` : the voltage was at a limit although the model was wrong there. ``model_left_envelope`` : what was
+        learnt was further from the identified model than a stage can be. In both the identified model is served.
+        """
+        parts = self.parts
+        return parts.front.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
 
     # ---- snapshots out
 

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 from adaptive.admission import AdmissionConfig
 from adaptive.drift import DriftConfig
+from adaptive.envelope import EnvelopeConfig
 from adaptive.errors import InputError
 from adaptive.residual import Eviction
 from adaptive.smoothing import SmootherConfig
@@ -28,7 +29,7 @@ class LearnerConfig:
     fallback_floor : share of the voltage span by which the learner may be worse than the model it started from before
     that one is served in its stead.
     creep_s : time within which what the constant takes up at rest goes over to the frame, s; 0: it stays (``rest``).
-    weights : how much doubtful and old samples count.
+    weights : how much doubtful and old samples count. envelope : what the stage can become.
     """
 
     window: int = 500
@@ -46,6 +47,7 @@ class LearnerConfig:
     drift: DriftConfig = field(default_factory=DriftConfig)
     weights: WeightConfig = field(default_factory=WeightConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
+    envelope: EnvelopeConfig = field(default_factory=EnvelopeConfig)
 
     def __post_init__(self) -> None:
         if self.window < 10:
@@ -67,7 +69,7 @@ class LearnerConfig:
 
     def state_dict(self) -> StateDict:
         """All fields under flat names."""
-        names = ("admission", "drift", "weights", "solver")
+        names = ("admission", "drift", "weights", "solver", "envelope")
         parts = {name: asdict(getattr(self, name)) for name in names}
         flat = joined(parts)
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
@@ -83,6 +85,7 @@ class LearnerConfig:
             drift=DriftConfig(**under("drift.", values)),
             weights=WeightConfig(**under("weights.", values)),
             solver=SolverConfig(**under("solver.", values)),
+            envelope=EnvelopeConfig(**under("envelope.", values)),
         )
 
     def smoother(self, dt_s: float) -> SmootherConfig:

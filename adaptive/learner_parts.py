@@ -12,6 +12,8 @@ from adaptive.errors import ModelFileError
 from adaptive.front import Front
 from adaptive.judgement import Delay, Judgement
 from adaptive.learner_config import LearnerConfig
+from adaptive.levels import level_of
+from adaptive.reckoning import Reckoning, drive_V
 from adaptive.residual import ResidualWindow
 from adaptive.rest import Rest
 from adaptive.snapshot import LssvmInverse
@@ -19,7 +21,7 @@ from adaptive.state import joined, under
 from adaptive.types import FloatArray, StateDict
 
 #: Names of what is counted beside the samples.
-EVENTS = ("fallbacks", "rollbacks", "adoptions", "adoptions_refused")
+EVENTS = ("fallbacks", "rollbacks", "distrusts", "begun_again", "adoptions", "adoptions_refused")
 
 #: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
 #: well, its estimate is marked this often, s.
@@ -27,6 +29,12 @@ ROLLBACK_S, MARK_S = 0.5, 1.0
 
 #: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
 JUMP_DOUBT = 0.3
+#: Time between two looks at the envelope, the rails and the sensor, s; a step of the filter at least.
+CHECK_S = 0.004
+#: A voltage at a limit for this long, s, where the model is wrong by this share of the span, is the model's doing.
+RAIL_S, RAIL_SHARE = 0.1, 0.05
+#: Time inside the envelope after which a model that had left it is no trouble any more, s.
+LEFT_S = 1.0
 
 Mark = tuple[FloatArray, FloatArray]
 
@@ -40,6 +48,12 @@ class Parts:
     rest : what a rest has taught. judgement, delay : errors at the age of serving.
     domain : (6,) learnt range, as of the snapshot.
     point : (d,) kernel inputs of the last instant that was due to teach, NaN before any.
+    first : the filter's estimate of the identified model.
+    check_every, check_s : samples between two looks at envelope, rails and sensor, and the time between them, s.
+    allowed_V : by how much the model may leave the identified linear part, V; 0 for no bound.
+    left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
+    rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
+    confirmed : estimates from before readings that certainly followed the drive, the older one first.
     mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
     some of what went wrong. counters : samples by outcome. events : by name.
     """
@@ -51,22 +65,29 @@ class Parts:
         covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
         step_s = config.filter_every * base.dt_s
         self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
+        self.first = self.filter.mark()
         self.window = ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark: Mark = self.filter.mark()
         self.next_mark: Mark = self.mark
         self.jump_mark: Mark = self.mark
+        self.confirmed: tuple[Mark, Mark] = (self.mark, self.mark)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
         self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
         self.rest = Rest()
         self.delay = Delay(round(config.serving_age_s / step_s))
+        steps = max(1, round(CHECK_S / self.filter.step_s))
+        self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
+        # A model without a linear part has nothing that the kernel could be held to; what the kernel of the identified
+        # one adds to its linear part is allowed beside the bound.
+        self.allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
+        self.rail_s = 0.0
+        self.railed = False
+        self.left_s = 0.0
+        self.left = False
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
-
-    def voltage(self, basis: FloatArray, kernel: FloatArray) -> float:
-        """What the learnt model asks for, V, at basis (p,) and kernel inputs (d,)."""
-        return float(basis @ self.filter.beta) + self.window.mean(kernel)
 
     def expect_change(self) -> None:
         """The stage has changed: the filter follows faster, and what the window has from before will count less."""
@@ -117,12 +138,65 @@ class Parts:
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
 
+    def watch_rail(self, saturated: bool) -> None:
+        """After ``judge``: a voltage that stays at a limit by the model's fault ends in the identified model.
+
+        ``railed`` is True from then until the voltage has been off the limits for as long.
+        """
+        limit_V = RAIL_SHARE * self.filter.span_V
+        step_s = self.check_s
+        if saturated:
+            self.rail_s = min(max(self.rail_s, 0.0) + step_s, RAIL_S)
+            if self.rail_s >= RAIL_S and self.judgement.short_V2 > limit_V * limit_V and not self.railed:
+                self.railed = True
+                self.begin_again()
+        else:
+            self.rail_s = max(min(self.rail_s, 0.0) - step_s, -RAIL_S)
+            self.railed = self.railed and self.rail_s > -RAIL_S
+
+    def watch_shape(self, away_V: float) -> None:
+        """How far the model is from the identified linear part, V. One that stays outside ends in the identified one.
+
+        ``left`` is True from then until it has been inside for a second.
+        """
+        step_s = self.check_s
+        if self.allowed_V and abs(away_V) > self.allowed_V:
+            self.left_s = max(self.left_s, 0.0) + step_s
+            if self.left_s >= RAIL_S:
+                self.left, self.left_s = True, 0.0
+                self.begin_again()
+        else:
+            self.left_s = max(min(self.left_s, 0.0) - step_s, -LEFT_S)
+            self.left = self.left and self.left_s > -LEFT_S
+
+    def confirm(self) -> None:
+        """The readings follow the drive: what was learnt from those before them is right."""
+        self.confirmed = (self.confirmed[1], self.filter.mark())
+
+    def go_back(self) -> None:
+        """The readings do not follow the drive: forget what was learnt since they certainly did."""
+        self.filter.restore(self.confirmed[0])
+        self.window.keep()
+        self.events["distrusts"] += 1
+
+    def begin_again(self) -> None:
+        """Forget all that was learnt: the identified model is the one that is known to be right."""
+        base, c = self.front.base, self.config
+        self.front.to_base_frame()
+        self.filter.go_back(self.first)
+        self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
+        self.mark = self.next_mark = self.jump_mark = self.filter.mark()
+        self.confirmed = (self.mark, self.mark)
+        self.domain = base.domain.copy()
+        self.events["begun_again"] += 1
+
     def take_jump(self, jump_um: float, fresh: bool) -> None:
         """The reading has jumped by so much, µm; ``fresh`` : and did not only undo a jump."""
         front = self.front
         self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / front.range_um * front.base.span_V) ** 2
         if fresh:
             self.jump_mark = self.filter.mark()
+        self.confirmed = (self.filter.mark(),) * 2
 
     def undo_jump(self) -> None:
         """Forget what was learnt since the jump: it was learnt of a stage that never was."""
@@ -138,7 +212,7 @@ class Parts:
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part, now, in its marks, and as it was served."""
         self.filter.shift_constant(by_V)
-        for beta, _ in {id(m): m for m in (self.mark, self.next_mark, self.jump_mark)}.values():
+        for beta, _ in {id(m): m for m in (self.mark, self.next_mark, self.jump_mark, *self.confirmed)}.values():
             beta[0] += by_V
         self.delay.shift(by_V)
 
@@ -146,8 +220,9 @@ class Parts:
 def model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
     """What is learnt, as an immutable model; the identified one while learning is worse than it."""
     j, window, seq = parts.judgement, parts.window, parts.front.gates.seq
+    valid = j.valid and not parts.front.fault
     if j.fallback:
-        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=j.valid)
+        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
     support, alpha, bias = window.arrays()
     beta = parts.filter.beta
     beta[0] += bias
@@ -164,7 +239,9 @@ def model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
         kernel_variance=window.kernel_variance,
         beta_covariance=np.empty((0, 0)),
         seq=seq,
-        valid=j.valid,
+        valid=valid,
+        anchor=base.beta if parts.allowed_V else np.empty(0),
+        allowed_V=parts.allowed_V,
     )
 
 
@@ -178,7 +255,12 @@ def warm(base: LssvmInverse, config: LearnerConfig) -> None:
     if len(window) < config.window:
         window.learn(10.0 + np.zeros_like(kernel), 0.0)
     window.learn(window.arrays()[0][0], 0.0)
-    parts.voltage(basis, kernel)
+    y = base.features.y_rest_um
+    readings = np.array([y, y])
+    reckoning = Reckoning.begin(base, (y, 0.0, 0.0), 0.0, np.zeros(2), readings, base.rest_memory(y))
+    reckoning.advance(0.0)
+    for drifts in (False, True):
+        level_of(np.arange(8.0) % 3.0, 1.0, drifts)
     window.with_hyperparameters(window.hyper).newest_error_V(1)
     for moving in (True, False):
         parts.filter.update(basis, 0.0, moving)
@@ -201,6 +283,8 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
         "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
         "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
+        "confirmed0": {"beta": parts.confirmed[0][0].copy(), "covariance": parts.confirmed[0][1].copy()},
+        "confirmed1": {"beta": parts.confirmed[1][0].copy(), "covariance": parts.confirmed[1][1].copy()},
     }
     state = joined(groups)
     return state | {
@@ -208,6 +292,10 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "point": parts.point.copy(),
         "delay": parts.delay.array(),
         "frozen": frozen,
+        "rail_s": parts.rail_s,
+        "railed": parts.railed,
+        "left_s": parts.left_s,
+        "left": parts.left,
     }
 
 
@@ -226,9 +314,13 @@ def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool
         parts.events |= {key: int(value) for key, value in under("events.", state).items()}
         parts.domain = np.array(state["domain"], dtype=np.float64)
         parts.point = np.array(state["point"], dtype=np.float64)
+        parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
+        parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
         parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
         parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
+        kept = [under(f"confirmed{i}.", state) for i in range(2)]
+        parts.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (parts.mark, parts.next_mark)
         return base, config, parts, bool(state["frozen"])
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFileError(

@@ -20,6 +20,7 @@ def counters(learner: Learner) -> dict[str, int]:
         "restarts": parts.front.restarts,
         "jumps": parts.front.jumps,
         "jumps_undone": parts.front.undone,
+        "trials": parts.front.trials,
         **parts.events,
     }
     return {

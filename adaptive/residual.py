@@ -70,6 +70,12 @@ class ResidualWindow:
         return len(self._window)
 
     @property
+    def reach_V(self) -> float:
+        """Largest size of the kernel part at the samples of a window that was just made from a model, V."""
+        window, gamma = self._window, self._config.gamma
+        return float(np.max(np.abs(window.y - window.alpha / gamma), initial=0.0))
+
+    @property
     def residual_V(self) -> float:
         """Worst row residual of the last round over all rows, V."""
         return self._window.round_residual

@@ -19,7 +19,7 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.snapshot_loops import evaluate_packed, evaluate_point, mean_of, track_memory
 from adaptive.state import prefixed, under
-from adaptive.types import Feedforward, FloatArray, StateDict
+from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from adaptive.window_state import IntArray
 
 #: Share of the learnt range by which a point may lie outside and still count as inside.
@@ -43,6 +43,8 @@ class LssvmInverse:
     span_V : voltage range of the recording it was identified from, V.
     seq : sequence number of the last sample that it has seen, -1 for none.
     valid : whether the learner vouches for it.
+    anchor, allowed_V : (p,) linear part of the identified model, or (0,), and by how much the voltage may leave what it
+    asks for, V: whatever was learnt, no answer is further from what was identified.
     """
 
     name: str
@@ -59,6 +61,8 @@ class LssvmInverse:
     span_V: float = 1.0
     seq: int = -1
     valid: bool = True
+    anchor: FloatArray = field(default_factory=lambda: np.empty(0))
+    allowed_V: float = 0.0
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
     _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
     #: All that `evaluate_packed` needs.
@@ -76,11 +80,16 @@ class LssvmInverse:
             object.__setattr__(self, name, value)
         # What is stated as a deviation is the root of these.
         positive = ("gamma", "span_V")
-        for name in (*positive, "noise_variance", "kernel_variance"):
+        for name in (*positive, "noise_variance", "kernel_variance", "allowed_V"):
             number = float(getattr(self, name))
             if not math.isfinite(number) or number < 0.0 or (number == 0.0 and name in positive):
                 expected = "above" if name in positive else "of at least"
                 raise InputError(f"{name}: got {number}, expected a finite number {expected} 0")
+        anchor = np.array(self.anchor, dtype=np.float64)
+        if anchor.shape not in ((0,), (p,)) or not np.all(np.isfinite(anchor)):
+            raise InputError(f"anchor: got shape {anchor.shape}, expected ({p},) finite numbers, or (0,)")
+        anchor.flags.writeable = False
+        object.__setattr__(self, "anchor", anchor)
         covariance = np.array(self.beta_covariance, dtype=np.float64)
         if covariance.shape not in ((0, 0), (p, p)):
             raise InputError(f"beta_covariance: got shape {covariance.shape}, expected ({p}, {p}) or (0, 0)")
@@ -93,12 +102,14 @@ class LssvmInverse:
         spans = np.repeat(self.domain[1::2] - self.domain[::2], 2) * DOMAIN_MARGIN
         margins = self.domain + spans * np.array([-1.0, 1.0] * 3)
         m = self.features.arrays
-        scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma))
+        scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma), self.allowed_V)
         parts = (m.frame, scalars, margins, m.scale, m.thresholds, m.arcs, m.retain, self.beta, 1.0 / self.widths,
-                 self.alpha, scaled.ravel(), covariance.ravel())  # fmt: skip
+                 self.alpha, scaled.ravel(), covariance.ravel(), anchor)  # fmt: skip
         object.__setattr__(self, "_constants", np.concatenate(parts))
         sizes = [m.thresholds.size, m.arcs.size, m.retain.size, p, d, n, covariance.shape[0]]
-        object.__setattr__(self, "_counts", np.array([*sizes, *m.flags, *m.kernel_plays], dtype=np.int64))
+        object.__setattr__(
+            self, "_counts", np.array([*sizes, *m.flags, anchor.size > 0, *m.kernel_plays], dtype=np.int64)
+        )
 
     @property
     def dt_s(self) -> float:
@@ -142,6 +153,15 @@ class LssvmInverse:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
         return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
 
+    def at_bound(self, y_um: FloatArray, u_V: FloatArray) -> BoolArray:
+        """(n,) whether the voltages, (n,) V, that it gave for (n,) places at rest are held by ``allowed_V``."""
+        if not self.anchor.size:
+            return np.zeros(y_um.size, dtype=np.bool_)
+        still = np.zeros(y_um.size)
+        basis, _, _ = self.features.run(y_um, still, still, self.rest_memory(float(y_um[0])))
+        held: BoolArray = np.abs(u_V - basis @ self.anchor) >= (1.0 - 1e-9) * self.allowed_V
+        return held
+
     def track(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
     ) -> FloatArray:
@@ -181,9 +201,9 @@ class LssvmInverse:
         """Flat names to arrays and JSON scalars; ``from_state`` builds an equal model."""
         state: StateDict = {"kind": "lssvm", "name": self.name, "gamma": self.gamma}
         state |= prefixed("features.", self.features.state_dict())
-        for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance"):
+        for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance", "anchor"):
             state[name] = getattr(self, name).copy()
-        for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid"):
+        for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid", "allowed_V"):
             state[name] = getattr(self, name)
         return state
 
@@ -200,6 +220,9 @@ class LssvmInverse:
                 span_V=float(state["span_V"]),
                 seq=int(state["seq"]),
                 valid=bool(state["valid"]),
+                # Files from before there was a bound have none.
+                anchor=np.asarray(state.get("anchor", ()), dtype=np.float64),
+                allowed_V=float(state.get("allowed_V", 0.0)),
                 **{name: np.asarray(state[name], dtype=np.float64) for name in
                    ("beta", "support", "alpha", "widths", "domain", "beta_covariance")},
             )  # fmt: skip

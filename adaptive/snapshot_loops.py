@@ -47,11 +47,16 @@ def evaluate(
     kernel_variance: float,
     shrink: float,
     domain: FloatArray,
+    anchor: FloatArray,
+    allowed: float,
     u: FloatArray,
     std: FloatArray,
     inside: BoolArray,
 ) -> None:  # pragma: no cover - compiled
-    """Voltages, deviations and domain flags of n points; ``memory`` advances in place."""
+    """Voltages, deviations and domain flags of n points; ``memory`` advances in place.
+
+    ``anchor`` (p,) or (0,): linear part that the voltage leaves by ``allowed``, V, at most.
+    """
     n = y.shape[0]
     d, count = scaled.shape
     p = beta.shape[0]
@@ -71,9 +76,37 @@ def evaluate(
             rbf_column(scaled, count, x, k, bits)
             kernel_part, nearest = weigh(k, alpha)
             mean += kernel_part
+        if anchor.shape[0] > 0:
+            known = dot(anchor, basis, p)
+            mean = min(max(mean, known - allowed), known + allowed)
         u[i] = mean
         std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
         inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def unpacked(
+    constants: FloatArray, counts: IntArray
+) -> tuple[FeatureArrays, FloatArray, FloatArray, FloatArray, FloatArray, int]:  # pragma: no cover - compiled
+    """(feature map, beta (p,), 1/widths (d,), alpha (n,), scaled support (d, n), place of what follows); views."""
+    K, A, M, p, d, n = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5]
+    at = 17
+    thresholds = constants[at : at + K]
+    at += K
+    arcs = constants[at : at + A]
+    at += A
+    retain = constants[at : at + M]
+    at += M
+    beta = constants[at : at + p]
+    at += p
+    inverse_widths = constants[at : at + d]
+    at += d
+    alpha = constants[at : at + n]
+    at += n
+    scaled = constants[at : at + d * n].reshape(d, n)
+    at += d * n
+    m = FeatureArrays(thresholds, arcs, retain, constants[13:17], counts[10:], counts[7:9], constants[0:3])
+    return m, beta, inverse_widths, alpha, scaled, at
 
 
 @compiled
@@ -92,29 +125,37 @@ def evaluate_packed(
 
     Twenty arrays cost more to hand over than one point costs to work out, and are twenty places in memory to fetch.
     """
-    K, A, M, p, d, n, c = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5], counts[6]
-    frame, scalars, domain, scale = constants[0:3], constants[3:6], constants[6:12], constants[12:16]
-    at = 16
-    thresholds = constants[at : at + K]
-    at += K
-    arcs = constants[at : at + A]
-    at += A
-    retain = constants[at : at + M]
-    at += M
-    beta = constants[at : at + p]
-    at += p
-    inverse_widths = constants[at : at + d]
-    at += d
-    alpha = constants[at : at + n]
-    at += n
-    scaled = constants[at : at + d * n].reshape(d, n)
-    at += d * n
+    m, beta, inverse_widths, alpha, scaled, at = unpacked(constants, counts)
+    c, p = counts[6], beta.shape[0]
     covariance = constants[at : at + c * c].reshape(c, c)
-    m = FeatureArrays(thresholds, arcs, retain, scale, counts[9:], counts[7:9], frame)
+    at += c * c
+    anchor = constants[at : at + counts[9] * p]
+    scalars, domain = constants[3:7], constants[7:13]
     evaluate(
         y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
-        u, std, inside,
+        anchor, scalars[3], u, std, inside,
     )  # fmt: skip
+
+
+@compiled
+def voltage_of(
+    y: float,
+    v: float,
+    a: float,
+    memory: FloatArray,
+    scratch: FloatArray,
+    m: FeatureArrays,
+    beta: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Voltage at a trial point after ``memory`` (m,), which stays; ``scratch`` (m,) is written to."""
+    scratch[:] = memory
+    advance(y, scratch, m)
+    basis, kernel = np.empty(beta.shape[0]), np.empty(inverse_widths.shape[0])
+    fill(y, v, a, scratch, m, basis, kernel)
+    return mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
 
 
 @compiled

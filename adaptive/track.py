@@ -50,13 +50,48 @@ class Taken:
     """What a sample came to: the gate that refused it or "", and the steps to make.
 
     jump_um : by how much the frame has moved, µm. undone : whether it has gone back to where it was before the last
-    jump, and what was learnt since is to be forgotten.
+    jump, and what was learnt since is to be forgotten. distrusted : whether the readings are on trial from now on;
+    renamed : whether what is wrong with them has got another name, or none.
     """
 
     refused: str
     steps: tuple[Step, ...] = ()
     jump_um: float = 0.0
     undone: bool = False
+    distrusted: bool = False
+    renamed: bool = False
+
+
+@dataclass(slots=True)
+class Past:
+    """A place that the stage is known to have been at, and the voltages since: reckoning can begin from there.
+
+    motion, u_before_V, lag_V, lag_um : as ``Track.since_motion`` gives them. memory : (m,) of that instant.
+    u_V : voltages since.
+    """
+
+    motion: Motion
+    u_before_V: float
+    lag_V: FloatArray
+    lag_um: FloatArray
+    memory: FloatArray
+    u_V: list[float]
+
+    @classmethod
+    def of(cls, track: Track) -> Past:
+        return cls(*track.since_motion(), track.memory.copy(), [])
+
+    def state_dict(self) -> StateDict:
+        values = {"motion": self.motion, "u_before_V": self.u_before_V, "lag_V": self.lag_V, "lag_um": self.lag_um,
+                  "memory": self.memory, "u_V": self.u_V}  # fmt: skip
+        return {name: np.array(value, dtype=np.float64) for name, value in values.items()}
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Past:
+        """Inverse of ``state_dict``."""
+        y, v, a = (float(x) for x in values["motion"])
+        lag_V, lag_um, memory = (np.array(values[name], dtype=np.float64) for name in ("lag_V", "lag_um", "memory"))
+        return cls((y, v, a), float(values["u_before_V"]), lag_V, lag_um, memory, [float(u) for u in values["u_V"]])
 
 
 @dataclass(slots=True)
@@ -115,10 +150,10 @@ class Track:
             self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion, self.switch,
         )  # fmt: skip
 
-    def move(self, served: FeatureMap, ratio: float, shift_um: float) -> None:
-        """A jump: the smoother goes on at another place, y <- offset + ratio (y - offset) + shift, in a new frame."""
-        self.state.x *= ratio
-        self.state.x[0] += (1.0 - ratio) * self.served.offset_um + shift_um
+    def move(self, served: FeatureMap, slope: float, shift_um: float) -> None:
+        """A jump: the smoother goes on at another place, y <- slope y + shift, in a new frame."""
+        self.state.x *= slope
+        self.state.x[0] += shift_um
         self.served, self.switch = served, self.state.count + self.lag
 
     def creep(self, by_um: float) -> None:
@@ -156,14 +191,32 @@ class Track:
         slots = self.good.shape[0]
         self.good[np.arange(self.state.count - min(n, slots), self.state.count) % slots] = False
 
-    def since_motion(self) -> tuple[Motion, FloatArray, FloatArray]:
-        """The last smoothed motion, in the frame that is served, and (lag,) voltages and readings since then."""
+    def steps_over_lag(self, y_um: float) -> tuple[float, float]:
+        """By how much the voltage, V, and with a next reading ``y_um`` the readings, µm, have moved over the lag."""
+        slots, last = self.u_V.shape[0], self.state.count - 1
+        first = last - self.lag
+        return float(self.u_V[last % slots] - self.u_V[first % slots]), y_um - float(self.y_um[(first + 1) % slots])
+
+    def since_motion(self) -> tuple[Motion, float, FloatArray, FloatArray]:
+        """The last smoothed motion, in the frame that is served, its voltage, and (lag,) voltages and readings since.
+
+        The readings are as they came; just after a jump, those from before it are moved to where they would be now.
+        """
         assert self.motion is not None
-        past = np.arange(self.state.count - self.lag, self.state.count) % self.u_V.shape[0]
+        slots = self.u_V.shape[0]
+        numbers = np.arange(self.state.count - self.lag, self.state.count)
+        past = numbers % slots
+        u_before_V = float(self.u_V[(self.state.count - self.lag - 1) % slots])
         f, g = self.features, self.served
         y, v, a = self.motion
         # Just after a jump the smoothed instants are still in the frame from before it.
-        return (g.offset_um + g.gain / f.gain * (y - f.offset_um), v, a), self.u_V[past], self.y_um[past]
+        ratio = g.gain / f.gain
+        y_um = self.y_um[past]
+        if f is not g:
+            early = numbers < self.switch - self.lag
+            y_um[early] = g.offset_um + ratio * (y_um[early] - f.offset_um)
+        motion = g.offset_um + ratio * (y - f.offset_um), ratio * v, ratio * a
+        return motion, u_before_V, self.u_V[past], y_um
 
     def memory_now(self, frozen: bool) -> FloatArray:
         """(m,) hysteresis memory after the last step: the smoothed one, carried along the readings since.

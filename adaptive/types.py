@@ -87,6 +87,16 @@ class Sample:
     y_um: float
 
 
+@runtime_checkable
+class SelfWatching(Protocol):
+    """An online model that knows when its samples are not fit to learn from, and says so."""
+
+    @property
+    def trouble(self) -> str:
+        """Name of what is wrong, "" while nothing is."""
+        ...
+
+
 class OnlineModel(Protocol):
     """A model that learns sample by sample; the learner and all adaptive baselines are of this kind.
 

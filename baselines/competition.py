@@ -15,7 +15,7 @@ from typing import Any
 
 from adaptive.errors import InputError
 from adaptive.learner import Hyperparameters
-from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import InverseModel, OnlineModel, Sample, SelfWatching, StateDict
 from baselines import competition_report
 from baselines.champion import ChampionInverse
 from baselines.competition_state import made_of, to_state
@@ -84,6 +84,12 @@ class Competition:
     def champion(self) -> str:
         """Name of the contestant that is served."""
         return self.names[self._serving.champion]
+
+    @property
+    def trouble(self) -> str:
+        """What the favourite says is wrong with the samples, "" while nothing is."""
+        favourite = self.favourite
+        return favourite.trouble if isinstance(favourite, SelfWatching) else ""
 
     @property
     def seq(self) -> int:

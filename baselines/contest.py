@@ -21,7 +21,8 @@ from baselines.contest_config import CompetitionConfig
 
 #: Verdicts on a sample that speak against scoring the pair.
 NOT_SCORED: Final = frozenset(
-    {admission.GLITCH, admission.SATURATED, admission.OUT_OF_RANGE, admission.SETTLING, admission.GAP}
+    {admission.GLITCH, admission.RINGING, admission.UNTRUSTED, admission.SATURATED}
+    | {admission.OUT_OF_RANGE, admission.SETTLING, admission.GAP}
 )
 #: Sample time up to which ``glitch_share`` holds as it is, s; it grows with longer ones.
 _GLITCH_DT_S = 1e-3

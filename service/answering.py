@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass
 from operator import attrgetter
@@ -83,9 +84,13 @@ def answer(
     if query.pending is not None:
         check_domain(query.pending.y_um, limits, "pending.y_um")
         check_voltages(query.pending.u_V, limits, "pending.u_V")
-    memory = query.memory
+    memory, y_um, v_um_per_s, a_um_per_s2 = query.memory, query.y_um, query.v_um_per_s, query.a_um_per_s2
+    resumes_V = math.nan
     if memory is None:
-        memory = carried(model, served.memories[name], query.pending, served.seq)
+        way, resumed = under_way(query, served.seq, model.dt_s)
+        memory = carried(model, served.memories[name], way)
+        if resumed is not None:
+            y_um, v_um_per_s, a_um_per_s2, resumes_V = resumed
     if memory.size != model.memory_size:
         raise FieldError(
             "memory",
@@ -96,12 +101,13 @@ def answer(
     got = answer_safely(
         model,
         memory,
-        (query.y_um, query.v_um_per_s, query.a_um_per_s2),
+        (y_um, v_um_per_s, a_um_per_s2),
         query.u_before_V,
         # What does not learn is as good as ever, whatever the samples are.
         Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
         served.standing_in_for(name),
         blends(name, default, config),
+        resumes_V,
     )
     return FeedforwardReply(
         got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
@@ -109,16 +115,34 @@ def answer(
     )  # fmt: skip
 
 
-def carried(model: InverseModel, memory: FloatArray, pending: Pending | None, seq: int) -> FloatArray:
-    """(m,) memory of ``model`` once what is under way after sample ``seq`` has been done; ``memory`` is not changed."""
-    if pending is None:
+def under_way(
+    query: FeedforwardQuery, seq: int, dt_s: float
+) -> tuple[Pending | None, tuple[FloatArray, FloatArray, FloatArray, float] | None]:
+    """(what is under way after sample ``seq``, how the answer resumes from its last point).
+
+    The last point under way is asked for again, ahead of the points of the query: (n + 1,) displacements, µm,
+    velocities, µm/s, and accelerations, µm/s², and the voltage, V, that was commanded there. What the model asks for
+    there now is another voltage: the difference fades (``service.fallback``), so that a new snapshot is no step. Its
+    velocity is the first point's less a step of its acceleration. None where nothing is under way.
+    """
+    pending = query.pending
+    # What was commanded for samples before the last one seen is long done.
+    if pending is None or pending.first + pending.y_um.size <= seq:
+        return None, None
+    seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size - 1)
+    way = Pending(pending.first + seen, pending.y_um[seen:-1], pending.u_V[seen:-1])
+    y_um = np.concatenate([pending.y_um[-1:], query.y_um])
+    v, a = query.v_um_per_s, query.a_um_per_s2
+    v_um_per_s, a_um_per_s2 = np.concatenate([v[:1] - a[:1] * dt_s, v]), np.concatenate([a[:1], a])
+    return way, (y_um, v_um_per_s, a_um_per_s2, float(pending.u_V[-1]))
+
+
+def carried(model: InverseModel, memory: FloatArray, way: Pending | None) -> FloatArray:
+    """(m,) memory of ``model`` once what is under way has been done; ``memory`` is not changed."""
+    if way is None or not way.y_um.size:
         return memory
-    seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size)
-    y_um, u_V = pending.y_um[seen:], pending.u_V[seen:]
-    if not y_um.size:
-        return memory
-    still = np.zeros(y_um.size)
-    after = model.track(y_um, still, still, u_V, memory)
+    still = np.zeros(way.y_um.size)
+    after = model.track(way.y_um, still, still, way.u_V, memory)
     return after if all_finite(after) else memory
 
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import DehystError
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, SelfWatching, StateDict
 from baselines.champion import ChampionInverse
 from service.answering import Served
 from service.axis_operations import AxisOperations
@@ -61,7 +61,8 @@ class AxisLearning(AxisOperations):
             except (DehystError, ValueError, ArithmeticError) as error:
                 self._failed(f"snapshot: {error}")
         before = self.watch.trouble
-        good = self.watch.judge(candidate, last.models.get(last.stand_in))
+        told = self.learner.trouble if isinstance(self.learner, SelfWatching) and not self._learner_dead else ""
+        good = self.watch.judge(candidate, last.models.get(last.stand_in), told)
         now = self.watch.trouble
         if not now and not before:
             self._mark()

@@ -33,6 +33,8 @@ STATE_SCHEMA: Final = 3
 #: Parts of a learner's state that tell what it is and not what it has learnt: its settings, and of the model that it
 #: began from what no re-tuning changes. They must be those of the present one.
 _FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")
+#: Settings that states from before there were any lack; they had no such bounds.
+_SINCE: Final = re.compile(r"(^|\.)config\.envelope\.")
 
 
 def axis_state(axis: Axis) -> StateDict:
@@ -104,7 +106,7 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
         raise ModelFileError("it holds no learner, but this axis learns")
     own = like.state_dict()
     for name, value in own.items():
-        if not _FIXED.search(name):
+        if not _FIXED.search(name) or (name not in state and _SINCE.search(name)):
             continue
         if name not in state or not _same(value, state[name]):
             what = "setting" if "config." in name else "identified model"

@@ -33,6 +33,11 @@ class Competing:
         return getattr(self.competition, name)
 
     @property
+    def trouble(self) -> str:
+        """What the learner says is wrong with the samples, "" while nothing is."""
+        return self.competition.trouble
+
+    @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self.competition.seq

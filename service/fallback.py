@@ -11,6 +11,7 @@ on. The stand-in is a baseline whose form bounds what it says far from its data.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,9 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.champion import ChampionInverse
 from service.guard import Limits, guard, guarded
 from service.wire_flags import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
+
+#: Time constant with which the difference between two snapshots fades, s.
+FADE_S = 0.006
 
 
 class StandIn(NamedTuple):
@@ -66,12 +70,18 @@ def answer_safely(
     rules: Rules,
     stand_in: StandIn | None,
     blends: bool = True,
+    resumes_V: float = math.nan,
 ) -> Answer:
     """Voltages for (n,) points (y µm, v µm/s, a µm/s²) from ``memory`` (m,) on; never raises.
 
     ``blends``: whether ``model`` is one that gives way to ``stand_in`` outside its domain and by its trust; where not,
     the stand-in serves for what is not finite alone.
+    ``resumes_V``: where finite, the first of the points was commanded already, with this voltage, V, and is not
+    answered again: (n - 1,) come out. What the model asks for more or less there fades with ``FADE_S``, so that no new
+    snapshot steps the voltage: a step would make the stage ring.
     """
+    if math.isfinite(resumes_V):
+        return _resumed(model, memory, points, u_before_V, rules, stand_in, blends, resumes_V)
     forward = _forward(model, points, memory)
     u, std = forward.u_V, forward.std_V
     after_ok = all_finite(forward.memory)
@@ -102,6 +112,26 @@ def answer_safely(
         flags |= STALE
     fallback = not ok or not after_ok or not trusted
     return Answer(safe, std, flags, forward.memory if after_ok else memory, fallback, name)
+
+
+def _resumed(
+    model: InverseModel,
+    memory: FloatArray,
+    points: tuple[FloatArray, FloatArray, FloatArray],
+    u_before_V: float,
+    rules: Rules,
+    stand_in: StandIn | None,
+    blends: bool,
+    resumes_V: float,
+) -> Answer:
+    free = rules._replace(limits=replace(rules.limits, slew_V_per_s=math.inf))
+    got = answer_safely(model, memory, points, math.nan, free, stand_in, blends)
+    n = got.u_V.size - 1
+    fade = np.exp(-np.arange(1, n + 1) * (model.dt_s / FADE_S))
+    limits, marks = rules.limits, got.flags[1:]
+    u_V = got.u_V[1:] + (resumes_V - got.u_V[0]) * fade
+    safe, flags = guard(u_V, (marks & OUTSIDE_DOMAIN) == 0, model.dt_s, limits, u_before_V)
+    return got._replace(u_V=safe, std_V=got.std_V[1:], flags=flags | marks)
 
 
 def domain_weight(

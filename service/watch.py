@@ -7,9 +7,14 @@ Trouble has a name, begins and ends with hysteresis, and ends by itself:
 - ``samples_poisoned``: most samples of the last while were refused for their values.
 - ``model_bad``: the newest model is not finite, or far from every other, at places all over the range.
 - ``learner_failed``: the learner raised; another is begun from the last good model after a while.
+- ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope``: the learner says that the
+  readings do not follow the drive as this stage's can (``adaptive.trial``).
+- ``rail``, ``model_left_envelope``: the voltage was at a limit because the model was wrong, or the model had left what
+  a stage can become; the learner has begun again from the identified one.
 
-During the first two the learner is frozen and the model from before the trouble is served; during the others the last
-that passed. What was served for too long without being renewed gives way, over a ramp, to the baseline.
+During the first two and what the sensor has, the learner is frozen and the model from before the trouble is served;
+where the learner has begun again, the identified one, during the others the last that passed. What was served for too
+long without being renewed gives way, over a ramp, to the baseline.
 """
 
 from __future__ import annotations
@@ -20,6 +25,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from adaptive.learner import MODEL_LEFT_ENVELOPE, RAIL
+from adaptive.snapshot import LssvmInverse
+from adaptive.trial import SENSOR_FAULTS
 from adaptive.types import FloatArray, InverseModel
 from service.guard import Limits
 
@@ -27,8 +35,10 @@ SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"
 MODEL_BAD: Final = "model_bad"
 LEARNER_FAILED: Final = "learner_failed"
+#: After these the learner has begun again: the model from before is what was wrong.
+BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
 #: During these the learner is not to be taught.
-POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED})
+POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
 #: Refusals that speak of the values themselves; a stage at rest or out of sequence is no poison.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
 _PROBES: Final = 9
@@ -110,15 +120,19 @@ class Watch:
             return SENSOR_FROZEN
         return ""
 
-    def judge(self, candidate: InverseModel | None, baseline: InverseModel | None) -> InverseModel | None:
+    def judge(
+        self, candidate: InverseModel | None, baseline: InverseModel | None, told: str = ""
+    ) -> InverseModel | None:
         """The model to serve, of ``candidate`` (None: the learner failed) and those before; None: nothing but what is.
 
-        Call once per snapshot. Sets ``trouble`` and ``trust``.
+        ``told`` : what the learner says is wrong. Call once per snapshot. Sets ``trouble`` and ``trust``.
         """
         n, c = self._n, self.config
         now, elapsed = n["count"], n["count"] - n["seen"]
         n["seen"] = now
-        found = self._samples_say()
+        found = told or self._samples_say()
+        if found in SENSOR_FAULTS and self.trouble in (SENSOR_FROZEN, SAMPLES_POISONED):
+            found = self.trouble  # the same trouble, seen by another
         if not found and candidate is None:
             found = LEARNER_FAILED
         if not found and candidate is not None and candidate is not self._good and not self._sane(candidate, baseline):
@@ -136,6 +150,8 @@ class Watch:
             n["clean"] += elapsed
             if n["clean"] * self._dt_s >= c.recover_s:
                 self.trouble = ""
+        if self.trouble in BEGUN_AGAIN and candidate is not None:
+            self._mark = self._next_mark = self._good = candidate
         if not self.trouble and candidate is not None:
             self._good = candidate
             if (now - n["marked"]) * self._dt_s >= c.mark_s or self._mark is None:
@@ -166,12 +182,15 @@ class Watch:
         if not (math.isfinite(low) and math.isfinite(high)):
             low, high = 0.0, 1.0
             baseline = None
-        u = _at_rest(model, np.linspace(low, high, _PROBES))
+        probes = np.linspace(low, high, _PROBES)
+        u = _at_rest(model, probes)
         if not np.isfinite(u).all():
+            return False
+        if isinstance(model, LssvmInverse) and np.mean(model.at_bound(probes, u)) > 0.5:
             return False
         if baseline is None:
             return True
-        other = _at_rest(baseline, np.linspace(low, high, _PROBES))
+        other = _at_rest(baseline, probes)
         inside = np.isfinite(other)
         return bool((np.abs(u - other)[inside] <= self.config.insane_share * self._span_V).all())
 

@@ -48,16 +48,6 @@ def test_no_file_names_a_machine_path() -> None:
     assert not named
 
 
-def test_no_module_of_the_four_packages_is_longer_than_one_subject_needs() -> None:
-    lengths = {
-        str(path.relative_to(ROOT)): len(path.read_text().splitlines())
-        for package in ("adaptive", "baselines", "service", "sim")
-        for path in (ROOT / package).rglob("*.py")
-    }
-    assert len(lengths) > 200
-    assert not {name: n for name, n in lengths.items() if n > 250}
-
-
 def test_serving_imports_no_torch_and_works_where_it_is_missing() -> None:
     """The whole of what `dehyst serve` and `dehyst demo` import, with torch made unimportable."""
     program = (

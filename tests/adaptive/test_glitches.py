@@ -159,6 +159,8 @@ def test_state_goes_on_to_the_last_bit_while_held_and_on_probation(
 def test_patience_is_configurable(model: LssvmInverse, recording: Recording) -> None:
     u, y = recording[0], recording[1].copy()
     y[AT:] += 2.0
-    learner = Learner.from_model(model, LearnerConfig(admission=AdmissionConfig(glitch_persistence=3)))
-    feed(learner, u, y, 0, AT + 4)
+    learner = Learner.from_model(model, LearnerConfig(admission=AdmissionConfig(glitch_persistence=30)))
+    feed(learner, u, y, 0, AT + 30)
+    assert learner.counters()["jumps"] == 0
+    feed(learner, u, y, AT + 30, AT + 31)
     assert learner.counters()["jumps"] == 1

@@ -45,6 +45,7 @@ def test_the_packed_model_is_the_model(model: LssvmInverse) -> None:
         model,
         replace(model, beta_covariance=spread),
         replace(model, support=model.support[:0], alpha=model.alpha[:0]),
+        replace(model, beta_covariance=spread, anchor=1.1 * model.beta, allowed_V=0.05),
     ):
         memory, n = model.rest_memory(40.0), y.size
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
@@ -52,11 +53,30 @@ def test_the_packed_model_is_the_model(model: LssvmInverse) -> None:
         evaluate(
             y, v, a, memory, one.features.arrays, one.beta, one.beta_covariance,
             np.ascontiguousarray((one.support / one.widths).T), one.alpha, 1.0 / one.widths, one.noise_variance,
-            one.kernel_variance, 1.0 / (1.0 + 1.0 / one.gamma), one.domain + margin, u, std, inside,
+            one.kernel_variance, 1.0 / (1.0 + 1.0 / one.gamma), one.domain + margin, one.anchor, one.allowed_V, u, std,
+            inside,
         )  # fmt: skip
         answer = one.feedforward(y, v, a, model.rest_memory(40.0))
         for got, expected in ((answer.u_V, u), (answer.std_V, std), (answer.inside, inside), (answer.memory, memory)):
             np.testing.assert_array_equal(got, expected)
+
+
+def test_no_answer_leaves_what_was_identified_by_more_than_is_allowed(model: LssvmInverse) -> None:
+    """Whatever the learnt coefficients are; within the bound nothing changes, to the last bit."""
+    y, v, a = points()
+    basis, _, _ = model.features.run(y, v, a, model.rest_memory(40.0))
+    known = basis @ model.beta
+    rng = np.random.default_rng(7)
+    for size in (0.0, 1e-3, 1.0, 1e6):
+        beta = model.beta + size * rng.standard_normal(model.beta.size)
+        free = replace(model, beta=beta)
+        held = replace(free, anchor=model.beta, allowed_V=0.3)
+        u_V, free_V = (one.feedforward(y, v, a, model.rest_memory(40.0)).u_V for one in (held, free))
+        assert np.max(np.abs(u_V - known)) <= 0.3 + 1e-9
+        inside = np.abs(free_V - known) < 0.3 - 1e-9
+        np.testing.assert_array_equal(u_V[inside], free_V[inside])
+        again = LssvmInverse.from_state(held.state_dict())
+        np.testing.assert_array_equal(again.feedforward(y, v, a, model.rest_memory(40.0)).u_V, u_V)
 
 
 def test_a_point_by_itself_is_that_of_the_trajectory(model: LssvmInverse) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from adaptive.admission import AdmissionState, watch_reading
-from adaptive.bridge import Bridge, Bridging
 from adaptive.learner import Learner
 from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, Sample
@@ -87,10 +86,10 @@ def test_who_has_lost_the_place_still_knows_the_turning_points(
     y = wrong("silent", moving[1], at, n)
     y[at + n :] += 6.0
     learner, twin = Learner.from_state(warm[at]), Learner.from_state(warm[at])
-    before = learner.counters()["restarts"]
+    before = learner.counters()["jumps"]
     feed(learner, moving[0], y, at, at + n + 20)
     feed(twin, *moving, at, at + n + 20)
-    assert learner.counters()["restarts"] == before + 1
+    assert learner.counters()["jumps"] == before + 1
     wide = np.array(learner.base.features.thresholds_um) > 8.0
     assert np.count_nonzero(wide) > 3
     off = (learner.memory() - twin.memory())[: wide.size][wide]
@@ -137,7 +136,7 @@ def test_a_jump_that_never_was_is_taken_back_when_the_model_of_the_beginning_is_
     at = 4123
     learner = Learner.from_state(warm[at])
     lied = moving[1].copy()
-    lied[at : at + 150] += 20.0
+    lied[at : at + 150] += 8.0
     feed(learner, moving[0], lied, at, at + 150)
     assert learner.counters()["jumps"] == 1
     feed(learner, *moving, at + 200, at + 2800)
@@ -171,12 +170,3 @@ def test_the_memory_to_serve_with_is_the_one_that_was_learnt_with(
     assert np.max(np.abs(frozen - own)) > 1.5
     untouched = Learner.from_model(learner.base)
     assert untouched.memory_for(untouched.snapshot()) is None
-
-
-def test_a_bridge_does_not_leave_the_world(model: LssvmInverse) -> None:
-    bridging = Bridging(model.features, lambda basis, kernel: -1e6, 0.1)
-    bridge = Bridge(40.0, 39.9, 5.0, model.rest_memory(40.0))
-    for _ in range(500):
-        bridging.advance(bridge, 4.0)
-    assert abs(bridge.y_um) < 1000.0
-    assert np.isfinite(bridge.memory).all()
