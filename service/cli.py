@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     "query": "ask a running service for voltages",
     "replay": "run the learner over a recording, offline, and see what its gates and its errors do",
     "scenarios": "drift of every kind, adapting against not adapting, with a table and pictures",
+    "rehearse": "try the service on a simulated stage of your own, and see what happens when something happens",
     "soak": "run everything under a seeded plan of faults, and judge what must hold",
     "bench": "the solver's speed and accuracy beside its yardsticks and peers, from a checkout",
     "reproduce": "the chapter's tables and figures, computed anew beside its own numbers",

@@ -1,0 +1,1 @@
+"""Stages that share nothing with the project, and what the service does on them."""

@@ -1,0 +1,172 @@
+"""The family of random stages itself: the same by its seed, hysteretic, ringing where it should, and changeable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.rehearsal.plant import Change, Changeable, Plant
+from tests.foreign.plants import (
+    BOUC_WEN,
+    DUHEM,
+    HYSTERESIS,
+    PLAYS,
+    PREISACH,
+    StageFactory,
+    issue_plant,
+    random_plant,
+    with_traits,
+)
+
+
+def of_kind(kind: int) -> StageFactory:
+    """The first stage drawn of a kind, quiet, at 1 kHz, quasi-static."""
+    factory = next(
+        random_plant(seed) for seed in range(200) if random_plant(seed).traits.hysteresis == HYSTERESIS[kind]
+    )
+    return with_traits(
+        factory, dt_s=1e-3, u_min_V=0.0, u_max_V=100.0, range_um=80.0, offset_um=0.0, creep=(), creep_s=(), modes=(),
+        drift_um=0.0, noise_um=0.0, amplifier_s=0.0, bend2=0.0, bend3=0.0,
+    )  # fmt: skip
+
+
+def ringing(share: float = 0.01) -> StageFactory:
+    """An issue's stage with one mode at 200 Hz, without noise and creep."""
+    return with_traits(
+        issue_plant(1), modes=((200.0, share, 1.0),), noise_um=0.0, creep=(), creep_s=(), amplifier_s=0.0, dt_s=5e-4
+    )
+
+
+def triangle(low_V: float, high_V: float, n: int) -> np.ndarray:
+    up = np.linspace(low_V, high_V, n)
+    return np.concatenate([up, up[::-1]])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_seed_makes_the_same_stage_whatever_the_blocks(seed: int) -> None:
+    factory = random_plant(seed)
+    traits = factory.traits
+    one, other = factory(), factory()
+    assert isinstance(one, Plant)
+    assert isinstance(one, Changeable)
+    u_V = traits.u_min_V + (traits.u_max_V - traits.u_min_V) * np.random.default_rng(seed).uniform(size=2000)
+    whole = one.run(u_V)
+    parts = [other.run(part) for part in np.split(u_V, [3, 500, 505, 1999])]
+    for i in range(2):
+        assert np.array_equal(whole[i], np.concatenate([part[i] for part in parts]))
+        assert np.isfinite(whole[i]).all()
+    assert random_plant(seed).traits == traits
+
+
+def test_the_family_has_what_it_is_to_have() -> None:
+    traits = [random_plant(seed).traits for seed in range(300)]
+    assert {t.hysteresis for t in traits} == set(HYSTERESIS)
+    assert {len(t.modes) for t in traits} == {0, 1, 2}
+    assert {round(1.0 / t.dt_s) for t in traits} == {500, 1000, 2000, 5000, 10000}
+    assert {len(t.creep) for t in traits} == {0, 1, 2, 3}
+    assert min(t.range_um for t in traits) < 0.0 < max(t.range_um for t in traits)
+    assert all(1.0 <= abs(t.range_um) <= 500.0 and 0.08 <= t.width <= 0.2 for t in traits)
+    assert all(100.0 <= f <= 1000.0 and 0.005 <= zeta <= 0.3 for t in traits for f, zeta, _ in t.modes)
+    assert all(t.noise_um <= 5e-4 * abs(t.range_um) for t in traits)
+    assert all(t.u_min_V <= t.excite_V[0] < t.excite_V[1] <= t.u_max_V for t in traits)
+
+
+@pytest.mark.parametrize("kind", [PLAYS, PREISACH, BOUC_WEN, DUHEM])
+def test_the_largest_loop_is_as_wide_as_told_and_the_voltage_leads(kind: int) -> None:
+    factory = of_kind(kind)
+    plant = factory()
+    loop = triangle(0.0, 100.0, 20_000)
+    plant.run(loop)
+    true_um, _ = plant.run(loop)
+    up, down = true_um[1:20_000], true_um[20_001:][::-1]
+    gap = down - up
+    assert gap.max() / np.ptp(true_um) == pytest.approx(factory.traits.width, rel=0.05)
+    # It closes at its ends, and nowhere does the way back lie below the way there.
+    assert gap.min() > -1e-3 * np.ptp(true_um)
+    # Higher voltage, higher displacement: the stage can be inverted.
+    assert (np.diff(up) > 0.0).all()
+
+
+@pytest.mark.parametrize("kind", [PLAYS, PREISACH])
+def test_a_minor_loop_closes_and_is_wiped_out(kind: int) -> None:
+    plant = of_kind(kind)()
+    slow = np.concatenate(
+        [triangle(0.0, 100.0, 20_000), np.linspace(0.0, 60.0, 20_000), np.linspace(60.0, 30.0, 20_000)]
+    )
+    plant.run(slow)
+    there, back = np.linspace(30.0, 60.0, 20_000), np.linspace(60.0, 30.0, 20_000)
+    first = plant.run(np.concatenate([there, back]))[0]
+    second = plant.run(np.concatenate([there, back]))[0]
+    # From sample 1 on: the first reading is of the voltage before.
+    assert np.abs(first[1:] - second[1:]).max() < 1e-3 * np.ptp(first)
+
+
+def test_a_thousand_turns_do_not_fill_the_preisach_stack() -> None:
+    plant = of_kind(PREISACH)()
+    amplitude = np.linspace(50.0, 0.5, 6000)
+    true_um, _ = plant.run(50.0 + amplitude * np.where(np.arange(6000) % 2, 1.0, -1.0))
+    assert np.isfinite(true_um).all()
+
+
+def test_a_step_rings_at_the_frequency_and_damping_of_the_mode() -> None:
+    factory = ringing()
+    plant = factory()
+    plant.run(np.full(2000, 4.0))
+    true_um, _ = plant.run(np.full(4096, 4.5))
+    swing = true_um[1:] - true_um[-500:].mean()
+    spectrum = np.abs(np.fft.rfft(swing * np.hanning(swing.size)))
+    assert np.fft.rfftfreq(swing.size, factory.traits.dt_s)[spectrum.argmax()] == pytest.approx(200.0, abs=1.0)
+    # The envelope falls by exp(-zeta omega t): between 0 and 0.1 s.
+    early, late = (np.abs(swing[k : k + 40]).max() for k in (0, 200))
+    assert late / early == pytest.approx(np.exp(-0.01 * 2.0 * np.pi * 200.0 * 0.1), rel=0.1)
+
+
+def test_changes_are_taken_and_scale_as_told() -> None:
+    factory = with_traits(ringing(0.3), modes=())
+    u_V = np.full(4000, 6.0)
+    plain = factory()
+    plain.run(u_V)
+    before_um = float(plain.run(u_V)[0][-1])
+    gained = factory()
+    gained.run(u_V)
+    assert gained.change(Change("gain", 0.06))
+    assert gained.run(u_V)[0][-1] == pytest.approx(1.06 * before_um, rel=1e-9)
+    shifted = factory()
+    shifted.run(u_V)
+    assert shifted.change(Change("zero", -2.5, over_s=0.2))
+    true_um, _ = shifted.run(u_V)
+    assert true_um[200] - before_um == pytest.approx(-1.25, abs=0.02)  # half way at 0.1 s
+    assert true_um[-1] - before_um == pytest.approx(-2.5, rel=1e-9)
+    assert not factory().change(Change("knock", 1.0))  # nothing there that rings
+    assert not factory().change(Change("unheard of", 1.0))
+
+
+def test_a_knock_rings_by_its_size_and_leaves_nothing() -> None:
+    factory = ringing()
+    struck, plain = factory(), factory()
+    u_V = np.full(1000, 4.0)
+    for plant in (struck, plain):
+        plant.run(u_V)
+    assert struck.change(Change("knock", 2.0))
+    rest = np.full(20_000, 4.0)
+    swing = struck.run(rest)[0] - plain.run(rest)[0]
+    assert np.abs(swing[:10]).max() == pytest.approx(2.0, rel=0.1)
+    assert np.abs(swing[-100:]).max() < 1e-3
+
+
+def test_a_payload_lowers_the_frequency_and_a_lag_slows() -> None:
+    heavy = ringing()()
+    heavy.run(np.full(2000, 4.0))
+    assert heavy.change(Change("payload", 1.0))
+    true_um, _ = heavy.run(np.full(4096, 4.5))
+    swing = true_um[1:] - true_um[-500:].mean()
+    spectrum = np.abs(np.fft.rfft(swing * np.hanning(swing.size)))
+    assert np.fft.rfftfreq(swing.size, 5e-4)[spectrum.argmax()] == pytest.approx(200.0 / np.sqrt(2.0), abs=1.0)
+    factory = with_traits(ringing(), modes=())
+    slow, plain = factory(), factory()
+    for plant in (slow, plain):
+        plant.run(np.full(2000, 4.0))
+    assert slow.change(Change("lag", 5e-3))
+    for plant, share in ((slow, 1.0 - np.exp(-1.0)), (plain, 1.0)):
+        true_um, _ = plant.run(np.full(2000, 4.5))
+        assert (true_um[10] - true_um[0]) / (true_um[-1] - true_um[0]) == pytest.approx(share, abs=0.1)
