@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
+SEED   ?= 0
 # Tests that only compute, which may share the cores; the others time real processes and have them for themselves.
-PURE   := tests/adaptive tests/baselines tests/sim tests/hidden \
+PURE   := tests/adaptive tests/baselines tests/sim tests/foreign tests/hidden \
           $(addprefix tests/service/test_,diagnose_command.py identify.py reproduce.py scenarios.py warm.py watch.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
@@ -13,7 +14,7 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test check bench fuzz blind requirements clean
+.PHONY: help setup setup-test demo test check bench foreign fuzz blind requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -38,6 +39,8 @@ $(BIN)/python:
 
 demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
 	$(BIN)/dehyst demo --out $(OUT)
+	@# The demonstration's stage was built together with the service; these were not.
+	@$(BIN)/python -m benchmarks.foreign --line
 
 test: ## lint, types, import contract, and all tests
 	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
@@ -53,6 +56,9 @@ check: .setup-test ## ruff, mypy --strict, the import contract
 
 bench: setup-test ## the solver beside its yardsticks and its peers
 	$(BIN)/dehyst bench
+
+foreign: setup ## 500 random stages and events in lockstep, with the table of goals (half an hour; SEED=0)
+	$(BIN)/python -m benchmarks.foreign --runs 500 --first-seed $(SEED) --jobs 2 --json out/foreign.jsonl
 
 fuzz: setup-test ## a million malformed payloads, by coverage, and a live service under fire (minutes)
 	$(BIN)/python -m benchmarks.fuzz --out out/fuzz

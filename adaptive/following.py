@@ -23,11 +23,13 @@ NOISE_PAIRS = 250
 STEP_S = 0.01
 #: What one step makes of those before it; from what count of steps on they tell, and of which share of them the voltage
 #: must have moved as far as the readings.
-FORGET, ENOUGH, OF_VOLTAGE = 0.9, 3.4, 0.3
+FORGET, ENOUGH, OF_VOLTAGE = 0.9, 3.4, 0.7
 #: Share of the span, a second, below which a voltage that moves may hold a creeping stage in place.
 CREEP_PER_S = 0.05
+#: Count of steps from which on a slope is taken at its word.
+ENOUGH_SLOPE = 6.0
 #: Slopes outside are no change of a stage, hysteresis and a wrong model included; nor is a line less straight.
-SLOPES, STRAIGHT = (0.45, 2.2), 0.35
+SLOPES, STRAIGHT = (0.62, 1.6), 0.35
 #: A reading that moves by less than this share of the voltage's step stands still; so many steps in a row show it.
 STILL, STILL_STEPS = 0.2, 4
 #: Steps after which what was so far is known to have followed.
@@ -47,6 +49,7 @@ class Following:
     p_V: float = math.nan
     steps: int = 0
     count: float = 0.0
+    driven: float = 0.0
     uu: float = 0.0
     pp: float = 0.0
     up: float = 0.0
@@ -60,7 +63,7 @@ class Following:
         self.u_V = self.p_V = math.nan
         self.last_V = math.nan
         self.steps = self.good = self.still = 0
-        self.count = self.uu = self.pp = self.up = 0.0
+        self.count = self.driven = self.uu = self.pp = self.up = 0.0
 
     def take(self, u_V: float, p_V: float, span_V: float, dt_s: float) -> bool:
         """One pair: the voltage, and what the model asks for at the reading. Returns whether a fault shows.
@@ -92,7 +95,8 @@ class Following:
         self.pp = FORGET * self.pp + p * p
         self.up = FORGET * self.up + u * p
         # Readings that move where the voltage does not are a matter of surprise, not of following.
-        if self.count < ENOUGH or self.uu < OF_VOLTAGE * self.count:
+        self.driven = FORGET * self.driven + (abs(u) >= STILL)
+        if self.count < ENOUGH or self.driven < OF_VOLTAGE * self.count:
             return False
         fault = self._fault()
         self.good = 0 if fault else self.good + 1
@@ -103,7 +107,7 @@ class Following:
         if straight < STRAIGHT:
             # More motion than the drive's is something else that moves the stage.
             return self.pp <= SLOPES[1] ** 2 * self.uu
-        return not SLOPES[0] <= slope <= SLOPES[1]
+        return self.count >= ENOUGH_SLOPE and not SLOPES[0] <= slope <= SLOPES[1]
 
     def state_dict(self) -> StateDict:
         return asdict(self)

@@ -353,9 +353,10 @@ class Front:
             away_um = sample.y_um - trial.reckoning.y_um
             self.jumps += 1
         track.served = track.features = frame
-        track.remember(trial.reckoning.memory)
         self.gates.since_glitch = 0
-        return replace(self._restart(sample, admission.SETTLING), jump_um=away_um, renamed=True)
+        taken = self._restart(sample, admission.SETTLING)
+        track.remember(trial.reckoning.memory)
+        return replace(taken, jump_um=away_um, renamed=True)
 
     # ---- where the stage is
 

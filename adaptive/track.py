@@ -129,7 +129,11 @@ class Track:
         return cls(smoother, base, smoother.initial_state(y_um), *rings, served, served, *memories)
 
     def restart(self, y_um: float) -> None:
-        """Begin smoothing anew; the hysteresis memory follows to where the stage now is."""
+        """Begin smoothing anew; the hysteresis memory follows to where the stage now is.
+
+        Over the readings that were not smoothed yet too: where many samples are lost there is nothing else.
+        """
+        self.memory, self.frozen_memory = self.memory_now(False), self.memory_now(True)
         self.state = self.smoother.initial_state(y_um)
         self.good[:] = False
         self.features, self.motion, self.switch = self.served, None, 0

@@ -57,7 +57,7 @@ GAIN_STEP, AGREE = 0.02, 0.02
 UNCLEAR = 6
 #: Windows in which p must have followed the voltage; share of its variance and slope from which on it does, and by what
 #: share of the drive it is off where the readings are those of before.
-OBEYED, OBEYS, OBEYS_SLOPE, SAME_SHARE = 2, 0.8, 1.5, 0.03
+OBEYED, OBEYS, OBEYS_SLOPE, SAME_SHARE = 2, 0.8, 1.4, 0.03
 
 
 class Outcome(Enum):

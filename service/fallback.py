@@ -24,8 +24,8 @@ from baselines.champion import ChampionInverse
 from service.guard import Limits, guard, guarded
 from service.wire_flags import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
 
-#: Time constant with which the difference between two snapshots fades, s.
-FADE_S = 0.006
+#: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
+FADE_S, FADE_SAMPLES = 0.006, 6.0
 
 
 class StandIn(NamedTuple):
@@ -127,7 +127,7 @@ def _resumed(
     free = rules._replace(limits=replace(rules.limits, slew_V_per_s=math.inf))
     got = answer_safely(model, memory, points, math.nan, free, stand_in, blends)
     n = got.u_V.size - 1
-    fade = np.exp(-np.arange(1, n + 1) * (model.dt_s / FADE_S))
+    fade = np.exp(-np.arange(1, n + 1) / max(FADE_S / model.dt_s, FADE_SAMPLES))
     limits, marks = rules.limits, got.flags[1:]
     u_V = got.u_V[1:] + (resumes_V - got.u_V[0]) * fade
     safe, flags = guard(u_V, (marks & OUTSIDE_DOMAIN) == 0, model.dt_s, limits, u_before_V)

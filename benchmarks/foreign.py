@@ -1,0 +1,373 @@
+"""How the service does on stages that it was not built with: stages, events and instants drawn at random, in lockstep.
+
+``python -m benchmarks.foreign --runs 500 --jobs 2 --json out/foreign.jsonl`` draws a stage, an event and its instant
+for each seed (``tests/foreign/plants.py``), rehearses it (``service.rehearsal``), writes one line a run as it goes, and
+prints two tables: the goals with what the runs came to, and one row for each class of events. ``--table FILE`` prints
+the tables of runs that are done. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute
+errors in percent of the commanded range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.rehearsal.events import CLASSES, SENSOR, draw
+
+PRESETS = ("random", "issue")
+#: The event comes this long after the start of the closed loop, s, by the stages, and up to so much later.
+SETTLE_S, LATER_S = {"random": 4.0, "issue": 9.0}, 1.5
+#: Closed loop after the event, s.
+AFTER_S = 5.0
+#: Stages of the preset "issue" follow tones alone, as those did that the issue tells of.
+ISSUE_TONES = 0.45
+#: Limits: time of motion within which a sensor fault is named, s; time above 5 % of the range, s.
+NAMED_S, LARGE_S = 0.5, 0.1
+#: Step of the gain that the goal is for, percent.
+STEP_PCT = 6.0
+#: Runs of ``--line``, class and seed. From seed 900000 on, each is the first whose stage has 1 kHz or less, whose
+#: gain rises and falls in turn, and which has a mode to ring where it is knocked; no outcome was looked at.
+LINE = (
+    ("none", 900_001), ("knock", 900_008), ("gain_at_once", 900_009), ("gain_at_once", 900_017),
+    ("zero_at_once", 900_018), ("spikes", 900_019), ("gap", 900_021), ("losses", 900_022),
+    ("number_stray", 900_023), ("stuck_noise", 900_024), ("sensor_gain", 900_027), ("sign", 900_028),
+)  # fmt: skip
+
+Record = dict[str, Any]
+
+
+def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
+    """One run of an event of the class ``name``, as JSON has it. A run that raises is a record with its traceback."""
+    from service.rehearsal import RandomReference, RehearsalConfig, identify, run_event
+    from tests.foreign.plants import issue_plant, random_plant
+
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    record: Record = {"seed": seed, "preset": preset, "class": name}
+    try:
+        factory = issue_plant(seed) if preset == "issue" else random_plant(seed)
+        at_s = SETTLE_S[preset] + float(np.random.default_rng([seed, 22]).uniform(0.0, LATER_S))
+        record["stage"] = factory.traits.summary()
+        low_V, high_V = factory.traits.excite_V
+        config = RehearsalConfig(
+            excite_low_V=low_V,
+            excite_high_V=high_V,
+            after_s=after_s,
+            reference=(lambda wish: RandomReference(wish, ISSUE_TONES)) if preset == "issue" else None,
+        )
+        known = identify(factory, config)
+        record["identify_s"] = time.process_time() - begin_cpu
+        run = run_event(factory, known, config, draw(name, seed, at_s), seed)
+        record |= run.outcome.as_dict() | {"range_um": run.range_um, "heldout_mae_pct": known.heldout_mae_pct}
+    except Exception:
+        record["failed"] = traceback.format_exc()
+    return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+
+
+def run_all(
+    plan: Sequence[tuple[str, int]], jobs: int, preset: str = "random", after_s: float = AFTER_S
+) -> Iterator[Record]:
+    """The runs of ``plan``, (class, seed) each, in the order in which they end. If a process dies, its run failed."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    if jobs == 1:
+        for name, seed in plan:
+            yield run_one(name, seed, preset, after_s)
+        return
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        waiting = {pool.submit(run_one, name, seed, preset, after_s): (name, seed) for name, seed in plan}
+        for done in as_completed(waiting):
+            try:
+                yield done.result()
+            except BrokenProcessPool:
+                name, seed = waiting[done]
+                yield {"seed": seed, "preset": preset, "class": name, "failed": "the process ended"}
+
+
+# ---- what a run came to
+
+
+def _numbers(values: Iterable[float | None]) -> np.ndarray:
+    """(n,) numbers; JSON says null for what is not finite."""
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _of(records: Iterable[Record], model: str, name: str) -> np.ndarray:
+    return _numbers(record[model][name] for record in records)
+
+
+def _at_rail(record: Record) -> bool:
+    return bool(record["adaptive"]["ends_at_rail"])
+
+
+def _large(record: Record) -> bool:
+    return bool(record["adaptive"]["large_s"] > LARGE_S)
+
+
+def _named(record: Record) -> bool:
+    return record["named_s"] is not None and record["named_s"] <= NAMED_S
+
+
+def _in_order(record: Record) -> bool:
+    return record["sensor_excess"] is not None and record["sensor_excess"] <= 1.0
+
+
+def _percentiles(values: np.ndarray, *shares: float, digits: int = 3) -> str:
+    if not np.isfinite(values).any():
+        return "-"
+    return " / ".join(f"{value:.{digits}f}" for value in np.nanpercentile(values, shares))
+
+
+def _count(records: Sequence[Record], holds: Callable[[Record], bool]) -> str:
+    """``3 of 4``, or ``-`` of none."""
+    return f"{sum(map(holds, records))} of {len(records)}" if records else "-"
+
+
+def _parts(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
+    """(runs with a sound sensor, runs with a wrong one), without those that failed."""
+    done = [record for record in records if "failed" not in record]
+    return [r for r in done if r["category"] != SENSOR], [r for r in done if r["category"] == SENSOR]
+
+
+# ---- tables
+
+
+def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(cells) + " |" for cells in rows)])
+
+
+GOALS_HEAD = ("what is measured", "goal", "these runs")
+
+
+def goals(records: Sequence[Record]) -> str:
+    """Markdown: the goals of ``What it must come to``, each with what the runs came to and over which it was taken."""
+    intact, sensors = _parts(records)
+    knocks = [record for record in intact if record["class"] == "knock"]
+    steps = [record for record in intact if record["class"] == "gain_at_once"]
+    first = _of(steps, "adaptive", "first_second_pct")
+    size_pct = 100.0 * np.abs(_numbers(record["event"]["size"] for record in steps))
+    ratio = _numbers(record["worst_ratio"] for record in knocks)
+    settled = _of(intact, "adaptive", "settled_pct")
+    hours = sum(record["healthy_s"] for record in (*intact, *sensors)) / 3600.0
+    false = sum(len(record["false_troubles"]) for record in (*intact, *sensors))
+    rows = [
+        (
+            "stage intact: runs that end at a rail, or are above 5 % of the range for longer than 0.1 s",
+            "0",
+            _count(intact, lambda record: _at_rail(record) or _large(record)),
+        ),
+        (
+            "sensor faults: error ≤ 1 %, or ≤ 1.5 × the frozen model's; named within 0.5 s of motion; both",
+            "all",
+            "; ".join(
+                _count(sensors, holds)
+                for holds in (_in_order, _named, lambda record: _in_order(record) and _named(record))
+            ),
+        ),
+        (
+            f"knock: worst half second over that of the frozen model, median / worst of {len(knocks)} runs",
+            "≤ 1.1",
+            _percentiles(ratio, 50, 100, digits=2),
+        ),
+        (
+            f"step of the gain by 6 % at once: first second, median / 95 % of {len(steps)} runs of 3 to 12 %, each "
+            "error times 6 % over its step (as drawn)",
+            "≤ 0.3 / 0.8 %",
+            f"{_percentiles(first * STEP_PCT / size_pct, 50, 95)} % ({_percentiles(first, 50, 95)} %)",
+        ),
+        (
+            f"settled: median over {len(intact)} runs with an intact stage; twenty scenarios no worse than before",
+            "≤ 0.030 %",
+            f"{_percentiles(settled, 50)} %; for the scenarios run `dehyst scenarios`",
+        ),
+        (
+            "healthy runs: false `trouble`, counted until the event",
+            "0 in 8 h",
+            f"{false} in {hours:.2f} h of simulated time",
+        ),
+        ("cost of a sample", "≤ 1.1 × before", "not measured by these runs"),
+    ]
+    return _markdown(GOALS_HEAD, rows)
+
+
+HEAD = (
+    "event", "runs", "failed", "end at a rail", "above 5 % for longer than 0.1 s", "first second, median / 95 %",
+    "settled, median / 95 %", "frozen model settled, median", "worst half second over frozen, median / worst",
+    "fault named within 0.5 s of motion", "error ≤ 1 % or ≤ 1.5 × frozen", "`trouble` with an intact stage",
+)  # fmt: skip
+
+
+def row(name: str, all_records: Sequence[Record]) -> tuple[str, ...]:
+    """The cells of a class of events."""
+    intact, sensors = _parts(all_records)
+    records = [*intact, *sensors]
+    failed = str(len(all_records) - len(records))
+    if not records:
+        return (name, str(len(all_records)), failed, *["-"] * (len(HEAD) - 3))
+    return (
+        name,
+        str(len(all_records)),
+        failed,
+        str(sum(map(_at_rail, records))),
+        str(sum(map(_large, records))),
+        _percentiles(_of(records, "adaptive", "first_second_pct"), 50, 95),
+        _percentiles(_of(records, "adaptive", "settled_pct"), 50, 95),
+        _percentiles(_of(records, "frozen", "settled_pct"), 50),
+        _percentiles(_numbers(record["worst_ratio"] for record in records), 50, 100, digits=2),
+        _count(sensors, _named),
+        _count(sensors, _in_order),
+        str(sum(bool(record["troubles"]) for record in intact)) if intact else "-",
+    )
+
+
+def by_class(records: Sequence[Record]) -> str:
+    """Markdown: a row for each class of events."""
+    intact, sensors = _parts(records)
+    classes = ((name, [record for record in records if record.get("class") == name]) for name in CLASSES)
+    groups = (("**stage intact**", intact), ("**sensor faults**", sensors), ("**all**", list(records)))
+    return _markdown(HEAD, [row(name, part) for name, part in (*classes, *groups) if part])
+
+
+def table(records: Sequence[Record]) -> str:
+    """Both tables, and how many runs they are of."""
+    failed = sum("failed" in record for record in records)
+    return f"{goals(records)}\n\n{by_class(records)}\n\nruns: {len(records)}, of which {failed} failed"
+
+
+def line(records: Sequence[Record]) -> str:
+    """All runs in one line, for people. Settled: over the runs with a sound sensor."""
+    intact, sensors = _parts(records)
+    done = [*intact, *sensors]
+    failed = len(records) - len(done)
+    settled = _percentiles(_of(intact, "adaptive", "settled_pct"), 50)
+    told = [
+        f"{len(records)} runs",
+        *([f"{failed} FAILED"] if failed else []),
+        f"{sum(map(_at_rail, done))} at a rail",
+        f"{sum(map(_large, done))} above 5 % of range for longer than {LARGE_S:g} s",
+        f"{_count(sensors, _named)} sensor faults named",
+        f"settled {settled} % (median)",
+    ]
+    return "foreign stages: " + ", ".join(told)
+
+
+def told(record: Record) -> str:
+    """A run in a line."""
+    if "failed" in record:
+        return f"seed {record['seed']} {record.get('class', '')}: FAILED: {record['failed'].strip().splitlines()[-1]}"
+    adaptive, stage = record["adaptive"], record["stage"]
+    marks = [
+        *(["AT A RAIL"] if _at_rail(record) else []),
+        *([f"LARGE for {adaptive['large_s']:.2f} s from {adaptive['large_at_s']:+.2f} s"] if _large(record) else []),
+        *(["NOT NAMED"] if record["category"] == SENSOR and not _named(record) else []),
+    ]
+    return (
+        f"seed {record['seed']} {stage['hysteresis']} {1.0 / stage['dt_s']:.0f} Hz, {record['text']}: "
+        f"first {adaptive['first_second_pct']:.3f}, settled {adaptive['settled_pct']:.3f}, "
+        f"{record['cpu_s']:.1f} s {' '.join(marks)}".rstrip()
+    )
+
+
+# ---- command line
+
+
+def read(paths: Iterable[Path]) -> list[Record]:
+    """The runs in files; a last line that was cut off is left out."""
+    records = []
+    for path in paths:
+        for text in path.read_text().splitlines():
+            try:
+                records.append(json.loads(text))
+            except json.JSONDecodeError:
+                print(f"{path}: left out a line that is cut off", file=sys.stderr)
+    return records
+
+
+def run_line(jobs: int) -> list[Record]:
+    """The runs of ``LINE``, with their progress on stderr."""
+    print(
+        f"{len(LINE)} runs on simulated stages that the service was not built with, about half a minute ...",
+        file=sys.stderr,
+        flush=True,
+    )
+    records = []
+    for record in run_all(LINE, jobs):
+        records.append(record)
+        if sys.stderr.isatty():
+            print(f"\r{len(records)} of {len(LINE)}", end="", file=sys.stderr, flush=True)
+    if sys.stderr.isatty():
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
+    for record in records:
+        if "failed" in record:
+            print(told(record), file=sys.stderr)
+    return records
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run, or read runs that are done; prints the tables or the line. Returns 1 where a run failed."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.foreign", description=__doc__)
+    parser.add_argument("--runs", type=int, default=40, metavar="N", help="how many seeds (40)")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="S", help="the first of them (0)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (1; 2 with --line)")
+    parser.add_argument("--json", type=Path, metavar="F", help="write a line of JSON for each run, as it ends")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="EVENT", help=f"classes of events: {', '.join(CLASSES)}"
+    )
+    parser.add_argument("--preset", choices=PRESETS, default="random", help="which stages (random)")
+    parser.add_argument(
+        "--after", type=float, default=AFTER_S, metavar="S", help=f"closed loop after the event, s ({AFTER_S:g})"
+    )
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
+    only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
+    given = parser.parse_args(arguments)
+    if unknown := [name for name in given.only if name not in CLASSES]:
+        parser.error(f"--only: got {unknown[0]!r}, expected some of {', '.join(CLASSES)}")
+    jobs = given.jobs if given.jobs is not None else 2 if given.line else 1
+    if given.runs < 1 or jobs < 1 or given.first_seed < 0:
+        parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
+    if given.after < 4.0:
+        parser.error(f"--after: got {given.after:g} s, expected 4 s or more")
+    if given.line:
+        records = run_line(jobs)
+        print(line(records))
+    elif given.table:
+        records = read(given.table)
+        print(table(records))
+    else:
+        records = _run(given, jobs)
+        print(table(records))
+    return 1 if any("failed" in record for record in records) else 0
+
+
+def _run(given: argparse.Namespace, jobs: int) -> list[Record]:
+    classes = given.only or list(CLASSES)
+    seeds = range(given.first_seed, given.first_seed + given.runs)
+    plan = [(classes[seed % len(classes)], seed) for seed in seeds]
+    records = []
+    if given.json:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        given.json.write_text("")
+    for record in run_all(plan, jobs, given.preset, given.after):
+        records.append(record)
+        print(f"[{len(records)}/{given.runs}] {told(record)}", file=sys.stderr, flush=True)
+        if given.json:
+            with given.json.open("a") as file:
+                file.write(json.dumps(record) + "\n")
+    return records
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

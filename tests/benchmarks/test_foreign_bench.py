@@ -1,0 +1,138 @@
+"""The benchmark of foreign stages: its tables and its line over made-up runs, and the fixed runs of the line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.foreign import HEAD, LINE, by_class, goals, line, main, read, table, told
+from service.rehearsal.events import KINDS, SENSOR, draw
+from tests.foreign.plants import random_plant
+
+
+def run(name: str, **given: Any) -> dict[str, Any]:
+    """A run in which nothing went wrong, but for what is given."""
+    figures = {"first_second_pct": 0.1, "settled_pct": 0.02, "ends_at_rail": False, "large_s": 0.0, "large_at_s": None}
+    kind = draw(name, 1, 4.0).kind
+    record = {
+        "seed": 1, "class": name, "category": KINDS[kind].category, "text": name, "event": {"kind": kind, "size": 0.06},
+        "stage": {"hysteresis": "plays", "dt_s": 1e-3}, "adaptive": figures | {"first_second_pct": 0.1},
+        "frozen": {"settled_pct": 0.5}, "worst_ratio": 0.5, "sensor_excess": None, "troubles": [],
+        "false_troubles": [], "healthy_s": 360.0, "named_s": None, "cpu_s": 1.0,
+    }  # fmt: skip
+    record["adaptive"] = figures | {name: given.pop(name) for name in list(given) if name in figures}
+    return record | given
+
+
+FAILED = {"seed": 7, "class": "spikes", "failed": "Traceback\nValueError: no"}
+
+
+def last_cells(text: str) -> list[str]:
+    return [row.split("|")[-2].strip() for row in text.splitlines()[2:]]
+
+
+def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
+    records = [
+        run("none", settled_pct=0.01),
+        run("knock", worst_ratio=0.9, settled_pct=0.03),
+        run("knock", worst_ratio=1.3, large_s=0.2, settled_pct=0.05),
+        run("gain_at_once", first_second_pct=0.2, event={"size": -0.03}, settled_pct=0.02),
+        run("gain_at_once", first_second_pct=0.6, event={"size": 0.12}, settled_pct=0.04),
+        run("zero_at_once", ends_at_rail=True, settled_pct=9.0, troubles=[{"name": "rail"}], false_troubles=["rail"]),
+        run("sign", sensor_excess=0.5, named_s=0.4),
+        run("stuck_noise", sensor_excess=1.5, named_s=0.1),
+        run("sensor_gain", sensor_excess=0.9, named_s=0.6),
+        run("foreign", sensor_excess=0.9),
+        FAILED,
+    ]
+    told_goals = goals(records)
+    intact, sensors, knock, step, settled, false, cost = last_cells(told_goals)
+    assert intact == "2 of 6"
+    assert sensors == "3 of 4; 2 of 4; 1 of 4"
+    assert knock == "1.10 / 1.30"
+    # 0.2 % after 3 % and 0.6 % after 12 % are 0.4 and 0.3 % after 6 %.
+    assert step == "0.350 / 0.395 % (0.400 / 0.580 %)"
+    assert settled.startswith("0.035 %")
+    assert false == "1 in 1.00 h of simulated time"
+    assert cost.startswith("not measured")
+    assert "2 runs of 3 to 12 %" in told_goals
+    assert "median over 6 runs" in told_goals
+
+
+def test_classes_are_rows_in_their_order_then_the_groups() -> None:
+    records = [run("sign", sensor_excess=0.5, named_s=0.4), run("none", troubles=[{"name": "rail"}]), FAILED]
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in by_class(records).splitlines()]
+    assert all(len(row) == len(HEAD) for row in rows)
+    assert [row[0] for row in rows[2:]] == [
+        "none", "spikes", "sign", "**stage intact**", "**sensor faults**", "**all**"
+    ]  # fmt: skip
+    none, spikes, sign = rows[2:5]
+    assert none == [
+        "none", "1", "0", "0", "0", "0.100 / 0.100", "0.020 / 0.020", "0.500", "0.50 / 0.50", "-", "-", "1"
+    ]  # fmt: skip
+    assert spikes == ["spikes", "1", "1", *["-"] * 9]
+    assert sign[-3:] == ["1 of 1", "1 of 1", "-"]
+    assert rows[-1][1:3] == ["3", "1"]
+    assert table(records).endswith("runs: 3, of which 1 failed")
+
+
+def test_tables_of_nothing_or_of_what_has_no_number_are_still_tables() -> None:
+    assert last_cells(goals([]))[:2] == ["-", "-; -; -"]
+    nothing = run("knock", worst_ratio=None, settled_pct=None, first_second_pct=None)
+    assert last_cells(goals([nothing]))[2] == "-"
+    assert by_class([nothing]).splitlines()[2].count(" - ") == 5
+
+
+def test_the_line_says_all_in_plain_words() -> None:
+    records = [
+        run("none", settled_pct=0.03), run("knock", settled_pct=0.05), run("gap", settled_pct=0.07, large_s=0.11),
+        run("sign", sensor_excess=0.5, named_s=0.4, settled_pct=3.0), run("sensor_gain", sensor_excess=0.5),
+    ]  # fmt: skip
+    assert line(records) == (
+        "foreign stages: 5 runs, 0 at a rail, 1 above 5 % of range for longer than 0.1 s, 1 of 2 sensor faults named, "
+        "settled 0.050 % (median)"
+    )
+    assert ", 1 FAILED, 0 at a rail" in line([*records, FAILED])
+
+
+def test_the_runs_of_the_line_are_slow_stages_one_of_each_event() -> None:
+    events = [draw(name, seed, 4.0) for name, seed in LINE]
+    assert all(random_plant(seed).traits.dt_s >= 1e-3 for _, seed in LINE)
+    steps = [event.size for event in events if event.name == "gain_at_once"]
+    assert min(steps) < 0.0 < max(steps)
+    assert random_plant(dict(LINE)["knock"]).traits.modes
+    assert sum(event.category == SENSOR for event in events) == 3
+    assert len({seed for _, seed in LINE}) == len(LINE) == 12
+
+
+def test_a_file_is_read_again_and_what_failed_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "runs.jsonl"
+    file.write_text(json.dumps(run("none")) + "\n" + json.dumps(FAILED) + '\n{"seed": 3')
+    assert len(read([file])) == 2
+    assert main(["--table", str(file)]) == 1
+    said = capsys.readouterr()
+    assert "**stage intact**" in said.out
+    assert "cut off" in said.err
+    assert told(FAILED) == "seed 7 spikes: FAILED: ValueError: no"
+    assert "plays 1000 Hz" in told(run("sign"))
+    assert "NOT NAMED" in told(run("sign"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--only", "earthquake"], "expected some of none"),
+        (["--runs", "0"], "expected at least 1"),
+        (["--after", "1"], "expected 4 s or more"),
+        (["--line", "--table", "x"], "not allowed with"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert words in capsys.readouterr().err
