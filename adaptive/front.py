@@ -28,7 +28,7 @@ from adaptive.smoothing import FixedLagSmoother
 from adaptive.snapshot import LssvmInverse
 from adaptive.state import prefixed, under
 from adaptive.track import Pair, Past, Step, Taken, Track
-from adaptive.trial import OUT_OF_ENVELOPE, Outcome, Trial
+from adaptive.trial import Outcome, Trial
 from adaptive.types import FloatArray, Sample, StateDict
 
 #: A jump back differs from the jump by less than this share of it.
@@ -113,6 +113,11 @@ class Front:
     def fault(self) -> str:
         """Name of what is wrong with the sensor, "" while nothing is known to be."""
         return "" if self._trial is None else self._trial.fault
+
+    @property
+    def why(self) -> str:
+        """The reason for ``fault`` in words."""
+        return "" if self._trial is None else self._trial.why
 
     # ---- what a sample is
 
@@ -347,8 +352,9 @@ class Front:
         frame, away_um = track.served, 0.0
         if decision.outcome is Outcome.CHANGED:
             frame = hypotheses.frame_after(frame, decision.slope, decision.shift_um)
-            if self._envelope.refuses(self.base.features, frame):
-                trial.refuse(OUT_OF_ENVELOPE)
+            refused = self._envelope.refuses(self.base.features, frame)
+            if refused:
+                trial.refuse(refused)
                 return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
             away_um = sample.y_um - trial.reckoning.y_um
             self.jumps += 1

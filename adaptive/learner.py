@@ -17,7 +17,7 @@ from adaptive.admission import check_pair
 from adaptive.adoption import adopt
 from adaptive.features import FeatureMap
 from adaptive.learner_config import LearnerConfig
-from adaptive.learner_parts import Parts, model_of, restored, state_of, warm
+from adaptive.learner_parts import RAIL_S, RAIL_SHARE, Parts, model_of, restored, state_of, warm
 from adaptive.snapshot import LssvmInverse
 from adaptive.track import Pair
 from adaptive.types import FloatArray, Sample, StateDict
@@ -178,6 +178,16 @@ class Learner:
         """
         parts = self.parts
         return parts.front.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
+
+    @property
+    def why(self) -> str:
+        """The reason for ``trouble`` in words, with numbers."""
+        parts = self.parts
+        if parts.front.fault:
+            return parts.front.why
+        if parts.railed:
+            return f"the voltage was at a limit for {RAIL_S} s with the model off by more than {100 * RAIL_SHARE:.0f} %"
+        return f"more than {parts.allowed_V:.3g} V from the identified model for {RAIL_S} s" if parts.left else ""
 
     # ---- snapshots out
 

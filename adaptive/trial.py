@@ -81,7 +81,8 @@ OPEN = Decision(Outcome.OPEN)
 
 @dataclass(slots=True)
 class Trial:
-    """reckoning : where the stage is. fault : name of what is wrong with the sensor, "" while open.
+    """reckoning : where the stage is. fault, why : name of what is wrong with the sensor, and the reason in
+    words, "" while open.
 
     base, memory : the identified model, and (m,) its memory as if the readings were true.
     window : (4, VALUES) of voltage, reading, place, and the voltage that the identified model asks for at the reading,
@@ -97,6 +98,7 @@ class Trial:
     memory: FloatArray
     window: FloatArray
     fault: str = ""
+    why: str = ""
     count: int = 0
     since: int = 0
     looked: int = 0
@@ -151,7 +153,7 @@ class Trial:
         follows = s.share >= FOLLOWS and now.envelope.gain_allows(s.slope)
         if not whole:
             if not (obeyed or follows):
-                self._suspect(_fault(s, float(np.std(y))))
+                self._suspect(*_fault(s, float(np.std(y))))
             return OPEN
         self.obeyed = self.obeyed + 1 if obeyed else 0
         if self.obeyed >= OBEYED * LOOKS:
@@ -162,7 +164,7 @@ class Trial:
             return self._following(s, x, y, now)
         self.followed = self.agreed = 0
         if not obeyed:
-            self._suspect(_fault(s, float(np.std(y))))
+            self._suspect(*_fault(s, float(np.std(y))))
         return OPEN
 
     def _following(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
@@ -193,15 +195,15 @@ class Trial:
             return Decision(Outcome.CHANGED, 1.0, off)
         return OPEN
 
-    def refuse(self, fault: str) -> None:
+    def refuse(self, why: str) -> None:
         """What the readings say is refused by the envelope."""
-        self._suspect(fault)
+        self._suspect(OUT_OF_ENVELOPE, why)
 
-    def _suspect(self, fault: str) -> None:
+    def _suspect(self, fault: str, why: str) -> None:
         self.times = self.times + 1 if fault == self.suspected else 1
         self.suspected = fault
         if self.times >= (RENAMED if self.fault else NAMED):
-            self.fault = fault
+            self.fault, self.why = fault, why
 
     def state_dict(self) -> StateDict:
         """All of it under flat names."""
@@ -228,13 +230,16 @@ class Trial:
 
 
 _NUMBERS = {
-    "fault": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
+    "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
     "obeyed": int, "followed": int, "agreed": int, "slope": float, "shift_um": float,
 }  # fmt: skip
 
 
-def _fault(s: Slope, spread: float) -> str:
-    """The name of what readings do that do not follow: ``s`` of the readings over the places."""
+def _fault(s: Slope, spread_um: float) -> tuple[str, str]:
+    """(name, why in words) of what readings do that do not follow: ``s`` of the readings over the places."""
+    why = f"readings go {s.slope:.3g} times as far as the voltage must have moved the stage, {s.share:.0%} on a line"
     if s.share >= STRAIGHT:
-        return SENSOR_SIGN if s.slope < 0.0 else SENSOR_GAIN
-    return SENSOR_STUCK if spread <= STILL * s.swing else SENSOR_FOREIGN
+        return (SENSOR_SIGN if s.slope < 0.0 else SENSOR_GAIN), why
+    if spread_um <= STILL * s.swing:
+        return SENSOR_STUCK, f"readings vary by {spread_um:.3g} um rms where the stage must have by {s.swing:.3g} um"
+    return SENSOR_FOREIGN, why

@@ -96,6 +96,11 @@ class SelfWatching(Protocol):
         """Name of what is wrong, "" while nothing is."""
         ...
 
+    @property
+    def why(self) -> str:
+        """The reason in words."""
+        ...
+
 
 class OnlineModel(Protocol):
     """A model that learns sample by sample; the learner and all adaptive baselines are of this kind.

@@ -92,6 +92,12 @@ class Competition:
         return favourite.trouble if isinstance(favourite, SelfWatching) else ""
 
     @property
+    def why(self) -> str:
+        """The reason for ``trouble`` in words."""
+        favourite = self.favourite
+        return favourite.why if isinstance(favourite, SelfWatching) else ""
+
+    @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self._seq

@@ -19,7 +19,7 @@ from service.axis_state import restored_learner
 from service.competing import champion_of
 from service.keys import AUTO
 from service.sequence import SequenceTracker
-from service.watch import LEARNER_FAILED, POISON
+from service.watch import BEGUN_AGAIN, LEARNER_FAILED, POISON
 
 #: How often the learner's state is marked while all is well, s of samples.
 MARK_S: Final = 1.0
@@ -70,7 +70,9 @@ class AxisLearning(AxisOperations):
             if before in POISON and not now:
                 self._go_back()
             self.set_teaching()
-            detail = f"{now}: the last good model is served, then {last.stand_in or 'nothing else'}" if now else before
+            why = f" ({self.learner.why})" if told and isinstance(self.learner, SelfWatching) else ""
+            served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
+            detail = f"{now}{why}: {served} is served, then {last.stand_in or 'nothing else'}" if now else before
             if now != LEARNER_FAILED:  # which has told of itself
                 self.note("trouble" if now else "recovered", detail)
         for event in getattr(self.learner, "take_events", list)():

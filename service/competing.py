@@ -38,6 +38,11 @@ class Competing:
         return self.competition.trouble
 
     @property
+    def why(self) -> str:
+        """The reason for ``trouble`` in words."""
+        return self.competition.why
+
+    @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self.competition.seq
