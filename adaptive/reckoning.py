@@ -243,7 +243,8 @@ def _step(
     low = max(n[_LOW], line - OFF_LINE * span)
     high = min(n[_HIGH], line + OFF_LINE * span)
     held = min(max(y, low), high) if math.isfinite(y) else before
-    n[_CUT] += abs(held - y) if math.isfinite(y) else span
+    # What is cut off stays the same error while the stage stands still: the largest of it, not the sum.
+    n[_CUT] = max(n[_CUT], abs(held - y) if math.isfinite(y) else span)
     n[_V] = (held - before) / dt
     n[_A] *= math.exp(-dt / FORGET_S)
     n[_WAY] += abs(held - before)
