@@ -229,6 +229,7 @@ class Front:
         reckoning = Reckoning.begin(frame, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
         for u in past.u_V:
             reckoning.advance(u)
+        reckoning.begin_way()
         return reckoning
 
     def _of_track(self, track: Track, model: LssvmInverse) -> LssvmInverse:

@@ -94,8 +94,12 @@ class Reckoning:
         if off.size:
             # The middle one of the last: some of these readings may have rung, or been wrong, already.
             made.numbers[_OFF] = float(np.median((y_um - off)[-ANCHORS:]))
-        made.numbers[[_WAY, _CUT]] = 0.0
+        made.begin_way()
         return made
+
+    def begin_way(self) -> None:
+        """The doubt begins here: readings up to here, or the model over the voltages up to here, are believed."""
+        self.numbers[[_WAY, _CUT]] = 0.0
 
     @property
     def range_um(self) -> float:
