@@ -33,7 +33,7 @@ def first(said: list[bool]) -> int:
     return said.index(True) if True in said else -1
 
 
-@pytest.mark.parametrize("slope", [0.55, 0.9, 1.0, 1.35, 1.7])
+@pytest.mark.parametrize("slope", [1.05 * SLOPES[0], 0.9, 1.0, 1.35, 0.95 * SLOPES[1]])
 @pytest.mark.parametrize("offset_V", [0.0, -6.0])
 def test_a_sensor_that_follows_is_no_fault(slope: float, offset_V: float) -> None:
     """Whatever its offset, and with a gain that a stage and a model of another amplitude may have."""
@@ -51,7 +51,7 @@ def test_hysteresis_and_turning_points_are_no_fault() -> None:
     assert not any(asked(Following(), u, p))
 
 
-@pytest.mark.parametrize("slope", [-1.0, -0.3, 0.02, 0.3])
+@pytest.mark.parametrize("slope", [-1.0, -0.3, 0.02, 0.3, 0.8 * SLOPES[0], 1.3 * SLOPES[1], 5.0])
 def test_another_slope_or_sign_is_a_fault_within_a_tenth_of_the_span(slope: float) -> None:
     u = np.linspace(2.0, 8.0, 600)
     assert not SLOPES[0] <= slope <= SLOPES[1]
@@ -88,6 +88,29 @@ def test_readings_that_have_nothing_to_do_with_the_voltage_are_a_fault() -> None
     u = SPAN_V * (0.5 + 0.3 * np.sin(2.0 * math.pi * 1.0 * t_s))
     p = SPAN_V * (0.5 + 0.3 * np.sin(2.0 * math.pi * 1.7 * t_s + 1.0))
     assert first(asked(Following(), u, p)) > 0
+
+
+def test_readings_that_go_too_far_and_not_at_all_in_turns_are_a_fault() -> None:
+    """On average they go as far as the voltage asks for; but that is no straight line."""
+    u = 2.0 + 0.1 * np.arange(40)
+    p = 2.0 + np.cumsum(np.tile([0.25, 0.25, 0.25, 0.25, -0.03], 8))
+    following = Following()
+    straight = []
+    for a, b in zip(u, p, strict=True):
+        fault = following.take(float(a), float(b), SPAN_V, STEP_S)
+        if following.uu > 0.0 and SLOPES[0] < following.up / following.uu < SLOPES[1]:
+            straight.append(fault)
+    assert any(straight)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 60.0])
+def test_a_gain_that_breaks_down_is_found_as_soon_after_a_minute_as_after_a_second(seconds: float) -> None:
+    u = strokes(seconds + 1.0, 1.0)
+    at = round(seconds / EVERY_S)
+    p = np.where(np.arange(u.size) < at, u, u[at] + 0.35 * (u - u[at]))
+    said = asked(Following(), u, p)
+    assert not any(said[:at])
+    assert 0 < first(said) - at < round(0.35 / EVERY_S)
 
 
 def test_what_moves_while_the_voltage_rests_is_a_matter_of_surprise_and_not_of_following() -> None:
@@ -204,12 +227,14 @@ def test_state_goes_on_to_the_last_bit_and_an_old_one_is_that_of_a_beginning() -
     u = strokes(10.0)
     p = np.where(np.arange(u.size) < 1800, u, u[1800]) + 0.01 * np.random.default_rng(4).standard_normal(u.size)
     one = Following()
-    asked(one, u[:1750], p[:1750])
+    cut = 1812
+    asked(one, u[:cut], p[:cut])
+    assert 0 < one.still < STILL_STEPS
     two = Following.from_state(one.state_dict())
     assert two == one
-    said = asked(one, u[1750:], p[1750:])
+    said = asked(one, u[cut:], p[cut:])
     assert True in said
-    assert asked(two, u[1750:], p[1750:]) == said
+    assert asked(two, u[cut:], p[cut:]) == said
     assert one.state_dict() == two.state_dict()
     assert math.isnan(Following.from_state({}).u_V)
     with pytest.raises(KeyError):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -391,7 +392,7 @@ def test_a_zero_step_with_ringing_is_found_and_kept(
         off_pct.append(learner.diagnostics()["recent_rms_error_pct"])
     assert np.median(off_pct) < 0.4
     assert max(off_pct) < 2.0
-    assert trials <= {"slow": 1, "fast": 3}[strokes] * (ringing > 0.0)
+    assert trials <= {"slow": 2, "fast": 8}[strokes] * (ringing > 0.0)
 
 
 def test_a_jump_of_a_fifth_is_not_believed_from_readings_at_one_level(model: LssvmInverse, still: Recording) -> None:
@@ -476,6 +477,23 @@ def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
     assert one.trouble
     assert one.parts.front.holds
     assert_goes_on(one, (u, y), at + 400, at + 1500)
+
+
+def test_all_of_a_hold_is_in_its_state(model: LssvmInverse) -> None:
+    """Each of its fields with a value of its own."""
+    hold = hold_at(model)
+    for k in range(5):
+        put(hold, PLACE_UM + 0.1 * k, math.nan if k == 2 else PLACE_UM - 0.2 * k)
+    plain = [field for field in fields(Hold) if field.name not in ("reckoning", "u_V", "y_um", "old_um")]
+    values = {
+        field.name: {"int": 7 + i, "float": 0.5 + i, "bool": True}[str(field.type)] for i, field in enumerate(plain)
+    }
+    one = replace(hold, **values)
+    two = Hold.from_state(one.state_dict())
+    for field in fields(Hold):
+        if field.name != "reckoning":
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(one.reckoning.numbers, two.reckoning.numbers)
 
 
 def assert_goes_on(one: Learner, recording: Recording, start: int, stop: int) -> None:

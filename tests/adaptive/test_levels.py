@@ -109,7 +109,8 @@ def test_the_level_of_a_ramp_is_where_it_has_come_to(slope: float, n: int, mode_
     level = level_of(r, 1e-9, drifts=True)
     assert level.at == pytest.approx(0.4 + slope * (n - 1), rel=1e-5, abs=1e-6)
     assert level.rate == pytest.approx(slope, rel=1e-5, abs=1e-8)
-    assert level.std < 1e-6
+    # Without noise the fit is nearly singular, and the deviation is that of the ridge.
+    assert level.std < 5e-3
 
 
 def test_what_goes_on_and_on_has_no_level() -> None:
