@@ -136,6 +136,13 @@ class FeatureMap:
         arcs = y + (self.y_rest_um - y) * np.exp(-abs(y - self.y_rest_um) / rho)
         return np.concatenate([plays, arcs, slow, np.full(1 if rho.size else 0, y)])
 
+    def memory_in(self, other: FeatureMap, memory: FloatArray) -> FloatArray:
+        """(m,) memory as a map in another frame has it, of the same readings: every entry is a displacement."""
+        if other == self:
+            return memory.copy()
+        carried: FloatArray = (self.offset_um + self.gain * memory - other.offset_um) / other.gain
+        return carried
+
     def advance(self, y_um: float, memory: FloatArray) -> None:
         """Memory after one point, in place."""
         advance(y_um, memory, self._arrays)

@@ -44,6 +44,9 @@ LOOK_S = 0.002
 KNOWN = 0.05
 #: Age at which a place is from before anything that is noticed now, s.
 CLEAN_S = 0.06
+#: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with;
+#: time from one to the next while it has full credit, and while not, s; windows after which one has shown nothing.
+CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 2, 5.0, 0.3, 4
 
 Model = Callable[[], LssvmInverse]
 
@@ -80,10 +83,18 @@ class Front:
         self._heard = Heard()
         self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
+        # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
+        self._proven: FeatureMap | None = None
+        self._proven_past: Past | None = None
         self._calm = 1_000_000  # Samples since readings were last held back.
         # A model that does not answer to the displacement cannot tell whether a sensor does.
         self._tells = answers(base)
         self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
+        # A trial of readings that nobody doubts, the credit that such trials have left the model, and the samples until
+        # the next. A fault that it finds is the model's: a model that finds faults in a sound sensor is no judge.
+        self._control: Trial | None = None
+        self._credit, self._until_control = FIRST_CREDIT, 0
+        self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
         # Places from before the last steps in which the readings followed the drive, the older one first.
         self._pasts: list[Past] = []
 
@@ -91,6 +102,11 @@ class Front:
     def served(self) -> FeatureMap:
         """The feature map to serve with."""
         return self.base.features if self.track is None else self.track.served
+
+    @property
+    def _judges(self) -> bool:
+        """Whether the model is good enough to tell by it that a sensor is wrong."""
+        return self._tells and self._credit > 0
 
     @property
     def on_probation(self) -> bool:
@@ -101,6 +117,7 @@ class Front:
         """Forget the sequence: the next sample is taken whatever its number."""
         self.gates = admission.AdmissionState()
         self._hold, self._trial, self._lost = None, None, True
+        self._proven = self._proven_past = None
         self._heard.clear()
         self._forget()
 
@@ -108,6 +125,7 @@ class Front:
         """What the readings did so far says nothing about what comes."""
         self.following.forget()
         self._pasts.clear()
+        self._control = None
 
     @property
     def fault(self) -> str:
@@ -118,6 +136,11 @@ class Front:
     def why(self) -> str:
         """The reason for ``fault`` in words."""
         return "" if self._trial is None else self._trial.why
+
+    @property
+    def distrusted_s(self) -> float:
+        """For how long the readings have been on trial, s; 0 while they are not."""
+        return 0.0 if self._trial is None else self._trial.since * self.dt_s
 
     # ---- what a sample is
 
@@ -155,10 +178,12 @@ class Front:
         known = track.motion is not None and gates.since_start > c.settle
         limit = admission.surprise(c, gates, self.base.span_V)
         if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
-            self._hold = self._begin_hold(track, model(), past=True)
+            self._hold = self._lagging(track, model(), sample.y_um)
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
         if self._hold is None and not doubtful:
             admission.watch_innovation(c, gates, innovation)
+            if known:
+                self._check_model(track, sample, model)
             return Taken("", (Step(sample.y_um, sample.u_V),))
         # What a kink of the voltage makes of the motion is reckoned; it was a surprise to the smoother alone.
         limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
@@ -167,8 +192,9 @@ class Front:
     def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
         self._hold, self._trial, self._lost = None, None, False
+        self._proven_past = None
         self.gates.since_start = self.gates.since_jump = 0
-        self.gates.moved = 0
+        self.gates.moved = self._look_from = 0
         self._forget()
         if self.track is None:
             self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
@@ -181,24 +207,58 @@ class Front:
 
     def _keep(self, track: Track, model: Model, u_V: float, y_um: float) -> Hold:
         """Hold a sample back; begins a hold where there is none."""
+        self._control = None
         if self._hold is None:
             # Soon after another one its readings are no anchor: some of them may have rung.
             self._hold = self._begin_hold(track, model(), past=self._calm <= 2 * self.smoother.config.lag)
         self._hold.put(u_V, y_um)
         return self._hold
 
+    def _check_model(self, track: Track, sample: Sample, model: Model) -> None:
+        """Now and then, of a sample that is believed: would a trial of such readings find a fault?"""
+        if self._control is None:
+            self._until_control -= 1
+            if self._until_control > 0 or not self._tells:
+                return
+            self._control = Trial.begin(self._begin_hold(track, model()).reckoning, self.base, track.memory_now(True))
+        control = self._control
+        decision = control.put(sample.u_V, sample.y_um, self._circumstances(0.0))
+        done = decision.outcome is not Outcome.OPEN or bool(control.fault)
+        if not done and control.since * self.dt_s < CONTROL_WINDOWS * self._envelope.follow_s:
+            return
+        self._give_credit(-1 if control.fault else decision.credit)
+        self._control = None
+        self._until_control = round((CONTROL_S if self._credit == CREDIT else CONTROL_AGAIN_S) / self.dt_s)
+
+    def _give_credit(self, credit: int) -> None:
+        self._credit = min(max(self._credit + credit, -CREDIT), CREDIT)
+
     def _lags(self, track: Track, y_um: float) -> bool:
         """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
 
         A sensor that stops gently surprises no smoother.
         """
-        if not self._tells or not self._pasts:
+        if not self._judges or not self._pasts or self.gates.since_start < self._look_from:
             return False
         du_V, dy_um = track.steps_over_lag(y_um)
         x_um = du_V / self._slope_V_per_um
         if abs(x_um) <= self._least_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
             return False
         return bool(abs(x_um) > LAGS_SIGMA * self.gates.innovation2**0.5 * self.range_um)
+
+    def _lagging(self, track: Track, model: LssvmInverse, y_um: float) -> Hold | None:
+        """A hold, if the reading has not moved as the place has by reckoning: where the stage turns it moves little."""
+        past, lag = self._clean_past(), track.lag
+        reckoning = _from_past(past, self._of_track(track, model), len(past.u_V) - lag)
+        before_um = reckoning.y_um
+        for u in past.u_V[max(len(past.u_V) - lag, 0) :]:
+            reckoning.advance(u)
+        reckoning.begin_way()
+        dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
+        if abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
+            return Hold(reckoning, reckoning.y_um)
+        self._look_from = self.gates.since_start + lag
+        return None
 
     def _begin_hold(self, track: Track, model: LssvmInverse, past: bool = False) -> Hold:
         """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed.
@@ -223,14 +283,12 @@ class Front:
 
     def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
         """From the last place that readings have confirmed, over the voltages since."""
+        return _from_past(self._clean_past(), self._of_track(track, model))
+
+    def _clean_past(self) -> Past:
+        """The last place that readings have confirmed which is from before anything that is noticed now."""
         newest = self._pasts[-1]
-        past = newest if len(newest.u_V) * self.dt_s > CLEAN_S else self._pasts[0]
-        frame = self._of_track(track, model)
-        reckoning = Reckoning.begin(frame, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
-        for u in past.u_V:
-            reckoning.advance(u)
-        reckoning.begin_way()
-        return reckoning
+        return newest if len(newest.u_V) * self.dt_s > CLEAN_S else self._pasts[0]
 
     def _of_track(self, track: Track, model: LssvmInverse) -> LssvmInverse:
         """A model in the frame of the track: the identified one is served in its own, with a memory of its own."""
@@ -260,11 +318,14 @@ class Front:
         now = self._circumstances(limit)
         verdict = hypotheses.judge(hold, now)
         if verdict is Verdict.JUMP:
-            return self._take_jump(track, hold, now)
+            return self._take_jump(sample, track, hold, now)
         if verdict is Verdict.WAIT:
-            return Taken(admission.RINGING if hold.rang or hold.taken else admission.GLITCH)
+            if hold.rang or hold.taken:
+                return Taken(admission.RINGING)
+            # What waits for readings that never came is no wrong reading.
+            return Taken(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
         if verdict is Verdict.LOST:
-            return self._begin_trial(hold.reckoning)
+            return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
         self._hold = None
         if verdict is Verdict.MOTION:
             return Taken("", hypotheses.steps_of_motion(hold))
@@ -273,7 +334,7 @@ class Front:
         self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
 
-    def _take_jump(self, track: Track, hold: Hold, now: Circumstances) -> Taken:
+    def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
         """The readings have settled elsewhere: frame and place move.
 
         No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
@@ -292,12 +353,18 @@ class Front:
                 slope, shift_um, undone = back, back_um, True
         frame = before if undone and before is not None else hypotheses.frame_after(f, slope, shift_um)
         if self._envelope.refuses(self.base.features, frame):
-            return self._begin_trial(hold.reckoning)
+            return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
+        first = not undone and self._proven is None
+        if first:
+            self._proven_past = self._clean_past() if self._pasts else Past.of(track)
         if undone:
             self._before, self.gates.since_glitch = None, 0
             self.undone += 1
+            if self._proven == frame:
+                self._proven = self._proven_past = None
         else:
             self._before, self._jump_um = f, away_um
+            self._proven = self._proven or f
             self.jumps += 1
         self.gates.since_jump = 0
         track.move(frame, slope, shift_um)
@@ -308,35 +375,38 @@ class Front:
             hold.shift_um += level_um - hold.expected_um
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
             # It rings about the new level: the frame is right already, the readings are awaited.
-            return Taken(admission.RINGING, (), away_um, undone)
+            return Taken(admission.RINGING, (), away_um, undone, first=first)
         self._hold = None
-        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone)
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone, first=first)
 
     # ---- readings on trial
 
-    def distrust(self, model: Model) -> None:
-        """The readings do not follow the drive: from the next sample on they are on trial.
+    def distrust(self, model: Model) -> Taken | None:
+        """The readings do not follow the drive: from the next sample on they are on trial, if they are not already.
 
         Where the stage is follows from a place at which they still did, and the voltages since.
         """
         track = self.track
-        if track is None or track.motion is None or self._trial is not None:
-            return
+        if track is None or track.motion is None or self._trial is not None or not self._judges:
+            return None
         if self._hold is not None:
             reckoning = self._hold.reckoning
         else:
             reckoning = self._begin_hold(track, model(), past=True).reckoning
-        self._begin_trial(reckoning)
+        return self._begin_trial(reckoning)
 
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
-        undone, track = self.on_probation, self.track
-        if undone and self._before is not None and track is not None:
-            # A jump that was taken just now is in doubt with the readings that it was taken from.
-            reckoning = reckoning.in_frame(self._before)
-            track.features = track.served = self._before
-            self.undone += 1
-        self._hold, self._before = None, None
+        track, proven = self.track, self._proven
         assert track is not None
+        undone = proven is not None
+        if proven is not None:
+            # Jumps that no motion has borne out are in doubt with the readings that they were taken from.
+            reckoning = reckoning.in_frame(proven)
+            if self._proven_past is not None:
+                self._proven_past.u_V += () if self._hold is None else self._hold.u_V
+            track.features = track.served = proven
+            self.undone += 1
+        self._hold, self._before, self._proven = None, None, None
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True))
         self.trials += 1
         self._forget()
@@ -348,6 +418,7 @@ class Front:
         decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
         if decision.outcome is Outcome.OPEN:
             return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+        self._give_credit(min(decision.credit, 0))
         track = self.track
         assert track is not None
         frame, away_um = track.served, 0.0
@@ -364,6 +435,18 @@ class Front:
         taken = self._restart(sample, admission.SETTLING)
         track.remember(trial.reckoning.memory)
         return replace(taken, jump_um=away_um, renamed=True)
+
+    def reckon_by(self, model: LssvmInverse) -> None:
+        """From now on ``model`` is served while readings are on trial: the place is reckoned by the same.
+
+        After jumps that were taken back it is reckoned again, from before the first of them.
+        """
+        past, self._proven_past = self._proven_past, None
+        if self._trial is None or self.track is None:
+            return
+        model = self._of_track(self.track, model)
+        reckoning = self._trial.reckoning
+        self._trial.reckoning = reckoning.by_model(model) if past is None else _from_past(past, model)
 
     # ---- where the stage is
 
@@ -382,7 +465,8 @@ class Front:
         # The model of the beginning, in a frame of its own, has a memory of its own; while readings are in doubt the
         # reckoned one is the better.
         if reckoned is not None and (not frozen or self._trial is not None):
-            return reckoned.reckoning.memory.copy()
+            memory = reckoned.reckoning.memory
+            return self.served.memory_in(self.base.features, memory) if frozen else memory.copy()
         return self.track.memory_now(frozen)
 
     # ---- what it teaches
@@ -393,8 +477,15 @@ class Front:
         self.gates.since_start += 1
         self.gates.since_jump += 1
         self._calm += 1
+        if self._trial is not None:
+            # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
+            self._trial.reckoning.advance(step.u_V)
         for past in self._pasts:
             past.u_V.append(step.u_V)
+        if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
+            self._proven_past.u_V.append(step.u_V)
+            if len(self._proven_past.u_V) > hypotheses.MOST_BRIDGED:
+                self._proven_past = None
         if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
             # A stage at rest shows nothing: the place is as good as it was.
             self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
@@ -410,7 +501,7 @@ class Front:
             return
         track.features = track.served = self.base.features
         track.memory, track.switch = track.frozen_memory.copy(), 0
-        self._before, self._hold = None, None
+        self._before, self._hold, self._proven, self._proven_past = None, None, None, None
         self.undone += 1
 
     def creep(self, by_um: float) -> None:
@@ -426,7 +517,7 @@ class Front:
         """
         track, self.confirmed = self.track, False
         assert track is not None
-        if not self._tells:
+        if not self._judges:
             return False
         if track.features is not track.served:
             # Motion from before a jump, and from after it: together they follow nothing.
@@ -435,6 +526,8 @@ class Front:
         fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
         self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
         if self.confirmed:
+            if self.following.good >= CONFIRMED:
+                self._proven = self._proven_past = None
             self.following.good = 0
             self._pasts = [*self._pasts[-1:], Past.of(track)]
         return fault
@@ -451,13 +544,22 @@ class Front:
         state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
         for i, past in enumerate(self._pasts):
             state |= prefixed(f"past{i}.", past.state_dict())
+        if self._proven is not None:
+            state |= prefixed("proven.", self._proven.state_dict())
+        if self._proven_past is not None:
+            state |= prefixed("proven_past.", self._proven_past.state_dict())
         state |= {
             "heard": self._heard.array(),
             "lost": self._lost,
             "jump_um": self._jump_um,
             "calm": self._calm,
             "trials": self.trials,
+            "credit": self._credit,
+            "until_control": self._until_control,
+            "look_from": self._look_from,
         }
+        if self._control is not None:
+            state |= prefixed("control.", self._control.state_dict())
         return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
 
     def restore(self, state: StateDict) -> None:
@@ -466,7 +568,25 @@ class Front:
         self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
         pasts = (under(f"past{i}.", state) for i in range(2))
         self._pasts = [Past.from_state(values) for values in pasts if values]
+        control = under("control.", state)
+        self._control = Trial.from_state(control, self.base) if control else None
+        self._credit = int(state.get("credit", FIRST_CREDIT))
+        self._until_control = int(state.get("until_control", 0))
+        self._look_from = int(state.get("look_from", 0))
+        proven = under("proven.", state)
+        self._proven = FeatureMap.from_state(proven) if proven else None
+        past = under("proven_past.", state)
+        self._proven_past = Past.from_state(past) if past else None
         self._heard.restore(state["heard"])
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
         self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))
+
+
+def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:
+    """From a place in the past over the voltages since; over the first ``upto`` of them where that is given."""
+    reckoning = Reckoning.begin(model, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
+    for u in past.u_V if upto is None else past.u_V[: max(upto, 0)]:
+        reckoning.advance(u)
+    reckoning.begin_way()
+    return reckoning

@@ -48,8 +48,12 @@ VALUES, SPACING_S = 64, 5e-4
 SPAN_S = 0.008
 #: Sizes of the windows, in such values, that are tried beside the longest.
 WINDOWS = (28, 16)
+#: Time for which a reading repeats itself under a stage that moves, s, after which it is no lost sample but a fault.
+STUCK_S = 0.1
 #: Time for which readings must be where they must be, s.
 CALM_S = 0.005
+#: Share of a level that drifts at which its first reading may have been.
+BEGUN = 0.6
 #: Between what slopes readings follow the stage, and the stage's way from which on that is asked, as a share of the
 #: range, for a jump, and to lose the trust without waiting.
 FOLLOWING, MOTION_SHARE, SHOWN_SHARE = (0.6, 1.7), 0.004, 0.015
@@ -209,7 +213,8 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
     hold.seen_um = max(hold.seen_um, abs(away_um))
     if stuck:
         hold.silent = n
-        return Verdict.WAIT if n < MOST_BRIDGED else Verdict.LOST
+        shown = hold.same * now.dt_s >= STUCK_S and hold.high_um - hold.low_um > SHOWN_SHARE * now.range_um
+        return Verdict.LOST if shown or n >= MOST_BRIDGED else Verdict.WAIT
     if hold.reckoning.lost:
         return Verdict.LOST
     # A stage that goes where its readings do not has a sensor that is wrong: no need to wait.
@@ -277,6 +282,9 @@ def _known(level: Level, usual_um: float) -> bool:
 
 def _drifts(level: Level, hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
     """Whether a level that moves may be a drift of the stage: slow enough, and not a sensor that stands still."""
+    # What drifts begins where it was: readings that are elsewhere at once and then go on from there are no drift.
+    if abs(hold.y_um[hold.jumped] - hold.slope * hold.old_um[hold.jumped] - hold.shift_um) > BEGUN * abs(level.at):
+        return False
     rate = abs(level.rate) / (stride * now.dt_s)
     own = abs(hold.old_um[-1] - hold.old_um[-count]) / (count * now.dt_s)
     follows = slope_of(np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:]))
@@ -300,7 +308,8 @@ def _is_jump(level: Level, hold: Hold, count: int, r: FloatArray, usual_um: floa
         return False
     readings = np.array(hold.y_um)
     moved = float(np.nanmax(np.abs(readings - hold.last_um))) + hold.reckoning.way_um + now.usual_um
-    return away <= moved and _follow(hold, count, now)
+    # A sensor that stands still looks settled over a short while: all readings since the surprise are asked.
+    return away <= moved and _follow(hold, count, now) and _follow(hold, readings.size - hold.jumped, now)
 
 
 def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SHARE) -> bool:

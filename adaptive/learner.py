@@ -85,13 +85,13 @@ class Learner:
         parts, front = self.parts, self.parts.front
         front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
         taken = front.take(sample, self.snapshot)
-        if taken.undone:
+        if taken.distrusted:
+            self._go_on_without_readings(taken.undone)
+        elif taken.undone:
             parts.undo_jump()
-        elif taken.distrusted:
-            parts.go_back()
         if taken.jump_um:
-            parts.take_jump(taken.jump_um, fresh=not taken.undone)
-        if taken.undone or taken.jump_um or taken.distrusted or taken.renamed:
+            parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
+        if parts.watch_trial() or taken.undone or taken.jump_um or taken.distrusted or taken.renamed:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
@@ -163,10 +163,17 @@ class Learner:
             if front.confirmed:
                 parts.confirm()
             return ""
-        parts.go_back()
-        self._cache = None
-        front.distrust(self.snapshot)
+        taken = front.distrust(self.snapshot)
+        if taken is None:
+            return ""
+        self._go_on_without_readings(taken.undone)
         return admission.UNTRUSTED
+
+    def _go_on_without_readings(self, undone: bool) -> None:
+        """The readings are on trial. ``undone``: and jumps were taken back with them."""
+        self.parts.go_back(undone)
+        self._cache = None
+        self.parts.front.reckon_by(self.snapshot())
 
     @property
     def trouble(self) -> str:
@@ -178,6 +185,11 @@ class Learner:
         """
         parts = self.parts
         return parts.front.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
+
+    @property
+    def distrusts(self) -> bool:
+        """Whether the readings are on trial: what is served is from before them."""
+        return self.parts.front.distrusted_s > 0.0
 
     @property
     def why(self) -> str:

@@ -35,6 +35,10 @@ CHECK_S = 0.004
 RAIL_S, RAIL_SHARE = 0.1, 0.05
 #: Time inside the envelope after which a model that had left it is no trouble any more, s.
 LEFT_S = 1.0
+#: Time on trial from which on the identified model may be served, s, and how large its own recent error may be for
+#: that, rms, as a share of the span for each second on trial, and at most. The last estimate is exact where the stage
+#: was when readings were last believed; the longer that is ago, the less it is worth.
+ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.05
 
 Mark = tuple[FloatArray, FloatArray]
 
@@ -52,10 +56,12 @@ class Parts:
     check_every, check_s : samples between two looks at envelope, rails and sensor, and the time between them, s.
     allowed_V : by how much the model may leave the identified linear part, V; 0 for no bound.
     left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
+    alone : whether readings have been on trial for so long that the identified model, if it is good, is the better.
     rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
     confirmed : estimates from before readings that certainly followed the drive, the older one first.
     mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
-    some of what went wrong. counters : samples by outcome. events : by name.
+    some of what went wrong. jump_mark, proven_mark : those before the last jump, and before the first that is open.
+    counters : samples by outcome. events : by name.
     """
 
     def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
@@ -70,6 +76,7 @@ class Parts:
         self.mark: Mark = self.filter.mark()
         self.next_mark: Mark = self.mark
         self.jump_mark: Mark = self.mark
+        self.proven_mark: Mark = self.mark
         self.confirmed: tuple[Mark, Mark] = (self.mark, self.mark)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
@@ -86,6 +93,7 @@ class Parts:
         self.railed = False
         self.left_s = 0.0
         self.left = False
+        self.alone = False
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
 
@@ -169,13 +177,26 @@ class Parts:
             self.left_s = max(min(self.left_s, 0.0) - step_s, -LEFT_S)
             self.left = self.left and self.left_s > -LEFT_S
 
+    def watch_trial(self) -> bool:
+        """At each sample: returns whether ``alone`` has changed."""
+        on_trial_s, before = self.front.distrusted_s, self.alone
+        if on_trial_s or before:
+            limit_V = min(ALONE_SHARE_PER_S * on_trial_s, ALONE_SHARE) * self.filter.span_V
+            self.alone = on_trial_s >= ALONE_S and self.judgement.frozen_V2 <= limit_V * limit_V
+        if self.alone and not before:
+            self.front.reckon_by(self.front.base)
+        return self.alone != before
+
     def confirm(self) -> None:
         """The readings follow the drive: what was learnt from those before them is right."""
         self.confirmed = (self.confirmed[1], self.filter.mark())
 
-    def go_back(self) -> None:
-        """The readings do not follow the drive: forget what was learnt since they certainly did."""
-        self.filter.restore(self.confirmed[0])
+    def go_back(self, undone: bool) -> None:
+        """The readings do not follow the drive: forget what was learnt since they certainly did.
+
+        ``undone``: jumps are taken back with them; all since the first of them is forgotten.
+        """
+        self.filter.restore(self.proven_mark if undone else self.confirmed[0])
         self.window.keep()
         self.events["distrusts"] += 1
 
@@ -185,21 +206,23 @@ class Parts:
         self.front.to_base_frame()
         self.filter.go_back(self.first)
         self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
-        self.mark = self.next_mark = self.jump_mark = self.filter.mark()
+        self.mark = self.next_mark = self.jump_mark = self.proven_mark = self.filter.mark()
         self.confirmed = (self.mark, self.mark)
         self.domain = base.domain.copy()
         self.events["begun_again"] += 1
 
-    def take_jump(self, jump_um: float, fresh: bool) -> None:
-        """The reading has jumped by so much, µm; ``fresh`` : and did not only undo a jump."""
+    def take_jump(self, jump_um: float, fresh: bool, first: bool) -> None:
+        """The reading has jumped by so much, µm; ``fresh``: and did not only undo a jump; ``first``: see ``Taken``."""
         front = self.front
         self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / front.range_um * front.base.span_V) ** 2
         if fresh:
             self.jump_mark = self.filter.mark()
+        if first:
+            self.proven_mark = self.jump_mark
         self.confirmed = (self.filter.mark(),) * 2
 
     def undo_jump(self) -> None:
-        """Forget what was learnt since the jump: it was learnt of a stage that never was."""
+        """Forget what was learnt since the last jump: it was learnt of a stage that never was."""
         self.filter.restore(self.jump_mark)
         self.window.keep()
 
@@ -212,7 +235,8 @@ class Parts:
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part, now, in its marks, and as it was served."""
         self.filter.shift_constant(by_V)
-        for beta, _ in {id(m): m for m in (self.mark, self.next_mark, self.jump_mark, *self.confirmed)}.values():
+        marks = (self.mark, self.next_mark, self.jump_mark, self.proven_mark, *self.confirmed)
+        for beta, _ in {id(m): m for m in marks}.values():
             beta[0] += by_V
         self.delay.shift(by_V)
 
@@ -221,7 +245,7 @@ def model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
     """What is learnt, as an immutable model; the identified one while learning is worse than it."""
     j, window, seq = parts.judgement, parts.window, parts.front.gates.seq
     valid = j.valid and not parts.front.fault
-    if j.fallback:
+    if j.fallback or parts.alone:
         return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
     support, alpha, bias = window.arrays()
     beta = parts.filter.beta
@@ -283,6 +307,7 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
         "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
         "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
+        "proven_mark": {"beta": parts.proven_mark[0].copy(), "covariance": parts.proven_mark[1].copy()},
         "confirmed0": {"beta": parts.confirmed[0][0].copy(), "covariance": parts.confirmed[0][1].copy()},
         "confirmed1": {"beta": parts.confirmed[1][0].copy(), "covariance": parts.confirmed[1][1].copy()},
     }
@@ -296,6 +321,7 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "railed": parts.railed,
         "left_s": parts.left_s,
         "left": parts.left,
+        "alone": parts.alone,
     }
 
 
@@ -316,9 +342,12 @@ def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool
         parts.point = np.array(state["point"], dtype=np.float64)
         parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
         parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
+        parts.alone = bool(state.get("alone", False))
         parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
         parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
+        proven = under("proven_mark.", state)
+        parts.proven_mark = _mark(proven) if proven else parts.jump_mark
         kept = [under(f"confirmed{i}.", state) for i in range(2)]
         parts.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (parts.mark, parts.next_mark)
         return base, config, parts, bool(state["frozen"])

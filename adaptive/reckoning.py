@@ -152,6 +152,12 @@ class Reckoning:
         n[_LINE] = n[_U] - n[_SLOPE] * (frame.offset_um + slope * (line_um - f.offset_um))
         return Reckoning(replace(self.model, features=frame), self.memory.copy(), n)
 
+    def by_model(self, model: LssvmInverse) -> Reckoning:
+        """Go on by another model of the same frame. A reading must be where it had to be before the change."""
+        made = Reckoning(model, self.memory.copy(), self.numbers.copy())
+        made.numbers[_OFF] += self.y_um - made.advance(float(self.numbers[_U]))
+        return made
+
     def advance(self, u_V: float) -> float:
         """One sample on, under the voltage ``u_V``; returns where its reading must be, µm."""
         f = self.model.features

@@ -49,9 +49,9 @@ class Pair(NamedTuple):
 class Taken:
     """What a sample came to: the gate that refused it or "", and the steps to make.
 
-    jump_um : by how much the frame has moved, µm. undone : whether it has gone back to where it was before the last
-    jump, and what was learnt since is to be forgotten. distrusted : whether the readings are on trial from now on;
-    renamed : whether what is wrong with them has got another name, or none.
+    jump_um : by how much the frame has moved, µm. first : whether no other jump is open before this one. undone :
+    whether it has gone back to where it was, and what was learnt since is to be forgotten. distrusted : whether the
+    readings are on trial from now on; renamed : whether what is wrong with them has got another name, or none.
     """
 
     refused: str
@@ -60,6 +60,7 @@ class Taken:
     undone: bool = False
     distrusted: bool = False
     renamed: bool = False
+    first: bool = False
 
 
 @dataclass(slots=True)
@@ -186,9 +187,7 @@ class Track:
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""
-        self.memory = memory.copy()
-        if self.served == self.base:
-            self.frozen_memory = memory.copy()
+        self.memory, self.frozen_memory = memory.copy(), self.served.memory_in(self.base, memory)
 
     def doubt(self, n: int) -> None:
         """The last ``n`` readings were none: nothing is taught of them."""

@@ -46,6 +46,9 @@ VALUES, LOOKS = 128, 8
 SWING_SHARE, SWING_SIGMA = 0.003, 5.0
 #: Share of the variance from which on readings follow, and from which on they are a straight line at all.
 FOLLOWS, STRAIGHT = 0.9, 0.7
+#: Deviations of the reckoned place that the stage must move for the place to tell; where it does not, the share of the
+#: variance below which the voltage of the readings does not follow the applied one.
+TELLS, STRAIGHT_ALONE = 2.0, 0.4
 #: Readings that vary by less than this share of the stage's motion stand still.
 STILL = 0.15
 #: Looks in a row that must find a fault before it is named, and before it has another name; windows at rest before
@@ -55,9 +58,10 @@ NAMED, RENAMED, RESTED = 3, 24, 3
 GAIN_STEP, AGREE = 0.02, 0.02
 #: Windows of readings that follow, but not by the same change, after which it is the model that is wrong.
 UNCLEAR = 6
-#: Windows in which p must have followed the voltage; share of its variance and slope from which on it does, and by what
-#: share of the drive it is off where the readings are those of before.
-OBEYED, OBEYS, OBEYS_SLOPE, SAME_SHARE = 2, 0.8, 1.4, 0.03
+#: Windows in which p must have followed the voltage; share of its variance, and slope, from which on it does; slope up
+#: to which it does whatever the reckoning says; and by what share of the drive it is off where the readings are those
+#: of before.
+OBEYED, OBEYS, OBEYS_SLOPE, OBEYS_SURE, SAME_SHARE = 2, 0.8, 1.4, 1.2, 0.03
 
 
 class Outcome(Enum):
@@ -71,9 +75,12 @@ class Outcome(Enum):
 
 
 class Decision(NamedTuple):
+    """credit : 1 where the reckoning was right all the time, -1 where it was not and the readings were, else 0."""
+
     outcome: Outcome
     slope: float = 1.0
     shift_um: float = 0.0
+    credit: int = 0
 
 
 OPEN = Decision(Outcome.OPEN)
@@ -150,28 +157,36 @@ class Trial:
             and 1.0 / OBEYS_SLOPE <= obeys.slope <= OBEYS_SLOPE
             and abs(off_V) <= now.envelope.offset * drive
         )
-        follows = s.share >= FOLLOWS and now.envelope.gain_allows(s.slope)
+        straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
+        follows = straight and allowed
+        wrong = _fault(s, float(np.std(y)))
+        if s.swing < TELLS * self.reckoning.std_um:
+            # A place that is not known better than the stage moves tells nothing; the voltage alone must.
+            wrong = _fault(obeys, float(np.std(p)), "V") if obeys.share < STRAIGHT_ALONE else ("", "")
         if not whole:
             if not (obeyed or follows):
-                self._suspect(*_fault(s, float(np.std(y))))
+                self._suspect(*wrong)
             return OPEN
-        self.obeyed = self.obeyed + 1 if obeyed else 0
+        # Where the readings are the reckoned place but for a gain that no stage has, the answer must be quite right.
+        sure = allowed or not straight or 1.0 / OBEYS_SURE <= obeys.slope <= OBEYS_SURE
+        self.obeyed = self.obeyed + 1 if obeyed and sure else 0
         if self.obeyed >= OBEYED * LOOKS:
-            return Decision(Outcome.SAME)
+            return Decision(Outcome.SAME, credit=-1)
         if follows:
             if obeyed and abs(off_V) <= SAME_SHARE * drive:
-                return Decision(Outcome.SAME)
+                there = abs(float(np.mean(y - x))) <= tolerance_um(now, self.reckoning)
+                return Decision(Outcome.SAME, credit=1 if there else -1)
             return self._following(s, x, y, now)
         self.followed = self.agreed = 0
         if not obeyed:
-            self._suspect(*_fault(s, float(np.std(y))))
+            self._suspect(*wrong)
         return OPEN
 
     def _following(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
         off, at_um = float(np.mean(y - x)), float(x[-1])
         near = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
         if near and abs(off) <= tolerance_um(now, self.reckoning):
-            return Decision(Outcome.SAME)
+            return Decision(Outcome.SAME, credit=1)
         slope, shift_um = (1.0, off) if near else (s.slope, s.constant)
         # A change of the stage is the same in the next window; an error of the model is another one elsewhere.
         self.followed += 1
@@ -179,7 +194,7 @@ class Trial:
         agrees = abs(self.slope - slope) <= AGREE and abs(moved_um) <= max(AGREE * now.range_um, 2.0 * now.usual_um)
         if not agrees:
             self.agreed, self.slope, self.shift_um = 0, slope, shift_um
-            return Decision(Outcome.SAME) if self.followed >= UNCLEAR * LOOKS else OPEN
+            return Decision(Outcome.SAME, credit=-1) if self.followed >= UNCLEAR * LOOKS else OPEN
         self.agreed += 1
         return Decision(Outcome.CHANGED, slope, shift_um) if self.agreed >= LOOKS else OPEN
 
@@ -197,9 +212,14 @@ class Trial:
 
     def refuse(self, why: str) -> None:
         """What the readings say is refused by the envelope."""
+        # Straight lines outside tell more than the identified model's answer.
+        self.obeyed = -OBEYED * LOOKS
         self._suspect(OUT_OF_ENVELOPE, why)
 
     def _suspect(self, fault: str, why: str) -> None:
+        if not fault:
+            self.suspected, self.times = "", 0
+            return
         self.times = self.times + 1 if fault == self.suspected else 1
         self.suspected = fault
         if self.times >= (RENAMED if self.fault else NAMED):
@@ -235,11 +255,13 @@ _NUMBERS = {
 }  # fmt: skip
 
 
-def _fault(s: Slope, spread_um: float) -> tuple[str, str]:
-    """(name, why in words) of what readings do that do not follow: ``s`` of the readings over the places."""
+def _fault(s: Slope, spread: float, unit: str = "um") -> tuple[str, str]:
+    """(name, why in words) of what readings do that do not follow: ``s`` of the readings over the places, in ``unit``;
+    in V that of the voltages that they ask for over those applied. ``spread`` : rms of the first."""
     why = f"readings go {s.slope:.3g} times as far as the voltage must have moved the stage, {s.share:.0%} on a line"
     if s.share >= STRAIGHT:
         return (SENSOR_SIGN if s.slope < 0.0 else SENSOR_GAIN), why
-    if spread_um <= STILL * s.swing:
-        return SENSOR_STUCK, f"readings vary by {spread_um:.3g} um rms where the stage must have by {s.swing:.3g} um"
+    if spread <= STILL * s.swing:
+        must = f"where the stage must have by {s.swing:.3g} {unit}"
+        return SENSOR_STUCK, f"readings vary by {spread:.3g} {unit} rms {must}"
     return SENSOR_FOREIGN, why

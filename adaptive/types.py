@@ -101,6 +101,11 @@ class SelfWatching(Protocol):
         """The reason in words."""
         ...
 
+    @property
+    def distrusts(self) -> bool:
+        """Whether the readings are on trial: what it serves is from before them, and goes on without them."""
+        ...
+
 
 class OnlineModel(Protocol):
     """A model that learns sample by sample; the learner and all adaptive baselines are of this kind.

@@ -161,3 +161,16 @@ def test_state_round_trip() -> None:
 def test_bad_configuration_is_named(bad: dict[str, object]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
         replace(MAP, **bad)  # type: ignore[arg-type]
+
+
+@settings(max_examples=50, deadline=None)
+@given(paths, st.floats(0.7, 1.4), st.floats(-20.0, 20.0))
+def test_a_memory_in_another_frame_is_of_the_same_readings(path: list[float], gain: float, offset_um: float) -> None:
+    """Every entry is a displacement."""
+    other = replace(MAP, gain=gain, offset_um=offset_um)
+    memory = walk(path)
+    there = MAP.memory_in(other, memory)
+    np.testing.assert_allclose(there, (memory - offset_um) / gain)
+    np.testing.assert_allclose(other.memory_in(MAP, there), memory, atol=1e-9)
+    assert there is not memory
+    assert MAP.memory_in(MAP, memory) is not memory
