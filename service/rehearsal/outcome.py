@@ -41,7 +41,8 @@ class Figures:
     from the event on, and of 1 to 4 s after it. during_pct : while it lasts, nan where it does not last.
     settled_pct : of the last 2 s of the run. worst_half_second_pct : the largest mean over half a second from the event
     on. worst_pct : the largest error from the event on. large_s : longest time for which the error stayed above 5 %, in
-    the whole run; a moment below, of up to 10 ms, does not end it. large_at_s : when that began, s after the event
+    the whole run, but for what is beyond reach: where the voltage is at the limit that draws the stage to its target.
+    A moment below, of up to 10 ms, does not end it. large_at_s : when that began, s after the event
     (negative: before it); nan where it never was. rail_s : longest time at a limit of the drive that the reference did
     not ask for. ends_at_rail : whether the run ended so.
     """
@@ -122,10 +123,11 @@ def figures(course: Course, event: Event, range_um: float, limits: Limits, dt_s:
     second, quiet = round(1.0 / dt_s), round(QUIET_S / dt_s)
     window = max(1, round(WINDOW_S / dt_s))
     pause = round(BREAK_S / dt_s)
-    rail = bridged(_unasked_rail(course, event, error_pct, limits, dt_s), pause)
+    beyond = _beyond_reach(course, event, limits, dt_s)
+    rail = bridged(_at_limit(course, limits) & (error_pct > ASKED_PCT) & ~beyond, pause)
     # The last interruption cannot be told from an end of it.
     last = rail[n - max(1, round(END_S / dt_s)) : n - pause]
-    large, from_tick = longest(bridged((error_pct > LARGE_PCT) & ~_reference_beyond(course, event, dt_s), pause))
+    large, from_tick = longest(bridged((error_pct > LARGE_PCT) & ~beyond, pause))
     return Figures(
         before_pct=_mean(error_pct[max(0, at - quiet) : at]),
         first_second_pct=_mean(error_pct[at : at + second]),
@@ -208,17 +210,21 @@ def _mean(values: FloatArray) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def _reference_beyond(course: Course, event: Event, dt_s: float) -> BoolArray:
-    """(n,) where the reference asks for what may be beyond reach."""
-    t_s = course.t_s
-    return (t_s >= event.at_s) & (t_s <= event.end_s + dt_s) & (event.kind == "rail")
+def _beyond_reach(course: Course, event: Event, limits: Limits, dt_s: float) -> BoolArray:
+    """(n,) where the reference asks for what is beyond reach: by the event, or where the voltage is at the limit that
+    draws the stage to where it is wanted, and does not get it there."""
+    t_s, u = course.t_s, course.u_V
+    by_event = (t_s >= event.at_s) & (t_s <= event.end_s + dt_s) & (event.kind == "rail")
+    rising = np.sign(np.dot(u - u.mean(), course.true_um - course.true_um.mean()))
+    missing_um = rising * (course.wanted_um - course.true_um)
+    up = u > 0.5 * (limits.u_min_V + limits.u_max_V)
+    beyond: BoolArray = by_event | (_at_limit(course, limits) & np.where(up, missing_um > 0.0, missing_um < 0.0))
+    return beyond
 
 
-def _unasked_rail(course: Course, event: Event, error_pct: FloatArray, limits: Limits, dt_s: float) -> BoolArray:
-    """(n,) where the voltage is at a limit and the stage is not where it is wanted, which is within reach."""
+def _at_limit(course: Course, limits: Limits) -> BoolArray:
     near = RAIL_SHARE * (limits.u_max_V - limits.u_min_V)
-    rail = (course.u_V <= limits.u_min_V + near) | (course.u_V >= limits.u_max_V - near)
-    return rail & (error_pct > ASKED_PCT) & ~_reference_beyond(course, event, dt_s)
+    return (course.u_V <= limits.u_min_V + near) | (course.u_V >= limits.u_max_V - near)
 
 
 def _troubles(course: Course, event: Event, range_um: float, dt_s: float) -> tuple[Trouble, ...]:

@@ -279,12 +279,12 @@ def course(error_um: np.ndarray, u_V: np.ndarray, trouble: np.ndarray | None = N
 
 def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
     limits = Limits(0.0, 10.0, 1e4)
-    n, quiet = 9000, np.full(9000, 5.0)
+    n, quiet = 9000, 5.0 + 4.0 * np.sin(2.0 * np.pi * DT_S * np.arange(9000))
     error = np.zeros(n)
-    error[2000:4000] = 0.1
-    error[4000:5000], error[5000:8000], error[8000:] = 6.0, 2.0, 0.2
+    error[2000:4000] = -0.1
+    error[4000:5000], error[5000:8000], error[8000:] = -6.0, -2.0, -0.2
     u_V = quiet.copy()
-    u_V[4100:4300] = 10.0  # at the limit, and off by 6 µm of 100
+    u_V[4100:4300] = 10.0  # at the limit, and by 6 µm of 100 further up than wanted
     u_V[8000:] = 10.0  # at the limit, but where it is wanted
     event = Event("gain_at_once", "gain", 4.0, 0.06)
     result = outcome(event, course(error, u_V), course(0.5 * error, quiet), 100.0, limits, DT_S, "")
@@ -294,7 +294,11 @@ def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
     assert (one.large_s, one.large_at_s, one.rail_s) == pytest.approx((1.0, 0.0, 0.2))
     assert not one.ends_at_rail
     assert result.worst_ratio == pytest.approx(2.0)
-    error[8000:] = 50.0
+    error[8000:] = 20.0  # at the limit, and still not there: no voltage does better
+    result = outcome(event, course(error, u_V), course(error, quiet), 100.0, limits, DT_S, "")
+    assert not result.adaptive.ends_at_rail
+    assert (result.adaptive.large_s, result.adaptive.rail_s) == pytest.approx((1.0, 0.2))
+    error[8000:] = -20.0
     result = outcome(event, course(error, u_V), course(error, quiet), 100.0, limits, DT_S, "")
     assert result.adaptive.ends_at_rail
     assert "ENDS AT A RAIL" in remarks(result)
