@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
+from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answering import Served, answer, blends, learns
 from service.axis_counting import AxisCounting
@@ -201,7 +202,10 @@ class Axis(AxisCounting):
         config = self.config
         if self.learner is not None:
             models[config.learn] = self.learner.snapshot()
-        memories = {name: model.rest_memory(0.0) for name, model in models.items()}
+        # Before the first sample the stage is taken to be at rest, where it was when it was identified.
+        places = (model.features.y_rest_um for model in models.values() if isinstance(model, LssvmInverse))
+        rest_um = next(places, 0.0)
+        memories = {name: model.rest_memory(rest_um) for name, model in models.items()}
         # A model of the learner's own form is no stand-in for it.
         known = (name for name in STAND_INS if name in models and name not in (config.learn, config.served))
         return Served(-1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(known, ""))
