@@ -11,7 +11,7 @@ would follow those of the stage: that costs next to nothing, where its own answe
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -135,6 +135,11 @@ class ChampionInverse:
             ends.append(end if np.isfinite(end).all() else part)
         n = np.asarray(y_um).size
         return np.concatenate([self._weights(shares, n)[-1] if n else shares, *ends])
+
+    def with_model(self, name: str, model: InverseModel) -> ChampionInverse:
+        """The same with another model of the contestant called ``name``."""
+        models = tuple(model if name == own else old for own, old in zip(self.names, self.models, strict=True))
+        return replace(self, models=models)
 
     def with_memory(self, memory: FloatArray, name: str, own: FloatArray) -> FloatArray:
         """``memory`` (m,) with that of the contestant called ``name`` replaced by ``own``. Not changed in place."""

@@ -98,6 +98,12 @@ class Competition:
         return favourite.why if isinstance(favourite, SelfWatching) else ""
 
     @property
+    def distrusts(self) -> bool:
+        """Whether the favourite has the readings on trial."""
+        favourite = self.favourite
+        return isinstance(favourite, SelfWatching) and favourite.distrusts
+
+    @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self._seq

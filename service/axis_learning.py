@@ -61,8 +61,10 @@ class AxisLearning(AxisOperations):
             except (DehystError, ValueError, ArithmeticError) as error:
                 self._failed(f"snapshot: {error}")
         before = self.watch.trouble
-        told = self.learner.trouble if isinstance(self.learner, SelfWatching) and not self._learner_dead else ""
-        good = self.watch.judge(candidate, last.models.get(last.stand_in), told)
+        told, distrusts = "", False
+        if isinstance(self.learner, SelfWatching) and not self._learner_dead:
+            told, distrusts = self.learner.trouble, self.learner.distrusts
+        good = self.watch.judge(candidate, last.models.get(last.stand_in), told, distrusts)
         now = self.watch.trouble
         if not now and not before:
             self._mark()
@@ -79,9 +81,18 @@ class AxisLearning(AxisOperations):
             self.note(*event)
         if good is None:
             return {}
-        # While samples are poisoned the champion stays as it was; a learner that is bad it can do without.
-        auto = {} if now in POISON or self._learner_dead else champion_of(self.learner)
-        return {self.config.learn: good, **auto}
+        return {self.config.learn: good, **self._champion(last, good, now in POISON)}
+
+    def _champion(self, last: Served, good: InverseModel, poisoned: bool) -> dict[str, InverseModel]:
+        """The champion under its name. While samples are poisoned nobody is judged by them: it stays who it was."""
+        if self._learner_dead:
+            return {}
+        if not poisoned:
+            return champion_of(self.learner)
+        name, champion = self.config.learn, last.models.get(AUTO)
+        if not isinstance(champion, ChampionInverse) or name not in champion.names or last.models[name] is good:
+            return {}
+        return {AUTO: champion.with_model(name, good)}
 
     def _own_memory(self, models: dict[str, InverseModel], tracked: dict[str, FloatArray]) -> dict[str, FloatArray]:
         """``tracked`` memories, with the learner's own for its model, alone and as the champion's contestant."""

@@ -43,6 +43,11 @@ class Competing:
         return self.competition.why
 
     @property
+    def distrusts(self) -> bool:
+        """Whether the learner has the readings on trial."""
+        return self.competition.distrusts
+
+    @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self.competition.seq

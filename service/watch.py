@@ -12,8 +12,9 @@ Trouble has a name, begins and ends with hysteresis, and ends by itself:
 - ``rail``, ``model_left_envelope``: the voltage was at a limit because the model was wrong, or the model had left what
   a stage can become; the learner has begun again from the identified one.
 
-During the first two and what the sensor has, the learner is frozen and the model from before the trouble is served;
-where the learner has begun again, the identified one, during the others the last that passed. What was served for too
+During the first two the learner is frozen and the model from before the trouble is served. Where the learner itself
+distrusts the sensor, what it goes on serving is: it has gone back to before the fault. Where it has begun again, that
+is the identified model; during the others it is the last that passed. What was served for too
 long without being renewed gives way, over a ramp, to the baseline.
 """
 
@@ -121,11 +122,12 @@ class Watch:
         return ""
 
     def judge(
-        self, candidate: InverseModel | None, baseline: InverseModel | None, told: str = ""
+        self, candidate: InverseModel | None, baseline: InverseModel | None, told: str = "", distrusts: bool = False
     ) -> InverseModel | None:
         """The model to serve, of ``candidate`` (None: the learner failed) and those before; None: nothing but what is.
 
-        ``told`` : what the learner says is wrong. Call once per snapshot. Sets ``trouble`` and ``trust``.
+        ``told``: what the learner says is wrong. ``distrusts``: whether it has the readings on trial.
+        Call once per snapshot. Sets ``trouble`` and ``trust``.
         """
         n, c = self._n, self.config
         now, elapsed = n["count"], n["count"] - n["seen"]
@@ -152,6 +154,9 @@ class Watch:
                 self.trouble = ""
         if self.trouble in BEGUN_AGAIN and candidate is not None:
             self._mark = self._next_mark = self._good = candidate
+        elif self.trouble and distrusts and candidate is not None and self._sane(candidate, baseline):
+            # It has gone back to before the fault by itself, and knows more of before than one snapshot does.
+            self._good = candidate
         if not self.trouble and candidate is not None:
             self._good = candidate
             if (now - n["marked"]) * self._dt_s >= c.mark_s or self._mark is None:
