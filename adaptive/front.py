@@ -42,6 +42,8 @@ LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
 LOOK_S = 0.002
 #: Share of the identified range beyond its ends up to which the model is known.
 KNOWN = 0.05
+#: Deviation of a reckoned place, as a share of the range, up to which a hold begins from a past one.
+PAST_SHARE = 0.02
 #: Age at which a place is from before anything that is noticed now, s.
 CLEAN_S = 0.06
 #: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with;
@@ -255,7 +257,8 @@ class Front:
             reckoning.advance(u)
         reckoning.begin_way()
         dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
-        if abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
+        known = reckoning.std_um <= self._least_um
+        if known and abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
             return Hold(reckoning, reckoning.y_um)
         self._look_from = self.gates.since_start + lag
         return None
@@ -268,7 +271,9 @@ class Front:
         gates = self.gates
         if past and self._pasts:
             reckoning = self._from_past(track, model)
-            return Hold(reckoning, reckoning.y_um)
+            # A place from long ago, over a long way, is no better than readings that may have rung.
+            if reckoning.std_um <= PAST_SHARE * self.range_um:
+                return Hold(reckoning, reckoning.y_um)
         motion, u_before_V, past_V, past_um = track.since_motion()
         # Readings that were repeated before that was noticed are none, nor are they an anchor.
         repeated = gates.same - 1 if gates.same >= admission.REPEATED else 0
@@ -392,22 +397,25 @@ class Front:
         if self._hold is not None:
             reckoning = self._hold.reckoning
         else:
-            reckoning = self._begin_hold(track, model(), past=True).reckoning
+            reckoning = self._from_past(track, model()) if self._pasts else self._begin_hold(track, model()).reckoning
         return self._begin_trial(reckoning)
 
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
         track, proven = self.track, self._proven
         assert track is not None
-        undone = proven is not None
+        undone, jump = proven is not None, (0.0, 0.0)
         if proven is not None:
             # Jumps that no motion has borne out are in doubt with the readings that they were taken from.
+            # What they had made of a reading in the frame from before: y -> slope y + shift.
+            slope = track.served.gain / proven.gain
+            jump = slope, track.served.offset_um - slope * proven.offset_um
             reckoning = reckoning.in_frame(proven)
             if self._proven_past is not None:
                 self._proven_past.u_V += () if self._hold is None else self._hold.u_V
             track.features = track.served = proven
             self.undone += 1
         self._hold, self._before, self._proven = None, None, None
-        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True))
+        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump)
         self.trials += 1
         self._forget()
         return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)

@@ -58,7 +58,8 @@ class Parts:
     left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
     alone : whether readings have been on trial for so long that the identified model, if it is good, is the better.
     rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
-    confirmed : estimates from before readings that certainly followed the drive, the older one first.
+    confirmed : estimates from before readings that certainly followed the drive, the older one first. mark_ages,
+    confirmed_ages : at which judgement the marks were made.
     mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
     some of what went wrong. jump_mark, proven_mark : those before the last jump, and before the first that is open.
     counters : samples by outcome. events : by name.
@@ -78,6 +79,7 @@ class Parts:
         self.jump_mark: Mark = self.mark
         self.proven_mark: Mark = self.mark
         self.confirmed: tuple[Mark, Mark] = (self.mark, self.mark)
+        self.mark_ages = self.confirmed_ages = (0, 0)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
         start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
@@ -145,6 +147,11 @@ class Parts:
             self.events["rollbacks"] += 1
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
+            self.mark_ages = (self.mark_ages[1], j.judged)
+            if self.confirmed_ages[0] < self.mark_ages[0]:
+                # Where the stage moves little, nothing is confirmed for long: what was good for a second is as good.
+                self.confirmed = (self.mark, self.confirmed[1])
+                self.confirmed_ages = (self.mark_ages[0], self.confirmed_ages[1])
 
     def watch_rail(self, saturated: bool) -> None:
         """After ``judge``: a voltage that stays at a limit by the model's fault ends in the identified model.
@@ -189,7 +196,9 @@ class Parts:
 
     def confirm(self) -> None:
         """The readings follow the drive: what was learnt from those before them is right."""
-        self.confirmed = (self.confirmed[1], self.filter.mark())
+        newer = int(self.confirmed_ages[1] >= self.confirmed_ages[0])
+        self.confirmed = (self.confirmed[newer], self.filter.mark())
+        self.confirmed_ages = (self.confirmed_ages[newer], self.judgement.judged)
 
     def go_back(self, undone: bool) -> None:
         """The readings do not follow the drive: forget what was learnt since they certainly did.
@@ -208,6 +217,7 @@ class Parts:
         self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
         self.mark = self.next_mark = self.jump_mark = self.proven_mark = self.filter.mark()
         self.confirmed = (self.mark, self.mark)
+        self.mark_ages = self.confirmed_ages = (self.judgement.judged,) * 2
         self.domain = base.domain.copy()
         self.events["begun_again"] += 1
 
@@ -219,7 +229,7 @@ class Parts:
             self.jump_mark = self.filter.mark()
         if first:
             self.proven_mark = self.jump_mark
-        self.confirmed = (self.filter.mark(),) * 2
+        self.confirmed, self.confirmed_ages = (self.filter.mark(),) * 2, (self.judgement.judged,) * 2
 
     def undo_jump(self) -> None:
         """Forget what was learnt since the last jump: it was learnt of a stage that never was."""
@@ -322,6 +332,8 @@ def state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bo
         "left_s": parts.left_s,
         "left": parts.left,
         "alone": parts.alone,
+        "mark_ages": np.array(parts.mark_ages),
+        "confirmed_ages": np.array(parts.confirmed_ages),
     }
 
 
@@ -343,6 +355,7 @@ def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool
         parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
         parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
         parts.alone = bool(state.get("alone", False))
+        parts.mark_ages, parts.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
         parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
         parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
@@ -355,6 +368,12 @@ def restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool
         raise ModelFileError(
             f"learner state: entry missing or damaged: {error}; start from the model instead"
         ) from error
+
+
+def _ages(values: object) -> tuple[int, int]:
+    """Two counts; a state from before there were any knows none."""
+    first, second = (0, 0) if values is None else np.asarray(values).tolist()
+    return int(first), int(second)
 
 
 def _mark(values: StateDict) -> Mark:

@@ -56,6 +56,11 @@ STILL = 0.15
 NAMED, RENAMED, RESTED = 3, 24, 3
 #: A slope so far from 1 is a change of gain; slopes so near to each other, and places as a share of the range, agree.
 GAIN_STEP, AGREE = 0.02, 0.02
+#: By how much the slope may be another one where motion bears out a jump that was taken back.
+OPEN_SLOPE = 0.15
+#: Between what shares of a change of the zero the identified model must see it too, and share of the variance and
+#: distance of both slopes from 1 for which half a window is enough to believe it.
+ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
 #: Windows of readings that follow, but not by the same change, after which it is the model that is wrong.
 UNCLEAR = 6
 #: Windows in which p must have followed the voltage; share of its variance, and slope, from which on it does; slope up
@@ -97,7 +102,8 @@ class Trial:
     look. suspected, times : the last finding and how often in a row.
     rested : looks in a row with readings steady at another level. obeyed : looks in a row in which the readings have
     followed the voltage. followed, agreed : looks at which they followed the place, in a row without a fault, and of
-    those in a row by the same slope and shift_um.
+    those in a row by the same slope and shift_um. open_slope, open_shift_um : of the jumps that were taken back when
+    the trial began, 0 for none.
     """
 
     reckoning: Reckoning
@@ -117,11 +123,18 @@ class Trial:
     agreed: int = 0
     slope: float = 1.0
     shift_um: float = 0.0
+    open_slope: float = 0.0
+    open_shift_um: float = 0.0
 
     @classmethod
-    def begin(cls, reckoning: Reckoning, base: LssvmInverse, memory: FloatArray) -> Trial:
-        """``memory`` (m,) of the identified model ``base`` where the trial begins."""
-        return cls(reckoning, base, memory, np.zeros((4, VALUES)))
+    def begin(
+        cls, reckoning: Reckoning, base: LssvmInverse, memory: FloatArray, slope: float = 0.0, shift_um: float = 0.0
+    ) -> Trial:
+        """``memory`` (m,) of the identified model ``base`` where the trial begins.
+
+        ``slope``, ``shift_um``: what jumps that are taken back had made of a reading y, slope y + shift; 0 for none.
+        """
+        return cls(reckoning, base, memory, np.zeros((4, VALUES)), open_slope=slope, open_shift_um=shift_um)
 
     def put(self, u_V: float, y_um: float, now: Circumstances) -> Decision:
         """Take one sample; NaN for one without a reading."""
@@ -159,6 +172,18 @@ class Trial:
         )
         straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
         follows = straight and allowed
+        if self.open_slope and self._bears_out(s, x, y, now):
+            return Decision(Outcome.CHANGED, self.open_slope, self.open_shift_um)
+        off_um = float(np.mean(y - x))
+        by_model_um = off_V / self.reckoning.mean_slope_V_per_um
+        # Off the place, and the identified model says so too: then the zero has moved, and both are right.
+        there = abs(off_um) <= tolerance_um(now, self.reckoning)
+        moved = follows and not there and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
+        off_line = max(abs(s.slope - 1.0), abs(obeys.slope - 1.0))
+        plain = moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
+        if plain and min(s.share, obeys.share) >= PLAIN and off_line <= PLAIN_SLOPE:
+            # As clear as this, half a window is enough: a change of usual size, and no fault found so far.
+            return Decision(Outcome.CHANGED, 1.0, off_um)
         wrong = _fault(s, float(np.std(y)))
         if s.swing < TELLS * self.reckoning.std_um:
             # A place that is not known better than the stage moves tells nothing; the voltage alone must.
@@ -171,7 +196,7 @@ class Trial:
         sure = allowed or not straight or 1.0 / OBEYS_SURE <= obeys.slope <= OBEYS_SURE
         self.obeyed = self.obeyed + 1 if obeyed and sure else 0
         if self.obeyed >= OBEYED * LOOKS:
-            return Decision(Outcome.SAME, credit=-1)
+            return Decision(Outcome.CHANGED, 1.0, off_um) if moved else Decision(Outcome.SAME, credit=-1)
         if follows:
             if obeyed and abs(off_V) <= SAME_SHARE * drive:
                 there = abs(float(np.mean(y - x))) <= tolerance_um(now, self.reckoning)
@@ -181,6 +206,12 @@ class Trial:
         if not obeyed:
             self._suspect(*wrong)
         return OPEN
+
+    def _bears_out(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> bool:
+        """Whether motion now bears out the jumps that were taken back: the readings are where they would be by them."""
+        off_um = float(np.mean(y - self.open_slope * x - self.open_shift_um))
+        alike = abs(s.slope / self.open_slope - 1.0) <= OPEN_SLOPE
+        return s.share >= FOLLOWS and alike and abs(off_um) <= tolerance_um(now, self.reckoning)
 
     def _following(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
         off, at_um = float(np.mean(y - x)), float(x[-1])
@@ -244,7 +275,8 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
+        # A state from before there were any knows of no jumps that were taken back.
+        numbers: dict[str, Any] = {name: kind(values.get(name, 0.0)) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
         return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
 
@@ -252,6 +284,7 @@ class Trial:
 _NUMBERS = {
     "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
     "obeyed": int, "followed": int, "agreed": int, "slope": float, "shift_um": float,
+    "open_slope": float, "open_shift_um": float,
 }  # fmt: skip
 
 

@@ -240,6 +240,20 @@ def test_one_alone_answers_as_the_champion_itself_to_the_last_bit() -> None:
         np.testing.assert_array_equal(served.feedforward(y, zero, zero, served.rest_memory(5.0)).u_V, own.u_V)
 
 
+def test_one_contestant_is_exchanged_and_the_champion_stays() -> None:
+    models = (line(), line(offset_um=1.0))
+    before = ChampionInverse(("one", "two"), models, 1)
+    other = line(offset_um=2.0)
+    after = before.with_model("two", other)
+    assert after.champion == 1
+    assert (after.models[0], after.served) == (models[0], other)
+    assert before.served is models[1]
+    y, still = np.array([3.0]), np.zeros(1)
+    assert after.feedforward(y, still, still, after.rest_memory(0.0)).u_V == pytest.approx(
+        other.feedforward(y, still, still, other.rest_memory(0.0)).u_V
+    )
+
+
 def test_a_champion_that_is_not_finite_is_replaced_at_once() -> None:
     model, one, _ = contest(GAIN, 1.05 * GAIN)
     feed(model, 2000, 0)

@@ -136,6 +136,23 @@ def test_the_learners_model_is_served_with_the_memory_that_it_was_learnt_with() 
     assert abs(own[0] - place) < 2.0
 
 
+def test_while_the_learner_distrusts_the_sensor_what_it_serves_is_served_alone_and_as_champion() -> None:
+    """It has gone back by itself."""
+    bench = Bench(make_axis(compete=("linear",), served="auto", snapshot_every=20))
+    bench.run(3000)
+    bench.run(1200, lambda k, y: 90.0 - y)
+    served, learner = bench.axis.newest, bench.axis.learner
+    assert served.trouble == "sensor_sign"
+    assert learner.distrusts
+    assert served.models[NAME] is learner.snapshot()
+    champion = served.models["auto"]
+    assert champion.models[champion.names.index(NAME)] is served.models[NAME]
+    np.testing.assert_array_equal(served.memories[NAME], learner.memory_for(served.models[NAME]))
+    bench.run(2000)
+    assert bench.axis.newest.trouble == ""
+    assert not bench.axis.learner.distrusts
+
+
 def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
     bench = Bench(make_axis())
     bench.run(1000)
