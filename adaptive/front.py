@@ -184,7 +184,8 @@ class Front:
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
         if self._hold is None and not doubtful:
             admission.watch_innovation(c, gates, innovation)
-            if known:
+            self._until_control -= 1
+            if known and (self._control is not None or self._until_control <= 0):
                 self._check_model(track, sample, model)
             return Taken("", (Step(sample.y_um, sample.u_V),))
         # What a kink of the voltage makes of the motion is reckoned; it was a surprise to the smoother alone.
@@ -219,8 +220,7 @@ class Front:
     def _check_model(self, track: Track, sample: Sample, model: Model) -> None:
         """Now and then, of a sample that is believed: would a trial of such readings find a fault?"""
         if self._control is None:
-            self._until_control -= 1
-            if self._until_control > 0 or not self._tells:
+            if not self._tells:
                 return
             self._control = Trial.begin(self._begin_hold(track, model()).reckoning, self.base, track.memory_now(True))
         control = self._control
@@ -485,19 +485,27 @@ class Front:
         self.gates.since_start += 1
         self.gates.since_jump += 1
         self._calm += 1
-        if self._trial is not None:
-            # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
-            self._trial.reckoning.advance(step.u_V)
-        for past in self._pasts:
-            past.u_V.append(step.u_V)
-        if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
-            self._proven_past.u_V.append(step.u_V)
-            if len(self._proven_past.u_V) > hypotheses.MOST_BRIDGED:
-                self._proven_past = None
+        if self._trial is None and self._proven_past is None:
+            for past in self._pasts:
+                past.u_V.append(step.u_V)
+        else:
+            self._note_voltage(step.u_V)
         if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
             # A stage at rest shows nothing: the place is as good as it was.
             self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
         return self.track.advance(step)
+
+    def _note_voltage(self, u_V: float) -> None:
+        """For all that goes on by the voltages alone."""
+        if self._trial is not None:
+            # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
+            self._trial.reckoning.advance(u_V)
+        for past in self._pasts:
+            past.u_V.append(u_V)
+        if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
+            self._proven_past.u_V.append(u_V)
+            if len(self._proven_past.u_V) > hypotheses.MOST_BRIDGED:
+                self._proven_past = None
 
     def to_base_frame(self) -> None:
         """Go back to the frame that learning began with, and the memory tracked in it; nothing without a jump.

@@ -91,8 +91,9 @@ class Learner:
             parts.undo_jump()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
-        if parts.watch_trial() or taken.undone or taken.jump_um or taken.distrusted or taken.renamed:
-            self._cache = None
+        if taken.refused or taken.jump_um:
+            changed = parts.watch_trial() or taken.undone or taken.jump_um or taken.distrusted or taken.renamed
+            self._cache = None if changed else self._cache
         outcome = taken.refused
         for step in taken.steps:
             pair, switched = front.advance(step)
