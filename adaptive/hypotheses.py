@@ -52,8 +52,9 @@ WINDOWS = (28, 16)
 STUCK_S = 0.1
 #: Time for which readings must be where they must be, s.
 CALM_S = 0.005
-#: Share of a level that drifts at which its first reading may have been.
-BEGUN = 0.6
+#: Share of a level that drifts at which its first reading may have been, and how much faster than with the stage, in
+#: proportion to the place, it may drift beyond that.
+BEGUN, WITH_STAGE = 0.6, 2.0
 #: Between what slopes readings follow the stage, and the stage's way from which on that is asked, as a share of the
 #: range, for a jump, and to lose the trust without waiting.
 FOLLOWING, MOTION_SHARE, SHOWN_SHARE = (0.6, 1.7), 0.004, 0.015
@@ -282,11 +283,14 @@ def _known(level: Level, usual_um: float) -> bool:
 
 def _drifts(level: Level, hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
     """Whether a level that moves may be a drift of the stage: slow enough, and not a sensor that stands still."""
-    # What drifts begins where it was: readings that are elsewhere at once and then go on from there are no drift.
-    if abs(hold.y_um[hold.jumped] - hold.slope * hold.old_um[hold.jumped] - hold.shift_um) > BEGUN * abs(level.at):
-        return False
     rate = abs(level.rate) / (stride * now.dt_s)
     own = abs(hold.old_um[-1] - hold.old_um[-count]) / (count * now.dt_s)
+    # What drifts begins where it was: readings that are elsewhere at once and then go on from there are no drift. But
+    # the step that a gain makes moves with the stage.
+    place_um = max(abs(hold.old_um[-1] - now.rest_um), 0.1 * now.range_um)
+    begun_um = hold.y_um[hold.jumped] - hold.slope * hold.old_um[hold.jumped] - hold.shift_um
+    if abs(begun_um) > BEGUN * abs(level.at) and rate > WITH_STAGE * own * abs(level.at) / place_um:
+        return False
     follows = slope_of(np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:]))
     shown = follows.slope - 2.0 * follows.std > 0.5
     return rate <= now.envelope.drift_per_s * now.range_um and (shown or own < 0.3 * rate)
