@@ -330,7 +330,7 @@ class Front:
             # What waits for readings that never came is no wrong reading.
             return Taken(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
         if verdict is Verdict.LOST:
-            return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
+            return self._give_up(sample, hold)
         self._hold = None
         if verdict is Verdict.MOTION:
             return Taken("", hypotheses.steps_of_motion(hold))
@@ -338,6 +338,10 @@ class Front:
             self.gates.since_glitch = 0
         self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
+
+    def _give_up(self, sample: Sample, hold: Hold) -> Taken:
+        """A hold that stays unexplained: a trial, or a new start where the model may not judge the sensor."""
+        return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
 
     def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
         """The readings have settled elsewhere: frame and place move.
@@ -358,7 +362,7 @@ class Front:
                 slope, shift_um, undone = back, back_um, True
         frame = before if undone and before is not None else hypotheses.frame_after(f, slope, shift_um)
         if self._envelope.refuses(self.base.features, frame):
-            return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
+            return self._give_up(sample, hold)
         first = not undone and self._proven is None
         if first:
             self._proven_past = self._clean_past() if self._pasts else Past.of(track)
@@ -485,10 +489,9 @@ class Front:
         self.gates.since_start += 1
         self.gates.since_jump += 1
         self._calm += 1
-        if self._trial is None and self._proven_past is None:
-            for past in self._pasts:
-                past.u_V.append(step.u_V)
-        else:
+        for past in self._pasts:
+            past.u_V.append(step.u_V)
+        if self._trial is not None or self._proven_past is not None:
             self._note_voltage(step.u_V)
         if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
             # A stage at rest shows nothing: the place is as good as it was.
@@ -496,12 +499,10 @@ class Front:
         return self.track.advance(step)
 
     def _note_voltage(self, u_V: float) -> None:
-        """For all that goes on by the voltages alone."""
+        """For a trial, and for the place from before the jumps that are open."""
         if self._trial is not None:
             # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
             self._trial.reckoning.advance(u_V)
-        for past in self._pasts:
-            past.u_V.append(u_V)
         if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
             self._proven_past.u_V.append(u_V)
             if len(self._proven_past.u_V) > hypotheses.MOST_BRIDGED:

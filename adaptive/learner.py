@@ -91,9 +91,10 @@ class Learner:
             parts.undo_jump()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
-        if taken.refused or taken.jump_um:
-            changed = parts.watch_trial() or taken.undone or taken.jump_um or taken.distrusted or taken.renamed
-            self._cache = None if changed else self._cache
+        moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
+        # An ordinary sample neither begins nor ends a trial.
+        if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
+            self._cache = None
         outcome = taken.refused
         for step in taken.steps:
             pair, switched = front.advance(step)

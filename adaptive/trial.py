@@ -199,9 +199,8 @@ class Trial:
             return Decision(Outcome.CHANGED, 1.0, off_um) if moved else Decision(Outcome.SAME, credit=-1)
         if follows:
             if obeyed and abs(off_V) <= SAME_SHARE * drive:
-                there = abs(float(np.mean(y - x))) <= tolerance_um(now, self.reckoning)
                 return Decision(Outcome.SAME, credit=1 if there else -1)
-            return self._following(s, x, y, now)
+            return self._following(s, off_um, float(x[-1]), there, now)
         self.followed = self.agreed = 0
         if not obeyed:
             self._suspect(*wrong)
@@ -213,12 +212,11 @@ class Trial:
         alike = abs(s.slope / self.open_slope - 1.0) <= OPEN_SLOPE
         return s.share >= FOLLOWS and alike and abs(off_um) <= tolerance_um(now, self.reckoning)
 
-    def _following(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
-        off, at_um = float(np.mean(y - x)), float(x[-1])
+    def _following(self, s: Slope, off_um: float, at_um: float, there: bool, now: Circumstances) -> Decision:
         near = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
-        if near and abs(off) <= tolerance_um(now, self.reckoning):
+        if near and there:
             return Decision(Outcome.SAME, credit=1)
-        slope, shift_um = (1.0, off) if near else (s.slope, s.constant)
+        slope, shift_um = (1.0, off_um) if near else (s.slope, s.constant)
         # A change of the stage is the same in the next window; an error of the model is another one elsewhere.
         self.followed += 1
         moved_um = (self.slope - slope) * at_um + self.shift_um - shift_um
@@ -276,7 +274,8 @@ class Trial:
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
         # A state from before there were any knows of no jumps that were taken back.
-        numbers: dict[str, Any] = {name: kind(values.get(name, 0.0)) for name, kind in _NUMBERS.items()}
+        values = {"open_slope": 0.0, "open_shift_um": 0.0} | values
+        numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
         return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
 
