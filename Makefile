@@ -6,7 +6,8 @@ OUT    ?= out/demo
 SEED   ?= 0
 # Tests that only compute, which may share the cores; the others time real processes and have them for themselves.
 PURE   := tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
-          $(addprefix tests/service/test_,diagnose_command.py identify.py reproduce.py scenarios.py warm.py watch.py)
+          tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/service/identification \
+          $(addprefix tests/service/,reports server/test_model_watch.py test_warm.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
 

@@ -6,7 +6,7 @@
     ├── InputError        (also ValueError)  a field's value is not what it must be
     ├── ModelFileError                       a file of ours is damaged, foreign or of another version
     ├── NumericsError                        a computation left the finite or its tolerance
-    └── ServiceError                         defined in service.errors: the wire and the processes
+    └── ServiceError                         defined in service.protocol.errors: the wire and the processes
 
 Every message names the field, what was got, what was expected and what to do.
 """

@@ -1,19 +1,20 @@
 """Compile the compiled loops once, so that no process pays for it at start; see ``service.warm``.
 
 What the learner needs is compiled at every set-up; the rest of the window's operations, most of a minute of compiling,
-only where they are called: by the tests, the benchmarks, and whoever builds on `adaptive.window`.
+only where they are called: by the tests, the benchmarks, and whoever builds on `adaptive.window.window`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from adaptive.drift import DriftConfig, DriftFilter
 from adaptive.features import FeatureMap
 from adaptive.finite import all_finite
-from adaptive.learner import Learner, LearnerConfig
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
+from adaptive.online.drift import DriftConfig, DriftFilter
+from adaptive.online.learner import Learner
 from adaptive.smoothing import smooth_recording
-from adaptive.snapshot import LssvmInverse
 from adaptive.types import Sample
 
 

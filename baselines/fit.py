@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from baselines.bouc_wen import BoucWenParameters
-from baselines.bouc_wen_inverse import BoucWenInverse
-from baselines.identify_bouc_wen import identify_bouc_wen
-from baselines.identify_mpi import identify_linear, identify_mpi
+from baselines.bouc_wen.identify import identify_bouc_wen
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import BoucWenParameters
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.mpi_inverse import MpiInverse
-from baselines.prandtl_ishlinskii import MpiParameters
-from baselines.records import IdentificationReport
+from baselines.prandtl_ishlinskii.identify import identify_linear, identify_mpi
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.validation import IdentificationReport
 
 
 def _std_V(u_V: ArrayLike, report: IdentificationReport) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptive.drift_step import joseph, walk
+from adaptive.online.drift import joseph, walk
 from adaptive.types import FloatArray, StateDict
 
 #: Least and most that a gain may be: a stage whose gain has changed its sign or by more than this is another stage.

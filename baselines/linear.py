@@ -9,8 +9,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, StateDict
-from baselines.points import memory_copy, model_fields, model_state, points
-from baselines.records import Domain, deviation, positive
+from baselines.validation import Domain, deviation, memory_copy, model_fields, model_state, points, positive
 
 
 @dataclass(frozen=True)

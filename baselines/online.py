@@ -1,6 +1,6 @@
 """What the online baselines share: the gates of a raw sample, the counters, the running error.
 
-The names of the gates are those of ``adaptive.admission``, so that the service counts all models alike.
+The names of the gates are those of ``adaptive.online.gates``, so that the service counts all models alike.
 """
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from adaptive.admission import (
+from adaptive.errors import InputError
+from adaptive.online.gates import (
     DUPLICATE,
     GAP,
     LEARNT,
@@ -21,8 +22,7 @@ from adaptive.admission import (
     TIMING,
     UNEXCITED,
 )
-from adaptive.errors import InputError
-from adaptive.state import prefixed
+from adaptive.state_codec import prefixed
 from adaptive.types import Sample, StateDict
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.types import Sample
-from baselines.bouc_wen import TABLE_2_1
-from baselines.bouc_wen_inverse import BoucWenInverse
-from baselines.bounded import bounded_minimum
-from baselines.mpi_inverse import MpiInverse
-from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
-from baselines.online_least_squares import LeastSquaresConfig
-from baselines.online_mpi import MpiOnline
-from baselines.play import play_run
-from baselines.prandtl_ishlinskii import MpiParameters
-from baselines.records import Domain
-from baselines.swarm_identification import TABLE_2_1_UPPER, bouc_wen_costs
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
+from baselines.bounded_least_squares import bounded_minimum
+from baselines.least_squares import LeastSquaresConfig
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.online import MpiOnline
+from baselines.prandtl_ishlinskii.play import play_run
+from baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
+from baselines.validation import Domain
 
 
 def warm() -> None:

@@ -7,12 +7,13 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive import lssvm, window_core
+from adaptive import lssvm
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from adaptive.window import Window
-from adaptive.window_config import Form, WindowConfig
-from adaptive.window_state import WindowArrays
+from adaptive.window import steps as window_core
+from adaptive.window.arrays import WindowArrays
+from adaptive.window.config import Form, WindowConfig
+from adaptive.window.window import Window
 
 #: gamma and width that give condition numbers from some 1e3 to 1e8 with windows of 100 samples in three dimensions.
 HARDNESS: tuple[tuple[float, float], ...] = ((1e2, 0.5), (1.5e3, 1.0), (1e4, 1.0), (1e5, 1.0), (1.2e6, 1.5))

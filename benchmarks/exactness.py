@@ -18,16 +18,16 @@ from threadpoolctl import threadpool_limits
 from adaptive.types import StateDict
 from benchmarks.latency_processes import AXIS, STAGE, sent
 from benchmarks.latency_world import READY_S, World
-from service.axis import Axis
-from service.axis_state import fingerprint
-from service.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
-from service.client import Client
-from service.config import AxisConfig, read_config
-from service.errors import ServiceError
-from service.handover import ask_for_state
-from service.models import load_axis
-from service.retuning.adoption import Retuned
-from service.wire import joined
+from service.background.retuning.adoption import Retuned
+from service.client.client import Client
+from service.config.config import AxisConfig, read_config
+from service.failover.state_transfer import ask_for_state
+from service.protocol.errors import ServiceError
+from service.protocol.samples import joined
+from service.server.axis import Axis
+from service.server.axis_state import fingerprint
+from service.server.models import load_axis
+from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 #: Messages that the axis off line is given at once: another number than a live service ever gathers.
 _PORTION: Final = 37

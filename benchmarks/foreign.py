@@ -1,7 +1,7 @@
 """How the service does on stages that it was not built with: stages, events and instants drawn at random, in lockstep.
 
 ``python -m benchmarks.foreign --runs 500 --jobs 2 --json out/foreign.jsonl`` draws a stage, an event and its instant
-for each seed (``tests/foreign/plants.py``), rehearses it (``service.rehearsal``), writes one line a run as it goes, and
+for each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), writes one line a run as it goes, and
 prints two tables: the goals with what the runs came to, and one row for each class of events. ``--table FILE`` prints
 the tables of runs that are done. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute
 errors in percent of the commanded range.
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from service.rehearsal.events import CLASSES, SENSOR, draw
+from lab.rehearsal.events import CLASSES, SENSOR, draw
 
 PRESETS = ("random", "issue")
 #: The event comes this long after the start of the closed loop, s, by the stages, and up to so much later.
@@ -50,7 +50,7 @@ Record = dict[str, Any]
 
 def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
     """One run of an event of the class ``name``, as JSON has it. A run that raises is a record with its traceback."""
-    from service.rehearsal import RandomReference, RehearsalConfig, identify, run_event
+    from lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
     from tests.foreign.plants import issue_plant, random_plant
 
     begin, begin_cpu = time.perf_counter(), time.process_time()

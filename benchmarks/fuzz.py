@@ -27,9 +27,9 @@ from typing import Any
 #: Modules whose branches guide the mutations; everything else runs at full speed. None with compiled functions: numba
 #: cannot compile what the fuzzer has put into them.
 INSTRUMENTED = [
-    "service.wire", "service.wire_flags", "service.wire_query", "service.wire_reply", "service.wire_model",
-    "service.modelfile", "service.registry", "service.operating.request", "service.errors", "service.checkpoint",
-    "service.stage_faults", "service.handover",
+    "service.protocol.samples", "service.protocol.reply", "service.protocol.query", "service.protocol.model",
+    "service.storage.model_file", "service.operating.request", "service.protocol.errors", "service.storage.checkpoint",
+    "service.stage_node.faults", "service.failover.state_transfer",
 ]  # fmt: skip
 _MAX_BYTES = 4096
 _SLOW_S = 5

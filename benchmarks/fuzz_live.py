@@ -22,11 +22,11 @@ import psutil
 from adaptive.errors import DehystError
 from benchmarks.fuzz_targets import models, seeds
 from benchmarks.mutations import mutated
-from service.client import Client
-from service.delivery import SURELY
-from service.keys import Keys
-from service.modelfile import BundleMeta, write_bundle
-from service.session import open_client
+from service.client.client import Client
+from service.protocol.keys import Keys
+from service.runtime.delivery import SURELY
+from service.runtime.session import open_client
+from service.storage.model_file import BundleMeta, write_bundle
 
 _STAGE, _AXIS = "fuzz", "x"
 _PACE_HZ: Final = 200.0
@@ -53,7 +53,7 @@ def bombard(out: Path, duration_s: float, rate_hz: float, seed: int) -> dict[str
     )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     serving = subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "serve", "--config", str(out / "serve.toml"), "--json"],
+        [sys.executable, "-m", "lab.cli", "serve", "--config", str(out / "serve.toml"), "--json"],
         stdout=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     assert serving.stdout is not None

@@ -16,15 +16,19 @@ import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
-from adaptive.snapshot import LssvmInverse
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.points import Domain
-from service import checkpoint, wire, wire_model, wire_query, wire_reply
-from service.errors import error_from_json, error_to_json
-from service.handover import join
+from baselines.validation import Domain
+from service.failover.state_transfer import join
 from service.operating.request import Request, decode_request, encode_request
-from service.stage_faults import decode_fault
+from service.protocol import model as wire_model
+from service.protocol import query as wire_query
+from service.protocol import reply as wire_reply
+from service.protocol import samples as wire
+from service.protocol.errors import error_from_json, error_to_json
+from service.stage_node.faults import decode_fault
+from service.storage import checkpoint
 
 Target = Callable[[bytes], None]
 #: What a decoder may raise on malformed bytes.

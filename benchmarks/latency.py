@@ -18,10 +18,10 @@ from adaptive.types import FloatArray
 from benchmarks.exactness import Adopted, exactness
 from benchmarks.latency_processes import AXIS, ECHO_KEY, STAGE
 from benchmarks.latency_world import READY_S, WINDOW, World, world
-from service.client import Client
-from service.session import open_client
-from service.wire_query import encode_query
-from service.wire_reply import FeedforwardReply, encode_reply
+from service.client.client import Client
+from service.protocol.query import encode_query
+from service.protocol.reply import FeedforwardReply, encode_reply
+from service.runtime.session import open_client
 
 TRAJECTORY = 100
 #: Of a query, s: on a machine with too much to do it is late, and that is to be measured.

@@ -14,13 +14,13 @@ import numpy as np
 import zenoh
 
 from adaptive.types import FloatArray
-from service import wire
-from service.delivery import SURELY, wait_followed
-from service.keys import Keys
-from service.server import tune_process
-from service.session import open_client, open_service
-from service.stopping import StopSignal
-from service.wire import SampleBatch
+from service.protocol import samples as wire
+from service.protocol.keys import Keys
+from service.protocol.samples import SampleBatch
+from service.runtime.delivery import SURELY, wait_followed
+from service.runtime.session import open_client, open_service
+from service.runtime.stopping import StopSignal
+from service.server.process import tune_process
 
 #: Where the echo answers: the number of bytes of its reply stands in the key.
 ECHO_KEY = "echo"

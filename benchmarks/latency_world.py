@@ -12,13 +12,13 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from benchmarks.latency_processes import AXIS, STAGE
-from service.demo.processes import Child, Children, free_port
-from service.identifying import identify_one
-from service.modelfile import BundleMeta, write_bundle
-from sim.presets import preset
-from sim.reference import demo_reference
-from sim.signals import training_input
-from sim.stage import Stage
+from lab.testbed.processes import Child, Children, free_port
+from service.identification.identifying import identify_one
+from service.storage.model_file import BundleMeta, write_bundle
+from sim.signals.signals import training_input
+from sim.signals.unseen_reference import demo_reference
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 LOW_UM, HIGH_UM = 4.0, 80.0
 WINDOW = 500
@@ -88,7 +88,7 @@ def prepare(folder: Path, rate_hz: float, batch: int, every_sample: bool, keeps:
 
 def start_service(children: Children, files: Prepared) -> Child:
     """Start it, and return it once it is ready. Raises ServiceError where it does not come up."""
-    service = children.start("serve", ["-m", "service.cli", "serve", "--config", str(files.config), "--json"])
+    service = children.start("serve", ["-m", "lab.cli", "serve", "--config", str(files.config), "--json"])
     service.wait_line("{", READY_S)
     return service
 

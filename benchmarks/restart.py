@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.latency_processes import AXIS, STAGE
 from benchmarks.latency_world import READY_S, prepare, start_feed, start_service
-from service.client import Client
-from service.demo.processes import Children
+from lab.testbed.processes import Children
+from service.client.client import Client
 from sim.recordings import read
 
 #: What a service cannot do without, and what a start therefore costs at least.

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.retune_config import RetuneConfig
+from adaptive.tuning.config import RetuneConfig
+from adaptive.tuning.samples import Hyperparameters, WindowData
 from adaptive.types import FloatArray
-from adaptive.window_data import Hyperparameters, WindowData
 from benchmarks.latency_processes import AXIS, STAGE
 from benchmarks.latency_world import WINDOW, World, world
 from benchmarks.measuring import DIMENSION, stream
-from service.client import Client
-from service.retuning.job import Job, pack
-from service.retuning.settings import RetuningConfig
+from service.background.retuning.job import Job, pack
+from service.background.retuning.settings import RetuningConfig
+from service.client.client import Client
 
 QUANTILES = {"p50": 50.0, "p99": 99.0}
 #: Between two questions, s: a controller asks block by block, and does not keep a core busy by itself.

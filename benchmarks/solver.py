@@ -6,11 +6,12 @@ import numpy as np
 from scipy.linalg import blas
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from adaptive import kernels, window_core
+from adaptive import kernels
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
-from adaptive.window import Window
-from adaptive.window_config import Backend, Form, WindowConfig
+from adaptive.window import steps as window_core
+from adaptive.window.config import Backend, Form, WindowConfig
+from adaptive.window.window import Window
 from benchmarks.measuring import DIMENSION, GAMMA, WIDTH, Times, interleaved, stream, times
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from adaptive.identification import identify_lssvm
-from adaptive.learner import Learner
-from adaptive.snapshot import LssvmInverse
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
-from service.demo.plan import TEACHER, Plan
-from sim.stage import Stage
+from lab.demo.plan import TEACHER, Plan
+from sim.stage.stage import Stage
 
 #: What is asked for, percent of the commanded range: first second, 1 to 4 s, last ten seconds.
 GOALS = {"first": 0.25, "then": 0.10, "settled": 0.03}

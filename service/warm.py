@@ -14,9 +14,9 @@ import sys
 import time
 from pathlib import Path
 
-PACKAGES = ("adaptive", "baselines", "sim", "service")
+PACKAGES = ("adaptive", "baselines", "sim", "service", "lab")
 #: What is compiled side by side, in a process each: modules with a ``warm()``.
-GROUPS = (("adaptive.warm",), ("baselines.warm", "sim.warm", "service.guard"))
+GROUPS = (("adaptive.warm",), ("baselines.warm", "sim.warm", "service.answers.guard"))
 
 
 def digest(root: Path) -> str:

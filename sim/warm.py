@@ -6,8 +6,8 @@ import numpy as np
 
 from sim.diagnosis.warm import warm as warm_diagnosis
 from sim.effects import KINDS, Chain, simulate
-from sim.presets import PRESETS
-from sim.stage import Stage
+from sim.stage.presets import PRESETS
+from sim.stage.stage import Stage
 
 
 def warm() -> None:

@@ -53,19 +53,24 @@ def test_serving_imports_no_torch_and_works_where_it_is_missing() -> None:
     program = (
         "import sys; sys.modules['torch'] = None\n"
         "import importlib\n"
+        "from lab.cli import COMMANDS\n"
         "for name in ('serve', 'query', 'stage', 'view', 'identify', 'demo'):\n"
-        "    importlib.import_module(f'service.commands.{name}')\n"
+        "    importlib.import_module(COMMANDS[name].module)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def test_every_command_has_help_with_units() -> None:
-    from service.cli import COMMANDS
+    from lab.cli import COMMANDS
 
     for name in COMMANDS:
         done = subprocess.run(
-            [sys.executable, "-m", "service.cli", name, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
+            [sys.executable, "-m", "lab.cli", name, "--help"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, (name, done.stderr)
         assert name in done.stdout

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import zenoh
 
-from service.errors import FieldError, NoReplyError, ReplyTimeoutError, ServiceError, error_from_json
-from service.keys import ROOT, Keys
 from service.operating.request import Request, encode_request
-from service.told import fields_of
+from service.protocol.errors import FieldError, NoReplyError, ReplyTimeoutError, ServiceError, error_from_json
+from service.protocol.json_message import fields_of
+from service.protocol.keys import ROOT, Keys
 
 #: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
 _SETTLE_S: Final = 0.5

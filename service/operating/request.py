@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from service.errors import FieldError
+from service.protocol.errors import FieldError
 
 #: Longest request that is read, bytes.
 MAX_BYTES: Final = 16_384

@@ -11,11 +11,11 @@ from typing import Any, Final
 import zenoh
 
 from adaptive.errors import DehystError
-from service.errors import FieldError, ServiceError, error_to_json
-from service.keys import Keys
 from service.operating.journal import Journal
 from service.operating.request import MAX_BYTES, Request, decode_request
 from service.operating.verbs import Verbs
+from service.protocol.errors import FieldError, ServiceError, error_to_json
+from service.protocol.keys import Keys
 
 SCHEMA: Final = 1
 JSON: Final = "application/json"

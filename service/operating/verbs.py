@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from adaptive.errors import DehystError
-from service.errors import FieldError, ServiceError
 from service.operating.request import Request, take
+from service.protocol.errors import FieldError, ServiceError
 
 
 class OperableAxis(Protocol):

@@ -14,9 +14,9 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
-from sim.closed_loop import PID, Run
-from sim.reference import Reference
-from sim.stage import Stage, StageState
+from sim.signals.unseen_reference import Reference
+from sim.stage.closed_loop import PID, Run
+from sim.stage.stage import Stage, StageState
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def track_learning(
     """Follow ``reference`` with the feedforward of a model that learns on the way; ``online`` and ``state`` change.
 
     Without ``state`` the stage is at rest. The memory begins at rest at 0 µm and travels from block to block.
-    Limits, and the feedback's integral at them, are handled as in ``sim.closed_loop.track``.
+    Limits, and the feedback's integral at them, are handled as in ``sim.stage.closed_loop.track``.
     """
     config = config or BlockConfig()
     state = state or stage.initial_state()

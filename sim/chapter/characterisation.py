@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim import signals
 from sim.chapter.experiments import DT_S, Record, record
-from sim.stage import Stage
-from sim.stage_config import StageConfig
+from sim.signals import signals
+from sim.stage.config import StageConfig
+from sim.stage.stage import Stage
 
 AMPLITUDES_V = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 FREQUENCIES_HZ = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)

@@ -9,22 +9,22 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.identification import identify_lssvm
-from adaptive.learner import Learner
-from adaptive.snapshot import LssvmInverse
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, OnlineModel
-from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.online import BoucWenOnline
 from baselines.fit import fit_bouc_wen, fit_mpi
-from baselines.mpi_inverse import MpiInverse
-from baselines.online_bouc_wen import BoucWenOnline
-from baselines.online_mpi import MpiOnline
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Score
 from sim.chapter.references import control_references
-from sim.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
 from sim.effects import effect
-from sim.reference import Reference
-from sim.stage import Stage
-from sim.stage_config import StageConfig
+from sim.signals.unseen_reference import Reference
+from sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
+from sim.stage.config import StageConfig
+from sim.stage.stage import Stage
 
 Progress = Callable[[str], None]
 Clock = Callable[[], float]

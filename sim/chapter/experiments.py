@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim import signals
-from sim.presets import preset
-from sim.stage import Stage
-from sim.stage_config import StageConfig
+from sim.signals import signals
+from sim.stage.config import StageConfig
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 #: Control period of the chapter, s, and how many of them lie between two of its 500 samples.
 DT_S = 1e-3

@@ -15,15 +15,13 @@ import numpy as np
 
 from adaptive import lssvm
 from adaptive.errors import InputError
-from adaptive.evidence import Evidence, problem
 from adaptive.features import FeatureMap
-from adaptive.identification import design_features
-from adaptive.identification_config import IdentifyConfig
-from adaptive.identification_fit import prior_deviations
-from adaptive.inference import InferenceConfig, infer
+from adaptive.identification import IdentifyConfig, design_features, prior_deviations
 from adaptive.lssvm import LssvmModel
 from adaptive.scaling import MinMaxScaling
 from adaptive.smoothing import backward_difference
+from adaptive.tuning.evidence import Evidence, problem
+from adaptive.tuning.search import InferenceConfig, infer
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, EVERY
 

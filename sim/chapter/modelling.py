@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from baselines.bouc_wen import BoucWenParameters
-from baselines.identify_bouc_wen import identify_bouc_wen
-from baselines.identify_mpi import identify_mpi
-from baselines.prandtl_ishlinskii import MpiParameters
-from baselines.swarm import SwarmConfig
-from baselines.swarm_identification import swarm_bouc_wen, swarm_mpi
+from baselines.bouc_wen.identify import identify_bouc_wen
+from baselines.bouc_wen.model import BoucWenParameters
+from baselines.prandtl_ishlinskii.identify import identify_mpi
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.swarm.identification import swarm_bouc_wen, swarm_mpi
+from baselines.swarm.particle_swarm import SwarmConfig
 from sim.chapter import published
 from sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
 from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs

@@ -9,8 +9,8 @@ import numpy as np
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, Experiments, Record
-from sim.reference import Reference, demo_reference
-from sim.timebase import times
+from sim.signals.unseen_reference import Reference, demo_reference
+from sim.stage.timebase import times
 
 #: Step of the central differences that give velocity and acceleration of a formula, s.
 _STEP_S = 1e-4

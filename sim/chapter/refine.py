@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen import BoucWenParameters
+from baselines.bouc_wen.model import BoucWenParameters
 
 #: m/k that is as good as none, s².
 _NO_INERTIA = 1e-9

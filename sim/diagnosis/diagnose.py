@@ -8,21 +8,20 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
-from sim.diagnosis.converter import converter_causes, grid_of, repeats
-from sim.diagnosis.evidence import split
 from sim.diagnosis.experiments import Rival, next_experiment
-from sim.diagnosis.fit import Fit, calibrate, refreshed
-from sim.diagnosis.naming import named, not_excited, verdict_of
-from sim.diagnosis.noise import Floor, noise_floor
-from sim.diagnosis.nominal_fit import begins_at_rest, calibrated, nominal_setting, with_other_axis
+from sim.diagnosis.model.converter import converter_causes, grid_of, repeats
+from sim.diagnosis.model.fit import Fit, calibrate, refreshed
+from sim.diagnosis.model.measured import Setting
+from sim.diagnosis.model.nominal_fit import begins_at_rest, calibrated, nominal_setting, with_other_axis
 from sim.diagnosis.prepare import Prepared
-from sim.diagnosis.result import FOLDS, TEST, Diagnosis
-from sim.diagnosis.review import review
-from sim.diagnosis.rules import Rules
-from sim.diagnosis.search import Progress, Search
-from sim.diagnosis.second import second_error
-from sim.diagnosis.setting import Setting
-from sim.stage_config import StageConfig
+from sim.diagnosis.report.naming import named, not_excited, verdict_of
+from sim.diagnosis.report.result import FOLDS, TEST, Diagnosis
+from sim.diagnosis.search.evidence import split
+from sim.diagnosis.search.noise_floor import Floor, noise_floor
+from sim.diagnosis.search.search import Progress, Search, review
+from sim.diagnosis.search.second_recording import second_error
+from sim.diagnosis.search.thresholds import Rules
+from sim.stage.config import StageConfig
 
 
 def _silent(stage: str, share: float) -> None:

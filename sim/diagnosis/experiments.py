@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.catalogue import FORMS
-from sim.diagnosis.chain import Model
-from sim.diagnosis.fit import Fit
-from sim.diagnosis.monitor import drive_at_samples
-from sim.diagnosis.setting import Setting
+from sim.diagnosis.causes.catalogue import FORMS
+from sim.diagnosis.model.chain import Model
+from sim.diagnosis.model.fit import Fit
+from sim.diagnosis.model.measured import Setting
+from sim.diagnosis.search.monitor import drive_at_samples
 
 #: What a voltage monitor resolves, relative to the swing.
 MONITOR_NOISE = 2e-4

@@ -8,10 +8,10 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.nominal_fit import NAMED
-from sim.diagnosis.setting import Setting
+from sim.diagnosis.model.measured import Setting
+from sim.diagnosis.model.nominal_fit import NAMED
 from sim.recordings import Finding, Recording, check, repaired, require_usable
-from sim.stage_config import StageConfig
+from sim.stage.config import StageConfig
 
 #: Longer records are diagnosed on their longest head of this many samples: memory stays below 1 GB.
 MOST_SAMPLES = 200_000
@@ -38,7 +38,8 @@ def prepare(
 ) -> Prepared:
     """Check, repair and cut.
 
-    ``nominal``: ``"bouc_wen"`` (the chapter's stage), ``"linear"`` (one mode), or a stage (`sim.stagefile.load_stage`).
+    ``nominal``: ``"bouc_wen"`` (the chapter's stage), ``"linear"`` (one mode), or a stage
+    (`sim.stage.file.load_stage`).
     ``test``: another recording of the same stage with the same sample time, on which the held-out errors are taken.
     Raises InputError where nothing can be diagnosed, with what to do about it.
     """

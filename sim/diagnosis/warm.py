@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.diagnosis import loops, loops_linear
-from sim.diagnosis.dynamics import Dynamics, respond
-from sim.diagnosis.restoring import Loop, Stops
-from sim.diagnosis.slip_dates import dated, moved, slips_of
+from sim.diagnosis.causes.slip_dates import dated, moved, slips_of
+from sim.diagnosis.model import loops, loops_linear
+from sim.diagnosis.model.dynamics import Dynamics, respond
+from sim.diagnosis.model.restoring_force import Loop, Stops
 
 
 def warm() -> None:

@@ -1,6 +1,6 @@
 """What an effect is: one cause, its parameters and units, and its compiled step.
 
-An effect serves twice. A stage is composed of effects (`sim.stage`), and a diagnosis finds out which effect a
+An effect serves twice. A stage is composed of effects (`sim.stage.stage`), and a diagnosis finds out which effect a
 recording holds by fitting the parameters of the same step. ``a + b`` makes a `Chain` (`sim.effects.chain`).
 
 Signals through the chain are arrays of one value a sample: the value at the *end* of the step from ``t_k`` to

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.recordings.causality import swapped
-from sim.recordings.masks import dropout_mask, repeat_mask, runs
 from sim.recordings.recording import Recording
+from sim.recordings.repair import dropout_mask, repeat_mask, runs
 
 Severity = Literal["note", "warning", "refusal"]
 

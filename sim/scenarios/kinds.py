@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import InputError
-from sim.presets import preset
 from sim.scenarios.motion import Parts, Shifted, Tones, demo_motion, in_band, strokes
 from sim.scenarios.readings import glitch_burst
 from sim.scenarios.scenario import Scenario
-from sim.stage_config import Change, StageConfig
+from sim.stage.config import Change, StageConfig
+from sim.stage.presets import preset
 
 LOW_UM, HIGH_UM = 4.0, 80.0
 CHANGE_S, RUN_S = 15.0, 40.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.reference import DemoReference, Reference
+from sim.signals.unseen_reference import DemoReference, Reference
 
 #: Time over which one part goes over into the next, s.
 BLEND_S = 0.6

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from sim.reference import Reference
 from sim.scenarios.motion import Motion
 from sim.scenarios.readings import Readings
-from sim.stage_config import Change, StageConfig
-from sim.timebase import times
+from sim.signals.unseen_reference import Reference
+from sim.stage.config import Change, StageConfig
+from sim.stage.timebase import times
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adaptive.identification import identify_lssvm
-from adaptive.identification_config import IdentifyConfig
-from adaptive.snapshot import LssvmInverse
-from sim.presets import preset
-from sim.signals import training_input
-from sim.stage import Stage
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.inverse_model import LssvmInverse
+from sim.signals.signals import training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 DT = 1e-3
 

@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 
 from adaptive.identification import identify_lssvm
-from adaptive.learner import Learner
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.snapshot import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
-from baselines.champion import ChampionInverse
-from baselines.competition_making import of_models
+from baselines.competition.champion import ChampionInverse
+from baselines.competition.competition import of_models
 from baselines.fit import fit_linear, fit_mpi
-from baselines.online_mpi import MpiOnline
-from sim.presets import preset
-from sim.signals import generalisation_input, multitone, training_input
-from sim.stage import Stage
-from sim.stage_config import Change
+from baselines.prandtl_ishlinskii.online import MpiOnline
+from sim.signals.signals import generalisation_input, multitone, training_input
+from sim.stage.config import Change
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))

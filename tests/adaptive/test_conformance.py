@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adaptive.identification import identify_lssvm
-from adaptive.identification_config import IdentifyConfig
-from adaptive.learner import Learner, LearnerConfig
-from adaptive.snapshot import LssvmInverse
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
+from adaptive.online.learner import Learner
 from adaptive.types import InverseModel, OnlineModel, Sample
-from baselines.bouc_wen import TABLE_2_1
-from baselines.bouc_wen_inverse import BoucWenInverse
-from baselines.competition_making import of_models
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.online import BoucWenOnline
+from baselines.competition.competition import of_models
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.mpi_inverse import MpiInverse
-from baselines.online_bouc_wen import BoucWenOnline
-from baselines.online_linear import LinearOnline
-from baselines.online_mpi import MpiOnline
-from baselines.prandtl_ishlinskii import MpiParameters
-from baselines.records import Domain
+from baselines.linear_online import LinearOnline
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.online import MpiOnline
+from baselines.validation import Domain
 
 DT, N = 1e-3, 1500
 PACKAGES = ("adaptive", "baselines")

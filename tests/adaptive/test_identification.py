@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from adaptive.identification import identify_lssvm
-from adaptive.identification_config import IdentifyConfig
-from adaptive.identification_fit import select
-from adaptive.snapshot import LssvmInverse
+from adaptive.identification import IdentifyConfig, identify_lssvm, select
+from adaptive.inverse_model import LssvmInverse
 
 DT = 1e-3
 QUICK = IdentifyConfig(tune=False, n=200)

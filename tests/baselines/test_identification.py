@@ -12,15 +12,15 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen import TABLE_2_1
-from baselines.dead_zone import dead_zone
+from baselines.bouc_wen.identify import identify_bouc_wen
+from baselines.bouc_wen.model import TABLE_2_1
 from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi, inverse_of
-from baselines.identify_bouc_wen import identify_bouc_wen
-from baselines.identify_mpi import MpiGrid, bounded_least_squares, identify_linear, identify_mpi
-from baselines.play import play_run, play_start
-from baselines.prandtl_ishlinskii import from_inverse_saturation, inverse_thresholds, inverse_weights
-from baselines.swarm import MissingTorchError, SwarmConfig, minimise
-from baselines.swarm_identification import swarm_bouc_wen, swarm_mpi
+from baselines.prandtl_ishlinskii.dead_zone import dead_zone
+from baselines.prandtl_ishlinskii.identify import MpiGrid, bounded_least_squares, identify_linear, identify_mpi
+from baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
+from baselines.prandtl_ishlinskii.play import play_run, play_start
+from baselines.swarm.identification import swarm_bouc_wen, swarm_mpi
+from baselines.swarm.particle_swarm import MissingTorchError, SwarmConfig, minimise
 
 
 def chapter_input(dt_s: float, n: int, amplitude_V: float = 4.0) -> FloatArray:

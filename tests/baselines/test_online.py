@@ -9,17 +9,17 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, Sample
-from baselines.bouc_wen import TABLE_2_1
-from baselines.bouc_wen_inverse import BoucWenInverse
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
+from baselines.least_squares import LeastSquaresConfig
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.mpi_inverse import MpiInverse
-from baselines.online_bouc_wen import BoucWenOnline, TrackingConfig
-from baselines.online_least_squares import LeastSquaresConfig
-from baselines.online_linear import LinearOnline
-from baselines.online_mpi import MpiOnline
-from baselines.play import play_run
-from baselines.prandtl_ishlinskii import MpiParameters
-from baselines.records import Domain
+from baselines.linear_online import LinearOnline
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.online import MpiOnline
+from baselines.prandtl_ishlinskii.play import play_run
+from baselines.validation import Domain
 
 DT = 1e-3
 SEEN = Domain(0.0, 80.0, 2000.0)

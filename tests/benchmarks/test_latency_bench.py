@@ -16,9 +16,9 @@ import pytest
 from benchmarks.exactness import differing, offline_state, taught
 from benchmarks.latency import TRAJECTORY, latency, page
 from benchmarks.latency_processes import AXIS, STAGE, sent
-from service.axis_state import fingerprint
-from service.config import AxisConfig
-from service.modelfile import BundleMeta, write_bundle
+from service.config.config import AxisConfig
+from service.server.axis_state import fingerprint
+from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import DT_S, make_models
 
 PERCENTILES = {"p50", "p99", "p999"}

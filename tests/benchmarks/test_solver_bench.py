@@ -12,7 +12,7 @@ from benchmarks import run
 from benchmarks.drift import bench_drift
 from benchmarks.peers import bench_peers
 from benchmarks.solver import bench_window
-from service.cli import main
+from lab.cli import main
 
 #: What `dehyst bench --json` is read for.
 WINDOW_KEYS = {

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adaptive.types import FloatArray
-from service.client import Client
-from service.errors import ServiceError
-from service.keys import Keys
+from service.client.client import Client
 from service.operating.remote import operate, statuses
-from service.session import open_client
+from service.protocol.errors import ServiceError
+from service.protocol.keys import Keys
+from service.runtime.session import open_client
 
 STAGES = ("left", "right")
 AXES = ("x", "y")

@@ -21,7 +21,7 @@ DURATION_S = 12.0
 
 def demo(out: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "service.cli", "demo", "--out", str(out), "--duration", str(DURATION_S), *options],
+        [sys.executable, "-m", "lab.cli", "demo", "--out", str(out), "--duration", str(DURATION_S), *options],
         capture_output=True,
         text=True,
         timeout=170,
@@ -113,7 +113,7 @@ def test_ctrl_c_ends_the_demo_and_all_its_processes(tmp_path: Path) -> None:
     import psutil
 
     process = subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "demo", "--out", str(tmp_path / "out")],
+        [sys.executable, "-m", "lab.cli", "demo", "--out", str(tmp_path / "out")],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -138,7 +138,7 @@ def test_ctrl_c_ends_the_demo_and_all_its_processes(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_asked_for_is_refused_in_words(tmp_path: Path, options: list[str], named: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "service.cli", "demo", "--out", str(tmp_path), *options],
+        [sys.executable, "-m", "lab.cli", "demo", "--out", str(tmp_path), *options],
         capture_output=True,
         text=True,
         check=False,

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 import zenoh
 
-from service import wire
-from service.client import Client, Trajectory
-from service.identifying import identify_one
-from service.modelfile import BundleMeta, write_bundle
-from service.session import open_client
-from service.stage_faults import fault_key
-from service.stage_port import status_key
-from service.wire_flags import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
-from sim.presets import preset
-from sim.signals import training_input
-from sim.stage import Stage
+from service.client.client import Client, Trajectory
+from service.identification.identifying import identify_one
+from service.protocol import samples as wire
+from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN
+from service.runtime.session import open_client
+from service.stage_node.faults import fault_key
+from service.stage_node.port import status_key
+from service.storage.model_file import BundleMeta, write_bundle
+from sim.signals.signals import training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 from tests.service.conftest import unused_port
 from tests.service.living import Process
 
@@ -44,7 +44,7 @@ WANTED_UM = 40.0 + 2.0 * np.sin(2 * np.pi * 5.0 * DT_S * np.arange(20))
 ILL = """
 import os, time
 from dataclasses import replace
-from adaptive.learner import Learner
+from adaptive.online.learner import Learner
 _snapshot = Learner.snapshot
 def snapshot(self):
     while os.path.exists({hung!r}):

@@ -11,9 +11,9 @@ import time
 import pytest
 import zenoh
 
-from service.keys import Keys
-from service.session import LEASE_S, open_client
-from service.soak.control import AXIS, STAGE
+from lab.soak.processes.control import AXIS, STAGE
+from service.protocol.keys import Keys
+from service.runtime.session import LEASE_S, open_client
 from tests.service.conftest import unused_port
 
 RATE_HZ, BYTES = 500.0, 2000
@@ -30,7 +30,7 @@ def started(*module: str) -> subprocess.Popen[str]:
 @pytest.mark.e2e
 def test_a_slow_subscriber_holds_nobody_up() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
-    children = [started("service.cli", "router", "--listen", endpoint)]
+    children = [started("lab.cli", "router", "--listen", endpoint)]
     stop = threading.Event()
     came: list[float] = []
 
@@ -50,7 +50,7 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             sender = threading.Thread(target=send, args=(other,))
             sender.start()
             try:
-                children.append(started("service.soak.extras", "slow", endpoint))
+                children.append(started("lab.soak.processes.extras", "slow", endpoint))
                 time.sleep(6.0)
                 # Others come and go meanwhile, which is when everybody would have to wait.
                 for _ in range(4):

@@ -19,7 +19,7 @@ SAFE = {"voltages_finite", "voltages_within_limits", "voltages_within_slew", "an
 
 
 def command(out: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "service.cli", "soak", "--out", str(out), "--seed", "4", "--json", *options]
+    return [sys.executable, "-m", "lab.cli", "soak", "--out", str(out), "--seed", "4", "--json", *options]
 
 
 def read(out: Path) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def test_ctrl_c_leaves_a_report_of_what_ran(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_asked_for_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from service.cli import main
+    from lab.cli import main
 
     for options, named in (
         (["--duration", "1s"], "--duration: got '1s'"),

@@ -20,7 +20,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from service.rehearsal.plant import Change
+from lab.rehearsal.plant import Change
 
 FloatArray = NDArray[np.float64]
 

@@ -31,19 +31,19 @@ from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from adaptive.trial import SENSOR_FAULTS
+from adaptive.online.sensor_trial import SENSOR_FAULTS
 from adaptive.types import FloatArray
-from service.axis_state import axis_state, restore_axis
-from service.client_answers import Commanded
-from service.config import AxisConfig
-from service.modelfile import Bundle, BundleMeta
-from service.models import load_axis
-from service.rehearsal import Change, Event, Motion, RehearsalConfig, identify
-from service.rehearsal.disturbance import Line, Message, Sensor, World
-from service.rehearsal.identification import approach, excited
-from service.rehearsal.reference import Excursion, Reference, Step
-from service.wire import MAX_SEQ, SampleBatch
-from service.wire_query import FeedforwardQuery
+from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
+from lab.rehearsal.disturbance import Line, Message, Sensor, World
+from lab.rehearsal.identification import approach, excited
+from lab.rehearsal.reference import Excursion, Reference, Step
+from service.client.answers import Commanded
+from service.config.config import AxisConfig
+from service.protocol.query import FeedforwardQuery
+from service.protocol.samples import MAX_SEQ, SampleBatch
+from service.server.axis_state import axis_state, restore_axis
+from service.server.models import load_axis
+from service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.plants import StageFactory, issue_plant, random_plant, with_traits
 
 DT_S, BLOCK = 1e-3, 5

@@ -46,21 +46,15 @@ from numpy.typing import NDArray
 # ---------------------------------------------------------------------------------------------------------------------
 # Adapter: the only section that names the product. Change the imports and these functions after files have moved;
 # leave everything below the next line as it is.
-from adaptive.identification import identify_lssvm
-from adaptive.identification_config import IdentifyConfig
+from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.types import InverseModel
 from baselines.fit import fit_linear, fit_mpi
-from service.axis import Axis
-from service.axis_state import axis_state
-from service.checkpoint import CheckpointFolder, CheckpointMeta
-from service.config import AxisConfig
-from service.guard import Limits
-from service.keeper import restore_newest
-from service.modelfile import Bundle, BundleMeta
-from service.models import load_axis
-from service.replay import covered, replay
-from service.stage_faults import CHANGE, DELIVERY, READING, Fault, Injector
-from service.wire import (
+from service.answers.guard import Limits
+from service.config.config import AxisConfig
+from service.protocol.model import decode_model, encode_model
+from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
+from service.protocol.reply import FeedforwardReply, decode_reply, encode_reply
+from service.protocol.samples import (
     SampleBatch,
     decode_samples,
     encode_command,
@@ -68,13 +62,18 @@ from service.wire import (
     encode_samples,
     joined,
 )
-from service.wire_model import decode_model, encode_model
-from service.wire_query import FeedforwardQuery, Pending, decode_query, encode_query
-from service.wire_reply import FeedforwardReply, decode_reply, encode_reply
-from sim.presets import preset
+from service.replay.replay import covered, replay
+from service.server.axis import Axis
+from service.server.axis_state import axis_state
+from service.server.models import load_axis
+from service.stage_node.faults import CHANGE, DELIVERY, READING, Fault, Injector
+from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
+from service.storage.checkpoint_keeper import restore_newest
+from service.storage.model_file import Bundle, BundleMeta
 from sim.recordings import ColumnMap, Recording, read, repaired
-from sim.signals import multitone, training_input
-from sim.stage import Stage
+from sim.signals.signals import multitone, training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 LEARNER: Final = "lssvm_adaptive"
 CHAMPION: Final = "auto"

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from adaptive.features import FeatureMap
-from adaptive.snapshot import LssvmInverse
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.points import Domain
-from service.modelfile import BundleMeta, write_bundle
+from baselines.validation import Domain
+from service.storage.model_file import BundleMeta, write_bundle
 
 DT_S = 1e-3
 GAIN_UM_PER_V, OFFSET_UM = 11.0, 1.0
@@ -84,7 +84,7 @@ class ServeProcess:
     def __init__(self, config: Path, port: int) -> None:
         self.endpoint = f"tcp/127.0.0.1:{port}"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", "serve", "--config", str(config), "--json"],
+            [sys.executable, "-m", "lab.cli", "serve", "--config", str(config), "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

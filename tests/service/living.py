@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from service import wire
-from service.client import Client, Point
-from service.session import open_client
+from service.client.client import Client, Point
+from service.protocol import samples as wire
+from service.runtime.session import open_client
 
 DT_S = 1e-3
 
@@ -71,7 +71,7 @@ class Process:
             environment["PYTHONPATH"] = os.pathsep.join([str(path), environment.get("PYTHONPATH", "")])
         start = time.monotonic()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "service.cli", *args, "--json"],
+            [sys.executable, "-m", "lab.cli", *args, "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

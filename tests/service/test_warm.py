@@ -16,7 +16,7 @@ from service.warm import PACKAGES, make_bytecode
 _SOAK = """
 import sys
 from numba.core import event
-from service.cli import main
+from lab.cli import main
 
 class Compiled(event.Listener):
     def on_start(self, event):

@@ -12,12 +12,11 @@ from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel
 from baselines.fit import fit_mpi
 from sim.changes.columns import Scales, Stretch, base_of
-from sim.changes.compare import compare
-from sim.changes.comparison import Comparison
-from sim.presets import preset
-from sim.signals import training_input
-from sim.stage import Stage
-from sim.stage_config import StageConfig
+from sim.changes.compare import Comparison, compare
+from sim.signals.signals import training_input
+from sim.stage.config import StageConfig
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
 
 DT_S = 1e-3
 CHANGE_S = 11.0

@@ -12,7 +12,7 @@ from sim.scenarios import KINDS, Readings, Scenario, scenario
 from sim.scenarios.kinds import dwell
 from sim.scenarios.motion import Parts, Tones, in_band, strokes
 from sim.scenarios.readings import glitch_burst
-from sim.stage import Stage
+from sim.stage.stage import Stage
 
 KINDS_SEEDS = [(kind, seed) for kind in KINDS for seed in (1, 2)]
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from sim.reference import DemoReference, demo_reference
-from sim.signals import (
+from sim.signals.signals import (
     diagnosis_excitation,
     generalisation_input,
     growing_triangles,
@@ -20,6 +19,7 @@ from sim.signals import (
     training_input,
     triangle,
 )
+from sim.signals.unseen_reference import DemoReference, demo_reference
 
 
 def test_chapters_inputs() -> None:

@@ -1,0 +1,419 @@
+"""The served inverse LSSVM: an immutable model, evaluated over a whole trajectory by one compiled loop.
+
+    u = beta' basis(x) + sum_i alpha_i K(x, x_i)
+
+with basis and kernel inputs from a ``FeatureMap``. The linear part carries the model on where the kernel has no
+samples. One standard deviation comes from the nearest sample alone: with one sample of covariance k to the point, a
+Gaussian process of unit variance has 1 - k²/(1 + 1/gamma) left, an upper bound of what all samples leave, and it
+costs nothing on top of the mean. The learner calibrates its scale on its own prediction errors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adaptive.compiled import compiled, compiled_reassociating
+from adaptive.errors import InputError, ModelFileError
+from adaptive.features import FeatureArrays, FeatureMap, advance, fill
+from adaptive.kernels import rbf_column, weigh
+from adaptive.state_codec import prefixed, under
+from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from adaptive.window.arithmetic import dot
+from adaptive.window.arrays import IntArray
+
+# --- The compiled loops of a served inverse LSSVM: voltages and deviations of a trajectory, and its memory carried on.
+
+
+@compiled_reassociating
+def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
+    """basis' covariance basis, V², (p, p) and (p,); 0 for a covariance of no size. Half of a point's time, in order."""
+    p, total, j = covariance.shape[0], 0.0, 0
+    # Four rows at a time: each sum that ends costs as much as the row.
+    while j + 3 < p:
+        r0, r1, r2, r3 = covariance[j], covariance[j + 1], covariance[j + 2], covariance[j + 3]
+        b0, b1, b2, b3 = basis[j], basis[j + 1], basis[j + 2], basis[j + 3]
+        for i in range(p):
+            total += (r0[i] * b0 + r1[i] * b1 + r2[i] * b2 + r3[i] * b3) * basis[i]
+        j += 4
+    while j < p:
+        row, bj = covariance[j], basis[j]
+        for i in range(p):
+            total += row[i] * bj * basis[i]
+        j += 1
+    return total
+
+
+@compiled
+def evaluate(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    m: FeatureArrays,
+    beta: FloatArray,
+    beta_covariance: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+    noise_variance: float,
+    kernel_variance: float,
+    shrink: float,
+    domain: FloatArray,
+    anchor: FloatArray,
+    allowed: float,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """Voltages, deviations and domain flags of n points; ``memory`` advances in place.
+
+    ``anchor`` (p,) or (0,): linear part that the voltage leaves by ``allowed``, V, at most.
+    """
+    n = y.shape[0]
+    d, count = scaled.shape
+    p = beta.shape[0]
+    basis = np.empty(p)
+    x = np.empty(d)
+    k = np.empty(count)
+    bits = np.empty(count)
+    for i in range(n):
+        advance(y[i], memory, m)
+        fill(y[i], v[i], a[i], memory, m, basis, x)
+        mean = dot(beta, basis, p)
+        variance = noise_variance + spread(beta_covariance, basis)
+        nearest = 0.0
+        if count > 0:
+            for j in range(d):
+                x[j] *= inverse_widths[j]
+            rbf_column(scaled, count, x, k, bits)
+            kernel_part, nearest = weigh(k, alpha)
+            mean += kernel_part
+        if anchor.shape[0] > 0:
+            known = dot(anchor, basis, p)
+            mean = min(max(mean, known - allowed), known + allowed)
+        u[i] = mean
+        std[i] = np.sqrt(max(variance + kernel_variance * (1.0 - shrink * nearest * nearest), 0.0))
+        inside[i] = domain[0] <= y[i] <= domain[1] and domain[2] <= v[i] <= domain[3] and domain[4] <= a[i] <= domain[5]
+
+
+@compiled
+def unpacked(
+    constants: FloatArray, counts: IntArray
+) -> tuple[FeatureArrays, FloatArray, FloatArray, FloatArray, FloatArray, int]:  # pragma: no cover - compiled
+    """(feature map, beta (p,), 1/widths (d,), alpha (n,), scaled support (d, n), place of what follows); views."""
+    K, A, M, p, d, n = counts[0], counts[1], counts[2], counts[3], counts[4], counts[5]
+    at = 17
+    thresholds = constants[at : at + K]
+    at += K
+    arcs = constants[at : at + A]
+    at += A
+    retain = constants[at : at + M]
+    at += M
+    beta = constants[at : at + p]
+    at += p
+    inverse_widths = constants[at : at + d]
+    at += d
+    alpha = constants[at : at + n]
+    at += n
+    scaled = constants[at : at + d * n].reshape(d, n)
+    at += d * n
+    m = FeatureArrays(thresholds, arcs, retain, constants[13:17], counts[10:], counts[7:9], constants[0:3])
+    return m, beta, inverse_widths, alpha, scaled, at
+
+
+@compiled
+def evaluate_packed(
+    y: FloatArray,
+    v: FloatArray,
+    a: FloatArray,
+    memory: FloatArray,
+    constants: FloatArray,
+    counts: IntArray,
+    u: FloatArray,
+    std: FloatArray,
+    inside: BoolArray,
+) -> None:  # pragma: no cover - compiled
+    """`evaluate` with all that a model is made of in two arrays, as `LssvmInverse` packs it.
+
+    Twenty arrays cost more to hand over than one point costs to work out, and are twenty places in memory to fetch.
+    """
+    m, beta, inverse_widths, alpha, scaled, at = unpacked(constants, counts)
+    c, p = counts[6], beta.shape[0]
+    covariance = constants[at : at + c * c].reshape(c, c)
+    at += c * c
+    anchor = constants[at : at + counts[9] * p]
+    scalars, domain = constants[3:7], constants[7:13]
+    evaluate(
+        y, v, a, memory, m, beta, covariance, scaled, alpha, inverse_widths, scalars[0], scalars[1], scalars[2], domain,
+        anchor, scalars[3], u, std, inside,
+    )  # fmt: skip
+
+
+@compiled
+def voltage_of(
+    y: float,
+    v: float,
+    a: float,
+    memory: FloatArray,
+    scratch: FloatArray,
+    m: FeatureArrays,
+    beta: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Voltage at a trial point after ``memory`` (m,), which stays; ``scratch`` (m,) is written to."""
+    scratch[:] = memory
+    advance(y, scratch, m)
+    basis, kernel = np.empty(beta.shape[0]), np.empty(inverse_widths.shape[0])
+    fill(y, v, a, scratch, m, basis, kernel)
+    return mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
+
+
+@compiled
+def evaluate_point(
+    y: float, v: float, a: float, memory: FloatArray, constants: FloatArray, counts: IntArray
+) -> tuple[float, float, bool]:  # pragma: no cover - compiled
+    """`evaluate_packed` of one point, numbers to numbers: to hand over an array costs as much as five of them."""
+    five, inside = np.empty(5), np.empty(1, dtype=np.bool_)
+    five[0], five[1], five[2] = y, v, a
+    evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
+    return five[3], five[4], inside[0]
+
+
+@compiled
+def track_memory(y: FloatArray, memory: FloatArray, m: FeatureArrays) -> None:  # pragma: no cover - compiled
+    """Advance ``memory`` (m,) in place by (n,) measured displacements."""
+    for i in range(y.shape[0]):
+        advance(y[i], memory, m)
+
+
+@compiled
+def mean_of(
+    basis: FloatArray,
+    kernel: FloatArray,
+    beta: FloatArray,
+    scaled: FloatArray,
+    alpha: FloatArray,
+    inverse_widths: FloatArray,
+) -> float:  # pragma: no cover - compiled
+    """Mean at one point whose inputs are known."""
+    count = alpha.shape[0]
+    mean = dot(beta, basis, beta.shape[0])
+    if count > 0:
+        k = np.empty(count)
+        rbf_column(scaled, count, kernel * inverse_widths, k, np.empty(count))
+        for j in range(count):
+            mean += alpha[j] * k[j]
+    return mean
+
+
+#: Share of the learnt range by which a point may lie outside and still count as inside.
+DOMAIN_MARGIN = 0.05
+
+
+@dataclass(frozen=True)
+class LssvmInverse:
+    """Immutable inverse LSSVM; implements ``adaptive.types.InverseModel``.
+
+    Parameters
+    ----------
+    name : by which it is served.
+    features : the map from motion to inputs; its ``dt_s`` is the model's.
+    beta : (p,) linear part, V per normalised input.
+    support : (N, d) kernel inputs of the samples, dimensionless. alpha : (N,) their weights, V.
+    widths : (d,) kernel widths, dimensionless. gamma : regularisation.
+    domain : (6,) learnt range of y (µm), v (µm/s), a (µm/s²), as [y0, y1, v0, v1, a0, a1].
+    noise_variance : of one prediction at a sample, V². kernel_variance : of the kernel part away from samples, V².
+    beta_covariance : (p, p) of the linear part, V², or (0, 0) where unknown.
+    span_V : voltage range of the recording it was identified from, V.
+    seq : sequence number of the last sample that it has seen, -1 for none.
+    valid : whether the learner vouches for it.
+    anchor, allowed_V : (p,) linear part of the identified model, or (0,), and by how much the voltage may leave what it
+    asks for, V: whatever was learnt, no answer is further from what was identified.
+    """
+
+    name: str
+    features: FeatureMap
+    beta: FloatArray
+    support: FloatArray
+    alpha: FloatArray
+    widths: FloatArray
+    gamma: float
+    domain: FloatArray
+    noise_variance: float = 0.0
+    kernel_variance: float = 0.0
+    beta_covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    span_V: float = 1.0
+    seq: int = -1
+    valid: bool = True
+    anchor: FloatArray = field(default_factory=lambda: np.empty(0))
+    allowed_V: float = 0.0
+    _scaled: FloatArray = field(init=False, repr=False, compare=False)
+    _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
+    #: All that `evaluate_packed` needs.
+    _constants: FloatArray = field(init=False, repr=False, compare=False)
+    _counts: IntArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        p, d, n = self.features.basis_size, self.features.kernel_size, self.support.shape[0]
+        shapes = {"beta": (p,), "support": (n, d), "alpha": (n,), "widths": (d,), "domain": (6,)}
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.all(np.isfinite(value)):
+                raise InputError(f"{name}: got shape {value.shape}, expected {shape} finite numbers")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        # What is stated as a deviation is the root of these.
+        positive = ("gamma", "span_V")
+        for name in (*positive, "noise_variance", "kernel_variance", "allowed_V"):
+            number = float(getattr(self, name))
+            if not math.isfinite(number) or number < 0.0 or (number == 0.0 and name in positive):
+                expected = "above" if name in positive else "of at least"
+                raise InputError(f"{name}: got {number}, expected a finite number {expected} 0")
+        anchor = np.array(self.anchor, dtype=np.float64)
+        if anchor.shape not in ((0,), (p,)) or not np.all(np.isfinite(anchor)):
+            raise InputError(f"anchor: got shape {anchor.shape}, expected ({p},) finite numbers, or (0,)")
+        anchor.flags.writeable = False
+        object.__setattr__(self, "anchor", anchor)
+        covariance = np.array(self.beta_covariance, dtype=np.float64)
+        if covariance.shape not in ((0, 0), (p, p)):
+            raise InputError(f"beta_covariance: got shape {covariance.shape}, expected ({p}, {p}) or (0, 0)")
+        covariance.flags.writeable = False
+        object.__setattr__(self, "beta_covariance", covariance)
+        scaled = np.ascontiguousarray((self.support / self.widths).T)
+        scaled.flags.writeable = False
+        object.__setattr__(self, "_scaled", scaled)
+        object.__setattr__(self, "_inverse_widths", 1.0 / self.widths)
+        spans = np.repeat(self.domain[1::2] - self.domain[::2], 2) * DOMAIN_MARGIN
+        margins = self.domain + spans * np.array([-1.0, 1.0] * 3)
+        m = self.features.arrays
+        scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma), self.allowed_V)
+        parts = (m.frame, scalars, margins, m.scale, m.thresholds, m.arcs, m.retain, self.beta, 1.0 / self.widths,
+                 self.alpha, scaled.ravel(), covariance.ravel(), anchor)  # fmt: skip
+        object.__setattr__(self, "_constants", np.concatenate(parts))
+        sizes = [m.thresholds.size, m.arcs.size, m.retain.size, p, d, n, covariance.shape[0]]
+        object.__setattr__(
+            self, "_counts", np.array([*sizes, *m.flags, anchor.size > 0, *m.kernel_plays], dtype=np.int64)
+        )
+
+    @property
+    def dt_s(self) -> float:
+        return self.features.dt_s
+
+    @property
+    def memory_size(self) -> int:
+        return self.features.memory_size
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """(m,) memory, µm, of a stage that has come to rest at ``y_um`` from its rest position."""
+        return self.features.rest_memory(y_um)
+
+    def feedforward(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """Voltages for (n,) desired points; pure. Raises InputError on shapes that do not fit together."""
+        y, v, a = self._points(y_um, v_um_per_s, a_um_per_s2)
+        after = self._memory(memory)
+        n = y.size
+        u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+        evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
+        return Feedforward(u, std, inside, after)
+
+    @property
+    def packed(self) -> tuple[FloatArray, IntArray]:
+        """The whole model as two arrays, as `snapshot_loops.evaluate_point` takes it; not to be changed."""
+        return self._constants, self._counts
+
+    def evaluate_point(
+        self, y_um: float, v_um_per_s: float, a_um_per_s2: float, memory: FloatArray
+    ) -> tuple[float, float, bool]:
+        """``feedforward`` of one point, (voltage, deviation, inside), without its checks: three floats and no others.
+
+        ``memory`` (m,), contiguous doubles, is advanced in place. For who asks point by point at a controller's rate.
+        """
+        u_V, std_V, inside = evaluate_point(y_um, v_um_per_s, a_um_per_s2, memory, self._constants, self._counts)
+        return u_V, std_V, inside
+
+    def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
+        """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
+        return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
+
+    def at_bound(self, y_um: FloatArray, u_V: FloatArray) -> BoolArray:
+        """(n,) whether the voltages, (n,) V, that it gave for (n,) places at rest are held by ``allowed_V``."""
+        if not self.anchor.size:
+            return np.zeros(y_um.size, dtype=np.bool_)
+        still = np.zeros(y_um.size)
+        basis, _, _ = self.features.run(y_um, still, still, self.rest_memory(float(y_um[0])))
+        held: BoolArray = np.abs(u_V - basis @ self.anchor) >= (1.0 - 1e-9) * self.allowed_V
+        return held
+
+    def track(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
+    ) -> FloatArray:
+        """(m,) memory after (n,) measured points. This model's memory is of displacement: the voltage is not used."""
+        y, _, _ = self._points(y_um, v_um_per_s, a_um_per_s2)
+        after = self._memory(memory)
+        track_memory(y, after, self.features.arrays)
+        return after
+
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without its checks: (n,) contiguous displacements, µm; the voltages are not used."""
+        track_memory(y_um, memory, self.features.arrays)
+
+    def _points(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        y = np.ascontiguousarray(y_um, dtype=np.float64)
+        v = np.ascontiguousarray(v_um_per_s, dtype=np.float64)
+        a = np.ascontiguousarray(a_um_per_s2, dtype=np.float64)
+        if y.ndim != 1 or not y.shape == v.shape == a.shape:
+            raise InputError(
+                f"y_um, v_um_per_s, a_um_per_s2: got shapes {[x.shape for x in (y, v, a)]}, expected three of equal "
+                "(n,)"
+            )
+        return y, v, a
+
+    def _memory(self, memory: FloatArray) -> FloatArray:
+        after = np.array(memory, dtype=np.float64)
+        if after.shape != (self.memory_size,):
+            raise InputError(
+                f"memory: got shape {after.shape}, expected ({self.memory_size},);"
+                " start from rest_memory() or bring back the memory of the last reply"
+            )
+        return after
+
+    def state_dict(self) -> StateDict:
+        """Flat names to arrays and JSON scalars; ``from_state`` builds an equal model."""
+        state: StateDict = {"kind": "lssvm", "name": self.name, "gamma": self.gamma}
+        state |= prefixed("features.", self.features.state_dict())
+        for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance", "anchor"):
+            state[name] = getattr(self, name).copy()
+        for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid", "allowed_V"):
+            state[name] = getattr(self, name)
+        return state
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> LssvmInverse:
+        """Inverse of ``state_dict``. Raises ModelFileError on missing or misshapen entries."""
+        try:
+            return cls(
+                name=str(state["name"]),
+                features=FeatureMap.from_state(under("features.", state)),
+                gamma=float(state["gamma"]),
+                noise_variance=float(state["noise_variance"]),
+                kernel_variance=float(state["kernel_variance"]),
+                span_V=float(state["span_V"]),
+                seq=int(state["seq"]),
+                valid=bool(state["valid"]),
+                # Files from before there was a bound have none.
+                anchor=np.asarray(state.get("anchor", ()), dtype=np.float64),
+                allowed_V=float(state.get("allowed_V", 0.0)),
+                **{name: np.asarray(state[name], dtype=np.float64) for name in
+                   ("beta", "support", "alpha", "widths", "domain", "beta_covariance")},
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(f"lssvm model: entry missing or damaged: {error}; identify the stage again") from error

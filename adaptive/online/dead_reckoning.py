@@ -1,0 +1,260 @@
+"""Dead reckoning: where the stage must be, from the voltage alone. The inverse model is solved for the displacement.
+
+While readings are in doubt, the smoother's extrapolation is off by micrometres within ten samples. The inverse model is
+not: at each sample the displacement is sought at which it asks for the applied voltage; the hysteresis memory goes
+along. The model's own error is taken away where the reckoning begins, so only its change from then on counts.
+
+Why it cannot run off, for any model:
+
+- The velocity that the model sees is no free unknown. Where voltage rises with velocity (a lag), it is the backward
+  difference of the displacement: an implicit Euler step, which is stable. Where voltage falls with velocity, that
+  recursion would be unstable; there the velocity follows from the change of the voltage itself, which is no recursion.
+- A step of the displacement answers a change of the voltage by a slope within ``SLOPES`` times the mean one. Summed
+  from the start this gives a band, and the place is held to it.
+- The place stays within ``OFF_LINE`` ranges of a straight line through the start, of the model's mean slope.
+
+What the band and the line cut off is counted as uncertainty, and with it the way gone. Beyond ``LOST_SHARE`` of the
+range the reckoning is lost and says so; who asks then holds frame and last velocity, and begins anew at a reading.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.features import FeatureMap, advance
+from adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
+from adaptive.state_codec import prefixed, under
+from adaptive.types import FloatArray, StateDict
+from adaptive.window.arrays import IntArray
+
+#: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
+STEPS, SLOPE_SHARE = 2, 1e-5
+#: Slopes, as shares of the mean one, that a stage can have. A slope beyond is the model's error.
+SLOPES = (0.4, 2.5)
+#: Distance from the straight line through the start, in ranges, that hysteresis, creep and bend explain together.
+OFF_LINE = 0.35
+#: Readings before the doubtful one from which the model's error is taken.
+ANCHORS = 5
+#: Time constant with which the acceleration at the start is forgotten, s; time for which the stage's own motion at the
+#: start (lag, ringing) widens the band, s.
+FORGET_S, RUN_OUT_S = 0.05, 0.01
+#: One standard deviation of the place, as a share of the way gone, and as a share of the range the most that this adds
+#: and the limit of what is of use.
+WAY_SHARE, WAY_MOST, LOST_SHARE = 0.002, 0.02, 0.05
+
+#: Entries of a reckoning's numbers.
+_Y, _V, _A, _U, _LOW, _HIGH, _WAY, _CUT, _OFF, _SLOPE, _LINE = range(11)
+
+
+@dataclass(slots=True)
+class Reckoning:
+    """A place carried on by a model that stays as it was at the start.
+
+    Parameters
+    ----------
+    model : an immutable snapshot. memory : (m,) hysteresis memory after the last sample.
+    numbers : place (µm, µm/s, µm/s²) and voltage (V) of the last sample; the band (µm); way gone and what the band cut
+    off since the doubt began (µm); what a reading shows more than the place (µm); mean slope (V/µm), and the voltage
+    at which the line through the start is at 0 µm (V).
+    """
+
+    model: LssvmInverse
+    memory: FloatArray
+    numbers: FloatArray
+
+    @classmethod
+    def begin(
+        cls,
+        model: LssvmInverse,
+        motion: tuple[float, float, float],
+        u_before_V: float,
+        u_V: FloatArray,
+        y_um: FloatArray,
+        memory: FloatArray,
+    ) -> Reckoning:
+        """From the last smoothed instant over the (n,) samples after it, with their voltages and (k,) first readings.
+
+        ``motion`` (µm, µm/s, µm/s²) and ``memory`` (m,) are of that instant, ``u_before_V`` is its voltage.
+        """
+        y, v, a = motion
+        made = cls(model, memory.copy(), np.zeros(11))
+        slack = abs(v) * RUN_OUT_S + 1e-3 * made.range_um
+        made.numbers[:_WAY] = (y, v, a, u_before_V, y - slack, y + slack)
+        slope = mean_slope(model)
+        made.numbers[[_SLOPE, _LINE]] = slope, u_before_V - slope * y
+        off = np.array([made.advance(float(u)) for u in u_V[: y_um.size]])
+        for u in u_V[y_um.size :]:
+            made.advance(float(u))
+        if off.size:
+            # The middle one of the last: some of these readings may have rung, or been wrong, already.
+            made.numbers[_OFF] = float(np.median((y_um - off)[-ANCHORS:]))
+        made.begin_way()
+        return made
+
+    def begin_way(self) -> None:
+        """The doubt begins here: readings up to here, or the model over the voltages up to here, are believed."""
+        self.numbers[[_WAY, _CUT]] = 0.0
+
+    @property
+    def range_um(self) -> float:
+        """Displacement range of the model, as a reading shows it, µm."""
+        f = self.model.features
+        return (f.y_max_um - f.y_min_um) * f.gain
+
+    @property
+    def y_um(self) -> float:
+        """Where a reading must be at the last sample, µm."""
+        return float(self.numbers[_Y] + self.numbers[_OFF])
+
+    @property
+    def v_um_per_s(self) -> float:
+        """Velocity there, µm/s."""
+        return float(self.numbers[_V])
+
+    @property
+    def std_um(self) -> float:
+        """One standard deviation of the place, µm: it grows with the way gone, and by what the band cut off.
+
+        The way makes it no larger than a share of the range: the voltage alone tells the place but for hysteresis.
+        """
+        most = WAY_MOST * self.range_um
+        return most * (1.0 - math.exp(-WAY_SHARE * self.way_um / most)) + float(self.numbers[_CUT])
+
+    @property
+    def mean_slope_V_per_um(self) -> float:
+        """Slope of the straight line through the model's range, V/µm; negative where voltage draws the stage back."""
+        return float(self.numbers[_SLOPE])
+
+    @property
+    def way_um(self) -> float:
+        """Way gone since the doubt began, µm."""
+        return float(self.numbers[_WAY])
+
+    @property
+    def lost(self) -> bool:
+        """Whether the place is too uncertain to be of use."""
+        return not self.std_um <= LOST_SHARE * self.range_um
+
+    def in_frame(self, frame: FeatureMap) -> Reckoning:
+        """The same stage read in another frame; the hysteresis memory is of the stage and stays."""
+        f, n = self.model.features, self.numbers.copy()
+        slope = frame.gain / f.gain
+        n[[_Y, _LOW, _HIGH]] = frame.offset_um + slope * (n[[_Y, _LOW, _HIGH]] - f.offset_um)
+        n[[_V, _A, _WAY, _CUT, _OFF]] *= slope
+        n[_SLOPE] /= slope
+        line_um = (n[_U] - n[_LINE]) / self.numbers[_SLOPE]
+        n[_LINE] = n[_U] - n[_SLOPE] * (frame.offset_um + slope * (line_um - f.offset_um))
+        return Reckoning(replace(self.model, features=frame), self.memory.copy(), n)
+
+    def by_model(self, model: LssvmInverse) -> Reckoning:
+        """Go on by another model of the same frame. A reading must be where it had to be before the change."""
+        made = Reckoning(model, self.memory.copy(), self.numbers.copy())
+        made.numbers[_OFF] += self.y_um - made.advance(float(self.numbers[_U]))
+        return made
+
+    def advance(self, u_V: float) -> float:
+        """One sample on, under the voltage ``u_V``; returns where its reading must be, µm."""
+        f = self.model.features
+        constants, counts = self.model.packed
+        _step(u_V, f.dt_s, self.range_um, self.memory, self.numbers, constants, counts)
+        return self.y_um
+
+    def state_dict(self) -> StateDict:
+        """All of it under flat names."""
+        own = {"memory": self.memory.copy(), "numbers": self.numbers.copy()}
+        return {**own, **prefixed("model.", self.model.state_dict())}
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Reckoning:
+        """Inverse of ``state_dict``."""
+        model = LssvmInverse.from_state(under("model.", values))
+        memory, numbers = (np.array(values[name], dtype=np.float64) for name in ("memory", "numbers"))
+        if numbers.shape != (11,) or memory.shape != (model.memory_size,):
+            raise ValueError(f"reckoning: got shapes {memory.shape}, {numbers.shape}, expected {model.memory_size}, 11")
+        return cls(model, memory, numbers)
+
+
+def drive_V(model: LssvmInverse) -> float:
+    """Voltage, V, over which a model drives its range: that of its recording, or more where it asks for more."""
+    low_V, high_V, _ = _ends(model)
+    return max(model.span_V, abs(high_V - low_V))
+
+
+def mean_slope(model: LssvmInverse) -> float:
+    """Slope, V/µm, of the straight line through the ends of a model's range, of a size that a stage can have."""
+    low_V, high_V, range_um = _ends(model)
+    usual, slope = model.span_V / range_um, (high_V - low_V) / range_um
+    # A model that asks for the same voltage everywhere has at least a sign.
+    return math.copysign(max(abs(slope), 0.5 * usual), slope)
+
+
+def answers(model: LssvmInverse) -> bool:
+    """Whether a model asks for other voltages at the two ends of its range, as a stage's inverse does."""
+    low_V, high_V, _ = _ends(model)
+    return bool(abs(high_V - low_V) > 0.3 * model.span_V)
+
+
+def _ends(model: LssvmInverse) -> tuple[float, float, float]:
+    """Voltages, V, at the lower and the upper end of the range, and the range, µm."""
+    f = model.features
+    low_um, high_um = (f.offset_um + f.gain * y for y in (f.y_min_um, f.y_max_um))
+    low_V, high_V = (model.evaluate_point(y, 0.0, 0.0, model.rest_memory(y))[0] for y in (low_um, high_um))
+    return low_V, high_V, high_um - low_um
+
+
+@compiled
+def _step(
+    u: float,
+    dt: float,
+    span: float,
+    memory: FloatArray,
+    n: FloatArray,
+    constants: FloatArray,
+    counts: IntArray,
+) -> None:  # pragma: no cover - compiled
+    """One sample: place, velocity, band and memory in place."""
+    m, beta, inverse_widths, alpha, scaled, _ = unpacked(constants, counts)
+    scratch = np.empty(memory.shape[0])
+    before, v, k = n[_Y], n[_V], n[_SLOPE]
+    sign, least, most = math.copysign(1.0, k), SLOPES[0] * abs(k), SLOPES[1] * abs(k)
+    dv = 1e-3 / (m.scale[2] * m.frame[1])
+    # How the voltage depends on velocity here decides where the velocity comes from.
+    lag = (
+        voltage_of(before, v + dv, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        - voltage_of(before, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+    ) / dv
+    implicit = sign * lag > 0.0
+    du = u - n[_U]
+    h = SLOPE_SHARE * span
+    y = before + v * dt
+    for _ in range(STEPS):
+        if implicit:
+            v = (y - before) / dt
+        there = voltage_of(y, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        more = voltage_of(y + h, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        slope = sign * min(max(sign * (more - there) / h, least), most)
+        if implicit:
+            slope += lag / dt
+        else:
+            v = du / (slope * dt)
+            there = voltage_of(y, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
+        y -= (there - u) / slope
+    # The band: what this change of the voltage can have made of the place, at the least and at the most.
+    rises, falls = max(sign * du, 0.0), min(sign * du, 0.0)
+    n[_LOW] += rises / most + falls / least
+    n[_HIGH] += rises / least + falls / most
+    line = (u - n[_LINE]) / k
+    low = max(n[_LOW], line - OFF_LINE * span)
+    high = min(n[_HIGH], line + OFF_LINE * span)
+    held = min(max(y, low), high) if math.isfinite(y) else before
+    # What is cut off stays the same error while the stage stands still: the largest of it, not the sum.
+    n[_CUT] = max(n[_CUT], abs(held - y) if math.isfinite(y) else span)
+    n[_V] = (held - before) / dt
+    n[_A] *= math.exp(-dt / FORGET_S)
+    n[_WAY] += abs(held - before)
+    n[_Y], n[_U] = held, u
+    advance(held, memory, m)

@@ -1,0 +1,692 @@
+"""From readings to motion: what each sample is, and which steps of the track (``adaptive.online.track``) it leads to.
+
+Samples go in by ``take``, which says what each is and which steps are to be made for it; ``advance`` makes them and
+returns the pair of smoothed motion and voltage, ``lag`` samples old, that may teach.
+
+A reading is in one of three hands. Trusted, it goes to the smoother. One that surprises is held back with those that
+follow (``adaptive.online.glitch_or_jump``) until they turn out to be a glitch, ringing, or a jump; a jump of the
+reading that no
+voltage made moves the frame of the features, and with it everything that was learnt. Readings that stay undecided, or
+that do not follow the drive, are on trial (``adaptive.online.sensor_trial``). While readings are held or on trial
+nothing is taught,
+and dead reckoning carries the hysteresis memory on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from math import nan
+
+import numpy as np
+
+from adaptive.features import FeatureMap
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online import gates as admission
+from adaptive.online import glitch_or_jump as hypotheses
+from adaptive.online.config import LearnerConfig
+from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
+from adaptive.online.gates import AdmissionState
+from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
+from adaptive.online.sensor_check import CONFIRMED, Following
+from adaptive.online.sensor_trial import Outcome, Trial
+from adaptive.online.track import Pair, Past, Step, Taken, Track
+from adaptive.smoothing import FixedLagSmoother
+from adaptive.state_codec import joined, prefixed, under
+from adaptive.types import FloatArray, Sample, StateDict
+
+# --- What a front holds beside its numbers, as flat entries and back.
+
+
+def parts_to_state(
+    gates: AdmissionState,
+    track: Track | None,
+    hold: Hold | None,
+    trial: Trial | None,
+    before: FeatureMap | None,
+    following: Following,
+) -> StateDict:
+    """All of the parts that are there; copies."""
+    parts = {"gates": gates.state_dict(), "following": following.state_dict()}
+    for name, part in (("track", track), ("hold", hold), ("trial", trial), ("before", before)):
+        if part is not None:
+            parts[name] = part.state_dict()
+    return joined(parts)
+
+
+def parts_of(
+    smoother: FixedLagSmoother, model: LssvmInverse, state: StateDict
+) -> tuple[AdmissionState, Track | None, Hold | None, Trial | None, FeatureMap | None, Following]:
+    """Inverse of ``parts_to_state``; ``model`` is the identified one.
+
+    Raises KeyError, TypeError, ValueError or InputError where it does not fit.
+    """
+    gates = AdmissionState.from_state(under("gates.", state))
+    track, hold, trial, before = (under(f"{name}.", state) for name in ("track", "hold", "trial", "before"))
+    return (
+        gates,
+        Track.from_state(smoother, model.features, track) if track else None,
+        Hold.from_state(hold) if hold else None,
+        Trial.from_state(trial, model) if trial else None,
+        FeatureMap.from_state(before) if before else None,
+        Following.from_state(under("following.", state)),
+    )
+
+
+# --- The voltages of samples without a reading, and a guess at those of samples that never came.
+
+
+#: Samples without a reading whose voltages are kept.
+MOST_HEARD = MOST_BRIDGED
+
+
+class Heard:
+    """Pairs (seq, voltage in V) of samples whose readings were none, since the last one taken."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[int, float]] = deque(maxlen=MOST_HEARD)
+
+    def put(self, sample: Sample) -> None:
+        """Keep the voltage of a sample: no reading, but the stage goes on."""
+        self._kept.append((sample.seq, sample.u_V))
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._kept.clear()
+
+    def missed(self, gates: AdmissionState, sample: Sample, max_gap: int) -> tuple[list[float], bool]:
+        """Voltages, V, of the samples without a reading before ``sample``, and whether too many never came."""
+        first, missing = gates.seq + 1, sample.seq - gates.seq - 1
+        heard = {seq: u for seq, u in self._kept if seq < sample.seq}
+        # Nobody knows the voltages of samples that never came; a straight line between is the best guess.
+        slope_V = (sample.u_V - gates.u_V) / (missing + 1)
+        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_HEARD))]
+        return between, missing > MOST_HEARD or missing - len(heard) > max_gap
+
+    def array(self) -> FloatArray:
+        """(n, 2) pairs, for a file."""
+        return np.array(self._kept, dtype=np.float64).reshape(-1, 2)
+
+    def restore(self, pairs: Iterable[Iterable[float]]) -> None:
+        """Inverse of ``array``."""
+        self._kept.clear()
+        self._kept.extend((int(seq), float(u)) for seq, u in pairs)
+
+
+#: A jump back differs from the jump by less than this share of it.
+BACK_SHARE = 0.1
+#: A place further from the middle of the range than this many ranges is none, and a reading no reading.
+FAR_OUT = 1.5
+#: Over the smoother's lag, between what shares of what the mean slope makes of the voltage a reading moves, where that
+#: is more than this share of the range and so many deviations. Turning points, lag and hysteresis included.
+LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
+#: Time between two looks at that, s.
+LOOK_S = 0.002
+#: Share of the identified range beyond its ends up to which the model is known.
+KNOWN = 0.05
+#: Deviation of a reckoned place, as a share of the range, up to which a hold begins from a past one.
+PAST_SHARE = 0.02
+#: Age at which a place is from before anything that is noticed now, s.
+CLEAN_S = 0.06
+#: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with;
+#: time from one to the next while it has full credit, and while not, s; windows after which one has shown nothing.
+CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 2, 5.0, 0.3, 4
+
+Model = Callable[[], LssvmInverse]
+
+
+class Front:
+    """The front end of a learner; ``base`` is the model that it starts from.
+
+    Attributes
+    ----------
+    track : where the stage is and has been, None before the first reading. gates : of the admission.
+    doubt_V : deviation of the model's predictions, V, as far as it is known; the learner tells.
+    following : whether the readings follow the drive; confirmed : whether they were found to just now.
+    """
+
+    def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
+        self.base = base
+        self.dt_s = base.dt_s
+        self.range_um = base.features.y_max_um - base.features.y_min_um
+        self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
+        self.gates = admission.AdmissionState()
+        self.track: Track | None = None
+        self.doubt_V = 0.0
+        self.restarts = self.jumps = self.undone = self.trials = 0
+        self.following = Following()
+        self.confirmed = False
+        self._look_every = max(1, round(LOOK_S / self.dt_s))
+        self._least_um = LAGS_SHARE * self.range_um
+        self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
+        self._admission = config.admission.at(self.dt_s)
+        self._envelope = config.envelope
+        self._hold: Hold | None = None
+        self._trial: Trial | None = None
+        self._lost = True  # The smoother has to start again.
+        self._heard = Heard()
+        self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
+        self._jump_um = 0.0
+        # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
+        self._proven: FeatureMap | None = None
+        self._proven_past: Past | None = None
+        self._calm = 1_000_000  # Samples since readings were last held back.
+        # A model that does not answer to the displacement cannot tell whether a sensor does.
+        self._tells = answers(base)
+        self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
+        # A trial of readings that nobody doubts, the credit that such trials have left the model, and the samples until
+        # the next. A fault that it finds is the model's: a model that finds faults in a sound sensor is no judge.
+        self._control: Trial | None = None
+        self._credit, self._until_control = FIRST_CREDIT, 0
+        self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
+        # Places from before the last steps in which the readings followed the drive, the older one first.
+        self._pasts: list[Past] = []
+
+    @property
+    def served(self) -> FeatureMap:
+        """The feature map to serve with."""
+        return self.base.features if self.track is None else self.track.served
+
+    @property
+    def _judges(self) -> bool:
+        """Whether the model is good enough to tell by it that a sensor is wrong."""
+        return self._tells and self._credit > 0
+
+    @property
+    def on_probation(self) -> bool:
+        """Whether a jump was taken so recently that it may still be undone."""
+        return self._before is not None and self.gates.since_jump * self.dt_s <= self._admission.undo_s
+
+    def resync(self) -> None:
+        """Forget the sequence: the next sample is taken whatever its number."""
+        self.gates = admission.AdmissionState()
+        self._hold, self._trial, self._lost = None, None, True
+        self._proven = self._proven_past = None
+        self._heard.clear()
+        self._forget()
+
+    def _forget(self) -> None:
+        """What the readings did so far says nothing about what comes."""
+        self.following.forget()
+        self._pasts.clear()
+        self._control = None
+
+    @property
+    def fault(self) -> str:
+        """Name of what is wrong with the sensor, "" while nothing is known to be."""
+        return "" if self._trial is None else self._trial.fault
+
+    @property
+    def why(self) -> str:
+        """The reason for ``fault`` in words."""
+        return "" if self._trial is None else self._trial.why
+
+    @property
+    def distrusted_s(self) -> float:
+        """For how long the readings have been on trial, s; 0 while they are not."""
+        return 0.0 if self._trial is None else self._trial.since * self.dt_s
+
+    # ---- what a sample is
+
+    def take(self, sample: Sample, model: Model) -> Taken:
+        """Judge one sample; ``model`` gives what is served, should the place have to be reckoned by it.
+
+        Never raises on data.
+        """
+        c, gates, track = self._admission, self.gates, self.track
+        refused = admission.check_sample(c, gates, sample, self.dt_s)
+        if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
+            refused = admission.OUT_OF_RANGE
+        if refused:
+            if gates.seq >= 0 and not admission.check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
+                self._heard.put(sample)
+            return Taken(refused)
+        missing = sample.seq - gates.seq - 1 if gates.seq >= 0 else 0
+        between, gone = self._heard.missed(gates, sample, c.max_gap) if missing else ([], False)
+        self._heard.clear()
+        for u in (*between, sample.u_V):
+            admission.watch_voltage(c, gates, u, self.base.span_V)
+        gates.seq, gates.t_s = sample.seq, sample.t_s
+        gates.since_glitch += 1 + missing
+        if self._trial is not None:
+            # What never came is taken for no motion: the reckoning is off by it, and the readings will say so.
+            for u in between:
+                self._trial.put(u, nan, self._circumstances(0.0))
+            return self._try(self._trial, sample)
+        if track is None or self._lost or gone or (missing and track.motion is None):
+            return self._restart(sample, admission.GAP if missing else admission.SETTLING)
+        for u in between:
+            self._keep(track, model, u, nan)
+        stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
+        innovation = (sample.y_um - track.predicted_um) / self.range_um
+        known = track.motion is not None and gates.since_start > c.settle
+        limit = admission.surprise(c, gates, self.base.span_V)
+        if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
+            self._hold = self._lagging(track, model(), sample.y_um)
+        doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
+        if self._hold is None and not doubtful:
+            admission.watch_innovation(c, gates, innovation)
+            self._until_control -= 1
+            if known and (self._control is not None or self._until_control <= 0):
+                self._check_model(track, sample, model)
+            return Taken("", (Step(sample.y_um, sample.u_V),))
+        # What a kink of the voltage makes of the motion is reckoned; it was a surprise to the smoother alone.
+        limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
+        return self._decide(sample, track, self._keep(track, model, sample.u_V, sample.y_um), limit)
+
+    def _restart(self, sample: Sample, why: str) -> Taken:
+        """Begin smoothing anew at a sample."""
+        self._hold, self._trial, self._lost = None, None, False
+        self._proven_past = None
+        self.gates.since_start = self.gates.since_jump = 0
+        self.gates.moved = self._look_from = 0
+        self._forget()
+        if self.track is None:
+            self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
+        else:
+            self.track.restart(sample.y_um)
+        self.restarts += 1
+        return Taken(why, (Step(sample.y_um, sample.u_V),))
+
+    # ---- readings held back
+
+    def _keep(self, track: Track, model: Model, u_V: float, y_um: float) -> Hold:
+        """Hold a sample back; begins a hold where there is none."""
+        self._control = None
+        if self._hold is None:
+            # Soon after another one its readings are no anchor: some of them may have rung.
+            self._hold = self._begin_hold(track, model(), past=self._calm <= 2 * self.smoother.config.lag)
+        self._hold.put(u_V, y_um)
+        return self._hold
+
+    def _check_model(self, track: Track, sample: Sample, model: Model) -> None:
+        """Now and then, of a sample that is believed: would a trial of such readings find a fault?"""
+        if self._control is None:
+            if not self._tells:
+                return
+            self._control = Trial.begin(self._begin_hold(track, model()).reckoning, self.base, track.memory_now(True))
+        control = self._control
+        decision = control.put(sample.u_V, sample.y_um, self._circumstances(0.0))
+        done = decision.outcome is not Outcome.OPEN or bool(control.fault)
+        if not done and control.since * self.dt_s < CONTROL_WINDOWS * self._envelope.follow_s:
+            return
+        self._give_credit(-1 if control.fault else decision.credit)
+        self._control = None
+        self._until_control = round((CONTROL_S if self._credit == CREDIT else CONTROL_AGAIN_S) / self.dt_s)
+
+    def _give_credit(self, credit: int) -> None:
+        self._credit = min(max(self._credit + credit, -CREDIT), CREDIT)
+
+    def _lags(self, track: Track, y_um: float) -> bool:
+        """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
+
+        A sensor that stops gently surprises no smoother.
+        """
+        if not self._judges or not self._pasts or self.gates.since_start < self._look_from:
+            return False
+        du_V, dy_um = track.steps_over_lag(y_um)
+        x_um = du_V / self._slope_V_per_um
+        if abs(x_um) <= self._least_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
+            return False
+        return bool(abs(x_um) > LAGS_SIGMA * self.gates.innovation2**0.5 * self.range_um)
+
+    def _lagging(self, track: Track, model: LssvmInverse, y_um: float) -> Hold | None:
+        """A hold, if the reading has not moved as the place has by reckoning: where the stage turns it moves little."""
+        past, lag = self._clean_past(), track.lag
+        reckoning = _from_past(past, self._of_track(track, model), len(past.u_V) - lag)
+        before_um = reckoning.y_um
+        for u in past.u_V[max(len(past.u_V) - lag, 0) :]:
+            reckoning.advance(u)
+        reckoning.begin_way()
+        dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
+        known = reckoning.std_um <= self._least_um
+        if known and abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
+            return Hold(reckoning, reckoning.y_um)
+        self._look_from = self.gates.since_start + lag
+        return None
+
+    def _begin_hold(self, track: Track, model: LssvmInverse, past: bool = False) -> Hold:
+        """A hold of what comes: the place goes on from where ``track`` last was by readings that were believed.
+
+        ``past`` : or from where it was when the readings had followed the drive, where the last ones are in doubt too.
+        """
+        gates = self.gates
+        if past and self._pasts:
+            reckoning = self._from_past(track, model)
+            # A place from long ago, over a long way, is no better than readings that may have rung.
+            if reckoning.std_um <= PAST_SHARE * self.range_um:
+                return Hold(reckoning, reckoning.y_um)
+        motion, u_before_V, past_V, past_um = track.since_motion()
+        # Readings that were repeated before that was noticed are none, nor are they an anchor.
+        repeated = gates.same - 1 if gates.same >= admission.REPEATED else 0
+        track.doubt(repeated)
+        past_um = past_um[: max(past_um.size - repeated, 0)]
+        reckoning = Reckoning.begin(self._of_track(track, model), motion, u_before_V, past_V, past_um, track.memory)
+        hold = Hold(reckoning, float(past_um[-1]) if past_um.size else motion[0])
+        if gates.same > 1:
+            hold.same_um, hold.same = gates.y_um, gates.same - 1
+            hold.low_um = hold.high_um = gates.y_um
+        return hold
+
+    def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
+        """From the last place that readings have confirmed, over the voltages since."""
+        return _from_past(self._clean_past(), self._of_track(track, model))
+
+    def _clean_past(self) -> Past:
+        """The last place that readings have confirmed which is from before anything that is noticed now."""
+        newest = self._pasts[-1]
+        return newest if len(newest.u_V) * self.dt_s > CLEAN_S else self._pasts[0]
+
+    def _of_track(self, track: Track, model: LssvmInverse) -> LssvmInverse:
+        """A model in the frame of the track: the identified one is served in its own, with a memory of its own."""
+        return model if model.features == track.served else replace(model, features=track.served)
+
+    def _circumstances(self, limit: float) -> Circumstances:
+        """What readings are judged by; ``limit`` : distance, in ranges, up to which one is no surprise."""
+        c, gates, served = self._admission, self.gates, self.served
+        usual = max(limit, c.surprise_share)
+        usual += min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
+        return Circumstances(
+            config=c,
+            envelope=self._envelope,
+            dt_s=self.dt_s,
+            range_um=self.range_um,
+            noise_um=max(gates.innovation2**0.5, c.surprise_share / c.surprise_sigma) * self.range_um,
+            usual_um=usual * self.range_um,
+            stuck_um=admission.stuck_share(gates) * self.range_um,
+            rest_um=served.offset_um + served.gain * served.y_rest_um,
+            low_um=served.offset_um + served.gain * (served.y_min_um - KNOWN * self.range_um),
+            high_um=served.offset_um + served.gain * (served.y_max_um + KNOWN * self.range_um),
+            trusted=gates.since_glitch * self.dt_s > c.doubt_s,
+        )
+
+    def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float) -> Taken:
+        """What the last sample held back decides."""
+        now = self._circumstances(limit)
+        verdict = hypotheses.judge(hold, now)
+        if verdict is Verdict.JUMP:
+            return self._take_jump(sample, track, hold, now)
+        if verdict is Verdict.WAIT:
+            if hold.rang or hold.taken:
+                return Taken(admission.RINGING)
+            # What waits for readings that never came is no wrong reading.
+            return Taken(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
+        if verdict is Verdict.LOST:
+            return self._give_up(sample, hold)
+        self._hold = None
+        if verdict is Verdict.MOTION:
+            return Taken("", hypotheses.steps_of_motion(hold))
+        if hold.seen_um > self._admission.glitch_share * self.range_um and not (hold.taken or hold.rang):
+            self.gates.since_glitch = 0
+        self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
+
+    def _give_up(self, sample: Sample, hold: Hold) -> Taken:
+        """A hold that stays unexplained: a trial, or a new start where the model may not judge the sensor."""
+        return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
+
+    def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
+        """The readings have settled elsewhere: frame and place move.
+
+        No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
+        """
+        before, f, away_um = self._before, track.served, hold.away_um
+        undone = False
+        level_um = hold.expected_um + away_um
+        slope, shift_um = hypotheses.jump_after(f, hold.expected_um, away_um)
+        if before is not None and self.on_probation:
+            back = before.gain / f.gain
+            back_um = before.offset_um - back * f.offset_um
+            least = min(
+                abs(back * hold.expected_um + back_um - hold.expected_um - away_um), abs(away_um + self._jump_um)
+            )
+            if least <= max(BACK_SHARE * abs(away_um), now.usual_um):
+                slope, shift_um, undone = back, back_um, True
+        frame = before if undone and before is not None else hypotheses.frame_after(f, slope, shift_um)
+        if self._envelope.refuses(self.base.features, frame):
+            return self._give_up(sample, hold)
+        first = not undone and self._proven is None
+        if first:
+            self._proven_past = self._clean_past() if self._pasts else Past.of(track)
+        if undone:
+            self._before, self.gates.since_glitch = None, 0
+            self.undone += 1
+            if self._proven == frame:
+                self._proven = self._proven_past = None
+        else:
+            self._before, self._jump_um = f, away_um
+            self._proven = self._proven or f
+            self.jumps += 1
+        self.gates.since_jump = 0
+        track.move(frame, slope, shift_um)
+        hold.take(slope, shift_um)
+        self._forget()
+        if undone:
+            # What was reckoned since then was reckoned in a frame that never was.
+            hold.shift_um += level_um - hold.expected_um
+        if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
+            # It rings about the new level: the frame is right already, the readings are awaited.
+            return Taken(admission.RINGING, (), away_um, undone, first=first)
+        self._hold = None
+        return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone, first=first)
+
+    # ---- readings on trial
+
+    def distrust(self, model: Model) -> Taken | None:
+        """The readings do not follow the drive: from the next sample on they are on trial, if they are not already.
+
+        Where the stage is follows from a place at which they still did, and the voltages since.
+        """
+        track = self.track
+        if track is None or track.motion is None or self._trial is not None or not self._judges:
+            return None
+        if self._hold is not None:
+            reckoning = self._hold.reckoning
+        else:
+            reckoning = self._from_past(track, model()) if self._pasts else self._begin_hold(track, model()).reckoning
+        return self._begin_trial(reckoning)
+
+    def _begin_trial(self, reckoning: Reckoning) -> Taken:
+        track, proven = self.track, self._proven
+        assert track is not None
+        undone, jump = proven is not None, (0.0, 0.0)
+        if proven is not None:
+            # Jumps that no motion has borne out are in doubt with the readings that they were taken from.
+            # What they had made of a reading in the frame from before: y -> slope y + shift.
+            slope = track.served.gain / proven.gain
+            jump = slope, track.served.offset_um - slope * proven.offset_um
+            reckoning = reckoning.in_frame(proven)
+            if self._proven_past is not None:
+                self._proven_past.u_V += () if self._hold is None else self._hold.u_V
+            track.features = track.served = proven
+            self.undone += 1
+        self._hold, self._before, self._proven = None, None, None
+        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump)
+        self.trials += 1
+        self._forget()
+        return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
+
+    def _try(self, trial: Trial, sample: Sample) -> Taken:
+        """One sample of a sensor that has to earn its trust."""
+        fault = trial.fault
+        decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
+        if decision.outcome is Outcome.OPEN:
+            return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+        self._give_credit(min(decision.credit, 0))
+        track = self.track
+        assert track is not None
+        frame, away_um = track.served, 0.0
+        if decision.outcome is Outcome.CHANGED:
+            frame = hypotheses.frame_after(frame, decision.slope, decision.shift_um)
+            refused = self._envelope.refuses(self.base.features, frame)
+            if refused:
+                trial.refuse(refused)
+                return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
+            away_um = sample.y_um - trial.reckoning.y_um
+            self.jumps += 1
+        track.served = track.features = frame
+        self.gates.since_glitch = 0
+        taken = self._restart(sample, admission.SETTLING)
+        track.remember(trial.reckoning.memory)
+        return replace(taken, jump_um=away_um, renamed=True)
+
+    def reckon_by(self, model: LssvmInverse) -> None:
+        """From now on ``model`` is served while readings are on trial: the place is reckoned by the same.
+
+        After jumps that were taken back it is reckoned again, from before the first of them.
+        """
+        past, self._proven_past = self._proven_past, None
+        if self._trial is None or self.track is None:
+            return
+        model = self._of_track(self.track, model)
+        reckoning = self._trial.reckoning
+        self._trial.reckoning = reckoning.by_model(model) if past is None else _from_past(past, model)
+
+    # ---- where the stage is
+
+    @property
+    def holds(self) -> bool:
+        """Whether readings are held back, or on trial."""
+        return self._hold is not None or self._trial is not None
+
+    def memory_now(self, frozen: bool = False) -> FloatArray:
+        """(m,) hysteresis memory of a stage that is where the last sample saw it, or must be by its voltage.
+
+        ``frozen`` : for a model in the frame that learning began with.
+        """
+        assert self.track is not None
+        reckoned = self._hold or self._trial
+        # The model of the beginning, in a frame of its own, has a memory of its own; while readings are in doubt the
+        # reckoned one is the better.
+        if reckoned is not None and (not frozen or self._trial is not None):
+            memory = reckoned.reckoning.memory
+            return self.served.memory_in(self.base.features, memory) if frozen else memory.copy()
+        return self.track.memory_now(frozen)
+
+    # ---- what it teaches
+
+    def advance(self, step: Step) -> tuple[Pair | None, bool]:
+        """One step of the track; see there."""
+        assert self.track is not None
+        self.gates.since_start += 1
+        self.gates.since_jump += 1
+        self._calm += 1
+        for past in self._pasts:
+            past.u_V.append(step.u_V)
+        if self._trial is not None or self._proven_past is not None:
+            self._note_voltage(step.u_V)
+        if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
+            # A stage at rest shows nothing: the place is as good as it was.
+            self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
+        return self.track.advance(step)
+
+    def _note_voltage(self, u_V: float) -> None:
+        """For a trial, and for the place from before the jumps that are open."""
+        if self._trial is not None:
+            # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
+            self._trial.reckoning.advance(u_V)
+        if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
+            self._proven_past.u_V.append(u_V)
+            if len(self._proven_past.u_V) > hypotheses.MOST_BRIDGED:
+                self._proven_past = None
+
+    def to_base_frame(self) -> None:
+        """Go back to the frame that learning began with, and the memory tracked in it; nothing without a jump.
+
+        For when the model of the beginning is right again: then no jump has moved the sensor for good.
+        """
+        track = self.track
+        if track is None or self.jumps == self.undone or track.served == self.base.features:
+            return
+        track.features = track.served = self.base.features
+        track.memory, track.switch = track.frozen_memory.copy(), 0
+        self._before, self._hold, self._proven, self._proven_past = None, None, None, None
+        self.undone += 1
+
+    def creep(self, by_um: float) -> None:
+        """The stage has crept by so much, µm, that no voltage made. Not while a jump of the frame is under way."""
+        if self.track is not None and not self.on_probation:
+            self.track.creep(by_um)
+
+    def follow(self, pair: Pair, p_V: float, since_s: float) -> bool:
+        """Ask of one pair whether the readings follow the drive.
+
+        ``p_V`` : what the identified model asks for there. ``since_s`` : time since the last that was asked, s.
+        Returns whether they do not; they are to be distrusted then.
+        """
+        track, self.confirmed = self.track, False
+        assert track is not None
+        if not self._judges:
+            return False
+        if track.features is not track.served:
+            # Motion from before a jump, and from after it: together they follow nothing.
+            self._forget()
+            return False
+        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
+        self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
+        if self.confirmed:
+            if self.following.good >= CONFIRMED:
+                self._proven = self._proven_past = None
+            self.following.good = 0
+            self._pasts = [*self._pasts[-1:], Past.of(track)]
+        return fault
+
+    def rests(self, y_um: float) -> bool:
+        """Whether the stage, now at ``y_um``, has not left its place for a while."""
+        count = self.track.state.count if self.track is not None else 0
+        return admission.at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
+
+    # ---- keeping
+
+    def state_dict(self) -> StateDict:
+        """All of the state under flat names."""
+        state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
+        for i, past in enumerate(self._pasts):
+            state |= prefixed(f"past{i}.", past.state_dict())
+        if self._proven is not None:
+            state |= prefixed("proven.", self._proven.state_dict())
+        if self._proven_past is not None:
+            state |= prefixed("proven_past.", self._proven_past.state_dict())
+        state |= {
+            "heard": self._heard.array(),
+            "lost": self._lost,
+            "jump_um": self._jump_um,
+            "calm": self._calm,
+            "trials": self.trials,
+            "credit": self._credit,
+            "until_control": self._until_control,
+            "look_from": self._look_from,
+        }
+        if self._control is not None:
+            state |= prefixed("control.", self._control.state_dict())
+        return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
+
+    def restore(self, state: StateDict) -> None:
+        """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
+        parts = parts_of(self.smoother, self.base, state)
+        self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
+        pasts = (under(f"past{i}.", state) for i in range(2))
+        self._pasts = [Past.from_state(values) for values in pasts if values]
+        control = under("control.", state)
+        self._control = Trial.from_state(control, self.base) if control else None
+        self._credit = int(state.get("credit", FIRST_CREDIT))
+        self._until_control = int(state.get("until_control", 0))
+        self._look_from = int(state.get("look_from", 0))
+        proven = under("proven.", state)
+        self._proven = FeatureMap.from_state(proven) if proven else None
+        past = under("proven_past.", state)
+        self._proven_past = Past.from_state(past) if past else None
+        self._heard.restore(state["heard"])
+        self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
+        self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
+        self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))
+
+
+def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:
+    """From a place in the past over the voltages since; over the first ``upto`` of them where that is given."""
+    reckoning = Reckoning.begin(model, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
+    for u in past.u_V if upto is None else past.u_V[: max(upto, 0)]:
+        reckoning.advance(u)
+    reckoning.begin_way()
+    return reckoning

@@ -1,0 +1,274 @@
+"""Where the stage is and has been: fixed-lag smoother, the last voltages and readings, frame and hysteresis memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.features import FeatureMap
+from adaptive.inverse_model import track_memory
+from adaptive.smoothing import FixedLagSmoother, SmootherState
+from adaptive.state_codec import joined, under
+from adaptive.types import BoolArray, FloatArray, StateDict
+
+Motion = tuple[float, float, float]
+
+
+class Step(NamedTuple):
+    """One step of the smoother: reading, µm, voltage applied from then on, V, and whether it is a good reading.
+
+    Where it is none, ``y_um`` is where the stage must have been.
+    """
+
+    y_um: float
+    u_V: float
+    good: bool = True
+
+
+class Pair(NamedTuple):
+    """What one instant can teach: its number, smoothed motion (µm, µm/s, µm/s²), its voltage and the one before, V.
+
+    good : whether the readings at that instant and before it were. near_bad : whether one that the smoother has looked
+    at for it was not.
+    """
+
+    now: int
+    y_um: float
+    v_um_per_s: float
+    a_um_per_s2: float
+    u_V: float
+    u_before_V: float
+    good: bool
+    near_bad: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What a sample came to: the gate that refused it or "", and the steps to make.
+
+    jump_um : by how much the frame has moved, µm. first : whether no other jump is open before this one. undone :
+    whether it has gone back to where it was, and what was learnt since is to be forgotten. distrusted : whether the
+    readings are on trial from now on; renamed : whether what is wrong with them has got another name, or none.
+    """
+
+    refused: str
+    steps: tuple[Step, ...] = ()
+    jump_um: float = 0.0
+    undone: bool = False
+    distrusted: bool = False
+    renamed: bool = False
+    first: bool = False
+
+
+@dataclass(slots=True)
+class Past:
+    """A place that the stage is known to have been at, and the voltages since: reckoning can begin from there.
+
+    motion, u_before_V, lag_V, lag_um : as ``Track.since_motion`` gives them. memory : (m,) of that instant.
+    u_V : voltages since.
+    """
+
+    motion: Motion
+    u_before_V: float
+    lag_V: FloatArray
+    lag_um: FloatArray
+    memory: FloatArray
+    u_V: list[float]
+
+    @classmethod
+    def of(cls, track: Track) -> Past:
+        return cls(*track.since_motion(), track.memory.copy(), [])
+
+    def state_dict(self) -> StateDict:
+        values = {"motion": self.motion, "u_before_V": self.u_before_V, "lag_V": self.lag_V, "lag_um": self.lag_um,
+                  "memory": self.memory, "u_V": self.u_V}  # fmt: skip
+        return {name: np.array(value, dtype=np.float64) for name, value in values.items()}
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Past:
+        """Inverse of ``state_dict``."""
+        y, v, a = (float(x) for x in values["motion"])
+        lag_V, lag_um, memory = (np.array(values[name], dtype=np.float64) for name in ("lag_V", "lag_um", "memory"))
+        return cls((y, v, a), float(values["u_before_V"]), lag_V, lag_um, memory, [float(u) for u in values["u_V"]])
+
+
+@dataclass(slots=True)
+class Track:
+    """A track with its state; ``base`` is the feature map of the model that the learner started from.
+
+    Attributes
+    ----------
+    state : of the smoother. u_V, y_um, good : rings of (lag + 2,) by the smoother's count.
+    features, served : the feature map of the instant that is being learnt, and the one to serve with; they differ for
+    a lag after a jump, until the smoother's count ``switch``.
+    memory, frozen_memory : (m,) hysteresis memory in the learner's frame and in that of ``base``, which knows of no
+    jump. motion : last smoothed motion (µm, µm/s, µm/s²), ``lag`` samples old; None before there is one.
+    """
+
+    smoother: FixedLagSmoother
+    base: FeatureMap
+    state: SmootherState
+    u_V: FloatArray
+    y_um: FloatArray
+    good: BoolArray
+    features: FeatureMap
+    served: FeatureMap
+    memory: FloatArray
+    frozen_memory: FloatArray
+    motion: Motion | None = None
+    switch: int = 0
+
+    @classmethod
+    def begin(cls, smoother: FixedLagSmoother, base: FeatureMap, served: FeatureMap, y_um: float) -> Track:
+        """A stage that came to rest at ``y_um`` in one stroke."""
+        slots = smoother.config.lag + 2
+        rings = np.zeros(slots), np.zeros(slots), np.zeros(slots, dtype=np.bool_)
+        memories = served.rest_memory(y_um), base.rest_memory(y_um)
+        return cls(smoother, base, smoother.initial_state(y_um), *rings, served, served, *memories)
+
+    def restart(self, y_um: float) -> None:
+        """Begin smoothing anew; the hysteresis memory follows to where the stage now is.
+
+        Over the readings that were not smoothed yet too: where many samples are lost there is nothing else.
+        """
+        self.memory, self.frozen_memory = self.memory_now(False), self.memory_now(True)
+        self.state = self.smoother.initial_state(y_um)
+        self.good[:] = False
+        self.features, self.motion, self.switch = self.served, None, 0
+
+    @property
+    def lag(self) -> int:
+        return self.smoother.config.lag
+
+    @property
+    def predicted_um(self) -> float:
+        """Where the smoother expects the next reading."""
+        return float(self.state.x[0])
+
+    def copy(self) -> Track:
+        """A track that goes its own way from here."""
+        return Track(
+            self.smoother, self.base, self.state.copy(), self.u_V.copy(), self.y_um.copy(), self.good.copy(),
+            self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion, self.switch,
+        )  # fmt: skip
+
+    def move(self, served: FeatureMap, slope: float, shift_um: float) -> None:
+        """A jump: the smoother goes on at another place, y <- slope y + shift, in a new frame."""
+        self.state.x *= slope
+        self.state.x[0] += shift_um
+        self.served, self.switch = served, self.state.count + self.lag
+
+    def creep(self, by_um: float) -> None:
+        """The frame's offset moves, µm, under a motion that stays. Nothing where the frame is about to jump."""
+        if self.features is self.served:
+            self.features = self.served = replace(self.served, offset_um=self.served.offset_um + by_um)
+
+    def advance(self, step: Step) -> tuple[Pair | None, bool]:
+        """One step: the pair of ``lag`` samples ago, None before there is one; whether it is the first after a jump."""
+        state, slots = self.state, self.u_V.shape[0]
+        slot = state.count % slots
+        self.y_um[slot], self.u_V[slot], self.good[slot] = step
+        self.motion = self.smoother.step(state, step.y_um)
+        if self.motion is None:
+            return None, False
+        switched = self.features is not self.served and state.count > self.switch
+        if switched:
+            self.features = self.served
+        self.features.advance(self.motion[0], self.memory)
+        self.base.advance(self.motion[0], self.frozen_memory)
+        now = state.count - 1 - self.lag
+        at, before = now % slots, (now - 1) % slots
+        good = bool(self.good[at] and self.good[before])
+        pair = Pair(now, *self.motion, float(self.u_V[at]), float(self.u_V[before]), good, not bool(self.good.all()))
+        return pair, switched
+
+    def remember(self, memory: FloatArray) -> None:
+        """Go on with another (m,) hysteresis memory, given in the frame that is served."""
+        self.memory, self.frozen_memory = memory.copy(), self.served.memory_in(self.base, memory)
+
+    def doubt(self, n: int) -> None:
+        """The last ``n`` readings were none: nothing is taught of them."""
+        slots = self.good.shape[0]
+        self.good[np.arange(self.state.count - min(n, slots), self.state.count) % slots] = False
+
+    def steps_over_lag(self, y_um: float) -> tuple[float, float]:
+        """By how much the voltage, V, and with a next reading ``y_um`` the readings, µm, have moved over the lag."""
+        slots, last = self.u_V.shape[0], self.state.count - 1
+        first = last - self.lag
+        return float(self.u_V[last % slots] - self.u_V[first % slots]), y_um - float(self.y_um[(first + 1) % slots])
+
+    def since_motion(self) -> tuple[Motion, float, FloatArray, FloatArray]:
+        """The last smoothed motion, in the frame that is served, its voltage, and (lag,) voltages and readings since.
+
+        The readings are as they came; just after a jump, those from before it are moved to where they would be now.
+        """
+        assert self.motion is not None
+        slots = self.u_V.shape[0]
+        numbers = np.arange(self.state.count - self.lag, self.state.count)
+        past = numbers % slots
+        u_before_V = float(self.u_V[(self.state.count - self.lag - 1) % slots])
+        f, g = self.features, self.served
+        y, v, a = self.motion
+        # Just after a jump the smoothed instants are still in the frame from before it.
+        ratio = g.gain / f.gain
+        y_um = self.y_um[past]
+        if f is not g:
+            early = numbers < self.switch - self.lag
+            y_um[early] = g.offset_um + ratio * (y_um[early] - f.offset_um)
+        motion = g.offset_um + ratio * (y - f.offset_um), ratio * v, ratio * a
+        return motion, u_before_V, self.u_V[past], y_um
+
+    def memory_now(self, frozen: bool) -> FloatArray:
+        """(m,) hysteresis memory after the last step: the smoothed one, carried along the readings since.
+
+        ``frozen`` : the one in the frame of ``base``.
+        """
+        end, slots = self.state.count, self.u_V.shape[0]
+        past = np.arange(max(end - self.lag, 0), end)
+        y_um = self.y_um[past % slots]
+        if frozen:
+            after = self.frozen_memory.copy()
+            track_memory(y_um, after, self.base.arrays)
+            return after
+        after = self.memory.copy()
+        # Readings from before a jump are in the frame from before it; else the two frames are one.
+        jumped = int(np.searchsorted(past, self.switch - self.lag))
+        track_memory(y_um[:jumped], after, self.features.arrays)
+        track_memory(y_um[jumped:], after, self.served.arrays)
+        return after
+
+    def state_dict(self) -> StateDict:
+        """All of it under flat names, but for what it was made with."""
+        parts = {
+            "smoother": self.smoother.state_dict(self.state),
+            "features": self.features.state_dict(),
+            "served": self.served.state_dict(),
+        }
+        state = joined(parts)
+        for name in ("u_V", "y_um", "good", "memory", "frozen_memory"):
+            state[name] = getattr(self, name).copy()
+        return state | {"motion": np.array(self.motion or (), dtype=np.float64), "switch": self.switch}
+
+    @classmethod
+    def from_state(cls, smoother: FixedLagSmoother, base: FeatureMap, values: StateDict) -> Track:
+        """Inverse of ``state_dict``. Raises InputError where it is of another lag."""
+        slots = smoother.config.lag + 2
+        floats = {name: np.array(values[name], dtype=np.float64) for name in ("u_V", "y_um", "memory", "frozen_memory")}
+        if floats["u_V"].shape != (slots,):
+            raise InputError(f"u_V: got {floats['u_V'].shape[0]} slots, expected {slots}; the smoother's lag differs")
+        features, served = (FeatureMap.from_state(under(f"{name}.", values)) for name in ("features", "served"))
+        motion = [float(x) for x in values["motion"]]
+        return cls(
+            smoother=smoother,
+            base=base,
+            state=smoother.from_state(under("smoother.", values)),
+            good=np.array(values["good"], dtype=np.bool_),
+            features=served if features == served else features,
+            served=served,
+            motion=(motion[0], motion[1], motion[2]) if motion else None,
+            switch=int(values["switch"]),
+            **floats,
+        )

@@ -1,0 +1,205 @@
+"""Hyper-parameters from the evidence: level 2 for gamma, level 3 or the joint optimum for the kernel widths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import minimize
+
+from adaptive.errors import InputError, NumericsError
+from adaptive.tuning.evidence import Evidence, Problem, evaluate
+from adaptive.types import FloatArray
+
+#: The chapter's start, first; the others because the evidence has several optima.
+STARTS: tuple[tuple[float, float], ...] = ((100.0, 1.0), (1e4, 0.4), (1e5, 2.5), (1e3, 6.0))
+
+
+@dataclass(frozen=True, slots=True)
+class InferenceConfig:
+    """How hyper-parameters are searched.
+
+    Attributes
+    ----------
+    method : ``joint`` minimises J2 over gamma and all widths at once; ``three_level`` is the chapter's: J3 over
+        the widths, with gamma at the optimum of J2 for each of them.
+    ard : one width a feature; otherwise one for all.
+    starts : (gamma, sigma) to start from, both positive.
+    gamma_range, width_range : bounds; the upper bound on gamma also bounds the condition number.
+    search_rows : starts are compared on at most this many evenly taken samples, the best goes on with all.
+    iterations : at most, of each descent.
+    """
+
+    method: Literal["joint", "three_level"] = "joint"
+    ard: bool = True
+    starts: Sequence[tuple[float, float]] = STARTS
+    gamma_range: tuple[float, float] = (1e-2, 1e8)
+    width_range: tuple[float, float] = (0.02, 50.0)
+    search_rows: int = 160
+    iterations: int = 40
+
+    def __post_init__(self) -> None:
+        if self.method not in ("joint", "three_level"):
+            raise InputError(f"method: got {self.method!r}, expected 'joint' or 'three_level'")
+        if not self.starts or any(not (g > 0 and s > 0) for g, s in self.starts):
+            raise InputError(f"starts: got {self.starts!r}, expected at least one pair (gamma, sigma), both positive")
+        for name, (low, high) in (("gamma_range", self.gamma_range), ("width_range", self.width_range)):
+            if not 0 < low < high:
+                raise InputError(f"{name}: got {(low, high)}, expected 0 < low < high")
+
+
+@dataclass(frozen=True, slots=True)
+class Inference:
+    """What was found: ``best`` with its gamma and widths, one entry of ``tried`` a start, and the cost."""
+
+    best: Evidence
+    tried: tuple[Evidence, ...]
+    evaluations: int
+
+
+class _Counted:
+    """`evaluate` with its calls counted, and a refusal in place of a factorisation that fails."""
+
+    def __init__(self, data: Problem) -> None:
+        self.data = data
+        self.calls = 0
+
+    def __call__(self, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence | None:
+        self.calls += 1
+        try:
+            found = evaluate(self.data, gamma, widths, third_level)
+        except NumericsError:
+            return None
+        return found if np.isfinite(found.J3) else None
+
+
+#: Value of a point that could not be evaluated: far above all others, finite for the line search.
+_REFUSED = 1e12
+
+
+def infer(data: Problem, config: InferenceConfig | None = None) -> Inference:
+    """Find gamma and the kernel widths. Deterministic.
+
+    Raises
+    ------
+    NumericsError : no start could be evaluated.
+    """
+    config = config or InferenceConfig()
+    rows = np.unique(np.linspace(0, data.size - 1, min(config.search_rows, data.size)).round().astype(np.int64))
+    few, whole = _Counted(data.subset(rows)), _Counted(data)
+    count = data.dimension if config.ard else 1
+    tried = []
+    for gamma, sigma in config.starts:
+        start = np.log(np.concatenate([[gamma], np.full(count, sigma)]))
+        found = _descend(few, start, config, "joint")
+        if found is not None:
+            tried.append(found)
+    if not tried:
+        raise NumericsError("evidence: no start could be evaluated; lower gamma_range or drop duplicated samples")
+    tried.sort(key=lambda e: e.J2)
+    best = tried[0]
+    polished: Evidence | None = best
+    for method in ("joint", config.method)[-1 if config.method == "joint" else 0 :]:
+        # The chapter's optimum lies close to the joint one, which costs a third of the evaluations to come near.
+        if polished is not None:
+            widths = polished.widths if config.ard else polished.widths[:1]
+            polished = _descend(whole, np.log(np.concatenate([[polished.gamma], widths])), config, method)
+    if polished is None:
+        raise NumericsError(
+            "evidence: the optimum of a part of the samples can't be evaluated on all; lower gamma_range"
+        )
+    return Inference(polished, tuple(tried), few.calls + whole.calls)
+
+
+def level_two(
+    data: Problem, widths: FloatArray, gamma: float = 100.0, config: InferenceConfig | None = None
+) -> Evidence:
+    """Gamma at the optimum of J2 for given widths (d,), from one start. Raises NumericsError where none evaluates."""
+    found = _best_gamma(_Counted(data), gamma, widths, config or InferenceConfig(), False)
+    if found is None:
+        raise NumericsError("evidence: not to be evaluated at these widths; widen gamma_range or drop duplicates")
+    return found
+
+
+def _spread(widths: FloatArray, dimension: int) -> FloatArray:
+    return widths if widths.size == dimension else np.full(dimension, float(widths[0]))
+
+
+def _collect(gradient: FloatArray, count: int) -> FloatArray:
+    return gradient if gradient.size == count else np.array([np.sum(gradient)])
+
+
+def _descend(value: _Counted, start: FloatArray, config: InferenceConfig, method: str) -> Evidence | None:
+    """Local optimum from log [gamma, widths]."""
+    best: list[Evidence] = []
+    count, d = start.size - 1, value.data.dimension
+    log_gamma, log_width = np.log(config.gamma_range), np.log(config.width_range)
+    last_gamma = float(np.exp(start[0]))
+
+    def joint(theta: FloatArray) -> tuple[float, FloatArray]:
+        found = value(float(np.exp(theta[0])), _spread(np.exp(theta[1:]), d))
+        if found is None:
+            return _REFUSED, np.zeros(theta.size)
+        if not best or found.J2 < best[0].J2:
+            best[:] = [found]
+        return found.J2, np.concatenate([found.J2_gradient[:1], _collect(found.J2_gradient[1:], count)])
+
+    def third(theta: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal last_gamma
+        found = _best_gamma(value, last_gamma, _spread(np.exp(theta), d), config, True)
+        if found is None:
+            return _REFUSED, np.zeros(theta.size)
+        last_gamma = found.gamma
+        if not best or found.J3 < best[0].J3:
+            best[:] = [found]
+        return found.J3, _collect(found.J3_gradient, count)
+
+    function: Callable[[FloatArray], tuple[float, FloatArray]] = joint if method == "joint" else third
+    bounds = [tuple(log_width)] * count
+    point = start[1:]
+    if method == "joint":
+        bounds, point = [tuple(log_gamma), *bounds], start
+    point = np.clip(point, [low for low, _ in bounds], [high for _, high in bounds])
+    options = {"maxiter": config.iterations, "maxfun": 3 * config.iterations, "ftol": 1e-10, "gtol": 1e-3}
+    minimize(function, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return best[0] if best else None
+
+
+def _best_gamma(
+    value: _Counted, gamma: float, widths: FloatArray, config: InferenceConfig, third_level: bool
+) -> Evidence | None:
+    """Root of dJ2/dlog gamma near ``gamma`` by safeguarded secant steps in log gamma; at a bound, the bound."""
+    low, high = np.log(config.gamma_range)
+    at = float(np.clip(np.log(gamma), low, high))
+    below: float | None = None  # slope negative here: the optimum lies above
+    above: float | None = None
+    previous: tuple[float, float] | None = None
+    found: Evidence | None = None
+    for _ in range(30):
+        found = value(float(np.exp(at)), widths)
+        if found is None:
+            return None
+        slope = float(found.J2_gradient[0])
+        if abs(slope) < 3e-7 * value.data.size or (slope > 0 and at == low) or (slope < 0 and at == high):
+            break
+        if slope < 0:
+            below = at
+        else:
+            above = at
+        step = -np.sign(slope) * 1.0
+        if previous is not None and slope != previous[1]:
+            secant = -slope * (at - previous[0]) / (slope - previous[1])
+            if np.sign(secant) == np.sign(step):
+                step = float(np.clip(secant, -3.0, 3.0))
+        previous = (at, slope)
+        target = float(np.clip(at + step, low, high))
+        if below is not None and above is not None and not min(below, above) < target < max(below, above):
+            target = 0.5 * (below + above)
+        if abs(target - at) < 1e-12:
+            break
+        at = target
+    if found is not None and third_level:
+        found = value(found.gamma, widths, True)
+    return found

@@ -1,0 +1,217 @@
+"""Bouc-Wen oscillator driven by a force, its hysteresis acting on the displacement.
+
+    m y'' + c y' + k y + z = u
+    z' = alpha y' - beta (gamma |y'| |z|^(nu-1) z + delta y' |z|^nu)
+
+Unlike (2.2), where the voltage drives the hysteresis and the stage only follows, z here depends on the motion that it
+brakes: there is no closed form, and the model is integrated. Of beta, gamma, delta only two products show, and with
+the force written as ``z = alpha s w`` for a displacement scale s, all that is left is dimensionless::
+
+    s w' = y' - (g |y'| |w|^(nu-1) w + d y' |w|^nu)
+
+**Integration.** Classical Runge-Kutta at ``oversample`` steps a sample. The input between samples is band-limited:
+a periodic record is interpolated by its Fourier series, exactly. Reference: J. P. Noël, M. Schoukens, "Hysteretic
+benchmark with a dynamic nonlinearity", 2016, whose records are such periods.
+
+**Identification.** Mean and deviation of whole periods are taken first, then the steady-state response to the
+periodic input is fitted by least squares over all seven parameters, from several starts whose linear part is that
+of the best linear approximation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from adaptive.compiled import compiled
+from adaptive.errors import InputError, NumericsError
+from adaptive.types import FloatArray
+from baselines.bouc_wen.periodic_record import PeriodicRecord, between_samples, linear_part
+from baselines.validation import positive, series
+
+
+@compiled
+def _slope(
+    y: float, v: float, w: float, u: float, theta: FloatArray, unit: bool
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """(v', w') at a point; theta = m, c, k, alpha, g, d, nu, s."""
+    size = abs(w)
+    power = size if unit else size ** theta[6]
+    sign = 1.0 if w > 0.0 else -1.0
+    acceleration = (u - theta[1] * v - theta[2] * y - theta[3] * theta[7] * w) / theta[0]
+    return acceleration, (v - (theta[4] * abs(v) * sign + theta[5] * v) * power) / theta[7]
+
+
+@compiled
+def _integrate(
+    u: FloatArray, h: float, every: int, theta: FloatArray, state: FloatArray, out: FloatArray
+) -> None:  # pragma: no cover - compiled
+    """Displacement at every ``every``-th step into ``out``; ``u`` holds the force at steps and half steps.
+
+    ``state`` (y, v, w) is advanced in place. ``out[0]`` is the state before the first step.
+    """
+    y, v, w = state[0], state[1], state[2]
+    unit = abs(theta[6] - 1.0) < 1e-12
+    for i in range(out.size):
+        out[i] = y
+        for j in range(every):
+            k = 2 * (i * every + j)
+            u0, u1, u2 = u[k % u.size], u[(k + 1) % u.size], u[(k + 2) % u.size]
+            a1, b1 = _slope(y, v, w, u0, theta, unit)
+            v2 = v + 0.5 * h * a1
+            a2, b2 = _slope(y + 0.5 * h * v, v2, w + 0.5 * h * b1, u1, theta, unit)
+            v3 = v + 0.5 * h * a2
+            a3, b3 = _slope(y + 0.5 * h * v2, v3, w + 0.5 * h * b2, u1, theta, unit)
+            v4 = v + h * a3
+            a4, b4 = _slope(y + h * v3, v4, w + h * b3, u2, theta, unit)
+            y += h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+            v += h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+            w += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
+    state[0], state[1], state[2] = y, v, w
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicalBoucWen:
+    """The oscillator's seven parameters and its displacement scale.
+
+    m_kg, c_N_s_per_m, k_N_per_m, alpha_N_per_m : as in the module's equation. g, d : dimensionless,
+    g = beta gamma (alpha s)^nu/alpha, d likewise with delta. nu : power. scale_m : s, m, given, no parameter.
+    """
+
+    m_kg: float
+    c_N_s_per_m: float
+    k_N_per_m: float
+    alpha_N_per_m: float
+    g: float
+    d: float
+    nu: float
+    scale_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("m_kg", "k_N_per_m", "alpha_N_per_m", "nu", "scale_m"):
+            positive(name, getattr(self, name), "")
+        if not all(math.isfinite(value) for value in (self.c_N_s_per_m, self.g, self.d)):
+            raise InputError(f"c_N_s_per_m, g, d: got {self!r}, expected finite values")
+
+    @property
+    def products(self) -> tuple[float, float]:
+        """beta gamma and beta delta of the module's equation, 1/m for nu = 1."""
+        share = self.alpha_N_per_m * (self.alpha_N_per_m * self.scale_m) ** -self.nu
+        return self.g * share, self.d * share
+
+    def steady_state(self, u_N: FloatArray, dt_s: float, oversample: int = 20, settle: float = 0.5) -> FloatArray:
+        """Displacement (n,) m over one period of the force ``u_N`` (n,) N, repeated for ever.
+
+        ``settle`` : periods run from rest before; they must outlast the transient. Raises InputError on the
+        arguments, NumericsError where the integration leaves the finite numbers.
+        """
+        u = series("u_N", u_N, 8)
+        if oversample < 1 or not 0.0 < settle < 100.0:
+            raise InputError(f"oversample, settle: got {oversample}, {settle}, expected >= 1 and above 0")
+        fine = between_samples(u, 2 * oversample)
+        return self._steady(fine, u.size, dt_s, oversample, settle)
+
+    def _steady(self, fine: FloatArray, n: int, dt_s: float, oversample: int, settle: float) -> FloatArray:
+        theta = np.array(
+            [self.m_kg, self.c_N_s_per_m, self.k_N_per_m, self.alpha_N_per_m, self.g, self.d, self.nu, self.scale_m]
+        )
+        state, h = np.zeros(3), dt_s / oversample
+        before = round(settle * n)
+        rolled = np.roll(fine, 2 * oversample * before)
+        _integrate(rolled, h, oversample, theta, state, np.empty(before))
+        out = np.empty(n)
+        _integrate(fine, h, oversample, theta, state, out)
+        if not np.all(np.isfinite(out)):
+            raise NumericsError("mechanical Bouc-Wen: the integration diverged; raise oversample")
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicalReport:
+    """How the fit went: RMSE against the mean periods and the noise expected there, both m; cost per start."""
+
+    rmse_m: float
+    noise_m: float
+    starts_m: tuple[float, ...]
+    evaluations: int
+    std: FloatArray
+    """(7,) standard deviations of m, c, k, alpha, g, d, nu, relative for the first four."""
+
+
+#: Starts: share of the linear stiffness that is hysteretic, g, d.
+_STARTS = ((0.5, 0.3, 0.0), (0.3, 0.6, 0.0), (0.7, 0.6, -0.3), (0.5, 1.0, 0.5))
+
+
+def identify_mechanical(
+    records: Sequence[PeriodicRecord],
+    *,
+    oversample: int = 20,
+    search_oversample: int = 4,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[MechanicalBoucWen, MechanicalReport]:
+    """All seven parameters from periodic steady-state records, by least squares from several starts.
+
+    Coarse steps (``search_oversample`` a sample) find the basin, ``oversample`` finishes. Raises InputError without
+    records, NumericsError where no start can be followed.
+    """
+    if not records:
+        raise InputError("records: got none, expected at least one periodic record")
+    s = float(np.sqrt(np.mean(np.concatenate([r.y_m for r in records]) ** 2)))
+    m, c, k = linear_part(records)
+    if not (m > 0.0 and k > 0.0):
+        raise InputError(
+            f"records: their linear part has mass {m:.3g} kg, stiffness {k:.3g} N/m, expected both above 0"
+        )
+    evaluations = 0
+
+    def model(x: FloatArray) -> MechanicalBoucWen:
+        m_kg, c, k, alpha = (float(value) for value in np.exp(np.clip(x[:4], -40.0, 40.0)))
+        return MechanicalBoucWen(m_kg, c, k, alpha, float(x[4]), float(x[5]), float(x[6]), s)
+
+    def solve(x: FloatArray, steps: int, limit: int) -> tuple[FloatArray, float, FloatArray]:
+        fine = [between_samples(r.u_N, 2 * steps) for r in records]
+
+        def residual(x: FloatArray) -> FloatArray:
+            nonlocal evaluations
+            evaluations += 1
+            found = model(x)
+            try:
+                parts = [
+                    (found._steady(f, r.u_N.size, r.dt_s, steps, 0.5) - r.y_m) * (math.sqrt(r.periods) / s)
+                    for f, r in zip(fine, records, strict=True)
+                ]
+            except NumericsError:
+                parts = [np.full(r.u_N.size, 1e3) for r in records]
+            return np.concatenate(parts)
+
+        low = np.array([-30.0] * 4 + [-20.0, -20.0, 0.3])
+        high = np.array([30.0] * 4 + [20.0, 20.0, 4.0])
+        got = least_squares(
+            residual, x, bounds=(low, high), x_scale=np.array([0.1, 0.5, 0.1, 0.1, 0.3, 0.3, 0.3]),
+            diff_step=1e-6, max_nfev=limit, xtol=1e-12, ftol=1e-12, gtol=1e-12,
+        )  # fmt: skip
+        weight = sum(r.periods * r.u_N.size for r in records)
+        rmse = s * math.sqrt(2.0 * got.cost / weight)
+        information = got.jac.T @ got.jac
+        variance = 2.0 * got.cost / max(1, got.fun.size - 7)
+        std = np.sqrt(variance * np.diag(np.linalg.pinv(information)))
+        return np.asarray(got.x, dtype=np.float64), rmse, np.asarray(std, dtype=np.float64)
+
+    tried = []
+    for number, (share, g, d) in enumerate(_STARTS, 1):
+        start = np.array([math.log(m), math.log(max(c, 1e-3 * math.sqrt(k * m)) * 0.3), math.log(k * (1.0 - share)),
+                          math.log(k * share), g, d, 1.0])  # fmt: skip
+        x, rmse, _ = solve(start, search_oversample, 40)
+        tried.append((rmse, x))
+        progress(f"start {number} of {len(_STARTS)}: RMSE {rmse:.3g} m")
+    best = min(tried, key=lambda entry: entry[0])
+    x, _, std = solve(best[1], oversample, 20)
+    found = model(x)
+    errors = [found.steady_state(r.u_N, r.dt_s, oversample) - r.y_m for r in records]
+    rmse = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    noise = float(np.sqrt(np.mean([r.noise_m**2 for r in records])))
+    return found, MechanicalReport(rmse, noise, tuple(entry[0] for entry in tried), evaluations, std)

@@ -1,0 +1,1 @@
+"""prandtl_ishlinskii."""

@@ -1,0 +1,213 @@
+"""Prandtl-Ishlinskii (PI) and modified PI (MPI) operators (2.4)-(2.10) and their exact inverse (2.11)-(2.18).
+
+The forward model is u -> play superposition x -> dead-zone superposition z::
+
+    x = sum_i w_h[i] H_r[i][u] + c,     y - y_ref = sum_j w_s[j] S_d[j][x]
+
+``c`` and ``y_ref`` are ours: a recording's displacement at 0 V is anything. With both zero these are (2.7)-(2.10).
+
+Memory is always the states of the *forward* plays, in volts. They do not depend on the weights, so that a
+memory stays good when the weights are learnt anew; the inverse works on (2.15) of it and converts back, which
+is exact because all partial sums of w_h are positive.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.errors import InputError
+from adaptive.types import FloatArray, StateDict
+from baselines.prandtl_ishlinskii.dead_zone import dead_zone_sum
+from baselines.prandtl_ishlinskii.play import play_start, play_step
+
+
+def inverse_weights(w: FloatArray) -> FloatArray:
+    """Weights of the inverse operator, (2.12), (2.13) for plays and (2.16), (2.17) for dead zones; (n+1,)."""
+    sums = np.cumsum(w)
+    out = np.empty_like(w)
+    out[0] = 1.0 / w[0]
+    out[1:] = -w[1:] / (sums[1:] * sums[:-1])
+    return out
+
+
+def inverse_thresholds(w: FloatArray, r: FloatArray) -> FloatArray:
+    """Thresholds of the inverse operator, (2.14) for plays and (2.18) for dead zones; (n+1,)."""
+    return np.cumsum(w) * r - np.cumsum(w * r)
+
+
+@compiled
+def states_to_inverse(w_h: FloatArray, state_V: FloatArray, out_um: FloatArray) -> None:
+    """Inverse play states from forward ones (2.15); all (n+1,)."""
+    tail = 0.0
+    for j in range(w_h.size):
+        tail += w_h[j] * state_V[j]
+    head = 0.0
+    for i in range(w_h.size):
+        head += w_h[i]
+        tail -= w_h[i] * state_V[i]
+        out_um[i] = head * state_V[i] + tail
+
+
+@compiled
+def states_from_inverse(sum_h: FloatArray, inverse_um: FloatArray, out_V: FloatArray) -> None:
+    """(2.15) solved for the forward states; ``sum_h`` are the partial sums of w_h, all positive."""
+    n = sum_h.size
+    out_V[n - 1] = inverse_um[n - 1] / sum_h[n - 1]
+    for i in range(n - 2, -1, -1):
+        out_V[i] = out_V[i + 1] + (inverse_um[i] - inverse_um[i + 1]) / sum_h[i]
+
+
+@compiled
+def run_forward(
+    u_V: FloatArray,
+    r_V: FloatArray,
+    w_h: FloatArray,
+    d_um: FloatArray,
+    w_s: FloatArray,
+    c_um: float,
+    y_ref_um: float,
+    state_V: FloatArray,
+    y_um: FloatArray,
+) -> None:
+    """Displacements (n,) for voltages (n,); ``state_V`` is advanced in place."""
+    for k in range(u_V.size):
+        play_step(u_V[k], r_V, state_V)
+        x = c_um
+        for i in range(r_V.size):
+            x += w_h[i] * state_V[i]
+        y_um[k] = dead_zone_sum(x, d_um, w_s) + y_ref_um
+
+
+def _tuple(values: FloatArray) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+@dataclass(frozen=True)
+class MpiParameters:
+    """An MPI model (2.10): thresholds, weights, offsets. With ``d_um = (0,)``, ``w_s = (1,)`` it is a PI model.
+
+    Attributes
+    ----------
+    r_V, w_h : (n+1,) play thresholds, V, ascending from 0, and weights, µm/V; partial sums positive.
+    d_um, w_s : (m+1,) dead-zone thresholds, µm of x, ascending from 0, and weights; partial sums positive.
+    c_um : offset of x, µm. y_ref_um : displacement where x = 0, µm.
+    lag_s : first-order lag of the stage, s, led by the inverse as y + lag v; 0 is the model of the chapter.
+    """
+
+    r_V: tuple[float, ...]
+    w_h: tuple[float, ...]
+    d_um: tuple[float, ...] = (0.0,)
+    w_s: tuple[float, ...] = (1.0,)
+    c_um: float = 0.0
+    y_ref_um: float = 0.0
+    lag_s: float = 0.0
+    r_: FloatArray = field(init=False, repr=False, compare=False)
+    w_h_: FloatArray = field(init=False, repr=False, compare=False)
+    d_: FloatArray = field(init=False, repr=False, compare=False)
+    w_s_: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        pairs = (("r_V", "w_h"), ("d_um", "w_s"))
+        for threshold_field, weight_field in pairs:
+            thresholds = np.array(getattr(self, threshold_field), dtype=np.float64)
+            weights = np.array(getattr(self, weight_field), dtype=np.float64)
+            if thresholds.shape != weights.shape or thresholds.size == 0:
+                raise InputError(
+                    f"{weight_field}: got {weights.size} weights for {thresholds.size} thresholds, expected as many"
+                )
+            if thresholds[0] != 0.0 or not np.all(np.diff(thresholds) > 0.0):
+                raise InputError(f"{threshold_field}: got {thresholds.tolist()}, expected ascending values from 0")
+            if not (np.all(np.isfinite(weights)) and np.all(np.cumsum(weights) > 0.0)):
+                raise InputError(
+                    f"{weight_field}: got {weights.tolist()}, expected partial sums above 0; else there is no inverse"
+                )
+            object.__setattr__(self, "r_" if threshold_field == "r_V" else "d_", thresholds)
+            object.__setattr__(self, f"{weight_field}_", weights)
+        for name in ("c_um", "y_ref_um", "lag_s"):
+            if not math.isfinite(getattr(self, name)):
+                raise InputError(f"{name}: got {getattr(self, name)!r}, expected a finite number")
+
+    def start(self, u_V: float = 0.0) -> FloatArray:
+        """Play states (n+1,) V of a stage brought monotonously from rest at 0 V to ``u_V`` (2.5)."""
+        return play_start(u_V, self.r_)
+
+    def simulate(self, u_V: FloatArray, dt_s: float, state_V: FloatArray | None = None) -> FloatArray:
+        """Displacement (n,) µm for voltages (n,) V, ``dt_s`` apart, from ``state_V`` (not changed) or from rest."""
+        u = np.ascontiguousarray(u_V, dtype=np.float64)
+        if u.size == 0:
+            return np.empty(0)
+        state = self.start(float(u[0])) if state_V is None else state_V.copy()
+        y = np.empty(u.size)
+        run_forward(u, self.r_, self.w_h_, self.d_, self.w_s_, self.c_um, self.y_ref_um, state, y)
+        return _lag(y, self.lag_s / dt_s) if self.lag_s > 0.0 else y
+
+    def state_dict(self) -> StateDict:
+        """Flat: the four vectors and three scalars by their own names."""
+        return {
+            "r_V": self.r_.copy(),
+            "w_h": self.w_h_.copy(),
+            "d_um": self.d_.copy(),
+            "w_s": self.w_s_.copy(),
+            "c_um": self.c_um,
+            "y_ref_um": self.y_ref_um,
+            "lag_s": self.lag_s,
+        }
+
+    @staticmethod
+    def from_state(state: StateDict) -> MpiParameters:
+        """Inverse of :meth:`state_dict`; raises InputError where a field is missing or wrong."""
+        try:
+            vectors = {key: _tuple(np.asarray(state[key], dtype=np.float64)) for key in ("r_V", "w_h", "d_um", "w_s")}
+            return MpiParameters(
+                **vectors,
+                c_um=float(state["c_um"]),
+                y_ref_um=float(state["y_ref_um"]),
+                lag_s=float(state["lag_s"]),
+            )
+        except KeyError as missing:
+            raise InputError(f"{missing.args[0]}: missing in the state of an mpi model; write the model anew") from None
+
+
+def pi_parameters(r_V: FloatArray, w_h: FloatArray) -> MpiParameters:
+    """The PI model (2.7) as the special case without dead zones."""
+    return MpiParameters(r_V=_tuple(r_V), w_h=_tuple(w_h))
+
+
+def from_inverse_saturation(
+    r_V: FloatArray,
+    w_h: FloatArray,
+    d_star_um: FloatArray,
+    w_star: FloatArray,
+    c_um: float,
+    y_ref_um: float,
+    lag_s: float = 0.0,
+) -> MpiParameters:
+    """Model from plays and the *inverse* saturation (d*, w*), as (2.40) identifies them.
+
+    (2.16)-(2.18) are their own inverse, and so give w_s and d.
+    """
+    return MpiParameters(
+        r_V=_tuple(r_V),
+        w_h=_tuple(w_h),
+        d_um=_tuple(inverse_thresholds(w_star, d_star_um)),
+        w_s=_tuple(inverse_weights(w_star)),
+        c_um=float(c_um),
+        y_ref_um=float(y_ref_um),
+        lag_s=float(lag_s),
+    )
+
+
+@compiled
+def _lag(y_um: FloatArray, lag_samples: float) -> FloatArray:
+    """First-order lag with an input linear within each step, exact, started in equilibrium."""
+    decay = math.exp(-1.0 / lag_samples)
+    mean = lag_samples * (1.0 - decay)
+    out = np.empty(y_um.size)
+    out[0] = y_um[0]
+    for k in range(1, y_um.size):
+        out[k] = decay * out[k - 1] + (mean - decay) * y_um[k - 1] + (1.0 - mean) * y_um[k]
+    return out

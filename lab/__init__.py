@@ -1,0 +1,1 @@
+"""Experiments on the service: demonstration, soak, scenarios, rehearsal, and the chapter reproduced."""

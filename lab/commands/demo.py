@@ -1,0 +1,104 @@
+"""``dehyst demo``: identify a simulated stage, run five models on twins of it, change it half way, show the table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from adaptive.errors import InputError
+from service.runtime.stopping import StopSignal
+
+EPILOG = """\
+What runs in real time: a simulated stage (five twins of one seed, one for each model), the service that learns from
+one of them, a controller that asks it for voltages ahead of time, the viewer stream, and a bare paced loop for
+comparison; each a process of its own, over zenoh on this machine's loopback. --fast runs the same plan in one
+process, and gives the same voltages. Displacements in µm, errors in percent of the commanded range.
+
+  dehyst demo
+  dehyst demo --fast --out out/fast
+  dehyst demo --view                 # and watch it in the Rerun viewer
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where the results go (default: %(default)s)")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--real-time", action="store_true", help="processes over zenoh at 1 kHz (default)")
+    how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
+    add("--duration", type=float, default=60.0, metavar="S", help="length of the run after identification, s (60)")
+    add(
+        "--stage", type=Path, metavar="STAGE.toml", help="a stage file in place of the usual stage, e.g. of a diagnosis"
+    )
+    add("--seed", type=int, default=20, metavar="N", help="of the stage's noise and of the reference (20)")
+    add("--view", action="store_true", help="also spawn the Rerun viewer and watch live (needs a display)")
+    add("--connect", metavar="URL", help="also stream to a viewer that runs already, rerun+http://HOST:PORT/proxy")
+    add("--json", action="store_true", help="print summary.json in place of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing could be measured."""
+    from lab.demo import session
+
+    if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
+        raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s: the table needs a settled part")
+    if args.seed < 0:
+        raise InputError(f"--seed: got {args.seed}, expected an integer from 0 on")
+    if args.fast and (args.view or args.connect):
+        raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
+    view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
+    begin = time.perf_counter()
+    stop = StopSignal(raising=True)
+
+    def say(text: str) -> None:
+        stop.look()
+        print(text, file=sys.stderr, flush=True)
+
+    done = session.run(
+        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage
+    )
+    if args.json:
+        print(json.dumps(done.summary))
+    else:
+        print(_result(done.summary, args.out, time.perf_counter() - begin))
+    lost = done.summary["samples"]["sent"] - done.summary["samples"]["received"]
+    if lost:
+        print(f"dehyst demo: {lost} samples were lost between stage and service", file=sys.stderr)
+    return 1 if lost else 0
+
+
+def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
+    from lab.demo.result import clock_missed, table
+
+    queries, samples, ticks = summary["queries"], summary["samples"], summary["ticks"]
+    files = {
+        "summary.json": "the numbers above, for programs",
+        "tracking.png": "reference and errors over time",
+        "loops.png": "what each model leaves of the hysteresis",
+        "demo.rrd": f"the whole run; open it with: rerun {out / 'demo.rrd'}",
+        "recording/": f"the samples in Parquet; learn from them with: dehyst identify {out / 'recording'} --out m.npz",
+        "identification/": "the recording that the models were identified from, and model.npz beside it",
+    }
+    lines = [
+        "",
+        table(summary),
+        "",
+        f"the stage changed at t = {summary['change']['t_s']:g} s: {summary['change']['text']}",
+        f"samples: {samples['sent']} sent, {samples['received']} received, {samples['learnt']} learnt from",
+        f"queries: {queries['count']}, median {queries['p50_us']:.0f} µs, 99 % within {queries['p99_us']:.0f} µs, "
+        f"{queries['late']} too late",
+        f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
+        f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
+        *filter(None, [clock_missed(ticks)]),
+        f"done in {seconds:.0f} s; in {out}/:",
+        *(f"  {name:<16}{what}" for name, what in files.items()),
+    ]
+    return "\n".join(lines)

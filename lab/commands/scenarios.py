@@ -1,0 +1,135 @@
+"""``dehyst scenarios``: drift of every kind, adapting against not adapting, and which of the two was the worse."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptive.errors import InputError
+from service.protocol.errors import FieldError
+
+if TYPE_CHECKING:
+    from lab.scenarios.judgement import Verdict
+
+EPILOG = """\
+Twin stages with the same noise and the same reference, one steered by the model that learns, one by the same model
+as it was identified. Displacement in µm, time in s, errors in percent of the commanded range (76 µm). In every 0.5 s
+the adaptive error may be at most 1.1 times the frozen model's plus three noise floors. Exit status 1 where it is not.
+
+  dehyst scenarios --out out/scenarios
+  dehyst scenarios --only glitches --seeds 10 --out out/glitches
+  dehyst scenarios --only dwell --rest 1 --out out/stop
+  dehyst scenarios --only gain_step --only creep --config learner.toml --out out/tuned
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="where table, JSON and pictures go")
+    add("--seeds", type=int, default=2, metavar="N", help="scenarios of each kind, seeds 1 to N (2)")
+    add("--only", action="append", default=[], metavar="NAME", help="a kind, or kind/seed; as often as needed (all)")
+    add("--rest", type=float, default=600.0, metavar="S", help="length of the rest of a dwell, s (600)")
+    add("--config", type=Path, metavar="FILE", help="settings of the learner: a TOML file, or a service's")
+    add("--jobs", type=int, default=1, metavar="N", help="scenarios at a time, one processor each (1)")
+    add("--no-pictures", action="store_true", help="draw nothing")
+    add("--markdown", action="store_true", help="print the table as Markdown")
+    add("--json", action="store_true", help="print JSON in place of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run, judge, draw. Returns 0 where all held, else 1."""
+    from lab.scenarios.judgement import table
+    from lab.scenarios.pictures import draw_overview
+    from service.config.learner import read_learner_settings
+
+    if not 1 <= args.seeds <= 1000:
+        raise FieldError("--seeds", args.seeds, "an integer from 1 to 1000")
+    if not 1 <= args.jobs <= 64:
+        raise FieldError("--jobs", args.jobs, "an integer from 1 to 64")
+    if not 0.0 < args.rest <= 86_400.0:
+        raise FieldError("--rest", args.rest, "a time above 0 s, up to a day (86400 s)")
+    settings = read_learner_settings(args.config).settings if args.config is not None else {}
+    chosen = _chosen(args.only, args.seeds)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: got {args.out}, expected a folder that can be written to: {error}") from error
+    start = time.perf_counter()
+    tasks = [(kind, seed, args.rest, settings, None if args.no_pictures else args.out) for kind, seed in chosen]
+    verdicts: list[Verdict] = []
+    for verdict in _all(tasks, args.jobs):
+        verdicts.append(verdict)
+        held = "held" if verdict.held else "NOT held"
+        print(
+            f"[{len(verdicts)}/{len(tasks)}] {verdict.name}: {verdict.text}: worst window {verdict.worst_ratio:.2f} of "
+            f"what is allowed, {held} ({time.perf_counter() - start:.0f} s)",
+            file=sys.stderr,
+            flush=True,
+        )
+    summary: dict[str, Any] = {
+        "schema": 1,
+        "held": all(v.held for v in verdicts),
+        "settings": settings,
+        "scenarios": [v.as_dict() for v in verdicts],
+        "seconds": round(time.perf_counter() - start, 1),
+    }
+    (args.out / "scenarios.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    (args.out / "scenarios.md").write_text(table(verdicts, markdown=True) + "\n", encoding="utf-8")
+    if not args.no_pictures:
+        draw_overview(args.out / "scenarios.png", verdicts)
+    if args.json:
+        print(json.dumps(summary))
+    else:
+        print(table(verdicts, args.markdown))
+        print(f"pictures, scenarios.json and scenarios.md are in {args.out}/", file=sys.stderr)
+    return 0 if summary["held"] else 1
+
+
+def _chosen(only: list[str], seeds: int) -> list[tuple[str, int]]:
+    from sim.scenarios import KINDS
+
+    every = [(kind, seed) for kind in KINDS for seed in range(1, seeds + 1)]
+    if not only:
+        return every
+    chosen: list[tuple[str, int]] = []
+    for name in only:
+        kind, slash, number = name.partition("/")
+        if kind not in KINDS or (slash and not (number.isdigit() and int(number) >= 1)):
+            raise FieldError("--only", repr(name), f"a kind, or kind/seed; kinds: {', '.join(KINDS)}")
+        chosen += [(kind, int(number))] if slash else [pair for pair in every if pair[0] == kind]
+    return list(dict.fromkeys(chosen))
+
+
+def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs: int) -> Any:
+    if jobs == 1:
+        yield from map(_one, tasks)
+        return
+    # One thread each: the processes share the processors among them.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(_one, tasks)
+
+
+def _one(task: tuple[str, int, float, dict[str, Any], Path | None]) -> Verdict:
+    from lab.scenarios.judgement import judge
+    from lab.scenarios.pictures import draw_course
+    from lab.scenarios.run import run_scenario
+    from sim.scenarios import scenario
+
+    kind, seed, rest_s, settings, out = task
+    course = run_scenario(scenario(kind, seed, rest_s), settings)
+    verdict = judge(course)
+    if out is not None:
+        draw_course(out / f"{kind}_{seed}.png", course, verdict)
+    return verdict

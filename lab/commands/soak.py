@@ -1,0 +1,93 @@
+"""``dehyst soak``: everything as processes under a seeded plan of faults, watched by invariants, with a verdict."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+from pathlib import Path
+
+from adaptive.errors import InputError
+
+EPILOG = """\
+What runs in real time: a router, two services (one a hot standby), a simulated stage, a controller, a second client
+that measures, a bare echo, and the viewer's stream; each a process of its own, on this machine's loopback. --fast runs
+what can happen to samples in one process. Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results: soak.json, report.md,
+pictures, plan.json with every fault as it happened; soak.json is there every minute, with what has been judged by then.
+
+  dehyst soak --duration 5m
+  dehyst soak --duration 40s --faults kill_primary,nan,gap --out out/short
+  dehyst soak --duration 2h --fast --seed 7
+"""
+_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+LEAST_S, MOST_S = 15.0, 90 * 86400.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    add = parser.add_argument
+    add("--duration", default="30m", metavar="T", help="how long: 90s, 30m, 2h, 3d (default: %(default)s)")
+    add("--seed", type=int, default=1, metavar="N", help="of the plan, the reference and the stage's noise (1)")
+    add("--out", type=Path, default=Path("out/soak"), metavar="DIR", help="where the results go (default: %(default)s)")
+    add("--fast", action="store_true", help="one process, as fast as possible; faults of processes are left out")
+    add("--faults", default="", metavar="A,B", help="only these kinds (default: all; --list names them), or none")
+    add("--stage", type=Path, metavar="FILE", help="a stage file in place of the one that stands in for hardware")
+    add("--list", action="store_true", help="list the kinds of faults, and end")
+    add("--json", action="store_true", help="print soak.json in place of the report")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the soak. Returns 0 where every invariant held, 1 where one did not, 130 where it was interrupted."""
+    from lab.soak.faults.catalogue import KINDS
+    from lab.soak.faults.plan import known_kinds, make_plan
+    from service.runtime.stopping import StopSignal
+
+    if args.list:
+        for name, kind in KINDS.items():
+            print(f"{name:<16}{kind.what}{'' if kind.fast else ' (not with --fast)'}")
+        return 0
+    duration_s = seconds(args.duration)
+    if args.seed < 0:
+        raise InputError(f"--seed: got {args.seed}, expected an integer from 0 on")
+    kinds = known_kinds([name.strip() for name in args.faults.split(",") if name.strip()])
+    if args.fast:
+        kinds = tuple(name for name in kinds if KINDS[name].fast)
+    stop = StopSignal()
+    from lab.soak import run as soak
+    from lab.soak.verdict.outcome import HELD, verdict_line
+
+    done = soak.run(
+        args.out,
+        make_plan(duration_s, args.seed, kinds),
+        fast=args.fast,
+        stage_file=args.stage,
+        stopped=lambda: bool(stop.reason),
+        say=_say,
+    )
+    _say(f"      {verdict_line(done.found)}")
+    print(json.dumps(done.found) if args.json else (args.out / "report.md").read_text(encoding="utf-8"))
+    if done.interrupted:
+        return 130
+    return 0 if done.found["verdict"] == HELD else 1
+
+
+def seconds(text: str) -> float:
+    """``"30m"`` in s. Raises InputError."""
+    match = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]*)\s*", text)
+    try:
+        value = float(match[1]) * _UNITS[match[2]] if match else math.nan
+    except (KeyError, ValueError):
+        value = math.nan
+    if not LEAST_S <= value <= MOST_S:
+        raise InputError(
+            f"--duration: got {text!r}, expected {LEAST_S:g}s to {MOST_S / 86400:g}d, such as 90s, 30m, 2h, 3d"
+        )
+    return value
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,206 @@
+"""The controller as a process: asks the service ahead of time, sends the voltages, keeps what the sensors read.
+
+``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: a block is asked
+for when the stage has published the tick that the plan says. Progress goes to standard output as lines of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from adaptive.errors import DehystError
+from adaptive.types import FloatArray
+from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
+from lab.demo.result import empty
+from service.client.client import Client, Trajectory
+from service.protocol import samples as wire
+from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
+from service.protocol.keys import Keys
+from service.protocol.query import NEWEST
+from service.runtime.delivery import SURELY, wait_followed
+from service.runtime.session import open_client
+
+#: How long to wait for the stage's next samples, and for the service to have learnt far enough, s.
+STALL_S, BEHIND_S = 10.0, 0.1
+
+
+class Twins:
+    """What the sensors of the twin stages have read so far, filled by the wire's thread."""
+
+    def __init__(self, plan: Plan, session: zenoh.Session) -> None:
+        self.y_um, self.u_V = empty(plan), empty(plan)
+        self.seen = {name: 0 for name in MODELS}
+        self._ticks = plan.ticks
+        self._moved = threading.Condition()
+        self._subscribers = [
+            session.declare_subscriber(Keys(STAGE, UNITS[name]).sample, self._taker(name)) for name in MODELS
+        ]
+
+    def _taker(self, name: str) -> Any:
+        def take(sample: zenoh.Sample) -> None:
+            batch = wire.decode_samples(sample.payload.to_bytes())
+            first, stop = int(batch.seq[0]), int(batch.seq[-1]) + 1
+            if stop > self._ticks:
+                return
+            self.y_um[name][first:stop] = batch.y_um
+            self.u_V[name][first:stop] = batch.u_V
+            with self._moved:
+                self.seen[name] = stop
+                self._moved.notify_all()
+
+        return take
+
+    def wait(self, ticks: int) -> bool:
+        """Until every twin has read ``ticks`` samples; False if they stopped coming."""
+        with self._moved:
+            return self._moved.wait_for(lambda: min(self.seen.values()) >= ticks, STALL_S)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def control(plan: Plan, endpoint: str, out: Path) -> int:
+    """Run the plan against the service and the stage behind ``endpoint``; writes ``out``. 1 if the stage stalled."""
+    wanted = plan.reference()
+    n, size = plan.ticks, plan.block
+    std_V = empty(plan)
+    durations: list[float] = []
+    late = 0  # answers that came after their block was due, or not from the snapshot they should have come from
+    answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
+    # Answers that are to know of no sample have no snapshot to name, and the first commands start the stage's clock:
+    # these wait until all such answers are there.
+    blind = sum(plan.as_of(block) < 0 for block in range(n // size))
+    held: list[tuple[zenoh.Publisher, bytes]] = []
+    # Two sessions, so that an answer never waits behind the samples of five twins.
+    with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
+        twins = Twins(plan, session)
+        commands = {
+            name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, congestion_control=SURELY, express=True)
+            for name in MODELS
+        }
+        event = session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
+        # The subscriptions must have reached the stage before the first commands start its clock.
+        time.sleep(0.3)
+        try:
+            for name, publisher in commands.items():
+                if not wait_followed(publisher, STALL_S):
+                    raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
+            stop = 0
+            while stop < n // size:
+                block = stop
+                if not twins.wait(block * size - plan.lead):
+                    print(json.dumps({"stalled": block * size}), flush=True)
+                    return 1
+                fresh, stop = blocks_now(plan, block, twins.seen[TEACHER])
+                part = slice(block * size, stop * size)
+                client.reference(part.start, wanted[0][part])
+                for name in MODELS:
+                    begin = time.perf_counter()
+                    # The service tracks the teacher's stage; the memory of the others travels, over all of the way.
+                    due = fresh * size if name == TEACHER else None
+                    asked = slice(part.start if due is None else due, part.stop)
+                    motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), due)
+                    late += waited
+                    durations.append(time.perf_counter() - begin)
+                    answers[name] = answer
+                    std_V[name][asked] = answer.std_V
+                    held.append((commands[name], wire.encode_command(asked.start, answer.u_V)))
+                    if block >= blind or len(held) == blind * len(MODELS):
+                        for publisher, command in held:
+                            publisher.put(command)
+                        held.clear()
+                late += twins.seen[TEACHER] > part.start
+                if part.start <= plan.change_tick < part.stop:
+                    # Told to the viewer only: the service has to find out by itself.
+                    event.put(
+                        json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text})
+                    )
+                if part.stop // 1000 > part.start // 1000:
+                    _report(plan, wanted[0], twins, max(0, part.start - plan.lead))
+            complete = twins.wait(n)
+        finally:
+            twins.close()
+            for publisher in (*commands.values(), event):
+                publisher.undeclare()  # type: ignore[no-untyped-call]
+    arrays = {f"{kind}/{name}": values[name] for kind, values in _kinds(twins, std_V).items() for name in MODELS}
+    np.savez(out, query_s=np.asarray(durations), late=late, **arrays)
+    print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
+    return 0 if complete else 1
+
+
+def blocks_now(plan: Plan, block: int, seen: int) -> tuple[int, int]:
+    """(fresh, stop): what to ask for after ``seen`` samples in place of ``block``: the blocks before ``stop``.
+
+    One, where it is in time. Else all up to the one that would be asked for now if it were, or a controller that was
+    late for once would be late until the end; what came before block ``fresh`` is due already and of no use.
+    """
+    size = plan.block
+    if seen <= block * size:
+        return block, block + 1
+    last = plan.ticks // size
+    return min(-(-seen // size), last - 1), min((seen + plan.lead) // size + 1, last)
+
+
+def ask(
+    client: Client,
+    motion: tuple[FloatArray, FloatArray, FloatArray],
+    model: str,
+    after: Trajectory | None,
+    as_of: int,
+    begin: int | None = None,
+) -> tuple[Trajectory, bool]:
+    """The voltages for a block, and whether they had to be asked for more than once.
+
+    A controller does not give up because the machine stalled: it asks again, and takes the newest snapshot where
+    the right one is not there in time. Raises what the client raises once ``STALL_S`` are over.
+    """
+    until = time.monotonic() + STALL_S
+    wanted, waited = as_of, False
+    while True:
+        try:
+            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=BEHIND_S)
+            return answer, waited
+        except (BehindError, ReplyTimeoutError, RefusedError) as error:
+            too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST
+            if time.monotonic() >= until or (isinstance(error, RefusedError) and not too_old):
+                raise
+            wanted, waited = NEWEST, True
+
+
+def _kinds(twins: Twins, std_V: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": std_V}
+
+
+def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
+    tail = slice(max(0, done - round(1.0 / plan.dt_s)), done)
+    if done > 0:
+        error = {name: float(np.nanmean(np.abs(wanted_um[tail] - twins.y_um[name][tail]))) for name in MODELS}
+        print(json.dumps({"done_ticks": done, "error_um": error}), flush=True)
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process. Returns its exit status."""
+    # The wire's threads must not wait 5 ms for the interpreter.
+    sys.setswitchinterval(5e-5)
+    plan = Plan(**json.loads(Path(argv[0]).read_text()))
+    try:
+        return control(plan, argv[1], Path(argv[2]))
+    except DehystError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,114 @@
+"""What a run of the demonstration leaves behind, whichever way it was made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from lab.demo.plan import MODELS, Plan
+
+# --- From errors to the table and to ``summary.json``.
+
+
+#: Share of the ticks without their voltage above which the errors are those of the machine: with 0.016 the table was
+#: as with none, with 0.5 every model was off by a fifth of the range.
+MOST_LATE = 0.02
+PHASE_TITLES = {"before": "before the change", "first_second": "first second after", "settled": "settled"}
+
+
+def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
+    """MAE (2.43), RMSE (2.44) and maximum of an error, in percent of the commanded range, phase by phase."""
+    percent = 100.0 * error_um / plan.range_um
+    return {
+        name: {
+            "mae_pct": float(np.mean(np.abs(percent[part]))),
+            "rmse_pct": float(np.sqrt(np.mean(percent[part] ** 2))),
+            "max_pct": float(np.max(np.abs(percent[part]))),
+        }
+        for name, part in plan.phases().items()
+    }
+
+
+def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
+    """Round trips of queries: how many, median and 99th percentile in µs, and how many came too late to be used."""
+    if seconds.size == 0:
+        return {"count": 0, "p50_us": None, "p99_us": None, "late": late}
+    p50, p99 = np.percentile(seconds * 1e6, [50, 99])
+    return {"count": int(seconds.size), "p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1), "late": late}
+
+
+def clock_missed(ticks: dict[str, int]) -> str:
+    """What to make of a run whose voltages often came too late, in words; "" where the machine kept up."""
+    share = ticks["late"] / max(1, ticks["count"])
+    if share <= MOST_LATE:
+        return ""
+    return (
+        f"THIS MACHINE DID NOT KEEP UP: {100.0 * share:.0f} % of the ticks went without their voltage, so the table "
+        "tells of that and not of the models. Close what else runs, or do without a clock: dehyst demo --fast is the "
+        "same run in one process"
+    )
+
+
+def table(summary: dict[str, Any]) -> str:
+    """The result as a person reads it: a row a model, three numbers a phase."""
+    width = max(len(title) for title in MODELS.values())
+    head = " " * width + "".join(f" | {title:^23}" for title in PHASE_TITLES.values())
+    units = f"{'% of ' + format(summary['range_um'], '.0f') + ' µm':<{width}}" + " |    MAE    RMSE     max" * 3
+    lines = [head, units, "-" * len(head)]
+    for model, title in MODELS.items():
+        cells = "".join(
+            " | "
+            + " ".join(f"{summary['models'][model][phase][key]:7.3f}" for key in ("mae_pct", "rmse_pct", "max_pct"))
+            for phase in PHASE_TITLES
+        )
+        lines.append(f"{title:<{width}}{cells}")
+    return "\n".join(lines)
+
+
+@dataclass(slots=True)
+class Run:
+    """Motion of the twin stages, by model, and what happened on the way.
+
+    Attributes
+    ----------
+    y_um, u_V, std_V : by model, (ticks,); what the sensor read, what was applied, its standard deviation.
+    query_s : durations of the feedforward queries, s. late_queries : answers that came after their block was due.
+    samples : counts ``sent``, ``received``, ``learnt`` of the stage that teaches.
+    ticks : counts ``count``, ``late`` (a command was not there in time) and ``bare_late`` (the bare loop's).
+    notes : records for the viewer (events, diagnostics, status), in order.
+    """
+
+    y_um: dict[str, FloatArray]
+    u_V: dict[str, FloatArray]
+    std_V: dict[str, FloatArray]
+    query_s: FloatArray
+    late_queries: int
+    samples: dict[str, int]
+    ticks: dict[str, int]
+    notes: list[Any] = field(default_factory=list)
+
+    def summary(self, plan: Plan, reference_um: FloatArray) -> dict[str, Any]:
+        """The content of ``summary.json``."""
+        return {
+            "schema": 1,
+            "range_um": plan.range_um,
+            "models": {name: score(reference_um - self.y_um[name], plan) for name in MODELS},
+            "queries": latency(self.query_s, self.late_queries),
+            "samples": self.samples,
+            "ticks": self.ticks,
+            "change": {
+                "t_s": plan.change_tick * plan.dt_s,
+                "gain": plan.gain_change,
+                "payload_ratio": plan.payload_ratio,
+                "text": plan.change_text,
+            },
+            "seed": plan.seed,
+        }
+
+
+def empty(plan: Plan) -> dict[str, FloatArray]:
+    """An array of ticks for each model, NaN where nothing is known yet."""
+    return {name: np.full(plan.ticks, np.nan) for name in MODELS}

@@ -1,0 +1,177 @@
+"""One demonstration from beginning to end: record, identify, run, score, draw, and leave the files behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import InputError
+from lab.demo.fast import run_fast
+from lab.demo.live import record_identification, run_live
+from lab.demo.own_stage import plan_for
+from lab.demo.pictures import draw_loops, draw_tracking
+from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
+from lab.demo.result import Run
+from lab.testbed.processes import free_port
+from service.config.config import read_config
+from service.identification.identifying import NAMES, Stretch, identify_all
+from service.server.models import load_axis
+from service.storage.model_file import BundleMeta, write_bundle
+from service.storage.output_folder import clear_output
+from service.storage.recorder import Recorder, RecorderConfig
+from service.viewer.feed import Event, Record, SceneConfig, Tracking
+from service.viewer.offline import write_recording
+from sim.recordings import read, repaired
+from sim.stage.stage import Stage
+
+Say = Callable[[str], None]
+#: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
+OURS = ("summary.json", "tracking.png", "loops.png", "demo.rrd", "recording", "identification", "model.npz", "logs")
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A finished demonstration."""
+
+    plan: Plan
+    run: Run
+    summary: dict[str, Any]
+
+
+def run(
+    out: Path, *, fast: bool, duration_s: float, seed: int, view: list[str], say: Say, stage: Path | None = None
+) -> Done:
+    """Run it all and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
+
+    Raises InputError on a folder that cannot be used, ServiceError where a process failed.
+    """
+    own = stage.resolve() if stage is not None else None
+    clear_output(out, OURS)
+    logs = out / "logs"
+    logs.mkdir()
+    plan = Plan(run_s=duration_s, seed=seed) if own is None else plan_for(own, logs, duration_s, seed)
+    say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
+    _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))
+    say("[2/4] identifying five inverse models from 10 s at 1 kHz")
+    model = out / "model.npz"
+    _identify(plan, out / "identification", model, say)
+    kind = "as fast as possible, in one process" if fast else "in real time, in processes over zenoh"
+    say(f"[3/4] {plan.run_s:g} s of a reference that no model has seen, {kind}")
+    say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
+    config, endpoint = _configure(plan, out, logs)
+    show = _Bar(plan.run_s, say)
+
+    def progress(ticks: int, error_um: dict[str, float]) -> None:
+        parts = ", ".join(f"{name} {100.0 * value / plan.range_um:.3f}" for name, value in error_um.items())
+        show(ticks * plan.dt_s, f"mean |error| of the last second, % of range: {parts}")
+
+    if fast:
+        axis = load_axis(STAGE, read_config(config).axes[0])
+        with Recorder(RecorderConfig(out / "recording")) as recorder:
+            done = run_fast(plan, axis, recorder, progress)
+        write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
+    else:
+        done = run_live(plan, config, endpoint, out / "demo.rrd", view, logs, progress)
+    say("[4/4] drawing")
+    wanted_um = plan.reference()[0]
+    summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time"}
+    (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    draw_tracking(out / "tracking.png", plan, wanted_um, done.y_um)
+    draw_loops(out / "loops.png", plan, wanted_um, done.y_um)
+    return Done(plan, done, summary)
+
+
+class _Bar:
+    """A line of progress every five seconds of the run, and at its end."""
+
+    def __init__(self, total_s: float, say: Say) -> None:
+        self._total_s, self._say, self._next_s = total_s, say, 5.0
+
+    def __call__(self, done_s: float, detail: str = "") -> None:
+        if done_s + 1e-9 < self._next_s:
+            return
+        self._next_s = (done_s // 5.0 + 1.0) * 5.0
+        filled = round(20.0 * min(1.0, done_s / self._total_s))
+        self._say(f"  [{'#' * filled:<20}] {done_s:4.0f} of {self._total_s:g} s  {detail}".rstrip())
+
+
+def _record(plan: Plan, folder: Path, logs: Path, fast: bool, bar: _Bar) -> None:
+    u_V = plan.identification_voltage()
+    with Recorder(RecorderConfig(folder)) as recorder:
+        if not fast:
+            record_identification(plan, recorder, logs, lambda received: bar(received * plan.dt_s))
+            return
+        stage = Stage(plan.stage(changing=False))
+        y_um, _ = stage.run(stage.initial_state(), u_V)
+        seq = np.arange(u_V.size)
+        recorder.put(seq, seq * plan.dt_s, u_V, y_um, "identification")
+
+
+def _identify(plan: Plan, data: Path, model: Path, say: Say) -> None:
+    recording = read(data)
+    whole = Stretch.of(repaired(recording))
+    results = identify_all(
+        whole, whole, recording.dt_s, follows=False, progress=lambda name: say(f"  {MODELS[name]} ...")
+    )
+    failed = [f"{result.name}: {result.failed}" for result in results if result.model is None]
+    if failed:
+        raise InputError(f"identification: {'; '.join(failed)}")
+    models = {result.name: result.model for result in results if result.model is not None}
+    assert set(models) == set(NAMES)
+    meta = BundleMeta(
+        stage=STAGE,
+        axis=AXIS,
+        dt_s=recording.dt_s,
+        source=data.name,
+        source_sha256=recording.sha256,
+        y_min_um=float(whole.motion[:, 0].min()),
+        y_max_um=float(whole.motion[:, 0].max()),
+        u_min_V=float(whole.u_V.min()),
+        u_max_V=float(whole.u_V.max()),
+    )
+    write_bundle(model, models, meta)
+
+
+def _configure(plan: Plan, out: Path, logs: Path) -> tuple[Path, str]:
+    """The service's configuration, as a user would write it, and the endpoint it listens at."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    stage = plan.stage(changing=True)
+    path = logs / "serve.toml"
+    path.write_text(
+        f'stage = "{STAGE}"\n'
+        f'listen = ["{endpoint}"]\n\n'
+        "[[axis]]\n"
+        f'name = "{AXIS}"\n'
+        f"model = {json.dumps(str((out / 'model.npz').resolve()))}\n"
+        f"u_min_V = {stage.u_min_V}\n"
+        f"u_max_V = {stage.u_max_V}\n"
+        "slew_V_per_s = 4000.0\n"
+        f'learn = "{TEACHER}"\n'
+        f"snapshot_every = {plan.block}\n"
+        f"recorder = {json.dumps(str((out / 'recording').resolve()))}\n"
+        # When the background is done depends on the machine; a run in real time and a fast one are to be the same.
+        "[axis.retuning]\nperiod_s = 0.0\n"
+    )
+    return path, endpoint
+
+
+def _scene(plan: Plan) -> SceneConfig:
+    models = (TEACHER, *(name for name in MODELS if name != TEACHER))
+    return SceneConfig(f"{STAGE}/{AXIS}", models, range_um=plan.range_um)
+
+
+def _records(plan: Plan, done: Run) -> list[Record]:
+    seq = np.arange(plan.ticks)
+    t_s = seq.astype(np.float64) * plan.dt_s
+    wanted_um = plan.reference()[0]
+    records: list[Record] = [
+        Tracking(name, seq, t_s, done.u_V[name], done.y_um[name], wanted_um, done.std_V[name]) for name in MODELS
+    ]
+    at = plan.change_tick
+    records.append(Event(at * plan.dt_s, at, f"the stage changes: {plan.change_text}", "WARN", change=True))
+    return records + list(done.notes)

@@ -1,0 +1,157 @@
+"""The seeded plan of a soak: which fault comes when, in seconds from the start of the watch."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from adaptive.errors import InputError
+from lab.soak.faults.catalogue import KINDS
+
+#: Calm before the first fault and at the end, s; between the end of one's recovery and the next at least and at most.
+WARM_S, TAIL_S = 6.0, 3.0
+CALM_S = (1.0, 8.0)
+#: The calm between two faults, as a share of the run.
+_CALM_SHARE = 1.0 / 180.0
+#: Share of the run after which nothing ends a serving process any more, so that its memory can be watched.
+KILLING_SHARE = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One fault of the plan: ``at_s`` after the start, for ``duration_s``; ``value`` as the kind has it."""
+
+    kind: str
+    at_s: float
+    duration_s: float
+    value: float = 0.0
+
+    @property
+    def end_s(self) -> float:
+        """When it is over."""
+        return self.at_s + self.duration_s
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """From its beginning until everything has to be well again."""
+        return self.at_s, self.end_s + KINDS[self.kind].recover_s
+
+
+@dataclass(frozen=True, slots=True)
+class SoakPlan:
+    """``faults`` in order of time, and the kinds for which there was no time."""
+
+    duration_s: float
+    seed: int
+    faults: tuple[Planned, ...]
+    left_out: tuple[str, ...]
+
+
+def known_kinds(names: list[str]) -> tuple[str, ...]:
+    """The kinds named, or all of them where none is; none of them for ``none``. Raises InputError on an unknown one."""
+    if names == ["none"]:
+        return ()
+    for name in names:
+        if name not in KINDS:
+            raise InputError(f"--faults: got {name!r}, expected none, or some of: {', '.join(KINDS)}")
+    return tuple(dict.fromkeys(names)) or tuple(KINDS)
+
+
+def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
+    """Faults one after the other, each with its time to recover, as many rounds of all kinds as there is time for.
+
+    The same arguments give the same plan. Kinds that end a serving process come in the first rounds only.
+    """
+    rng = np.random.default_rng(seed)
+    faults: list[Planned] = []
+    at_s = WARM_S
+    calm_s = min(max(_CALM_SHARE * duration_s, CALM_S[0]), CALM_S[1])
+    done: set[str] = set()
+    turn = 0
+    while kinds:
+        order = [kinds[i] for i in rng.permutation(len(kinds))]
+        if turn == 0:
+            # The stable sort keeps the drawn order within both groups.
+            order.sort(key=lambda name: not KINDS[name].ends_service)
+        placed = False
+        for name in order:
+            kind = KINDS[name]
+            low, high = kind.duration_s
+            fault = Planned(name, at_s, round(float(rng.uniform(low, high)), 3), _value(name, rng, turn))
+            late = kind.ends_service and turn > 0 and at_s > KILLING_SHARE * duration_s
+            if late or fault.window_s[1] > duration_s - TAIL_S:
+                continue
+            faults.append(fault)
+            done.add(name)
+            at_s = round(fault.window_s[1] + calm_s, 3)
+            placed = True
+        turn += 1
+        if not placed:
+            break
+    return SoakPlan(duration_s, seed, tuple(faults), tuple(name for name in kinds if name not in done))
+
+
+def _value(name: str, rng: np.random.Generator, turn: int) -> float:
+    """The number that goes with a fault: of a change, what the parameter becomes, there and back from turn to turn."""
+    if name == "gain":
+        return round(float(rng.uniform(-0.06, -0.03)), 4) if turn % 2 == 0 else 0.0
+    if name == "payload":
+        return 1.0 if turn % 2 == 0 else 0.0
+    return {"spike": 30.0, "stage_clock": -3600.0, "clock_back": -3600.0}.get(name, 0.0)
+
+
+# --- Which fault of a plan is next, and when it really comes.
+
+
+#: The calm between two faults has room for so much, s.
+LATE_S: Final = 0.5
+
+
+class Schedule:
+    """The faults of ``plan`` one after the other, each with its time to recover, whatever those before it took.
+
+    One that takes a process to begin begins when the machine has made that process; one that may not happen yet, as
+    ``possible`` says, waits; those behind it come as much later. What then has no time left to recover is left out.
+    """
+
+    def __init__(self, plan: SoakPlan, possible: Callable[[Planned], bool]) -> None:
+        self._plan, self._possible = plan, possible
+        self._waiting = deque(enumerate(plan.faults))
+        self._delay_s = 0.0
+        self._notes: list[str] = []
+
+    def due(self, now_s: float) -> tuple[int, Planned] | None:
+        """The fault that is to begin at ``now_s``, and its number in the plan; None where there is none."""
+        while self._waiting:
+            index, fault = self._waiting[0]
+            if now_s < fault.at_s + self._delay_s:
+                return None
+            if fault.window_s[1] + self._delay_s > self._plan.duration_s:
+                self._notes.append(_note(fault, "no time to recover"))
+            elif self._possible(fault):
+                self._waiting.popleft()
+                return index, fault
+            else:
+                self._delay_s = now_s - fault.at_s
+                return None
+            self._waiting.popleft()
+        return None
+
+    def over(self, index: int, end_s: float) -> None:
+        """The fault of that number has ended at ``end_s``."""
+        late_s = end_s - (self._plan.faults[index].end_s + self._delay_s)
+        if late_s > LATE_S:
+            self._delay_s += late_s
+
+    def left_out(self) -> list[str]:
+        """At the end of a run: which faults did not happen, and why."""
+        # Such as one that waited to the end for the standby to be synced, and those behind it.
+        return self._notes + [_note(fault, "it did not come to it") for _, fault in self._waiting]
+
+
+def _note(fault: Planned, why: str) -> str:
+    return f"{fault.kind} at {fault.at_s:.0f} s: left out, {why}"

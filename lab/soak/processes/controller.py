@@ -1,0 +1,205 @@
+"""The controller of a soak as a process: it asks ahead, sends what it gets, and never gives up.
+
+``python -m lab.soak.processes.controller CONTROL.json ENDPOINT``. Where no answer comes before a block is due the
+stage holds
+its last voltage, and the controller goes on with the next block.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from adaptive.errors import DehystError, InputError
+from lab.soak.processes.control import AXIS, STAGE, Control
+from lab.soak.reference import SoakReference
+from service.client.client import Client, Trajectory
+from service.protocol import samples as wire
+from service.protocol.errors import ServiceError
+from service.protocol.keys import Keys
+from service.runtime.delivery import SURELY
+from service.runtime.stopping import StopSignal
+from service.stage_node.node import status_key
+
+#: Time-out of a query, s: a controller that has 60 ms ahead does not wait for a second.
+TIMEOUT_S = 0.1
+REPORT_S = 1.0
+#: An answer that comes less than so many ticks before its block is due may not reach the stage in time: it is not sent,
+#: since a block that arrives half over would make the stage jump.
+MARGIN = 10
+
+
+def control_key() -> str:
+    """Where the controller of a soak is told to rest: JSON {"first": tick, "ticks": n}."""
+    return f"{Keys(STAGE, AXIS).base}/soak_dwell"
+
+
+class StageClock:
+    """The stage's newest number, and the first one of its present life; filled by the wire's thread."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.newest = -1
+        self.first = -1
+        self._moved = threading.Condition()
+        keys = Keys(STAGE, AXIS)
+        self._subscribers = [
+            session.declare_subscriber(keys.sample, self._sample),
+            session.declare_subscriber(status_key(STAGE, AXIS), self._status),
+        ]
+
+    def _sample(self, sample: zenoh.Sample) -> None:
+        try:
+            batch = wire.decode_samples(sample.payload.to_bytes())
+        except InputError:
+            # Anybody may publish; the stage's own samples go on.
+            return
+        with self._moved:
+            last = int(batch.seq[-1])
+            if self.first >= 0 and last >= self.first:
+                self.newest = max(self.newest, last)
+                self._moved.notify_all()
+
+    def _status(self, sample: zenoh.Sample) -> None:
+        told = json.loads(sample.payload.to_bytes())
+        with self._moved:
+            # A stage that waits for commands has a new life; one that runs is followed from where it is.
+            if told["state"] == "waiting" and told["first"] != self.first:
+                self.first, self.newest = told["first"], told["first"] - 1
+                self._moved.notify_all()
+            elif self.first != told["first"]:
+                self.first, self.newest = told["first"], told["tick"]
+                self._moved.notify_all()
+
+    def wait(self, first: int, seq: int, timeout_s: float) -> bool:
+        """Until sample ``seq`` of the life that began with ``first`` has come, or another life has begun."""
+        with self._moved:
+            return self._moved.wait_for(lambda: self.first != first or self.newest >= seq, timeout_s)
+
+    def before(self, seq: int) -> bool:
+        """Whether what is sent now reaches the stage before it takes sample ``seq``."""
+        return self.newest < max(seq - MARGIN, self.first)
+
+    def close(self) -> None:
+        """Stop listening."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Controller:
+    """One run; `run` returns when stopped."""
+
+    def __init__(self, control: Control, client: Client, session: zenoh.Session) -> None:
+        self.control = control
+        self.reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
+        self.counts = {"blocks": 0, "answered": 0, "given_up": 0, "retries": 0, "errors": 0, "fallback": 0, "unsafe": 0}
+        self._client = client
+        self._session = session
+        self._dwells = session.declare_subscriber(control_key(), self._rest)
+        key = Keys(STAGE, AXIS).command
+        self._commands = session.declare_publisher(key, congestion_control=SURELY, express=True)
+        self._last_V = math.nan
+        self._error = ""
+
+    def _rest(self, sample: zenoh.Sample) -> None:
+        told = json.loads(sample.payload.to_bytes())
+        self.reference.dwells = [*self.reference.dwells[-8:], (int(told["first"]), int(told["ticks"]))]
+
+    def run(self, stop: StopSignal) -> None:
+        """Follow the stage's clock until stopped."""
+        clock = StageClock(self._session)
+        first, begin = -1, 0
+        answer: Trajectory | None = None
+        told_s = time.monotonic()
+        size, lead = self.control.block, self.control.lead
+        try:
+            while not stop.reason:
+                if time.monotonic() - told_s >= REPORT_S:
+                    told_s = time.monotonic()
+                    print(json.dumps({**self.counts, "error": self._error}), flush=True)
+                if clock.first != first:
+                    first, answer, self._last_V = clock.first, None, math.nan
+                    # A stage that waits is given its first commands; one that runs, those of a little later.
+                    ahead = 0 if clock.newest < first else clock.newest + lead - first
+                    begin = first + -(-ahead // size) * size
+                if first < 0 or not clock.wait(first, begin - lead, 0.2) or clock.first != first:
+                    continue
+                if clock.newest - begin > lead:
+                    # Too far behind to catch up block by block: go on where the stage will be.
+                    begin += -(-(clock.newest - begin) // size) * size + lead
+                    answer = None
+                answer = self._block(first, begin, answer, clock)
+                begin += size
+        finally:
+            clock.close()
+            self._dwells.undeclare()  # type: ignore[no-untyped-call]
+            self._commands.undeclare()  # type: ignore[no-untyped-call]
+
+    def _block(self, first: int, begin: int, after: Trajectory | None, clock: StageClock) -> Trajectory | None:
+        """Ask for a block and send it; None where it was given up because it is due."""
+        size = self.control.block
+        motion = self.reference.rows(begin - first, size)
+        self.counts["blocks"] += 1
+        with contextlib.suppress(zenoh.ZError):
+            self._client.reference(begin, motion[0])
+        while clock.first == first and clock.before(begin):
+            try:
+                answer = self._client.trajectory(
+                    motion[0], motion[1], motion[2], after=after, begin=begin, u_before_V=self._last_V
+                )
+            except (ServiceError, InputError) as error:
+                self.counts["errors" if isinstance(error, InputError) else "retries"] += 1
+                self._error = str(error)
+                time.sleep(0.002)
+                continue
+            if not clock.before(begin):
+                break
+            self.counts["answered"] += 1
+            self.counts["unsafe"] += not self._safe(answer)
+            self.counts["fallback"] += answer.fallback
+            self._last_V = float(answer.u_V[-1])
+            with contextlib.suppress(zenoh.ZError):
+                self._commands.put(wire.encode_command(begin, answer.u_V))
+            return answer
+        self.counts["given_up"] += 1
+        return None
+
+    def _safe(self, answer: Trajectory) -> bool:
+        """Whether an answer keeps what the service promises: finite, within limits, within slew from where it was."""
+        c, u_V = self.control, answer.u_V
+        steps = np.abs(np.diff(u_V, prepend=self._last_V if math.isfinite(self._last_V) else u_V[0]))
+        within = bool(np.isfinite(u_V).all()) and c.u_min_V <= u_V.min() and u_V.max() <= c.u_max_V
+        return within and float(steps.max()) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process. Returns its exit status."""
+    stop = StopSignal()
+    # The wire's threads must not wait 5 ms for the interpreter.
+    sys.setswitchinterval(5e-5)
+    control = Control(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
+    from service.runtime.session import open_client
+
+    try:
+        with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
+            client.status()
+            with open_client(argv[1], 10.0) as session:
+                controller = Controller(control, client, session)
+                print("ready", flush=True)
+                controller.run(stop)
+                print(json.dumps(controller.counts), flush=True)
+    except DehystError as error:
+        print(json.dumps({"fatal": str(error)}), flush=True)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

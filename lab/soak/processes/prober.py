@@ -1,0 +1,154 @@
+"""A second client of a soak as a process: asks for points and a bare echo in turns, and follows the model.
+
+``python -m lab.soak.processes.prober CONTROL.json ENDPOINT`` prints a line of JSON every second: round trips in µs,
+how long
+nobody answered, voltages that were not as promised, and with every query how old the followed model was.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from adaptive.errors import DehystError, InputError
+from lab.soak.processes.control import AXIS, STAGE, Control
+from lab.soak.processes.extras import ECHO_KEY
+from lab.soak.processes.retry import MOST, Outcome, Patience
+from service.client.client import Client, Point
+from service.protocol.errors import NoReplyError
+from service.protocol.query import encode_query
+from service.protocol.reply import FeedforwardReply, encode_reply
+from service.runtime.session import open_client
+from service.runtime.stopping import StopSignal
+
+#: Pause between two rounds of one query and one echo; how long an answer is waited for before another is asked for
+#: beside it; and the time-out of both, s.
+PAUSE_S, AGAIN_S, TIMEOUT_S = 0.01, 0.1, 1.0
+
+Told = Outcome[Point | None, Point]
+
+
+class Prober:
+    """What is counted in a second, and the questions.
+
+    ``points`` asks for a point after another one; ``echoes`` sends so many bytes there and back.
+    """
+
+    def __init__(self, control: Control, points: Patience[Point | None, Point], echoes: Patience[bytes, int]) -> None:
+        self._control, self._points, self._echoes = control, points, echoes
+        self._last: Point | None = None
+        self._answered_s = time.monotonic()
+        self._clear()
+
+    def _clear(self) -> None:
+        self.told: dict[str, Any] = {
+            "service_us": [], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.0, "error": "", "ages_s": [],
+        }  # fmt: skip
+
+    def ask(self) -> None:
+        """One point; what is wrong with the answer is counted, as with one that comes late."""
+        for outcome in self._points.ask(self._last):
+            self._take(outcome)
+
+    def _take(self, outcome: Told) -> None:
+        told = self.told
+        if outcome.answer is None:
+            # What could be read, but not as an answer, is worse than none.
+            told["unsafe" if isinstance(outcome.error, InputError) else "failed"] += 1
+            told["error"] = str(outcome.error)
+            # A memory that no longer fits is asked for anew.
+            self._last = None
+            return
+        told["service_us"].append(round(outcome.took_us, 1))
+        told["silent_s"] = max(told["silent_s"], outcome.at_s - self._answered_s)
+        self._answered_s = max(self._answered_s, outcome.at_s)
+        told["unsafe"] += not self._safe(outcome.asked, outcome.answer)
+        self._last = outcome.answer
+
+    def _safe(self, before: Point | None, point: Point) -> bool:
+        c = self._control
+        safe = math.isfinite(point.u_V) and c.u_min_V <= point.u_V <= c.u_max_V
+        if before is None:
+            return safe
+        return safe and abs(point.u_V - before.u_V) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
+
+    def echo(self, payload: bytes) -> None:
+        """The bare round trip of as many bytes there and back."""
+        self.told["echo_us"] += [round(o.took_us, 1) for o in self._echoes.ask(payload) if o.answer is not None]
+
+    def look(self, age_s: float) -> None:
+        """At the age of the followed model, s."""
+        self.told["ages_s"].append(round(age_s, 4))
+
+    def report(self) -> str:
+        """The second's line, and a new second."""
+        # A silence that has not ended is told too.
+        self.told["silent_s"] = round(max(self.told["silent_s"], time.monotonic() - self._answered_s), 4)
+        line = json.dumps({"t_s": round(time.monotonic(), 3), **self.told})
+        self._clear()
+        return line
+
+
+def _echo(querier: zenoh.Querier, payload: bytes) -> int:
+    """Send ``payload`` to the echo and return how many bytes came back. Raises NoReplyError."""
+    for reply in querier.get(payload=payload):
+        if reply.ok is not None:
+            return len(reply.ok.payload.to_bytes())
+    raise NoReplyError("soak: no echo")
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process. Returns its exit status."""
+    stop = StopSignal()
+    sys.setswitchinterval(5e-5)
+    control = Control(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
+    y_um = 0.5 * (control.low_um + control.high_um)
+
+    def point(client: Client, before: Point | None) -> Point:
+        return client.point(y_um, after=before)
+
+    try:
+        with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
+            first = client.point(y_um)
+            payload = encode_query([0.0], [0.0], [0.0], memory=first.memory, model=first.model)
+            nothing = FeedforwardReply(
+                np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model
+            )
+            key = f"{ECHO_KEY}/{len(encode_reply(nothing))}"
+            with open_client(argv[1], 10.0) as session, ExitStack() as stack:
+                # A client is not for several threads at once.
+                clients = [
+                    stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)
+                ]
+                queriers = [session.declare_querier(key, timeout=TIMEOUT_S, express=True) for _ in range(MOST)]
+                points = stack.enter_context(Patience([partial(point, each) for each in clients], AGAIN_S))
+                echoes = stack.enter_context(Patience([partial(_echo, each) for each in queriers], AGAIN_S))
+                prober = Prober(control, points, echoes)
+                follower = client.follow()
+                print("ready", flush=True)
+                next_s = time.monotonic() + 1.0
+                while not stop.reason:
+                    prober.ask()
+                    prober.echo(payload)
+                    time.sleep(PAUSE_S)
+                    prober.look(follower.age_s)
+                    if time.monotonic() >= next_s:
+                        next_s += 1.0
+                        print(prober.report(), flush=True)
+    except DehystError as error:
+        print(json.dumps({"fatal": str(error)}), flush=True)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

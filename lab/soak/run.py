@@ -1,0 +1,178 @@
+"""One soak from beginning to end: identify, run, judge, draw, and leave the files behind."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lab.soak.faults.plan import SoakPlan
+from lab.soak.live import Say, run_live, withheld
+from lab.soak.processes.setup import identify, stage_of
+from lab.soak.verdict.interim import Interim
+from lab.soak.verdict.judge import TRACKING_PCT, judge, recorded
+from lab.soak.verdict.ledger import FAST, REAL_TIME, Ledger
+from lab.soak.verdict.outcome import PART, SECONDS, summary, write_found, write_seconds
+from lab.soak.verdict.report import report
+from lab.soak.verdict.settling import settle
+from lab.soak.verdict.track import OTHER_LIFE, Intervals
+from service.storage.output_folder import clear_output
+
+#: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
+OURS = ("soak.json", f"soak.json{PART}", "report.md", "plan.json", SECONDS, "error.png", "latency.png", "memory.png",
+        "soak.rrd", "model.npz", "a", "b", "logs")  # fmt: skip
+#: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
+OWN_STAGE_RATIO = 2.0
+#: What waits to be written when the disk is full, or to be passed on when the router dies, is lost too, s; and a second
+#: is told by its beginning.
+WAITING_S = 1.0
+#: No second without a sample is longer than this, s.
+_BEFORE_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A finished soak: the content of ``soak.json``, and whether it was ended early."""
+
+    found: dict[str, Any]
+    interrupted: bool
+
+
+def run(
+    out: Path, plan: SoakPlan, *, fast: bool, stage_file: Path | None, stopped: Callable[[], bool], say: Say
+) -> Done:
+    """Run the plan and write the results into ``out``.
+
+    Raises InputError on a folder or a stage that cannot be used, ServiceError where a process does not come up.
+    """
+    clear_output(out, OURS)
+    (out / "logs").mkdir()
+    stage = stage_of(stage_file, plan.seed)
+    say(f"[1/3] identifying stage {stage.name!r} from 10 s of the chapter's signal")
+    control = identify(stage, out / "model.npz", plan.seed)
+    where = "in one process, as fast as it goes" if fast else "in real time, in processes over zenoh"
+    say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, {where}")
+    if plan.left_out:
+        say(f"      no time for: {', '.join(plan.left_out)}")
+    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
+    ledger.planned = len(plan.faults)
+    # With a stage of one's own the limit is known when the first fault begins; the end judges it.
+    interim = Interim(ledger, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
+    missing: int | None = None
+    if fast:
+        from lab.soak.fast import run_fast
+
+        samples = run_fast(out, stage, control, plan, ledger, interim, stopped, say)
+    else:
+        monitor = run_live(out, stage, control, plan, ledger, interim, stopped, say)
+        missing, samples = _kept(out, ledger, monitor.track.seen, monitor.track.received)
+        samples |= {"withheld_by_faults": withheld(monitor.stage)}
+        samples |= {"without_their_voltage_in_time": sum(s.held for s in ledger.seconds)}
+    say("[3/3] judging and drawing")
+    settle(ledger)
+    invariants = judge(ledger, missing, **_tracking_limit(ledger, stage_file))
+    found = summary(ledger, invariants, samples)
+    ledger.notes += _machine(ledger)
+    interrupted = ledger.duration_s < plan.duration_s - 1.0
+    write_found(out / "soak.json", found)
+    write_seconds(out / SECONDS, ledger)
+    pictures = _draw(out, ledger)
+    text = report(found, ledger, plan, pictures, interrupted)
+    (out / "report.md").write_text(text, encoding="utf-8")
+    happened = [
+        {"kind": f.kind, "begin_s": f.begin_s, "end_s": f.end_s, "recovered_s": f.recovered_s, "silent_s": f.silent_s,
+         "told": f.told, "value": f.value}
+        for f in ledger.faults
+    ]  # fmt: skip
+    kept = {"seed": plan.seed, "duration_s": plan.duration_s, "left_out": plan.left_out, "faults": happened}
+    (out / "plan.json").write_text(json.dumps({**kept, "events": ledger.events}, indent=1) + "\n", encoding="utf-8")
+    return Done(found, interrupted)
+
+
+def _tracking_limit(ledger: Ledger, stage_file: Path | None) -> dict[str, float]:
+    if stage_file is None:
+        return {}
+    first = ledger.faults[0].begin_s if ledger.faults else ledger.duration_s
+    calm = [s for s in ledger.seconds if s.judged and 2.0 <= s.t_s < first]
+    if not calm:
+        return {}
+    # A second in which the stage had to hold a voltage tells of the machine.
+    calm = [s for s in calm if not s.held] or calm
+    mae_um = sum(s.error_sum_um for s in calm) / sum(s.judged for s in calm)
+    return {"tracking_pct": OWN_STAGE_RATIO * 100.0 * mae_um / ledger.range_um}
+
+
+def _machine(ledger: Ledger) -> list[str]:
+    """How busy the machine was with other things, in words."""
+    if not ledger.bare or not ledger.others:
+        return []
+    late_ms = [1e3 * late_s for _, late_s in ledger.bare]
+    share = [100.0 * share for _, share in ledger.others]
+    (usual, often), (late, later) = (_median_and_tenth(values) for values in (share, late_ms))
+    return [
+        f"the machine: others than the soak had {usual:.0f} % of the cores in the median second, {often:.0f} % in one "
+        f"of ten; a bare loop was late by up to {late:.1f} ms and {later:.1f} ms"
+    ]
+
+
+def _median_and_tenth(values: list[float]) -> tuple[float, float]:
+    ordered = sorted(values)
+    return ordered[len(ordered) // 2], ordered[len(ordered) * 9 // 10]
+
+
+def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[int, dict[str, int]]:
+    """How many samples that came are in no recording though they could be, and the counts of samples."""
+    # One that stands by records too, in a folder of its own.
+    folders = [out / name / folder for name in ("a", "b") for folder in ("recording", "recording-standby")]
+    found, rows = recorded(folders)
+    nowhere = Intervals()
+    for start, stop in seen.minus(found):
+        nowhere.add(start, stop)
+    missing = sum(stop - start for start, stop in nowhere.minus(_excused(ledger)))
+    return missing, {
+        "seen": len(seen),
+        "received_by_monitor": received,
+        "recorded": len(found),
+        "rows_recorded": rows,
+        "in_no_recording": len(nowhere),
+        "in_no_recording_and_no_fault_on": missing,
+    }
+
+
+def _excused(ledger: Ledger) -> Intervals:
+    """Samples of which the services could not keep what the monitor saw.
+
+    While no file may grow nothing can be kept, and behind a router that is gone nothing arrives: the services count
+    both, and what the monitor saw then proves nothing.
+    """
+    excused = Intervals()
+    for fault in ledger.faults:
+        begin, end = fault.window_s
+        if fault.kind not in ("disk_full", "restart_router"):
+            continue
+        # From some time before: whose last second is that which the first of them follows.
+        around = ledger.seconds_between(begin - _BEFORE_S, end)
+        for last, second in itertools.pairwise(around):
+            if begin - WAITING_S - 1.0 <= second.t_s <= end and second.samples:
+                # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
+                follows = 0 < second.seq - last.seq < OTHER_LIFE
+                excused.add(last.seq + 1 if follows else second.seq - second.samples + 1, second.seq + 1)
+    return excused
+
+
+def _draw(out: Path, ledger: Ledger) -> list[str]:
+    from lab.soak.verdict.pictures import draw_error, draw_latency, draw_memory
+
+    drawn = []
+    for name, draw, there in (
+        ("error.png", draw_error, bool(ledger.seconds)),
+        ("latency.png", draw_latency, bool(ledger.probes)),
+        ("memory.png", draw_memory, bool(ledger.memory)),
+    ):
+        if there:
+            draw(out / name, ledger)
+            drawn.append(name)
+    return drawn

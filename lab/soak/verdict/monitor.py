@@ -1,0 +1,141 @@
+"""Watches a soak from outside: the samples of the stage, what was wanted and sent, what the services say of it."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from adaptive.errors import InputError
+from lab.soak.processes.control import AXIS, STAGE, Control
+from lab.soak.verdict.track import Second, Track
+from service.protocol import samples as wire
+from service.protocol.keys import Keys
+from service.runtime.delivery import SURELY
+from service.runtime.session import open_client
+from service.stage_node.node import status_key
+
+#: So many events are kept: those of months, or of some days in which everybody complains.
+_MAX_EVENTS = 500_000
+
+
+class Monitor:
+    """Subscribes through the router, and asks all instances for their status; times are s from ``start_s``."""
+
+    def __init__(self, endpoint: str, control: Control, start_s: float) -> None:
+        self.start_s = start_s
+        self.track = Track(control, self.now)
+        self.events: list[dict[str, Any]] = []
+        #: By instance the newest status, and when it came.
+        self.statuses: dict[str, tuple[float, dict[str, Any]]] = {}
+        self.stage: dict[str, Any] = {}
+        self.malformed = 0
+        self._lock = threading.Lock()
+        self._session = open_client(endpoint, 10.0)
+        keys = Keys(STAGE, AXIS)
+        self._subscribers = [
+            self._session.declare_subscriber(key, self._guarded(take))
+            for key, take in (
+                (keys.sample, self._sample),
+                (keys.reference, self._reference),
+                (keys.command, self._command),
+                (keys.event, self._event),
+                (keys.status, self._status),
+                (f"{keys.base}/standby/*", self._status),
+                (status_key(STAGE, AXIS), self._stage),
+            )
+        ]
+        tokens = self._session.liveliness().declare_subscriber(f"{keys.base}/**", self._alive)
+        self._subscribers.append(tokens)
+
+    def _alive(self, sample: zenoh.Sample) -> None:
+        """A process of this axis has come, or gone: the wire's own word for it."""
+        event = "came" if sample.kind == zenoh.SampleKind.PUT else "gone"
+        with self._lock:
+            if len(self.events) < _MAX_EVENTS:
+                self.events.append({"t_s": round(self.now(), 3), "event": event, "detail": str(sample.key_expr)})
+
+    def begin(self) -> None:
+        """Let time begin now, and forget what was seen before."""
+        with self._lock:
+            self.start_s = time.monotonic()
+            self.track.seconds.clear()
+            self.events.clear()
+            self.statuses.clear()
+
+    def now(self) -> float:
+        """Seconds since the watch began."""
+        return time.monotonic() - self.start_s
+
+    def _guarded(self, take: Callable[[bytes], None]) -> Callable[[zenoh.Sample], None]:
+        def callback(sample: zenoh.Sample) -> None:
+            try:
+                with self._lock:
+                    take(sample.payload.to_bytes())
+            except (InputError, ValueError, KeyError):
+                self.malformed += 1
+
+        return callback
+
+    def _sample(self, payload: bytes) -> None:
+        self.track.take(wire.decode_samples(payload))
+
+    def _reference(self, payload: bytes) -> None:
+        block = wire.decode_reference(payload)
+        self.track.want(block.seq, block.values)
+
+    def _command(self, payload: bytes) -> None:
+        try:
+            block = wire.decode_command(payload)
+        except InputError:
+            # What is no number, or not even a block, is refused by whoever reads it: the breach is that it was sent.
+            self.track.refuse_command()
+            raise
+        self.track.command(block.seq, block.values)
+
+    def _event(self, payload: bytes) -> None:
+        if len(self.events) < _MAX_EVENTS:
+            self.events.append({"t_s": round(self.now(), 3), **json.loads(payload)})
+
+    def _status(self, payload: bytes) -> None:
+        told = json.loads(payload)
+        self.statuses[str(told["instance"])] = (self.now(), told)
+
+    def _stage(self, payload: bytes) -> None:
+        self.stage = json.loads(payload)
+
+    def ask(self) -> list[dict[str, Any]]:
+        """The status of every instance that answers now; the first is the one that serves queries."""
+        found = []
+        for reply in self._session.get(Keys(STAGE, AXIS).status, timeout=0.5):
+            if reply.ok is not None:
+                told = json.loads(reply.ok.payload.to_bytes())
+                with self._lock:
+                    self.statuses[str(told["instance"])] = (self.now(), told)
+                found.append(told)
+        return found
+
+    def put(self, key: str, value: dict[str, Any]) -> None:
+        """Publish JSON, to the stage or the controller."""
+        self._session.put(key, json.dumps(value), congestion_control=SURELY)
+
+    def samples(self) -> dict[str, int]:
+        """How many samples have been seen so far, and how many came."""
+        with self._lock:
+            return {"seen": len(self.track.seen), "received_by_monitor": self.track.received}
+
+    def latest(self) -> tuple[Second | None, int]:
+        """The second before the present one, and the newest number."""
+        with self._lock:
+            seconds = self.track.seconds
+            return (seconds[-2] if len(seconds) > 1 else None), self.track.newest
+
+    def close(self) -> None:
+        """Stop watching."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._session.close()  # type: ignore[no-untyped-call]

@@ -1,0 +1,174 @@
+"""The answer to a query: which snapshot, which model, from which memory; then by the rules of
+``service.answers.fallback``."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+from operator import attrgetter
+
+import numpy as np
+
+from adaptive.finite import all_finite
+from adaptive.types import FloatArray, InverseModel
+from service.answers.fallback import Rules, StandIn, answer_safely
+from service.answers.guard import Limits, check_domain, check_voltages
+from service.config.config import AxisConfig
+from service.protocol.errors import FieldError
+from service.protocol.keys import AUTO
+from service.protocol.query import NEWEST, FeedforwardQuery, Pending
+from service.protocol.reply import FeedforwardReply
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """What queries read: immutable, and replaced whole.
+
+    Attributes
+    ----------
+    seq : the last sample handled before this snapshot, -1 before any. t_s : its time, s; u_V : its voltage, V.
+    models : by name. memories : by name, (m,) each, tracked from the samples up to ``seq``.
+    default : name of the model that answers where a query names none.
+    stand_in : name of the baseline that stands in for it; empty for none.
+    trust : weight of the learning model inside its domain, 0 to 1.
+    trouble : name of what is wrong with the samples or the learner, empty while nothing is.
+    """
+
+    seq: int
+    t_s: float
+    u_V: float
+    models: dict[str, InverseModel]
+    memories: dict[str, FloatArray]
+    default: str = ""
+    stand_in: str = ""
+    trust: float = 1.0
+    trouble: str = ""
+
+    def standing_in_for(self, name: str) -> StandIn | None:
+        """The model that stands in for the one called ``name``; None where there is no other."""
+        if self.stand_in in ("", name) or self.stand_in not in self.models:
+            return None
+        return StandIn(self.stand_in, self.models[self.stand_in], self.memories[self.stand_in])
+
+
+def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[float, bool]:
+    """(weight, stale) of a model whose newest sample is ``age_s`` old, s, where samples are expected.
+
+    Stale from ``stale_s`` on (0: never); from ``last_good_s`` on the stand-in takes over within a second.
+    """
+    if stale_s == 0.0 or age_s <= stale_s:
+        return 1.0, False
+    return 1.0 - min(1.0, max(0.0, age_s - last_good_s)), True
+
+
+def answer(
+    query: FeedforwardQuery, ring: tuple[Served, ...], handled: int, config: AxisConfig, limits: Limits, age_s: float
+) -> FeedforwardReply:
+    """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
+
+    ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
+    ``age_s``: time since the newest sample that was handled came, s, 0 where none is expected. An ``as_of`` names its
+    snapshot: age does not change what it answers, or a replay could not repeat it.
+    """
+    served, behind, trust, stale = ring[-1], False, 1.0, False
+    if query.as_of == NEWEST:
+        trust, stale = trust_by_age(age_s, config.stale_s, config.last_good_s)
+    else:
+        served, behind = _as_of(ring, query.as_of, handled, config.snapshot_every)
+    default = served.default or config.served
+    name = query.model or default
+    model = served.models.get(name)
+    if model is None:
+        raise FieldError("model", repr(name), f"one of {', '.join(served.models)}, or empty for the default")
+    check_domain(query.y_um, limits)
+    if query.pending is not None:
+        check_domain(query.pending.y_um, limits, "pending.y_um")
+        check_voltages(query.pending.u_V, limits, "pending.u_V")
+    memory, y_um, v_um_per_s, a_um_per_s2 = query.memory, query.y_um, query.v_um_per_s, query.a_um_per_s2
+    resumes_V = math.nan
+    if memory is None:
+        way, resumed = under_way(query, served.seq, model.dt_s)
+        memory = carried(model, served.memories[name], way)
+        if resumed is not None:
+            y_um, v_um_per_s, a_um_per_s2, resumes_V = resumed
+    if memory.size != model.memory_size:
+        raise FieldError(
+            "memory",
+            f"{memory.size} values",
+            f"{model.memory_size} for model {name!r}",
+            "bring back the memory of this model's last reply, or none",
+        )
+    got = answer_safely(
+        model,
+        memory,
+        (y_um, v_um_per_s, a_um_per_s2),
+        query.u_before_V,
+        # What does not learn is as good as ever, whatever the samples are.
+        Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
+        served.standing_in_for(name),
+        blends(name, default, config),
+        resumes_V,
+    )
+    return FeedforwardReply(
+        got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
+        got.stand_in,
+    )  # fmt: skip
+
+
+def under_way(
+    query: FeedforwardQuery, seq: int, dt_s: float
+) -> tuple[Pending | None, tuple[FloatArray, FloatArray, FloatArray, float] | None]:
+    """(what is under way after sample ``seq``, how the answer resumes from its last point).
+
+    The last point under way is asked for again, ahead of the points of the query: (n + 1,) displacements, µm,
+    velocities, µm/s, and accelerations, µm/s², and the voltage, V, that was commanded there. What the model asks for
+    there now is another voltage: the difference fades (``service.answers.fallback``), so that a new snapshot is no
+    step. Its
+    velocity is the first point's less a step of its acceleration. None where nothing is under way.
+    """
+    pending = query.pending
+    # What was commanded for samples before the last one seen is long done.
+    if pending is None or pending.first + pending.y_um.size <= seq:
+        return None, None
+    seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size - 1)
+    way = Pending(pending.first + seen, pending.y_um[seen:-1], pending.u_V[seen:-1])
+    y_um = np.concatenate([pending.y_um[-1:], query.y_um])
+    v, a = query.v_um_per_s, query.a_um_per_s2
+    v_um_per_s, a_um_per_s2 = np.concatenate([v[:1] - a[:1] * dt_s, v]), np.concatenate([a[:1], a])
+    return way, (y_um, v_um_per_s, a_um_per_s2, float(pending.u_V[-1]))
+
+
+def carried(model: InverseModel, memory: FloatArray, way: Pending | None) -> FloatArray:
+    """(m,) memory of ``model`` once what is under way has been done; ``memory`` is not changed."""
+    if way is None or not way.y_um.size:
+        return memory
+    still = np.zeros(way.y_um.size)
+    after = model.track(way.y_um, still, still, way.u_V, memory)
+    return after if all_finite(after) else memory
+
+
+def learns(name: str, config: AxisConfig) -> bool:
+    """Whether the samples change the model called ``name``."""
+    return bool(config.learn) and name in (config.learn, AUTO)
+
+
+def blends(name: str, default: str, config: AxisConfig) -> bool:
+    """Whether a model gives way to the stand-in outside its domain: the default and the one that learns do.
+
+    The others are asked by name to be compared, and answer as themselves.
+    """
+    return name == default or learns(name, config)
+
+
+def _as_of(ring: tuple[Served, ...], as_of: int, handled: int, every: int) -> tuple[Served, bool]:
+    at = bisect_right(ring, as_of, key=attrgetter("seq")) - 1
+    if at < 0:
+        raise FieldError(
+            "as_of",
+            as_of,
+            f"{ring[0].seq} or later",
+            "older snapshots are gone: ask sooner, or keep more of them (snapshots_kept)",
+        )
+    following = (ring[at].seq // every + 1) * every
+    return ring[at], following <= as_of and handled < following

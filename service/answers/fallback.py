@@ -1,0 +1,195 @@
+"""One answer, safe to apply: the model's own, blended with a stand-in where the model is not to be trusted.
+
+Everything here is a pure function of a snapshot and a query. The service answers by it, and so does a follower in
+its own process, so that both give the same voltages to the last bit.
+
+Inside the learnt domain the model answers alone. Outside, its weight falls smoothly with the distance from the domain:
+with s the distance as a share of the learnt span, over ``blend_share``, the weight is 1 - s²(3 - 2s), and 0 from s = 1
+on. The stand-in is a baseline whose form bounds what it says far from its data.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.finite import all_finite
+from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
+from adaptive.types import Feedforward, FloatArray, InverseModel
+from baselines.competition.champion import ChampionInverse
+from service.answers.guard import Limits, guard, guarded
+from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
+
+#: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
+FADE_S, FADE_SAMPLES = 0.006, 6.0
+
+
+class StandIn(NamedTuple):
+    """The model that stands in, and (m,) the memory from which it begins: tracked from the samples to the snapshot."""
+
+    name: str
+    model: InverseModel
+    memory: FloatArray
+
+
+class Rules(NamedTuple):
+    """How far a model is trusted.
+
+    Attributes
+    ----------
+    limits : of what leaves. blend_share : distance from the learnt domain, as a share of the learnt span, at which the
+    stand-in answers alone. trust : weight of the model inside its domain, 0 to 1. stale : flag every point STALE.
+    """
+
+    limits: Limits
+    blend_share: float = 0.5
+    trust: float = 1.0
+    stale: bool = False
+
+
+class Answer(NamedTuple):
+    """What may leave: (n,) voltages, V, their deviations, V, and flags; (m,) memory; whether anything went wrong."""
+
+    u_V: FloatArray
+    std_V: FloatArray
+    flags: NDArray[np.uint8]
+    memory: FloatArray
+    fallback: bool
+    stand_in: str
+
+
+def answer_safely(
+    model: InverseModel,
+    memory: FloatArray,
+    points: tuple[FloatArray, FloatArray, FloatArray],
+    u_before_V: float,
+    rules: Rules,
+    stand_in: StandIn | None,
+    blends: bool = True,
+    resumes_V: float = math.nan,
+) -> Answer:
+    """Voltages for (n,) points (y µm, v µm/s, a µm/s²) from ``memory`` (m,) on; never raises.
+
+    ``blends``: whether ``model`` is one that gives way to ``stand_in`` outside its domain and by its trust; where not,
+    the stand-in serves for what is not finite alone.
+    ``resumes_V``: where finite, the first of the points was commanded already, with this voltage, V, and is not
+    answered again: (n - 1,) come out. What the model asks for more or less there fades with ``FADE_S``, so that no new
+    snapshot steps the voltage: a step would make the stage ring.
+    """
+    if math.isfinite(resumes_V):
+        return _resumed(model, memory, points, u_before_V, rules, stand_in, blends, resumes_V)
+    forward = _forward(model, points, memory)
+    u, std = forward.u_V, forward.std_V
+    after_ok = all_finite(forward.memory)
+    trusted = not blends or rules.trust >= 1.0
+    if trusted and after_ok and not rules.stale:
+        # Almost every answer: nothing speaks against what the model says.
+        safe, flags, found = guarded(u, forward.inside, model.dt_s, rules.limits, u_before_V)
+        if not found & (NOT_FINITE_REPLACED | (OUTSIDE_DOMAIN if blends else 0)):
+            return Answer(safe, std, flags, forward.memory, False, "")
+    finite = np.isfinite(u)
+    ok = bool(finite.all())
+    marks: NDArray[np.uint8] | None = None
+    name = ""
+    if not ok or not trusted or (blends and not forward.inside.all()):
+        weight = np.ones(u.size)
+        if blends:
+            weight = rules.trust * domain_weight(model, forward, points, rules.blend_share)
+        if stand_in is not None:
+            u, std, marks = _mix(forward, weight, finite, _forward(stand_in.model, points, stand_in.memory))
+            name = stand_in.name if marks.any() else ""
+        if not ok:
+            marks = np.zeros(u.size, dtype=np.uint8) if marks is None else marks
+            marks[~finite] |= NOT_FINITE_REPLACED
+    safe, flags = guard(u, forward.inside, model.dt_s, rules.limits, u_before_V)
+    if marks is not None:
+        flags |= marks
+    if rules.stale:
+        flags |= STALE
+    fallback = not ok or not after_ok or not trusted
+    return Answer(safe, std, flags, forward.memory if after_ok else memory, fallback, name)
+
+
+def _resumed(
+    model: InverseModel,
+    memory: FloatArray,
+    points: tuple[FloatArray, FloatArray, FloatArray],
+    u_before_V: float,
+    rules: Rules,
+    stand_in: StandIn | None,
+    blends: bool,
+    resumes_V: float,
+) -> Answer:
+    free = rules._replace(limits=replace(rules.limits, slew_V_per_s=math.inf))
+    got = answer_safely(model, memory, points, math.nan, free, stand_in, blends)
+    n = got.u_V.size - 1
+    fade = np.exp(-np.arange(1, n + 1) / max(FADE_S / model.dt_s, FADE_SAMPLES))
+    limits, marks = rules.limits, got.flags[1:]
+    u_V = got.u_V[1:] + (resumes_V - got.u_V[0]) * fade
+    safe, flags = guard(u_V, (marks & OUTSIDE_DOMAIN) == 0, model.dt_s, limits, u_before_V)
+    return got._replace(u_V=safe, std_V=got.std_V[1:], flags=flags | marks)
+
+
+def domain_weight(
+    model: InverseModel, forward: Feedforward, points: tuple[FloatArray, FloatArray, FloatArray], blend_share: float
+) -> FloatArray:
+    """(n,) weight of the model by distance from its domain: 1 inside, 0 from ``blend_share`` spans outside on."""
+    weight = forward.inside.astype(np.float64)
+    bounds = domain_of(model)
+    if forward.inside.all() or bounds is None:
+        # A baseline is bounded by its own form; that it is outside is told, and that is all there is to do about it.
+        return np.ones(weight.size)
+    distance = np.zeros(weight.size)
+    for low_high, x in zip(bounds, points, strict=True):
+        low, high = low_high
+        span = high - low
+        if math.isfinite(span) and span > 0.0:
+            np.maximum(distance, np.maximum(low - x, x - high) / span, out=distance)
+    s = np.clip(distance / blend_share, 0.0, 1.0)
+    return np.where(forward.inside, 1.0, 1.0 - s * s * (3.0 - 2.0 * s))
+
+
+def domain_of(model: InverseModel) -> list[tuple[float, float]] | None:
+    """Bounds of y (µm), v (µm/s) and a (µm/s²) inside which ``model`` says "inside"; None where it has no bounds."""
+    if isinstance(model, ChampionInverse):
+        model = model.served
+    if not isinstance(model, LssvmInverse):
+        return None
+    lows, highs = model.domain[::2].tolist(), model.domain[1::2].tolist()
+    return [
+        (low - DOMAIN_MARGIN * (high - low), high + DOMAIN_MARGIN * (high - low))
+        for low, high in zip(lows, highs, strict=True)
+    ]
+
+
+def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArray], memory: FloatArray) -> Feedforward:
+    """What the model says; NaN where it raises, which no model may."""
+    try:
+        return model.feedforward(*points, memory)
+    except Exception:
+        nothing = np.full(points[0].size, math.nan)
+        return Feedforward(nothing, nothing, np.zeros(points[0].size, dtype=np.bool_), memory)
+
+
+@np.errstate(all="ignore")  # a memory out of this world gives voltages out of it, which are guarded later
+def _mix(
+    forward: Feedforward, weight: FloatArray, finite: NDArray[np.bool_], other: Feedforward
+) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
+    """(voltages, deviations, flags) of the mixture; a stand-in that is not finite gets no weight."""
+    usable = np.isfinite(other.u_V)
+    w = np.where(finite, weight, 0.0)
+    w = np.where(usable, w, 1.0)
+    own = np.where(finite, forward.u_V, 0.0)
+    there = np.where(usable, other.u_V, 0.0)
+    u = np.where(w == 1.0, forward.u_V, there + w * (own - there))
+    # Of a mixture of two: each one's own variance, and that of their disagreement. Who states none adds none.
+    own_V2 = np.where(finite, np.nan_to_num(forward.std_V) ** 2, 0.0)
+    there_V2 = np.nan_to_num(other.std_V) ** 2
+    mixed = np.sqrt(w * own_V2 + (1.0 - w) * there_V2 + w * (1.0 - w) * (own - there) ** 2)
+    std = np.where(w == 1.0, forward.std_V, np.where(w == 0.0, other.std_V, mixed))
+    marks = np.where(w == 1.0, 0, np.where(w == 0.0, STAND_IN, BLENDED)).astype(np.uint8)
+    return u, std, marks

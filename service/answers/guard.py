@@ -1,0 +1,158 @@
+"""What may leave: finite voltages within the limits, and no faster than the slew limit along a trajectory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.compiled import compiled
+from adaptive.types import BoolArray, FloatArray
+from service.protocol.errors import FieldError
+from service.protocol.reply import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of one axis: voltage in V, slew in V/s, displacement in µm (infinite where there is none)."""
+
+    u_min_V: float
+    u_max_V: float
+    slew_V_per_s: float
+    y_min_um: float = -math.inf
+    y_max_um: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.u_min_V) and math.isfinite(self.u_max_V) and self.u_min_V < self.u_max_V):
+            raise FieldError("u_max_V", f"{self.u_max_V} (u_min_V {self.u_min_V})", "finite limits, u_min_V < u_max_V")
+        if not self.slew_V_per_s > 0:
+            raise FieldError("slew_V_per_s", self.slew_V_per_s, "a positive slew limit in V/s")
+        if not self.y_min_um < self.y_max_um:
+            raise FieldError("y_max_um", f"{self.y_max_um} (y_min_um {self.y_min_um})", "y_min_um < y_max_um, in µm")
+
+    def to_json(self) -> dict[str, Any]:
+        """For the status: infinite limits, which JSON cannot say, become null."""
+        return {
+            name: value if math.isfinite(value) else None
+            for name, value in (
+                ("u_min_V", self.u_min_V),
+                ("u_max_V", self.u_max_V),
+                ("slew_V_per_s", self.slew_V_per_s),
+                ("y_min_um", self.y_min_um),
+                ("y_max_um", self.y_max_um),
+            )
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Limits:
+        """The limits in a status. Raises InputError where they are not acceptable."""
+        try:
+            return cls(
+                float(data["u_min_V"]),
+                float(data["u_max_V"]),
+                math.inf if data["slew_V_per_s"] is None else float(data["slew_V_per_s"]),
+                -math.inf if data["y_min_um"] is None else float(data["y_min_um"]),
+                math.inf if data["y_max_um"] is None else float(data["y_max_um"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise FieldError("limits", repr(data)[:200], "the five limits of an axis") from error
+
+
+def check_domain(y_um: FloatArray, limits: Limits, field: str = "y_um") -> None:
+    """InputError naming the first desired point, (n,) µm, that is not within the displacement limits."""
+    if y_um.size == 1 and limits.y_min_um <= y_um.item(0) <= limits.y_max_um:
+        return
+    # The two ends decide for all; the search for which one it was is only made for the message.
+    if y_um.min() >= limits.y_min_um and y_um.max() <= limits.y_max_um:
+        return
+    bad = int(np.flatnonzero(~((y_um >= limits.y_min_um) & (y_um <= limits.y_max_um)))[0])
+    raise FieldError(
+        f"{field}[{bad}]",
+        f"{y_um[bad]:g} µm",
+        f"{limits.y_min_um:g} to {limits.y_max_um:g} µm",
+        "keep the trajectory within the range of the stage",
+    )
+
+
+def check_voltages(u_V: FloatArray, limits: Limits, field: str) -> None:
+    """InputError naming the first voltage, (n,) V, that the axis could not have answered."""
+    bad = np.flatnonzero(~((u_V >= limits.u_min_V) & (u_V <= limits.u_max_V)))
+    if bad.size:
+        raise FieldError(
+            f"{field}[{bad[0]}]",
+            f"{u_V[bad[0]]:g} V",
+            f"{limits.u_min_V:g} to {limits.u_max_V:g} V",
+            "send the voltages as they were answered",
+        )
+
+
+@compiled
+def limit(
+    u_V: FloatArray,
+    inside: BoolArray,
+    u_before_V: float,
+    u_min_V: float,
+    u_max_V: float,
+    step_V: float,
+    flags: NDArray[np.uint8],
+) -> int:
+    """Make ``u_V`` (n,) safe in place and say in ``flags`` (n,) what was done; returns all of their bits in one.
+
+    In order: what is not finite becomes the voltage before it (mid-range where there is none), then the voltage limits,
+    then at most ``step_V`` from one point to the next, beginning from ``u_before_V`` where that is finite.
+    """
+    found = 0
+    previous = u_before_V
+    if math.isfinite(previous):
+        previous = min(max(previous, u_min_V), u_max_V)
+    for i in range(u_V.size):
+        bits = flags[i]
+        u = u_V[i]
+        if not inside[i]:
+            bits |= OUTSIDE_DOMAIN
+        if not math.isfinite(u):
+            u = previous if math.isfinite(previous) else 0.5 * (u_min_V + u_max_V)
+            bits |= NOT_FINITE_REPLACED
+        if u < u_min_V:
+            u = u_min_V
+            bits |= LIMITED_VOLTAGE
+        elif u > u_max_V:
+            u = u_max_V
+            bits |= LIMITED_VOLTAGE
+        if math.isfinite(previous):
+            if u > previous + step_V:
+                u = previous + step_V
+                bits |= LIMITED_SLEW
+            elif u < previous - step_V:
+                u = previous - step_V
+                bits |= LIMITED_SLEW
+        u_V[i] = u
+        flags[i] = bits
+        found |= bits
+        previous = u
+    return found
+
+
+def guard(
+    u_V: FloatArray, inside: BoolArray, dt_s: float, limits: Limits, u_before_V: float = math.nan
+) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """(voltages, flags), both (n,), of what a model answered for points ``dt_s`` apart; the inputs are not changed."""
+    return guarded(u_V, inside, dt_s, limits, u_before_V)[:2]
+
+
+def guarded(
+    u_V: FloatArray, inside: BoolArray, dt_s: float, limits: Limits, u_before_V: float
+) -> tuple[FloatArray, NDArray[np.uint8], int]:
+    """As :func:`guard`, and all bits of the flags in one: 0 where nothing was done and nothing is outside."""
+    safe = np.array(u_V, dtype=np.float64)
+    flags = np.zeros(safe.size, dtype=np.uint8)
+    found = limit(safe, inside, u_before_V, limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * dt_s, flags)
+    return safe, flags, int(found)
+
+
+def warm() -> None:
+    """Compile the loop of this module once."""
+    guard(np.zeros(1), np.ones(1, dtype=np.bool_), 1e-3, Limits(0.0, 1.0, 1.0))

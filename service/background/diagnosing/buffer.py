@@ -1,0 +1,77 @@
+"""The last samples of one axis in a ring of fixed size; one thread writes, any thread copies."""
+
+from __future__ import annotations
+
+import threading
+from typing import Final
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from service.protocol.samples import SampleBatch
+
+#: Samples are kept up to this many, whatever the sample rate.
+MOST_SAMPLES: Final = 200_000
+#: That many old samples in a row are not late: the stage counts anew, and what was kept belongs to another time.
+_RESTART_AFTER: Final = 200
+
+
+class SampleBuffer:
+    """The newest samples as columns (seq, t_s, u_V, y_um), oldest overwritten."""
+
+    def __init__(self, samples: int) -> None:
+        self._rows = np.full((4, max(1, min(samples, MOST_SAMPLES))), np.nan)
+        self._end = 0
+        self._kept = 0
+        self._last = -1
+        self._old = 0
+        self._lock = threading.Lock()
+
+    @property
+    def last_seq(self) -> int:
+        """Newest number, -1 before any."""
+        return self._last
+
+    @property
+    def size(self) -> int:
+        """Samples kept."""
+        return self._kept
+
+    def add(self, batch: SampleBatch) -> bool:
+        """Append what is newer than all before. Returns False where the stage began to count anew."""
+        new = batch.seq > self._last
+        going_on = True
+        if not new.all():
+            # Doubles and stragglers teach nothing; a long run of them is a restarted stage.
+            self._old = self._old + int(batch.seq.size - new.sum()) if not new.any() else 0
+            if self._old >= _RESTART_AFTER:
+                self.clear()
+                new = np.ones_like(new)
+                going_on = False
+            elif not new.any():
+                return True
+        else:
+            self._old = 0
+        block = np.stack([batch.seq, batch.t_s, batch.u_V, batch.y_um])[:, new]
+        n, room = block.shape[1], self._rows.shape[1]
+        block = block[:, -room:]
+        where = (self._end + np.arange(block.shape[1])) % room
+        with self._lock:
+            self._rows[:, where] = block
+            self._end = int((self._end + block.shape[1]) % room)
+            self._kept = min(room, self._kept + n)
+            self._last = int(batch.seq[new][-1])
+        return going_on
+
+    def clear(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._end = self._kept = self._old = 0
+            self._last = -1
+
+    def copy(self, samples: int | None = None) -> FloatArray:
+        """The newest ``samples`` (all by default) as (4, n): seq, t_s, u_V, y_um; oldest first."""
+        with self._lock:
+            n = self._kept if samples is None else min(samples, self._kept)
+            where = (self._end - n + np.arange(n)) % self._rows.shape[1]
+            return np.asarray(self._rows[:, where])

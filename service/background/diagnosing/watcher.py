@@ -1,0 +1,227 @@
+"""Watches one axis: keeps its last samples, notices when the model's error grows, and has a process say why.
+
+The samples come from the thread that learns, which is never made to wait: a copy into a ring, and four times a
+second a look at the learner's own figures. Everything else is done by a process of the lowest priority, one at a time.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from service.background.diagnosing.alarm import Alarm, Levels
+from service.background.diagnosing.buffer import SampleBuffer
+from service.background.diagnosing.job import Job
+from service.background.diagnosing.settings import WatchConfig
+from service.protocol.errors import FieldError
+from service.protocol.samples import SampleBatch
+from service.server.axis import Axis
+
+#: How often the learner is asked for its figures, s of samples.
+_LOOK_S: Final = 0.25
+#: Verdicts told in the status, of which only the last one whole.
+_KEPT: Final = 10
+_TOLD: Final = ("job", "seq", "why", "text")
+#: A reference must move through this share of the axis' range.
+_LEAST_MOTION: Final = 0.05
+_ARGUMENTS: Final = ("recent_s", "report")
+
+
+class Watcher:
+    """The diagnosis in the background of one axis.
+
+    ``take`` is called from the thread that learns, ``tick`` from the one that publishes, ``request`` and ``status``
+    from any. Close it before the interpreter ends.
+    """
+
+    def __init__(self, axis: Axis, config: WatchConfig, name: str = "") -> None:
+        self.config = config
+        self._axis = axis
+        self._name = name or axis.config.name
+        self._dt_s = axis.dt_s
+        self._buffer = SampleBuffer(self._samples(config.history_s))
+        self._alarm = Alarm(config, _span_V(axis))
+        self._reference: FloatArray | None = None
+        #: A new reference is due once enough has been seen since the last verdict.
+        self._renew = True
+        self._since_reference = 0
+        self._next_look_s = 0.0
+        self._alarm_seq: int | None = None
+        self._alarm_why = ""
+        #: An alarm is looked into once this sample is there.
+        self._due_seq = 0
+        self._not_before_s = 0.0
+        self._job: Job | None = None
+        self._lock = threading.Lock()
+        self._counts = {"alarms": 0, "requests": 0, "started": 0, "finished": 0, "failed": 0, "waited": 0, "skipped": 0}
+        self._last: dict[str, Any] | None = None
+        self._history: list[dict[str, Any]] = []
+        self._closed = False
+
+    def take(self, batch: SampleBatch) -> None:
+        """Keep the samples of a message and look for a reason to diagnose. Never blocks; call from one thread."""
+        if not len(batch):
+            return
+        if not self._buffer.add(batch):
+            self._alarm_seq, self._since_reference, self._not_before_s = None, 0, 0.0
+        self._since_reference += len(batch)
+        t_s = self._buffer.last_seq * self._dt_s
+        if not 0.0 <= self._next_look_s - t_s <= _LOOK_S:
+            self._next_look_s = t_s + _LOOK_S
+            self._look(t_s)
+
+    def tick(self, now_s: float) -> None:
+        """Start what is due. Call from the publishing thread, with a clock that never goes back."""
+        seq = self._alarm_seq
+        if seq is None or self._buffer.last_seq < self._due_seq:
+            return
+        if self._job is not None and self._job.running:
+            return
+        self._alarm_seq = None
+        self._start("alarm", self._alarm_why, seq, now_s, "")
+
+    def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Diagnose the recent samples now, in the background. Returns ``{"started": True, "job": N}``, or why not.
+
+        ``arguments``: ``recent_s`` (s, the configuration's by default), ``report`` (True: a full report too, into the
+        folder ``reports`` of the configuration). Raises InputError on anything else.
+        """
+        for key in arguments:
+            if key not in _ARGUMENTS:
+                raise FieldError(key, repr(arguments[key])[:80], f"some of {', '.join(_ARGUMENTS)}")
+        recent_s, report = arguments.get("recent_s", self.config.recent_s), arguments.get("report", False)
+        if isinstance(recent_s, bool) or not isinstance(recent_s, int | float) or not 1.5 <= recent_s <= 3600.0:
+            raise FieldError("recent_s", repr(recent_s), "1.5 to 3600 s")
+        if not isinstance(report, bool):
+            raise FieldError("report", repr(report), "true or false")
+        if report and not self.config.reports:
+            raise FieldError("report", "true", "false", "name a folder for reports in the configuration (reports)")
+        with self._lock:
+            self._counts["requests"] += 1
+        have_s = self._buffer.size * self._dt_s
+        if self._reference is None:
+            return {"started": False, "why": f"no reference yet: {have_s:.0f} of {self.config.reference_s:g} s seen"}
+        first = self._buffer.last_seq - self._samples(float(recent_s)) + 1
+        out = f"{self.config.reports}/{self._name}-{time.strftime('%Y%m%d-%H%M%S')}" if report else ""
+        return self._start("request", "", first, time.monotonic(), out)
+
+    def status(self) -> dict[str, Any]:
+        """For the status of the axis: counts, whether one runs, and the last verdicts, newest first."""
+        with self._lock:
+            return {
+                "enabled": True,
+                "running": self._job is not None and self._job.running,
+                "reference": self._reference is not None,
+                "armed": self._alarm.armed,
+                **self._counts,
+                "last": self._last,
+                "history": list(self._history),
+            }
+
+    def close(self) -> None:
+        """End what runs; no verdict comes afterwards."""
+        self._closed = True
+        if self._job is not None:
+            self._job.cancel()
+
+    def _samples(self, seconds: float) -> int:
+        return max(1, round(seconds / self._dt_s))
+
+    def _levels(self) -> Levels | None:
+        tell: Callable[[], dict[str, Any]] | None = getattr(self._axis.learner, "diagnostics", None)
+        return Levels.of(tell()) if tell is not None and self._axis.learning else None
+
+    def _look(self, t_s: float) -> None:
+        wanted = self._samples(self.config.reference_s)
+        if self._renew and self._since_reference >= wanted and self._buffer.size >= wanted:
+            reference = self._buffer.copy(wanted)
+            if self._moves(reference):
+                self._reference, self._renew = reference, False
+                self._alarm.arm(self._levels())
+            return
+        levels = self._levels() if self._alarm.armed and self._alarm_seq is None else None
+        if levels is None or t_s < self._not_before_s:
+            return
+        why = self._alarm.check(t_s, levels)
+        if why:
+            # From here on is after: what raised the alarm had been there for hold_s.
+            seq = self._buffer.last_seq
+            self._alarm_why, self._due_seq, self._alarm_seq = why, seq + self._samples(self.config.collect_s), seq
+            self._not_before_s = t_s + self.config.cooldown_s
+            with self._lock:
+                self._counts["alarms"] += 1
+            self._axis.note("diagnosis_alarm", f"{why}; looking for the cause in {self.config.collect_s:g} s")
+
+    def _moves(self, samples: FloatArray) -> bool:
+        """Whether there is enough motion to tell a gain by."""
+        low, high = np.nanquantile(samples[3], [0.02, 0.98]) if np.isfinite(samples[3]).any() else (0.0, 0.0)
+        limits = self._axis.limits
+        return bool(high - low > _LEAST_MOTION * (limits.y_max_um - limits.y_min_um))
+
+    def _start(self, cause: str, why: str, from_seq: int, now_s: float, report: str) -> dict[str, Any]:
+        reference = self._reference
+        with self._lock:
+            busy = self._job is not None and self._job.running
+            if busy or self._closed or reference is None:
+                self._counts["skipped"] += 1
+                return {"started": False, "why": "one is running" if busy else "the service is ending"}
+            self._counts["started"] += 1
+            number = self._counts["started"]
+            recent = self._buffer.copy()
+            order = {
+                "model": str(self._axis.config.model.resolve()),
+                "name": self._axis.config.learn or self._axis.config.served,
+                "from_seq": from_seq,
+                "report": report,
+            }
+            last = int(recent[0, -1]) if recent.shape[1] else -1
+            about = {"job": number, "seq": last, "from_seq": from_seq, "cause": cause, "why": why}
+
+            def done(result: dict[str, Any]) -> None:
+                self._finish(about, result, time.monotonic() - now_s)
+
+            self._job = Job(order, reference, recent, self.config.timeout_s, done)
+            self._job.start()
+        return {"started": True, "job": number}
+
+    def _finish(self, about: dict[str, Any], result: dict[str, Any], seconds: float) -> None:
+        failed = "error" in result
+        if result.pop("wait", False) and about["cause"] == "alarm" and self._wait(about):
+            self._axis.note("diagnosis_waits", f"{result['error']}; once more in {self.config.collect_s:g} s")
+            return
+        text = f"no verdict: {result['error']}" if failed else str(result.get("text", ""))
+        verdict = {**about, "seconds": round(seconds, 2), "text": text, **result}
+        with self._lock:
+            self._counts["failed" if failed else "finished"] += 1
+            self._last = verdict
+            self._history = [{key: verdict[key] for key in _TOLD}, *self._history][:_KEPT]
+        self._axis.note("diagnosis_failed" if failed else "diagnosis", text)
+        if about["cause"] == "alarm":
+            # What comes next is told from how the stage is now, as soon as enough of that has been seen.
+            self._alarm.arm(None)
+            self._since_reference, self._renew = 0, True
+
+    def _wait(self, about: dict[str, Any]) -> bool:
+        """Whether an alarm is looked into again, with more samples: as long as some from before it are still kept."""
+        more = self._samples(self.config.collect_s)
+        newest, first = self._buffer.last_seq, int(about["from_seq"])
+        # A stage that counts anew since, or another alarm: what was asked is over.
+        over = self._closed or newest < about["seq"] or self._alarm_seq is not None
+        if over or newest + 2 * more - first > self._samples(self.config.history_s):
+            return False
+        with self._lock:
+            self._counts["waited"] += 1
+        # What raised it is still there and would raise another one while this is looked into.
+        self._not_before_s = (newest + more) * self._dt_s + self.config.cooldown_s
+        self._due_seq, self._alarm_seq = newest + more, first
+        return True
+
+
+def _span_V(axis: Axis) -> float:
+    base = getattr(axis.learner, "base", None)
+    return float(getattr(base, "span_V", axis.limits.u_max_V - axis.limits.u_min_V))

@@ -1,0 +1,99 @@
+"""The process that diagnoses: ``python -m service.background.diagnosing.worker FOLDER``, of the lowest priority.
+
+See ``service.background.job`` for what it finds in the folder and leaves there.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import DehystError
+from adaptive.types import BoolArray, FloatArray
+from service.background.job import work
+
+
+def main(arguments: list[str]) -> int:
+    """Diagnose one job. Returns 0; what goes wrong is in the result."""
+    return work(Path(arguments[0]), _diagnosed)
+
+
+def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
+    from sim.changes.regression import TooFewSamples
+
+    try:
+        return diagnose(job, arrays["reference"], arrays["recent"])
+    except TooFewSamples as error:
+        # Of what is recent there will be more; of the reference there will not.
+        return {"error": str(error), "wait": error.stretch == "recent"}
+    except DehystError as error:
+        return {"error": str(error)}
+
+
+def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> dict[str, Any]:
+    """The verdict on (4, n) samples ``recent`` (seq, t_s, u_V, y_um) against ``reference``.
+
+    ``job``: ``model`` (bundle file), ``name`` (in it), ``from_seq`` (what is recent of the recent samples), ``report``
+    (folder for the engine's full report, or empty). Raises InputError and ModelFileError.
+    """
+    from service.storage.model_file import read_bundle
+    from sim.changes.compare import compare
+
+    bundle = read_bundle(job["model"])
+    model = bundle.models[job["name"]]
+    result = compare(
+        model, stretch_of(reference, model.dt_s, -1), stretch_of(recent, model.dt_s, int(job["from_seq"]))
+    ).as_dict()
+    if job.get("report"):
+        result["report"] = full_report(Path(job["report"]), recent, model.dt_s)
+    return result
+
+
+def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
+    """Samples (4, n) as a stretch for the comparison; what is before ``from_seq`` only settles the memory.
+
+    A stage that said nothing for long cuts them: then the part with most of what is from ``from_seq`` on.
+    """
+    from adaptive.smoothing import SmootherConfig, smooth_recording
+    from sim.changes.columns import Stretch
+
+    first = int(np.searchsorted(samples[0], from_seq))
+    whole, valid = _repaired(samples, dt_s, first)
+    numbers = np.rint(whole.t_s / dt_s) + samples[0, 0]
+    scored = valid & (numbers >= from_seq)
+    config = SmootherConfig.for_rate(dt_s)
+    # Past its ends the smoother makes up what it has not seen.
+    scored[: config.lag] = scored[-config.lag :] = False
+    motion = smooth_recording(whole.y_um, config)
+    return Stretch(dt_s, whole.t_s, np.ascontiguousarray(whole.u_V), motion, scored)
+
+
+def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, BoolArray]:
+    from sim.recordings import Recording, repaired
+
+    # As for what learns, the numbers say how much time has passed: the stage's clock may have been set meanwhile.
+    recording = Recording(
+        t_s=dt_s * (samples[0] - samples[0, :1]), u_V=samples[2], y_um=samples[3], dt_s=dt_s, source="recent samples",
+        seq=samples[0].astype(np.int64),
+    )  # fmt: skip
+    fixed = repaired(recording, since)
+    return fixed.recording, fixed.valid
+
+
+def full_report(out: Path, samples: FloatArray, dt_s: float) -> dict[str, Any]:
+    """What the diagnosis of measured data finds in the recent samples, against the chapter's stage; with its report."""
+    from service.reports.diagnosis import Source, write_report
+    from sim.diagnosis.diagnose import diagnose_prepared
+    from sim.diagnosis.prepare import prepare
+
+    recording, _ = _repaired(samples, dt_s)
+    prepared = prepare(recording)
+    source = Source("recent samples", (*(f.message for f in prepared.findings), *prepared.notes))
+    return {"folder": str(out), **write_report(out, diagnose_prepared(prepared), source)}
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,96 @@
+"""``dehyst access``: certificates, passwords and zenoh configurations for more than one machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from service.protocol.errors import FieldError
+from service.security.files import DEFAULT_HOSTS, Plan, add, create, read_plan, remove
+from service.security.rules import CLIENT, CONTROLLER, OPERATOR, ROLES, ROUTER, SERVICE, STAGE
+
+EPILOG = """\
+roles:
+{roles}
+
+  dehyst access init --out access --host lab1.example.org --host 192.0.2.10 --stage afm --operator alice
+  dehyst access add --out access --operator bob --client plotter
+  dehyst access remove --out access --name bob
+
+Each NAME.json5 goes to the machine of that name and to no other; a service or a router needs users.txt beside it.
+'serve', 'router', 'stage', 'query', 'status' and 'view' take such a file by zenoh_config or --zenoh-config. See
+docs/access.md.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG.format(roles="\n".join(f"  {name:<11} {line}" for name, line in ROLES.items()))
+    parser.add_argument("what", choices=("init", "add", "remove", "list"), help="make a folder, change it, or show it")
+    parser.add_argument("--out", type=Path, default=Path("access"), metavar="DIR", help="the folder (access)")
+    parser.add_argument(
+        "--host",
+        action="append",
+        metavar="HOST",
+        help="init: name or address under which services and routers are reached; repeatable (localhost, 127.0.0.1)",
+    )
+    for role in ROLES:
+        stage = ", or NAME=STAGE to bind it to one stage" if role == STAGE else ""
+        parser.add_argument(f"--{role}", action="append", default=[], metavar="NAME", help=f"a {role}{stage}")
+    parser.add_argument("--name", action="append", default=[], metavar="NAME", help="remove: who is to be shut out")
+    parser.add_argument("--days", type=int, default=825, metavar="DAYS", help="validity of certificates, days (825)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it and print what was written. Returns 0."""
+    if not 1 <= args.days <= 36_500:
+        raise FieldError("--days", args.days, "1 to 36500 days")
+    users, stages = _named(args)
+    if args.what == "init":
+        if not users:
+            users = {role: role for role in (SERVICE, ROUTER, STAGE, CONTROLLER, CLIENT, OPERATOR)}
+        elif not {SERVICE, ROUTER} & set(users.values()):
+            users = {SERVICE: SERVICE, **users}
+        hosts = tuple(args.host or DEFAULT_HOSTS)
+        written = create(args.out, Plan(users, hosts, stages), args.days)
+    elif args.what == "add":
+        if not users:
+            raise FieldError("add", "nobody", "one or more of --client NAME, --operator NAME, ...")
+        written = add(args.out, users, stages, args.days)
+    elif args.what == "remove":
+        if not args.name:
+            raise FieldError("--name", "nothing", "who is to be shut out")
+        written = remove(args.out, args.name)
+    else:
+        written = []
+    plan = read_plan(args.out)
+    if args.json:
+        print(json.dumps({"schema": 1, "users": dict(plan.users), "written": [str(path) for path in written]}))
+        return 0
+    for name, role in plan.users.items():
+        bound = f" (stage {plan.stages[name]})" if name in plan.stages else ""
+        print(f"{name:<20} {role}{bound}: {ROLES[role]}")
+    for path in written:
+        print(f"wrote {path}")
+    if args.what in ("add", "remove"):
+        print("give services and routers their new files and start them again")
+    return 0
+
+
+def _named(args: argparse.Namespace) -> tuple[dict[str, str], dict[str, str]]:
+    users: dict[str, str] = {}
+    stages: dict[str, str] = {}
+    for role in ROLES:
+        for given in getattr(args, role):
+            name, _, stage = given.partition("=")
+            if name in users:
+                raise FieldError(f"--{role}", name, "a different name for each")
+            users[name] = role
+            if stage:
+                if role != STAGE:
+                    raise FieldError(f"--{role}", given, "a name")
+                stages[name] = stage
+    return users, stages

@@ -1,0 +1,113 @@
+"""``dehyst diagnose``: what a recording holds that the simulation lacks, named, fitted and measured."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from service.identification.recording_options import add_mapping_arguments, describe, load
+from service.protocol.errors import FieldError
+
+EPILOG = """\
+Writes DIR/report.md with its pictures, DIR/report.json (schema 1, see docs/diagnosis.md), DIR/stage.toml, the extended
+stage that `dehyst stage --file` and `dehyst demo --stage` run, and DIR/diagnosis.rrd for the Rerun viewer.
+Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
+
+  dehyst diagnose recording.parquet --out out/diagnosis
+  dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
+  dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 5e-4 --out out/diagnosis
+  dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``dehyst diagnose``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the report")
+    parser.add_argument("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--stage", type=Path, metavar="STAGE.toml", help="the simulation to judge: a stage file of yours")
+    what.add_argument(
+        "--nominal",
+        default="bouc_wen",
+        metavar="NAME",
+        help="or one by name: bouc_wen, the chapter's stage (default), or linear, one mode of second order",
+    )
+    parser.add_argument(
+        "--test",
+        type=Path,
+        metavar="FILE",
+        help="another recording of the same stage, same columns: nothing is fitted on it, held-out errors are its own",
+    )
+    parser.add_argument("--test-range", metavar="START:STOP", help="the part of it to use, s")
+    parser.add_argument("--seed", type=int, default=0, help="of the null distribution (0)")
+    parser.add_argument("--no-rrd", action="store_true", help="leave out diagnosis.rrd")
+    parser.add_argument("--json", action="store_true", help="print report.json in place of the summary")
+    add_mapping_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, check, diagnose, write. Returns 0."""
+    from service.reports.diagnosis import Source, write_report
+    from sim.diagnosis.diagnose import diagnose_prepared
+    from sim.diagnosis.prepare import prepare
+    from sim.stage.file import load_stage
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    if args.test_range is not None and args.test is None:
+        raise FieldError("--test-range", args.test_range, "a recording to cut", "name it by --test")
+    start = time.perf_counter()
+    nominal = load_stage(args.stage) if args.stage is not None else args.nominal
+    recording = load(args.data, args, args.range)
+    test = None if args.test is None else load(args.test, args, args.test_range)
+    prepared = prepare(recording, nominal=nominal, test=test)
+    say(describe(recording, list(prepared.findings)))
+    for note in prepared.notes:
+        say(f"  {note}")
+    findings = [f.message for f in prepared.findings] + list(prepared.notes)
+    if test is not None and prepared.test is not None:
+        say(describe(test, list(prepared.test.findings)))
+        findings += [f"{args.test.name}: {f.message}" for f in prepared.test.findings]
+
+    def progress(stage: str, share: float) -> None:
+        say(f"[{100.0 * share:3.0f} %] {stage} ({time.perf_counter() - start:.1f} s)")
+
+    diagnosis = diagnose_prepared(prepared, seed=args.seed, progress=progress)
+    progress("writing the report", 0.97)
+    source = Source(
+        args.data.name,
+        findings=tuple(findings),
+        test="" if args.test is None else args.test.name,
+        nominal=str(args.stage.name) if args.stage is not None else args.nominal,
+    )
+    data = write_report(args.out, diagnosis, source, rrd=not args.no_rrd)
+    say(f"[100 %] done in {time.perf_counter() - start:.1f} s")
+    print(json.dumps(data) if args.json else summary(data, args.out))
+    return 0
+
+
+def summary(data: dict[str, Any], out: Path) -> str:
+    """The verdict for people."""
+    lines = [
+        f"verdict: {data['verdict']}",
+        f"held-out free-run error: nominal {data['nominal']['heldout_rmse_um']:.4g} µm, extended "
+        f"{data['extended']['heldout_rmse_um']:.4g} µm, noise floor {data['noise_floor_um']:.4g} µm",
+    ]
+    for effect in data["effects"]:
+        numbers = ", ".join(f"{k} = {v:.4g}" for k, v in list(effect["parameters"].items())[:6])
+        also = f" (or {', '.join(effect['alternatives'])})" if effect["alternatives"] else ""
+        lines.append(f"  {effect['name']}{also}: removes {100.0 * effect['heldout_gain']:.3g} %; {numbers}")
+    if data["not_excited"]:
+        lines.append(f"not excited: {', '.join(data['not_excited'])}")
+    if data["next_experiment"]:
+        lines.append(f"next: {data['next_experiment']}")
+    lines.append(f"report: {out / 'report.md'}")
+    return "\n".join(lines)

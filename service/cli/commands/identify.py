@@ -1,0 +1,183 @@
+"""``dehyst identify``: the inverse models of a stage from a recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import InputError
+from service.identification.recording_options import add_mapping_arguments, describe, load
+from service.protocol.errors import FieldError
+from service.protocol.keys import check_name
+
+EPILOG = """\
+Errors are of the inverse: the model is given the measured motion of data it has not seen, and its voltage is
+compared with the one applied; the same in µm is that voltage error times the mean gain of the stage.
+
+  dehyst identify recording.csv --out stage.npz
+  dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
+      --out stage.npz
+  dehyst identify training.parquet --test other.parquet --range 2:40 --out stage.npz
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``dehyst identify``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
+    parser.add_argument("--out", type=Path, required=True, metavar="MODEL.npz", help="where the models go")
+    parser.add_argument("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    judged = parser.add_mutually_exclusive_group()
+    judged.add_argument("--holdout", type=float, default=0.25, help="share of the end held out for judging (0.25)")
+    judged.add_argument("--test", type=Path, metavar="FILE", help="judge on this recording instead")
+    parser.add_argument("--test-range", metavar="START:STOP", help="the part of the test recording to use, s")
+    parser.add_argument(
+        "--keep-apart",
+        action="store_true",
+        help="write the models that never saw the held-out part (default: identified anew from all of it)",
+    )
+    parser.add_argument("--models", metavar="A,B", help="which models (all five)")
+    parser.add_argument("--support", type=int, default=500, metavar="N", help="support vectors of the LSSVMs (500)")
+    parser.add_argument("--stage", default="demo", help="name of the stage on the wire (demo)")
+    parser.add_argument("--axis", default="x", help="name of its axis on the wire (x)")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="where the picture goes (beside the models)")
+    parser.add_argument("--no-picture", action="store_true", help="draw nothing")
+    parser.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    add_mapping_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
+    from service.identification.identifying import NAMES, Stretch, identify_all, split_at
+    from service.storage.model_file import BundleMeta, write_bundle
+    from sim.recordings import check, repaired, require_usable
+
+    check_name("--stage", args.stage)
+    check_name("--axis", args.axis)
+    names = tuple(args.models.split(",")) if args.models else NAMES
+    if unknown := [name for name in names if name not in NAMES]:
+        raise FieldError("--models", repr(unknown[0]), f"some of {', '.join(NAMES)}")
+    if args.support < 10:
+        raise FieldError("--support", args.support, "at least 10 support vectors")
+    if not args.out.parent.is_dir():
+        raise FieldError("--out", str(args.out), "a file in a folder that exists", f"make {args.out.parent} first")
+
+    def say(text: str) -> None:
+        # Progress and findings go beside the result, so that --json leaves nothing but JSON on standard output.
+        print(text, file=sys.stderr, flush=True)
+
+    start = time.perf_counter()
+    recording = load(args.data, args, args.range)
+    findings = check(recording)
+    say(describe(recording, findings))
+    require_usable(recording, findings)
+    whole_repaired = repaired(recording)
+    for line in whole_repaired.done:
+        say(f"  repaired: {line}")
+    whole = Stretch.of(whole_repaired)
+    dt_s = recording.dt_s
+    if args.test is not None:
+        tested = load(args.test, args, args.test_range)
+        if abs(tested.dt_s / dt_s - 1.0) > 1e-3:
+            raise InputError(
+                f"{args.test}: sample time: got {tested.dt_s:g} s, expected {dt_s:g} s as in {args.data}: resample it"
+            )
+        test_findings = check(tested)
+        say(describe(tested, test_findings))
+        require_usable(tested, test_findings)
+        train, test, follows, again = whole, Stretch.of(repaired(tested)), False, None
+        judged_on = str(args.test)
+    else:
+        split = split_at(len(whole), args.holdout)
+        train, test, follows = whole.part(0, split), whole.part(split, len(whole)), True
+        again = None if args.keep_apart else whole
+        judged_on = f"the last {100 * args.holdout:g} % of the recording"
+
+    def progress(name: str) -> None:
+        say(f"[{names.index(name) + 1}/{len(names)}] identifying {name} from {len(train)} samples ...")
+
+    results = identify_all(
+        train, test, dt_s, follows=follows, whole=again, names=names, n=args.support, progress=progress
+    )
+    models = {result.name: result.model for result in results if result.model is not None}
+    for result in results:
+        if result.failed:
+            say(f"  {result.name}: not identified: {result.failed}")
+    if not models:
+        print("dehyst identify: no model could be identified", file=sys.stderr)
+        return 1
+    gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
+    meta = BundleMeta(
+        stage=args.stage,
+        axis=args.axis,
+        dt_s=dt_s,
+        source=args.data.name,
+        source_sha256=recording.sha256,
+        y_min_um=float(whole.motion[:, 0].min()),
+        y_max_um=float(whole.motion[:, 0].max()),
+        u_min_V=float(whole.u_V.min()),
+        u_max_V=float(whole.u_V.max()),
+        notes={
+            "judged_on": Path(judged_on).name if args.test is not None else judged_on,
+            "heldout_rmse_um": {r.name: r.score.rmse_um for r in results if r.score is not None},
+            "sensor_late": args.sensor_late or 0,
+        },
+    )
+    write_bundle(args.out, models, meta)
+    picture: Path | None = None
+    if not args.no_picture:
+        from service.identification.pictures import draw_identification
+
+        picture = args.picture or args.out.with_suffix(".png")
+        draw_identification(
+            picture, f"{args.data.name}: inverse models, judged on {judged_on}", train, test, dt_s, results, gain
+        )
+    summary: dict[str, Any] = {
+        "data": str(args.data),
+        "sha256": recording.sha256,
+        "samples": len(recording),
+        "dt_s": dt_s,
+        "range_um": float(np.ptp(train.motion[:, 0])),
+        "gain_um_per_V": gain,
+        "judged_on": judged_on,
+        "findings": [finding.as_dict() for finding in findings],
+        "repaired": list(whole_repaired.done),
+        "models": {result.name: result.as_dict() for result in results},
+        "out": str(args.out),
+        "picture": str(picture) if picture else None,
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+    print(json.dumps(summary) if args.json else table(summary))
+    return 0
+
+
+def table(summary: dict[str, Any]) -> str:
+    """The held-out errors for people."""
+    lines = [
+        f"Free-run error of the inverse on {summary['judged_on']}, {summary['range_um']:.4g} µm range, "
+        f"{summary['gain_um_per_V']:.4g} µm/V",
+        f"{'model':<16}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}   {'MAE/µm':>8}{'RMSE/µm':>9}{'max/µm':>8}"
+        f"   {'MAE/%':>7}{'RMSE/%':>8}   {'time/s':>6}",
+    ]
+    for name, entry in summary["models"].items():
+        score = entry["heldout"]
+        if score is None:
+            lines.append(f"{name:<16}  {entry['failed']}")
+            continue
+        lines.append(
+            f"{name:<16}{1e3 * score['mae_V']:9.2f}{1e3 * score['rmse_V']:9.2f}{1e3 * score['max_V']:9.2f}   "
+            f"{score['mae_um']:8.4f}{score['rmse_um']:9.4f}{score['max_um']:8.3f}   "
+            f"{score['mae_pct']:7.3f}{score['rmse_pct']:8.3f}   {entry['seconds']:6.2f}"
+        )
+    lines.append(f"models: {summary['out']}" + (f"; picture: {summary['picture']}" if summary["picture"] else ""))
+    lines.append(
+        f'next: dehyst serve --config FILE (with model = "{summary["out"]}"); an example: dehyst serve --example'
+    )
+    return "\n".join(lines)

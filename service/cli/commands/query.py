@@ -1,0 +1,126 @@
+"""``dehyst query``: ask a running service for voltages, or for its status."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from service.client.client import Client, Trajectory
+from service.protocol.errors import FieldError
+from service.protocol.query import NEWEST
+from service.protocol.reply import flag_names
+from service.runtime.session import DEFAULT_ENDPOINT
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    add = parser.add_argument
+    add("y_um", nargs="*", type=float, help="desired displacements, µm, one sample time apart")
+    add(
+        "--from",
+        dest="source",
+        metavar="FILE",
+        help="read them from a file instead: CSV columns y[,v[,a]], - for stdin",
+    )
+    add("--v", dest="v_um_per_s", type=float, metavar="UM/S", help="velocity of a single point, µm/s (default: 0)")
+    add(
+        "--a",
+        dest="a_um_per_s2",
+        type=float,
+        metavar="UM/S2",
+        help="acceleration of a single point, µm/s² (default: 0)",
+    )
+    add("--model", default="", help="model to ask (default: the one that the service serves)")
+    add("--as-of", type=int, default=NEWEST, metavar="SEQ", help="snapshot that has seen no sample after this number")
+    add("--status", action="store_true", help="print the status of the axis instead")
+    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of the service (default: %(default)s)")
+    add("--stage", default="demo", help="stage on the wire (default: %(default)s)")
+    add("--axis", default="x", help="axis of the stage (default: %(default)s)")
+    add("--timeout", type=float, default=1.0, metavar="S", help="longest wait for an answer, s (default: %(default)s)")
+    add(
+        "--wait",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="how long to wait for the service to come up, s (default: 0)",
+    )
+    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
+    add("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask and print. Returns 0; errors, the service's own included, are raised."""
+    columns = _columns(args)
+    with Client.connect(
+        args.endpoint, args.stage, args.axis, args.timeout, args.wait, zenoh_config=args.zenoh_config
+    ) as client:
+        if args.status:
+            print(json.dumps(client.status(), indent=None if args.json else 2))
+            return 0
+        answer = client.trajectory(*columns, model=args.model, as_of=args.as_of)
+    if args.json:
+        print(json.dumps(_as_json(columns[0], answer)))
+        return 0
+    print(f"# model {answer.model}, snapshot {answer.snapshot_seq}{', fallback' if answer.fallback else ''}")
+    print(f"# {'y_um':>10} {'u_V':>10} {'std_V':>9}  flags")
+    for y, u, std, bits in zip(columns[0], answer.u_V, answer.std_V, answer.flags, strict=True):
+        print(f"{y:12.4f} {u:10.5f} {std:9.5f}  {' '.join(flag_names(int(bits)))}".rstrip())
+    return 0
+
+
+def _as_json(y_um: FloatArray, answer: Trajectory) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "model": answer.model,
+        "snapshot_seq": answer.snapshot_seq,
+        "fallback": answer.fallback,
+        "y_um": y_um.tolist(),
+        "u_V": answer.u_V.tolist(),
+        "std_V": [None if math.isnan(value) else value for value in answer.std_V.tolist()],
+        "flags": [flag_names(bits) for bits in answer.flags.tolist()],
+        "memory": answer.memory.tolist(),
+    }
+
+
+def _columns(args: argparse.Namespace) -> list[FloatArray]:
+    """y, and where given v and a, from the command line or the file."""
+    if args.status:
+        return []
+    if bool(args.y_um) == bool(args.source):
+        raise FieldError("y_um", "both or neither", "displacements in µm as arguments, or a file by --from")
+    if args.source:
+        return _read(args.source)
+    columns = [np.array(args.y_um)]
+    if args.v_um_per_s is not None or args.a_um_per_s2 is not None:
+        if len(args.y_um) != 1:
+            raise FieldError("--v, --a", f"{len(args.y_um)} points", "a single point", "give columns by --from FILE")
+        columns += [np.array([args.v_um_per_s or 0.0]), np.array([args.a_um_per_s2 or 0.0])]
+    return columns
+
+
+def _read(source: str) -> list[FloatArray]:
+    try:
+        text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FieldError("--from", str(error), "a readable CSV file") from error
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    rows = []
+    for i, line in lines:
+        try:
+            rows.append([float(part) for part in line.split(",")])
+        except ValueError as error:
+            if rows or i != lines[0][0]:
+                raise FieldError(f"{source}, line {i}", repr(line), "numbers y[,v[,a]] in µm, µm/s, µm/s²") from error
+    widths = {len(row) for row in rows}
+    if len(widths) != 1 or not widths <= {1, 2, 3}:
+        raise FieldError(
+            source, f"rows of {sorted(widths)} columns", "one to three columns y[,v[,a]], the same in all rows"
+        )
+    return [column.copy() for column in np.array(rows).T]

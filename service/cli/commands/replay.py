@@ -1,0 +1,154 @@
+"""``dehyst replay``: the learner over a recording, offline; what it would have done, before it is trusted live."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptive.errors import InputError
+from service.identification.recording_options import add_mapping_arguments, describe, load
+from service.protocol.errors import FieldError
+
+if TYPE_CHECKING:
+    from service.config.learner import LearnerSettings
+
+EPILOG = """\
+Every block of samples is first foretold by the model as a controller would have had it (--age s old), then learnt.
+Errors are of the voltage for the measured motion: in V, in percent of the voltage span the model was identified with,
+and seen as displacement in µm through the mean gain. The samples go the same way as live: the snapshots are the same.
+
+The configuration is that of 'dehyst serve', or the learner's settings alone (docs/learner.md):
+
+  window = 500
+  [drift]
+  gain_walk = 0.03
+
+  dehyst replay recordings/x --config serve.toml --out out/replay
+  dehyst replay test.csv --config learner.toml --model stage.npz --sensor-late 1 --out out/replay
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``dehyst replay``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    add = parser.add_argument
+    add("data", type=Path, metavar="RECORDING", help="the recording: a file, or a folder of segments")
+    add("--config", type=Path, required=True, metavar="FILE", help="TOML of 'dehyst serve', or of the learner alone")
+    add("--axis", metavar="NAME", help="which axis of the configuration (its only one)")
+    add("--model", type=Path, metavar="MODEL.npz", help="where learning starts (default: the configuration's model)")
+    add("--learn", metavar="NAME", help="which model of the file learns (the configuration's, or lssvm_adaptive)")
+    add("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    add("--age", type=float, metavar="S", help="age of the model when its answer takes effect, s (0.06)")
+    add(
+        "--window",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="window of the running mean error in the picture, s (0.5)",
+    )
+    add("--out", type=Path, required=True, metavar="DIR", help="where JSON, every decision, pictures and the model go")
+    add("--no-pictures", action="store_true", help="draw nothing")
+    add("--json", action="store_true", help="print JSON in place of the table")
+    add_mapping_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, replay, score, write. Returns 0."""
+    from service.background.retuning.adoption import read as read_adoptions
+    from service.config.learner import read_learner_settings
+    from service.replay.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
+    from service.server.models import load_axis
+    from service.storage.model_file import read_bundle, write_bundle
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    if not args.window > 0.0:
+        raise FieldError("--window", args.window, "a time above 0 s")
+    found: LearnerSettings = read_learner_settings(args.config, args.axis)
+    path = args.model if args.model is not None else found.axis.model if found.axis is not None else None
+    if path is None:
+        raise FieldError("--model", "nothing", f"a model file, as {args.config} names none", "see 'dehyst identify'")
+    bundle = read_bundle(path)
+    config = axis_config(found, path, bundle, args.learn)
+    # A replay is of one's own choosing: whose recording and whose model it is, is not checked again here.
+    axis = load_axis("replay", config, bundle=replace(bundle, meta=replace(bundle.meta, stage="", axis="")))
+    recording = load(args.data, args, args.range)
+    say(describe(recording, []))
+    if args.data.is_dir():
+        # What was tuned in the background while this was recorded takes effect at the same samples.
+        adopted = read_adoptions(args.data)
+        axis.adoptions.add(*adopted)
+        if adopted:
+            say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: got {args.out}, expected a folder that can be written to: {error}") from error
+    start = time.perf_counter()
+    shown = start
+
+    def progress(done: int, of: int) -> None:
+        nonlocal shown
+        now = time.perf_counter()
+        if now - shown > 5.0 or done == of:
+            shown = now
+            say(f"  {done * axis.dt_s:.0f} of {of * axis.dt_s:.0f} s replayed in {now - start:.0f} s")
+
+    done: Replayed = replay(recording, axis, AGE_S if args.age is None else args.age, progress)
+    seconds = time.perf_counter() - start
+    span_V = float(getattr(bundle.models[config.learn], "span_V", 1.0))
+    numbers: dict[str, Any] = {
+        "recording": args.data.name,
+        "sha256": recording.sha256,
+        "model": path.name,
+        "learn": config.learn,
+        "settings": found.settings,
+        "duration_s": recording.duration_s,
+        "seconds": round(seconds, 3),
+        "competition": getattr(axis.learner, "standing", lambda: None)(),
+        **summary(done, span_V),
+    }
+    (args.out / "replay.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    write_gates(args.out / "gates.csv", done)
+    write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
+    if not args.no_pictures:
+        from service.replay.pictures import draw_errors, draw_gates
+
+        draw_errors(args.out / "errors.png", f"{args.data.name}: foretold, then learnt", done, span_V, args.window)
+        draw_gates(args.out / "gates.png", args.data.name, done)
+    print(json.dumps(numbers) if args.json else table(numbers, args.out))
+    return 0
+
+
+def table(numbers: dict[str, Any], out: Path) -> str:
+    """The result for people."""
+    lines = [
+        f"{numbers['recording']}: {numbers['duration_s']:.4g} s replayed in {numbers['seconds']:.3g} s, "
+        f"{numbers['scored']} samples scored; {numbers['learn']} of {numbers['model']} learnt",
+        f"{'foretold less applied voltage':<30}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}{'MAE/%':>9}{'RMSE/µm':>9}",
+    ]
+    for key, label in (("frozen", "as it was identified"), ("adaptive", "learning")):
+        s = numbers[key]
+        if s["mae_V"] is None:
+            lines.append(f"{label:<30}nothing was scored")
+            continue
+        lines.append(
+            f"{label:<30}{1e3 * s['mae_V']:9.2f}{1e3 * s['rmse_V']:9.2f}{1e3 * s['max_V']:9.2f}{s['mae_pct']:9.3f}"
+            f"{s['rmse_um']:9.4f}"
+        )
+    stated = numbers["within_stated_std"]
+    lines.append(
+        f"errors within one stated deviation: {100 * stated['one_std']:.1f} % (68.3 stated), "
+        f"within two: {100 * stated['two_std']:.1f} % (95.4 stated)"
+    )
+    lines.append("samples by what the learner said: " + ", ".join(f"{k} {v}" for k, v in numbers["gates"].items()))
+    lines += [f"  repaired for scoring: {line}" for line in numbers["repaired"]]
+    lines.append(f"replay.json, gates.csv, errors.png, gates.png and the model at the end, model.npz, are in {out}/")
+    return "\n".join(lines)

@@ -1,0 +1,51 @@
+"""``dehyst router``: passes messages on between stages, services and clients on several hosts (docs/scale.md)."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    add = parser.add_argument
+    add("--listen", action="append", metavar="ENDPOINT", help="listen here; repeatable (tcp/127.0.0.1:7447)")
+    add("--connect", action="append", default=[], metavar="ENDPOINT", help="another router; repeatable")
+    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration: TLS, passwords, access control")
+    add(
+        "--insecure-beyond-loopback",
+        action="store_true",
+        help="let everybody in who reaches an address beyond this machine",
+    )
+    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
+    add("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Route until interrupted. Returns 0; endpoints that cannot be had or may not be used are raised."""
+    from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_router
+    from service.runtime.stopping import StopSignal
+    from service.security.check import check_reach, has_access_control
+    from service.security.refusals import count_refusals, refusal_counters
+
+    listen = [check_endpoint("--listen", endpoint) for endpoint in args.listen or [DEFAULT_ENDPOINT]]
+    connect = [check_endpoint("--connect", endpoint) for endpoint in args.connect]
+    check_reach("router", listen, connect, args.zenoh_config, args.insecure_beyond_loopback)
+    stop = StopSignal()
+    if has_access_control(args.zenoh_config):
+        count_refusals()
+    session = open_router(listen, connect, args.zenoh_config)
+    try:
+        ready = {"ready": True, "listen": listen, "connect": connect}
+        print(json.dumps(ready) if args.json else f"ready: router at {', '.join(listen)}", flush=True)
+        reason = stop.wait(args.duration)
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    refused = refusal_counters()
+    if args.json:
+        print(json.dumps({"stopped": reason, "refused": refused}), flush=True)
+    else:
+        counted = "" if refused is None else "; refused " + ", ".join(f"{n} {name}" for name, n in refused.items())
+        print(f"stopped: {reason}{counted}", flush=True)
+    return 0

@@ -1,0 +1,92 @@
+"""``dehyst serve``: the serving process."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from service.config.config import EXAMPLE, ServeConfig, read_config
+from service.protocol.errors import FieldError
+from service.runtime.memory import starting
+from service.runtime.session import check_endpoint, is_loopback
+from service.security.check import has_access_control
+from service.security.refusals import count_refusals
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    add = parser.add_argument
+    add("--config", type=Path, metavar="FILE", help="TOML file: stage, axes, model files, limits in V, V/s and µm")
+    add("--example", action="store_true", help="print a configuration with comments, and end")
+    add("--listen", action="append", metavar="ENDPOINT", help="listen here instead, on this machine only; repeatable")
+    add(
+        "--insecure-beyond-loopback",
+        action="store_true",
+        help="let everybody in who reaches an address of the configuration beyond this machine",
+    )
+    add(
+        "--standby",
+        action="store_true",
+        help="stand by for the one that serves: learn what it learns, and take over when it goes",
+    )
+    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
+    add("--json", action="store_true", help="print the ready line and the last status as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until interrupted. Returns 0; errors of configuration, model file or port are raised."""
+    if args.example:
+        print(EXAMPLE, end="")
+        return 0
+    if args.config is None:
+        raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints one to begin with")
+    with starting() as started:
+        config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
+        # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        from service.runtime.stopping import StopSignal
+        from service.server.process import Service, tune_process
+
+        tune_process()
+        stop = StopSignal()
+        if has_access_control(config.zenoh_config):
+            count_refusals()
+        with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
+            started()
+            _say_ready(service.ready(), args.json)
+            reason = stop.wait(args.duration)
+            statuses = {axis.keys.axis: axis.status() for axis in service.axes}
+    if args.json:
+        print(json.dumps({"stopped": reason, "axes": statuses}, default=str), flush=True)
+    else:
+        for name, status in statuses.items():
+            samples, queries = status["samples"], status["queries"]
+            print(
+                f"{name}: {samples['received']} samples received, {samples['learnt']} learnt, {samples['lost']} lost "
+                f"on the way, {samples['dropped']} dropped; {queries['count']} queries, {queries['errors']} refused"
+            )
+        print(f"stopped: {reason}", flush=True)
+    return 0
+
+
+def _say_ready(ready: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(ready), flush=True)
+        return
+    where = ", ".join((*ready["listen"], *ready["connect"]))
+    axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
+    role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the one that serves")
+    print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
+
+
+def _with_listen(config: ServeConfig, listen: list[str] | None, standby: bool) -> ServeConfig:
+    if not listen:
+        return config
+    for endpoint in listen:
+        if not is_loopback(check_endpoint("--listen", endpoint)):
+            raise FieldError("--listen", endpoint, "an endpoint of this machine", "name others in the configuration")
+    return replace(config, standby_listen=tuple(listen)) if standby else replace(config, listen=tuple(listen))

@@ -1,0 +1,155 @@
+"""``dehyst stage``: a simulated stage as a process on zenoh."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from service.protocol.errors import FieldError
+from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
+from service.runtime.stopping import StopSignal
+from sim.stage.config import Change, StageConfig
+
+EPILOG = """\
+The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
+A voltage that has not come in time is replaced by the last one and counted. The last line printed is JSON: ticks,
+late ticks, and per axis the samples published and the commands received, late, missing and refused.
+
+  dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
+  dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``dehyst stage``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--preset", default="rich", help="rich (default: stands in for hardware) or bouc_wen")
+    what.add_argument("--file", type=Path, metavar="STAGE.toml", help="a stage file in place of a preset")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--endpoint", metavar="ENDPOINT", help=f"connect to a service or router (default {DEFAULT_ENDPOINT})"
+    )
+    where.add_argument("--listen", metavar="ENDPOINT", help="listen there instead, for controllers without a service")
+    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait this long for the endpoint, s (10)")
+    parser.add_argument("--name", default="demo", help="name of the stage on the wire (demo)")
+    parser.add_argument("--axis", default="x", help="name of its axis on the wire (x)")
+    parser.add_argument(
+        "--axis2", default="", metavar="NAME", help="drive the second axis of the stage too, under this name (at 0 V)"
+    )
+    parser.add_argument("--twins", default="", metavar="A,B", help="further axes: equal stages with their own commands")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="sample rate, Hz (the stage's own, 1000 in presets)")
+    parser.add_argument("--duration", type=float, metavar="S", help="stop after this time, s (until Ctrl-C)")
+    parser.add_argument(
+        "--batch", type=int, default=1, metavar="N", help="samples a message; more if the wire is slow (1)"
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of its noise and drift (the stage's own)")
+    parser.add_argument("--free-run", action="store_true", help="start at once, at 0 V until commands come")
+    parser.add_argument(
+        "--change",
+        action="append",
+        default=[],
+        metavar="T:NAME=VALUE[,...]",
+        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; may be repeated",
+    )
+    parser.add_argument("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (0)")
+    parser.add_argument(
+        "--slew", type=float, default=math.inf, metavar="V/S", help="follow commands at most so fast, V/s (no limit)"
+    )
+    parser.add_argument(
+        "--inject", action="store_true", help="take faults by command, for tests of what listens (docs/stage.md)"
+    )
+    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own, for TLS and passwords")
+    parser.add_argument("--json", action="store_true", help="the ready line is JSON too")
+
+
+def parse_change(text: str) -> Change:
+    """``"30:gain_drift.gain=-0.06,resonance.payload_ratio=1"`` as (30.0, {...}). Raises InputError."""
+    time_text, _, rest = text.partition(":")
+    values: dict[str, float] = {}
+    try:
+        t_s = float(time_text)
+        for part in rest.split(","):
+            name, equals, value = part.partition("=")
+            if not (name.strip() and equals):
+                raise ValueError
+            values[name.strip()] = float(value)
+    except ValueError:
+        raise FieldError("--change", repr(text), "T:NAME=VALUE[,NAME=VALUE], T in s") from None
+    return t_s, values
+
+
+def stage_config(args: argparse.Namespace) -> StageConfig:
+    """The stage that the options describe. Raises InputError."""
+    if args.file is not None:
+        from sim.stage.file import load_stage
+
+        config = load_stage(args.file)
+    else:
+        from sim.stage.presets import preset
+
+        config = preset(args.preset)
+    if args.rate is not None:
+        if not (math.isfinite(args.rate) and args.rate > 0.0):
+            raise FieldError("--rate", args.rate, "a positive sample rate in Hz")
+        config = replace(config, dt_s=1.0 / args.rate)
+    if args.seed is not None:
+        config = replace(config, seed=args.seed)
+    if args.change:
+        config = replace(config, changes=(*config.changes, *(parse_change(text) for text in args.change)))
+    return config
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the stage until its end, Ctrl-C or SIGTERM. Returns 0."""
+    from service.runtime.session import open_client, open_service
+    from service.security.check import check_reach
+    from service.stage_node.node import NodeConfig, StageNode
+
+    stop = StopSignal(raising=True)
+    config = stage_config(args)
+    if args.duration is not None and not (math.isfinite(args.duration) and args.duration > 0.0):
+        raise FieldError("--duration", args.duration, "a positive time in s")
+    twins = [name.strip() for name in args.twins.split(",") if name.strip()]
+    node_config = NodeConfig(
+        stage=config,
+        name=args.name,
+        units=(args.axis, *twins),
+        batch=args.batch,
+        ticks=None if args.duration is None else max(1, round(args.duration / config.dt_s)),
+        free_run=args.free_run,
+        second=args.axis2,
+        inject=args.inject,
+        first=args.first,
+        slew_V_per_s=args.slew,
+    )
+    endpoint = check_endpoint(
+        "--listen" if args.listen else "--endpoint", args.listen or args.endpoint or DEFAULT_ENDPOINT
+    )
+    # A little more often than zenoh's callbacks need: the loop must not wait 5 ms for the interpreter.
+    sys.setswitchinterval(5e-4)
+    if args.listen:
+        check_reach("stage", [endpoint], [], args.zenoh_config)
+        session = open_service([endpoint], zenoh_config=args.zenoh_config)
+    else:
+        session = open_client(endpoint, args.wait, args.zenoh_config)
+    try:
+        node = StageNode(node_config, session)
+        # Before it is said to be ready, nothing has been moved: the run ends without its words.
+        stop.look()
+        stop.then(node.stop)
+        names = [name for name in (*node_config.units, args.axis2) if name]
+        ready = {"ready": True, "stage": args.name, "axes": names, "endpoint": endpoint}
+        begins = "running" if args.free_run else "waiting for commands"
+        text = f"ready: stage {args.name}, axes {', '.join(names)}, {1 / config.dt_s:g} Hz, {begins}"
+        print(json.dumps(ready) if args.json else f"{text} at {endpoint}", flush=True)
+        summary = node.run()
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    print(json.dumps(summary), flush=True)
+    return 0

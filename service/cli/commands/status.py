@@ -1,0 +1,115 @@
+"""``dehyst status``: all axes and instances that serve, once or live."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from service.operating.remote import Standbys, in_order, statuses
+from service.operating.table import screen, table
+from service.protocol.errors import FieldError
+from service.protocol.json_message import fields_of
+from service.protocol.keys import ROOT, check_name
+from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.stopping import StopSignal
+
+#: A standby tells of itself this often, and a little more, s.
+_STANDBY_PERIOD_S = 1.2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    add = parser.add_argument
+    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of a service or router (%(default)s)")
+    add("--stage", default="*", help="only this stage (all)")
+    add("--axis", default="*", help="only this axis (all)")
+    add("--once", action="store_true", help="print the table once, and end")
+    add("--period", type=float, default=1.0, metavar="S", help="how often the table is drawn, s (%(default)s)")
+    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
+    add("--timeout", type=float, default=1.0, metavar="S", help="longest wait for those that answer, s (%(default)s)")
+    add("--wait", type=float, default=0.0, metavar="S", help="how long to wait for the endpoint to come up, s (0)")
+    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
+    add("--json", action="store_true", help="print JSON: once an object, live one a line")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show it. Returns 0, or 1 where --once finds nobody; Ctrl-C ends the live table with 0."""
+    for name in ("stage", "axis"):
+        if getattr(args, name) != "*":
+            check_name(f"--{name}", getattr(args, name))
+    if not 0.1 <= args.period <= 3600.0:
+        raise FieldError("--period", args.period, "0.1 to 3600 s")
+    session = open_client(args.endpoint, args.wait, args.zenoh_config)
+    try:
+        standbys = Standbys(session, args.stage, args.axis)
+        try:
+            if not args.once:
+                return _live(session, standbys, args)
+            heard_all = time.monotonic() + _STANDBY_PERIOD_S
+            found = _settled(session, args)
+            time.sleep(max(0.0, heard_all - time.monotonic()))
+            found = in_order([*found, *standbys.statuses()])
+            print(json.dumps({"schema": 1, "axes": found}) if args.json else table(found))
+            return 0 if found else 1
+        finally:
+            standbys.undeclare()
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) -> int:
+    events: deque[str] = deque(maxlen=20)
+    subscriber = session.declare_subscriber(
+        f"{ROOT}/{args.stage}/{args.axis}/event", lambda sample: events.append(_event(sample))
+    )
+    alone = sys.stdout.isatty() and not args.json
+    until = None if args.duration is None else time.monotonic() + args.duration
+    # Not an exception in the middle of anything: one that is raised where an object is cleaned up is lost.
+    stop = StopSignal()
+    try:
+        if alone:
+            print("\x1b[?1049h\x1b[?25l", end="")  # a screen of its own, without a cursor
+        found = in_order([*_settled(session, args), *standbys.statuses()])
+        while not stop.reason and (until is None or time.monotonic() < until):
+            if args.json:
+                print(json.dumps({"schema": 1, "time_unix_s": time.time(), "axes": found}), flush=True)
+            elif alone:
+                print(screen(found, args.endpoint, list(events)), end="", flush=True)
+            else:
+                print(f"{table(found)}\n", flush=True)
+            stop.wait(args.period)
+            if stop.reason:
+                break
+            answers = statuses(session, args.stage, args.axis, args.timeout)
+            found = in_order([*answers, *standbys.statuses()])
+    except BrokenPipeError:
+        sys.stdout = None  # whoever read has gone; nothing is left to be flushed to
+    finally:
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+        if alone:
+            print("\x1b[?25h\x1b[?1049l", end="", flush=True)
+    return 0
+
+
+def _settled(session: zenoh.Session, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """The first answer, asked for again for half a second: a new session knows nobody yet."""
+    until = time.monotonic() + 0.5
+    while not (found := statuses(session, args.stage, args.axis, args.timeout)) and time.monotonic() < until:
+        time.sleep(0.05)
+    return found
+
+
+def _event(sample: zenoh.Sample) -> str:
+    data = fields_of(sample.payload.to_bytes())
+    try:
+        when = time.strftime("%H:%M:%S", time.localtime(float(data["time_unix_s"])))
+        return f"{when} {sample.key_expr} {data['event']}: {data['detail']}"
+    except (ValueError, KeyError, TypeError, OverflowError, OSError):
+        return f"{sample.key_expr}: an event that cannot be read"

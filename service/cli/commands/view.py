@@ -1,0 +1,161 @@
+"""``dehyst view``: stream a running service to the Rerun viewer or into an .rrd file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+from adaptive.errors import InputError
+from service.protocol.errors import ServiceError
+from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.stopping import StopSignal
+from service.viewer.consumer import Consumer, ConsumerConfig
+from service.viewer.feed import SceneConfig
+from service.viewer.output import Output, OutputConfig
+
+DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
+#: What the live plots show unless told otherwise, s; a file shows all of it.
+LIVE_HISTORY_S = 30.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command; units stand in the help."""
+    add = parser.add_argument
+    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of stage or service (default: %(default)s)")
+    add("--wait", type=float, default=10.0, metavar="S", help="how long to wait for it, s (default: %(default)s)")
+    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
+    add("--stage", default="demo", help="stage on the wire (default: %(default)s)")
+    add("--axis", default="x", help="axis that the service serves and learns from (default: %(default)s)")
+    add("--model", default="lssvm_adaptive", help="model that steers it; names its curves (default: %(default)s)")
+    add(
+        "--twin",
+        action="append",
+        default=[],
+        metavar="NAME=MODEL",
+        help="another axis of the stage, steered by MODEL, to compare with; as often as needed",
+    )
+    add(
+        "--change-at",
+        type=float,
+        action="append",
+        default=[],
+        metavar="S",
+        help="the stage changes then, s of its time",
+    )
+    add("--rrd", type=Path, metavar="FILE", help="write an .rrd, overwriting FILE")
+    add(
+        "--connect",
+        nargs="?",
+        const=DEFAULT_URL,
+        metavar="URL",
+        help=f"stream to a viewer that runs already (default: {DEFAULT_URL})",
+    )
+    add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays when we stop")
+    add("--port", type=int, default=9876, help="port of the spawned viewer, loopback only (default: %(default)s)")
+    add(
+        "--range-um", type=float, metavar="UM", help="range for percentages, µm (default: span of the reference so far)"
+    )
+    add(
+        "--history",
+        type=float,
+        metavar="S",
+        help=f"past that the plots show, s; 0 for all (default: all in a file, {LIVE_HISTORY_S:g} live)",
+    )
+    add(
+        "--batch",
+        type=float,
+        default=0.2,
+        metavar="S",
+        help="how often to send on, s, 0.05 to 5 (default: %(default)s)",
+    )
+    add("--duration", type=float, metavar="S", help="stop by itself after this time, s")
+    add("--json", action="store_true", help="print the counts at the end as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Stream until interrupted, ended, or the duration is over. Returns 0; 1 if the file is not complete."""
+    if not (args.rrd or args.connect or args.spawn):
+        raise InputError("rrd, connect, spawn: got none of them, expected at least one; --rrd FILE writes a file")
+    if args.connect and args.spawn:
+        raise InputError("connect, spawn: got both, expected one: --spawn starts the viewer that it streams to")
+    config = ConsumerConfig(
+        args.stage, args.axis, args.model, twins(args.twin), changes_s=tuple(args.change_at), batch_s=args.batch
+    )
+    # Before anything slow: whoever starts us may end us at once.
+    stop = StopSignal()
+    outputs: list[Output] = []
+    viewer: subprocess.Popen[bytes] | None = None
+    try:
+        with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
+            url = args.connect
+            if args.spawn:
+                from service.viewer.rerun_sink import spawn_viewer
+
+                viewer, url = spawn_viewer(args.port)
+            name = str(uuid.uuid4())
+            if args.rrd:
+                outputs.append(Output(OutputConfig(_scene(args, config, None), rrd=args.rrd, recording_id=name)))
+            if url:
+                scene = _scene(args, config, LIVE_HISTORY_S)
+                outputs.append(Output(OutputConfig(scene, connect=url, recording_id=name)))
+            consumer = Consumer(session, config, outputs)
+            try:
+                where = " and ".join(output.config.name for output in outputs)
+                print(f"viewing {args.stage}/{args.axis} at {args.endpoint} into {where}", flush=True)
+                _wait(stop, args.duration, viewer, alone=args.rrd is None)
+            finally:
+                consumer.close()
+        counts = dict(consumer.counts)
+    finally:
+        # A file gets all the time that a slow disk may need, a viewer does not: it may be gone.
+        finished = [(output.config, output.close(60.0 if output.config.rrd else 5.0)) for output in outputs]
+    lost_file = any(c.rrd and not ok for c, ok in finished)
+    drawn = all(ok for _, ok in finished)
+    if args.json:
+        print(json.dumps({"schema": 1, "complete": drawn, "counts": counts}), flush=True)
+    else:
+        lost = counts.get("dropped_batches", 0)
+        print(f"{counts.get('samples', 0)} samples drawn, {lost} batches dropped", flush=True)
+        if args.rrd:
+            print(f"open it with: rerun {args.rrd}", flush=True)
+    for output_config, ok in finished:
+        if not ok:
+            print(f"dehyst view: {output_config.name} did not take everything before the end", file=sys.stderr)
+    return 1 if lost_file else 0
+
+
+def twins(given: list[str]) -> tuple[tuple[str, str], ...]:
+    """``NAME=MODEL`` pairs. Raises InputError naming the one that is none."""
+    pairs = []
+    for text in given:
+        axis, sign, model = text.partition("=")
+        if not (axis and sign and model):
+            raise InputError(f"twin: got {text!r}, expected NAME=MODEL such as x_linear=linear")
+        pairs.append((axis, model))
+    return tuple(pairs)
+
+
+def _scene(args: argparse.Namespace, config: ConsumerConfig, history_s: float | None) -> SceneConfig:
+    if args.history is not None:
+        history_s = args.history or None
+    return SceneConfig(f"{args.stage}/{args.axis}", config.models, range_um=args.range_um, history_s=history_s)
+
+
+def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
+    """Until asked to stop, the time is over, or the viewer that we started has been closed and was ``alone``."""
+    until = time.monotonic() + duration_s if duration_s is not None else float("inf")
+    while not stop.reason and time.monotonic() < until:
+        stop.wait(0.1)
+        if viewer is not None and viewer.poll() is not None:
+            if viewer.returncode != 0:
+                raise ServiceError(
+                    f"the viewer ended with status {viewer.returncode}: is there a display and a graphics driver? "
+                    "--rrd FILE needs neither"
+                )
+            if alone:
+                return

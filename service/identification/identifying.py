@@ -1,0 +1,194 @@
+"""From a recording to the models that are served: identify each, and judge it on what it has not seen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import DehystError, InputError
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.smoothing import SmootherConfig, smooth_recording
+from adaptive.types import BoolArray, FloatArray, InverseModel
+from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
+from service.protocol.errors import FieldError
+from sim.recordings import Recording, Repaired
+
+#: Models in the order in which they are identified and shown.
+NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
+#: Share of a test recording of its own that only brings the models' memory up to date, and is not scored.
+SETTLE_SHARE = 0.05
+#: Samples that a part must have to be identified from, and to be judged on.
+LEAST_TRAIN, LEAST_TEST = 200, 50
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Free-run error of an inverse model on held-out data.
+
+    The model is given the measured motion (smoothed with zero phase) and answers with a voltage; the error is that
+    voltage less the one applied. ``_um`` figures are voltage errors seen as displacement through the mean gain of
+    the training data; ``_pct`` those in percent of the training data's displacement range.
+    """
+
+    mae_V: float
+    rmse_V: float
+    max_V: float
+    mae_um: float
+    rmse_um: float
+    max_um: float
+    mae_pct: float
+    rmse_pct: float
+    max_pct: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """One model, how it did on held-out data, and how long identifying took.
+
+    ``error_V`` is (n_test,) V, NaN where a sample is not scored. ``failed`` says why there is no model.
+    """
+
+    name: str
+    model: InverseModel | None
+    score: Score | None
+    error_V: FloatArray
+    seconds: float
+    failed: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        scores = {key: round(value, 9) for key, value in asdict(self.score).items()} if self.score else None
+        return {"heldout": scores, "seconds": round(self.seconds, 3), "failed": self.failed or None}
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Measured samples ``dt_s`` apart with their smoothed motion; ``valid`` is False where filled in."""
+
+    u_V: FloatArray
+    y_um: FloatArray
+    motion: FloatArray
+    valid: BoolArray
+
+    @staticmethod
+    def of(repaired: Repaired) -> Stretch:
+        recording = repaired.recording
+        return Stretch(recording.u_V, recording.y_um, motion_of(recording), repaired.valid)
+
+    def part(self, start: int, stop: int) -> Stretch:
+        return Stretch(self.u_V[start:stop], self.y_um[start:stop], self.motion[start:stop], self.valid[start:stop])
+
+    def __len__(self) -> int:
+        return len(self.u_V)
+
+
+def motion_of(recording: Recording) -> FloatArray:
+    """(n, 3) displacement µm, velocity µm/s and acceleration µm/s² at each sample, smoothed with zero phase."""
+    return smooth_recording(recording.y_um, SmootherConfig.for_rate(recording.dt_s))
+
+
+def split_at(n: int, holdout: float) -> int:
+    """Index where the held-out last part begins. Raises InputError where either part is too short."""
+    if not 0.0 < holdout < 0.9:
+        raise FieldError("--holdout", holdout, "a share of the recording above 0 and below 0.9")
+    split = round(n * (1.0 - holdout))
+    if split < LEAST_TRAIN or n - split < LEAST_TEST:
+        raise InputError(
+            f"recording: got {n} samples, {split} to learn from and {n - split} held out, expected at least "
+            f"{LEAST_TRAIN} and {LEAST_TEST}: record longer or give --test FILE"
+        )
+    return split
+
+
+def identify_one(name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: int) -> InverseModel:
+    """The inverse model ``name`` from (m,) voltages V and displacements µm, ``dt_s`` apart; ``n`` support vectors.
+
+    Raises what its identification raises: InputError on data, NumericsError on arithmetic.
+    """
+    if name == "linear":
+        return fit_linear(u_V, y_um, dt_s)[0]
+    if name == "bouc_wen":
+        return fit_bouc_wen(u_V, y_um, dt_s)[0]
+    if name == "mpi":
+        return fit_mpi(u_V, y_um, dt_s)[0]
+    inputs = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
+    if name not in inputs:
+        raise FieldError("models", repr(name), f"some of {', '.join(NAMES)}")
+    size = max(10, min(n, len(u_V) // 2))
+    if name == "lssvm_frozen":
+        return identify_lssvm(u_V, y_um, dt_s, inputs="two", config=IdentifyConfig(n=size), name=name)[0]
+    return identify_lssvm(u_V, y_um, dt_s, inputs="memory", config=IdentifyConfig(n=size), name=name)[0]
+
+
+def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
+    """(n_test,) voltages, V, that the model gives for the test's measured motion.
+
+    ``before``, the samples just ahead of the test, only brings the memory up to date; without them the memory is
+    that of a stage at rest where the test begins.
+    """
+    first = before if before is not None and len(before) else test
+    memory = model.rest_memory(float(first.motion[0, 0]))
+    if before is not None and len(before):
+        y, v, a = _columns(before)
+        memory = model.track(y, v, a, before.u_V, memory)
+    y, v, a = _columns(test)
+    return model.feedforward(y, v, a, memory).u_V
+
+
+def _columns(stretch: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    y, v, a = (np.ascontiguousarray(stretch.motion[:, i]) for i in range(3))
+    return y, v, a
+
+
+def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Score:
+    """Figures of (n,) voltage errors; NaN entries are left out."""
+    size = np.abs(error_V[np.isfinite(error_V)])
+    in_V = (float(np.mean(size)), float(np.sqrt(np.mean(size**2))), float(np.max(size)))
+    in_um = tuple(abs(gain_um_per_V) * value for value in in_V)
+    return Score(*in_V, *in_um, *(100.0 * value / range_um for value in in_um))
+
+
+def identify_all(
+    train: Stretch,
+    test: Stretch,
+    dt_s: float,
+    *,
+    follows: bool,
+    whole: Stretch | None = None,
+    names: tuple[str, ...] = NAMES,
+    n: int = 500,
+    progress: Callable[[str], None] = lambda _: None,
+) -> list[Identified]:
+    """Identify every model on ``train``, judge it on ``test``, and where ``whole`` is given identify it anew on that.
+
+    ``follows``: the test continues the training data in time; otherwise it is a recording of its own, whose first
+    ``SETTLE_SHARE`` only settles the memories. The model returned is that of ``whole`` where given. A model that
+    cannot be identified is returned with ``failed``; the others go on.
+    """
+    gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
+    range_um = float(np.ptp(train.motion[:, 0]))
+    settle = 0 if follows else max(1, round(SETTLE_SHARE * len(test)))
+    before = train if follows else test.part(0, settle)
+    scored = test.part(settle, len(test))
+    results: list[Identified] = []
+    for name in names:
+        start = time.perf_counter()
+        progress(name)
+        error_V = np.full(len(test), np.nan)
+        try:
+            model = identify_one(name, train.u_V, train.y_um, dt_s, n)
+            seconds = time.perf_counter() - start
+            error_V[settle:] = free_run(model, before, scored) - scored.u_V
+            error_V[~test.valid] = np.nan
+            score = score_of(error_V, gain, range_um)
+            if whole is not None:
+                model = identify_one(name, whole.u_V, whole.y_um, dt_s, n)
+        except (DehystError, np.linalg.LinAlgError) as error:
+            results.append(Identified(name, None, None, error_V, time.perf_counter() - start, str(error)))
+            continue
+        results.append(Identified(name, model, score, error_V, seconds))
+    return results

@@ -1,0 +1,116 @@
+"""The options by which a command is told what a foreign recording's columns mean; the same for every command."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from service.protocol.errors import FieldError
+from sim.recordings import ColumnMap, Finding, Recording, load_map, read
+from sim.recordings.columns import QUANTITIES
+
+READING = """\
+Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
+options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
+text with a header line, .parquet (or a folder of a recorder's segments), .mat up to version 7, .npz, and the array
+files of piezo controllers.
+"""
+
+
+def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--map --column --unit --scale --index --dt-s --sensor-late --delimiter --decimal``."""
+    quantities = ", ".join(QUANTITIES)
+    units = "; ".join(f"{quantity}: {' '.join(factors)}" for quantity, (_, factors) in QUANTITIES.items())
+    group = parser.add_argument_group("what the file's columns mean", READING)
+    group.add_argument("--map", type=Path, metavar="FILE.toml", help="these options from a file; options go over it")
+    group.add_argument(
+        "--column", action="append", default=[], metavar="Q=NAME", help=f"column of a quantity ({quantities})"
+    )
+    group.add_argument("--unit", action="append", default=[], metavar="Q=UNIT", help=f"its unit ({units})")
+    group.add_argument(
+        "--scale", action="append", default=[], metavar="Q=FACTOR", help="factor to V, µm or s in place of a unit"
+    )
+    group.add_argument(
+        "--index", action="append", default=[], metavar="Q=:,0,2", help="part of an array of several dimensions"
+    )
+    group.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
+    group.add_argument(
+        "--sensor-late", type=int, metavar="N", help="the sensor's column lies N samples late in the file"
+    )
+    group.add_argument("--delimiter", help="between the columns of a text file (default: as its header line shows)")
+    group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default .)")
+
+
+def mapping_from(args: argparse.Namespace) -> ColumnMap:
+    """The mapping that the options (and the file behind ``--map``) describe. Raises InputError."""
+    base = load_map(args.map) if args.map is not None else ColumnMap()
+    scale: dict[str, float] = {}
+    for quantity, text in _pairs("--scale", args.scale).items():
+        try:
+            scale[quantity] = float(text)
+        except ValueError:
+            raise FieldError("--scale", f"{quantity}={text}", "Q=FACTOR with a number") from None
+    units = _pairs("--unit", args.unit)
+    # An option goes over the file even where the one gives a unit and the other a scale.
+    kept_units = {q: unit for q, unit in base.units.items() if q not in scale}
+    kept_scale = {q: factor for q, factor in base.scale.items() if q not in units}
+    scalars = {
+        name: value
+        for name in ("dt_s", "sensor_late", "delimiter", "decimal")
+        if (value := getattr(args, name)) is not None
+    }
+    return replace(
+        base,
+        columns=base.columns | _pairs("--column", args.column),
+        units=kept_units | units,
+        scale=kept_scale | scale,
+        index=base.index | _pairs("--index", args.index),
+        **scalars,
+    )
+
+
+def _pairs(option: str, texts: list[str]) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for text in texts:
+        quantity, equals, value = text.partition("=")
+        if not equals or not value or quantity not in QUANTITIES:
+            raise FieldError(option, repr(text), f"QUANTITY=VALUE with one of {', '.join(QUANTITIES)}")
+        pairs[quantity] = value
+    return pairs
+
+
+def parse_range(option: str, text: str | None) -> tuple[float | None, float | None]:
+    """``"2:40"`` as (2.0, 40.0) in s; either end may be left out. Raises InputError."""
+    if text is None:
+        return None, None
+    start, colon, stop = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        ends = (float(start) if start else None, float(stop) if stop else None)
+        if ends[0] is not None and ends[1] is not None and not ends[0] < ends[1]:
+            raise ValueError
+    except ValueError:
+        raise FieldError(
+            option, repr(text), "START:STOP in s, the first below the second, either may be empty"
+        ) from None
+    return ends
+
+
+def load(path: Path, args: argparse.Namespace, range_option: str | None = None) -> Recording:
+    """Read ``path`` with the options of :func:`add_mapping_arguments`, cut to ``range_option``. Raises InputError."""
+    recording = read(path, mapping_from(args))
+    start_s, stop_s = parse_range("--range", range_option)
+    return recording if start_s is None and stop_s is None else recording.between(start_s, stop_s)
+
+
+def describe(recording: Recording, findings: list[Finding]) -> str:
+    """What was read and what was found, for people."""
+    extra = [name for name in recording.columns() if name not in ("t_s", "u_V", "y_um")]
+    lines = [
+        f"{recording.source}: {len(recording)} samples, {recording.duration_s:.4g} s at {1 / recording.dt_s:.6g} Hz"
+        + (f", also {', '.join(extra)}" if extra else "")
+    ]
+    lines += [f"  {finding.severity}: {finding.message}" for finding in findings]
+    return "\n".join(lines)

@@ -1,0 +1,172 @@
+"""Binary payload of a feedforward query; docs/protocol.md is the page about it."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adaptive.finite import all_finite
+from adaptive.types import FloatArray
+from service.protocol.errors import FieldError
+from service.protocol.samples import (
+    FEEDFORWARD_QUERY,
+    MAX_NAME_BYTES,
+    MAX_SEQ,
+    VERSION,
+    check_finite,
+    check_header,
+    check_length,
+    check_name,
+    check_seq,
+    check_sizes,
+    column,
+    doubles,
+)
+
+#: The query carries accelerations (options bit 0), a memory vector (bit 1), or what is under way (bit 2).
+HAS_ACCELERATION: Final = 1
+HAS_MEMORY: Final = 2
+HAS_PENDING: Final = 4
+#: Samples that may be under way.
+MAX_PENDING: Final = 4096
+#: ``as_of`` of a query that takes the newest snapshot.
+NEWEST: Final = -1
+
+# version, kind, options, n, as_of, u_before_V, m, bytes of the name
+_QUERY: Final = struct.Struct("<BBHIqdII")
+# first sample and number of those that are under way
+_PENDING: Final = struct.Struct("<qI")
+# y, v, a of a query for one point
+_ONE_POINT: Final = struct.Struct("<3d")
+
+
+class Pending(NamedTuple):
+    """What is under way: commanded, and not yet seen in the samples.
+
+    Attributes
+    ----------
+    first : the stage's number of the first sample. y_um, u_V : (k,) the motion wanted, µm, and the voltages for it, V.
+    """
+
+    first: int
+    y_um: FloatArray
+    u_V: FloatArray
+
+
+class FeedforwardQuery(NamedTuple):
+    """n desired points, one sample time apart.
+
+    Attributes
+    ----------
+    y_um, v_um_per_s, a_um_per_s2 : (n,) each, finite; the motion at the instants of the points.
+    memory : (m,) from the reply before, or None: start from what the service tracks from the samples ...
+    pending : ... and from there along this to the first point; None for nothing. Not together with ``memory``.
+    model : name of the model to ask; empty for the service's default.
+    as_of : answer from the newest snapshot that had seen no sample after this number; NEWEST for the newest.
+    u_before_V : voltage just before the first point, V, from where the slew limit counts; NaN where there is none.
+    """
+
+    y_um: FloatArray
+    v_um_per_s: FloatArray
+    a_um_per_s2: FloatArray
+    memory: FloatArray | None = None
+    model: str = ""
+    as_of: int = NEWEST
+    u_before_V: float = float("nan")
+    pending: Pending | None = None
+
+
+def encode_query(
+    y_um: ArrayLike,
+    v_um_per_s: ArrayLike,
+    a_um_per_s2: ArrayLike | None = None,
+    memory: ArrayLike | None = None,
+    model: str = "",
+    as_of: int = NEWEST,
+    u_before_V: float = float("nan"),
+    pending: Pending | None = None,
+) -> bytes:
+    """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError naming what does not fit."""
+    options, m, n = 0, 0, 1
+    parts = []
+    if memory is not None:
+        vector = np.ascontiguousarray(memory, dtype="<f8")
+        options, m = HAS_MEMORY, vector.size
+        parts.append(vector.tobytes())
+    if type(y_um) is float and type(v_um_per_s) is float and type(a_um_per_s2) is float:
+        options |= HAS_ACCELERATION
+        parts.append(_ONE_POINT.pack(y_um, v_um_per_s, a_um_per_s2))
+    else:
+        y = column("y_um", y_um)
+        n = y.size
+        columns = [y, _same_length("v_um_per_s", v_um_per_s, n)]
+        if a_um_per_s2 is not None:
+            columns.append(_same_length("a_um_per_s2", a_um_per_s2, n))
+            options |= HAS_ACCELERATION
+        parts += [values.astype("<f8", copy=False).tobytes() for values in columns]
+    name = model.encode()
+    if len(name) > MAX_NAME_BYTES:
+        raise FieldError("model", f"{len(name)} bytes", f"a name of at most {MAX_NAME_BYTES} bytes")
+    under_way = b""
+    if pending is not None:
+        options |= HAS_PENDING
+        y, u = column("pending.y_um", pending.y_um), _same_length("pending.u_V", pending.u_V, len(pending.y_um))
+        first = _PENDING.pack(check_seq("pending.first", pending.first), y.size)
+        under_way = b"".join((first, y.astype("<f8", copy=False).tobytes(), u.astype("<f8", copy=False).tobytes()))
+    head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, u_before_V, m, len(name))
+    return b"".join((head, *parts, name, under_way))
+
+
+def decode_query(data: bytes) -> FeedforwardQuery:
+    """The query in a payload. Raises InputError where it is malformed, not finite, or out of bounds."""
+    options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY | HAS_PENDING)
+    *_, as_of, u_before_V, m, name_bytes = _QUERY.unpack_from(data)
+    check_sizes(m, name_bytes)
+    if m and not options & HAS_MEMORY:
+        raise FieldError("m", m, "0 where the options say that there is no memory")
+    if not NEWEST <= as_of <= MAX_SEQ:
+        raise FieldError("as_of", as_of, "a sequence number from 0 to 2**62, or -1 for the newest")
+    if u_before_V in (float("inf"), float("-inf")):
+        raise FieldError("u_before_V", u_before_V, "a finite voltage in V, or NaN for none")
+    columns = 3 if options & HAS_ACCELERATION else 2
+    end = _QUERY.size + 8 * (m + columns * n)
+    pending = _pending(data, end + name_bytes, options) if options & HAS_PENDING else None
+    if pending is None:
+        check_length(data, end + name_bytes)
+    values = doubles(data, _QUERY.size, m + columns * n)
+    memory, y, v = values[:m], values[m : m + n], values[m + n : m + 2 * n]
+    a = values[m + 2 * n :] if columns == 3 else np.zeros(n)
+    if not all_finite(values):
+        for name, part in (("memory", memory), ("y_um", y), ("v_um_per_s", v), ("a_um_per_s2", a)):
+            check_finite(name, part)
+    return FeedforwardQuery(
+        y, v, a, memory if options & HAS_MEMORY else None,
+        check_name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
+    )  # fmt: skip
+
+
+def _pending(data: bytes, begin: int, options: int) -> Pending:
+    """What is under way, from ``begin`` to the end of a query. Raises InputError where it is malformed."""
+    if options & HAS_MEMORY:
+        raise FieldError("pending", "a memory beside it", "one of the two: a memory is of the instant before y_um[0]")
+    if len(data) < begin + _PENDING.size:
+        raise FieldError("payload", f"{len(data)} bytes", f"at least {begin + _PENDING.size}, for what is under way")
+    first, k = _PENDING.unpack_from(data, begin)
+    if not 1 <= k <= MAX_PENDING:
+        raise FieldError("pending", f"{k} samples", f"1 to {MAX_PENDING}")
+    check_length(data, begin + _PENDING.size + 16 * k)
+    values = doubles(data, begin + _PENDING.size, 2 * k)
+    pending = Pending(check_seq("pending.first", first), values[:k], values[k:])
+    check_finite("pending.y_um", pending.y_um)
+    check_finite("pending.u_V", pending.u_V)
+    return pending
+
+
+def _same_length(field: str, values: ArrayLike, n: int) -> FloatArray:
+    array = column(field, values)
+    if array.size != n:
+        raise FieldError(field, f"{array.size} values", f"{n}, as many as y_um")
+    return array

@@ -1,0 +1,212 @@
+"""Binary payloads of the stage and the controller; docs/protocol.md is the page about them.
+
+All numbers are little-endian. Every payload begins with the same eight bytes: version (u8), kind (u8), options (u16),
+count n (u32); columns of n values follow. Decoding is strict: a payload of another length, version or kind is refused
+with an :class:`InputError` that names the field, what was got and what was expected.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptive.finite import all_finite
+from adaptive.types import FloatArray
+from service.protocol.errors import FieldError
+
+VERSION: Final = 1
+SAMPLES: Final = 1
+COMMAND: Final = 2
+REFERENCE: Final = 3
+FEEDFORWARD_QUERY: Final = 4
+FEEDFORWARD_REPLY: Final = 5
+MODEL: Final = 6
+KIND_NAMES: Final = {
+    SAMPLES: "samples",
+    COMMAND: "command",
+    REFERENCE: "reference",
+    FEEDFORWARD_QUERY: "feedforward query",
+    FEEDFORWARD_REPLY: "feedforward reply",
+    MODEL: "model",
+}
+
+#: Longest block that is taken, so that one message cannot ask for all of the memory.
+MAX_COUNT: Final = 65_536
+MAX_SEQ: Final = 2**62
+MAX_MEMORY: Final = 4096
+MAX_NAME_BYTES: Final = 64
+
+HEADER: Final = struct.Struct("<BBHI")
+_BLOCK: Final = struct.Struct("<BBHIq")
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBatch:
+    """n samples of a stage: ``seq`` (n,), ``t_s`` (n,) s, ``u_V`` (n,) V, ``y_um`` (n,) µm.
+
+    The values may be anything, NaN included: what a stage measured is reported as it is, and refused by the gates.
+    """
+
+    seq: NDArray[np.int64]
+    t_s: FloatArray
+    u_V: FloatArray
+    y_um: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.seq.size)
+
+    def where(self, kept: ArrayLike) -> SampleBatch:
+        """The samples for which ``kept``, (n,) truth values, is true."""
+        rows = np.asarray(kept, dtype=np.bool_)
+        return SampleBatch(self.seq[rows], self.t_s[rows], self.u_V[rows], self.y_um[rows])
+
+
+def joined(batches: Sequence[SampleBatch]) -> SampleBatch:
+    """The samples of several messages, in their order, as those of one."""
+    return SampleBatch(
+        *(np.concatenate([getattr(batch, name) for batch in batches]) for name in ("seq", "t_s", "u_V", "y_um"))
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """n consecutive finite values from sequence number ``seq`` on: voltages in V, or displacements in µm."""
+
+    seq: int
+    values: FloatArray
+
+    def __len__(self) -> int:
+        return int(self.values.size)
+
+
+def check_header(data: bytes, kind: int, least_bytes: int, allowed_options: int = 0) -> tuple[int, int]:
+    """(options, n) of a payload that is to be of ``kind`` and at least ``least_bytes`` long."""
+    if len(data) < least_bytes:
+        raise FieldError("payload", f"{len(data)} bytes", f"at least {least_bytes} bytes for a {KIND_NAMES[kind]}")
+    version, got_kind, options, n = HEADER.unpack_from(data)
+    if version != VERSION:
+        raise FieldError("version", version, f"{VERSION}", "use a client of the same wire version as the service")
+    if got_kind != kind:
+        raise FieldError("kind", f"{got_kind} ({KIND_NAMES.get(got_kind, 'unknown')})", f"{kind} ({KIND_NAMES[kind]})")
+    if options & ~allowed_options:
+        raise FieldError("options", f"0x{options:04x}", f"no bit outside 0x{allowed_options:04x}")
+    if not 1 <= n <= MAX_COUNT:
+        raise FieldError("n", n, f"1 to {MAX_COUNT}", "split what is longer into several messages")
+    return options, n
+
+
+def check_length(data: bytes, expected: int) -> None:
+    """InputError unless the payload is exactly as long as its header says."""
+    if len(data) != expected:
+        raise FieldError("payload", f"{len(data)} bytes", f"exactly {expected} bytes by its own header")
+
+
+def check_finite(field: str, values: FloatArray) -> None:
+    """InputError naming the first element of ``values`` that is not finite."""
+    if not all_finite(values):
+        bad = int(np.argmin(np.isfinite(values)))
+        raise FieldError(f"{field}[{bad}]", float(values[bad]), "a finite number")
+
+
+def check_seq(field: str, seq: int) -> int:
+    """A sequence number that fits the wire, else InputError."""
+    if not 0 <= seq <= MAX_SEQ:
+        raise FieldError(field, seq, "a sequence number from 0 to 2**62")
+    return int(seq)
+
+
+def check_sizes(m: int, name_bytes: int) -> None:
+    """InputError where a memory or a name is longer than the wire takes."""
+    if m > MAX_MEMORY:
+        raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
+    if name_bytes > MAX_NAME_BYTES:
+        raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
+
+
+def check_name(raw: bytes) -> str:
+    """A model's name in UTF-8, else InputError."""
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        raise FieldError("model", repr(raw), "a name in UTF-8") from error
+
+
+def doubles(data: bytes, offset: int, count: int) -> FloatArray:
+    """``count`` doubles from ``offset`` on, as an array of its own (aligned and writeable)."""
+    return np.frombuffer(data, dtype="<f8", count=count, offset=offset).astype(np.float64)
+
+
+def column(field: str, values: ArrayLike) -> FloatArray:
+    """``values`` as a contiguous (n,) array of doubles with 1 ≤ n ≤ MAX_COUNT, else InputError."""
+    try:
+        array = np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FieldError(field, repr(values)[:80], "numbers") from error
+    if array.ndim > 1:
+        raise FieldError(field, f"shape {array.shape}", "one number or a one-dimensional array")
+    if not 1 <= array.size <= MAX_COUNT:
+        raise FieldError(field, f"{array.size} values", f"1 to {MAX_COUNT} values")
+    return array.reshape(-1)
+
+
+def encode_samples(seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike) -> bytes:
+    """A message of n samples; all arguments are numbers or (n,). Raises InputError on unequal lengths or bad seq."""
+    numbers = np.ascontiguousarray(seq, dtype=np.int64).reshape(-1)
+    columns = [column("t_s", t_s), column("u_V", u_V), column("y_um", y_um)]
+    for name, values in zip(("t_s", "u_V", "y_um"), columns, strict=True):
+        if values.size != numbers.size:
+            raise FieldError(name, f"{values.size} values", f"{numbers.size}, as many as seq")
+    check_seq("seq", int(numbers.min()))
+    head = HEADER.pack(VERSION, SAMPLES, 0, numbers.size)
+    return b"".join((head, numbers.astype("<i8").tobytes(), *(c.astype("<f8", copy=False).tobytes() for c in columns)))
+
+
+def decode_samples(data: bytes) -> SampleBatch:
+    """The samples of a message. Raises InputError where it is malformed; values are not judged."""
+    _, n = check_header(data, SAMPLES, HEADER.size)
+    check_length(data, HEADER.size + 32 * n)
+    seq = np.frombuffer(data, dtype="<i8", count=n, offset=HEADER.size).astype(np.int64)
+    check_seq("seq", int(seq.min()))
+    check_seq("seq", int(seq.max()))
+    rest = doubles(data, HEADER.size + 8 * n, 3 * n)
+    return SampleBatch(seq, rest[:n], rest[n : 2 * n], rest[2 * n :])
+
+
+def encode_command(seq: int, u_V: ArrayLike) -> bytes:
+    """Voltages, V, for samples ``seq``, ``seq + 1``, …; (n,) and finite."""
+    return _encode_block(COMMAND, "u_V", seq, u_V)
+
+
+def decode_command(data: bytes) -> Block:
+    """A command block; raises InputError where it is malformed or not finite."""
+    return _decode_block(COMMAND, "u_V", data)
+
+
+def encode_reference(seq: int, y_um: ArrayLike) -> bytes:
+    """Wanted displacements, µm, at samples ``seq``, ``seq + 1``, …; (n,) and finite."""
+    return _encode_block(REFERENCE, "y_um", seq, y_um)
+
+
+def decode_reference(data: bytes) -> Block:
+    """A reference block; raises InputError where it is malformed or not finite."""
+    return _decode_block(REFERENCE, "y_um", data)
+
+
+def _encode_block(kind: int, field: str, seq: int, values: ArrayLike) -> bytes:
+    array = column(field, values)
+    check_finite(field, array)
+    return _BLOCK.pack(VERSION, kind, 0, array.size, check_seq("seq", seq)) + array.astype("<f8", copy=False).tobytes()
+
+
+def _decode_block(kind: int, field: str, data: bytes) -> Block:
+    _, n = check_header(data, kind, _BLOCK.size)
+    check_length(data, _BLOCK.size + 8 * n)
+    seq = check_seq("seq", _BLOCK.unpack_from(data)[4])
+    values = doubles(data, _BLOCK.size, n)
+    check_finite(field, values)
+    return Block(seq, values)

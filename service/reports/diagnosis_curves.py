@@ -1,0 +1,368 @@
+"""Each cause's own picture, as curves: what is left of the readings without it and with it, over what shows it best.
+
+Curves are numbers here, drawn elsewhere: into a PNG by `service.reports.diagnosis_pictures`, for the viewer by
+`service.reports.diagnosis_viewer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.model.measured import Setting
+from sim.diagnosis.report.result import Cause
+from sim.diagnosis.search.noise_floor import standing
+
+# --- What a picture of a cause is made of: curves as numbers, and the means and units that they share.
+#
+# Residuals are in nm, or in µm where they are large.
+
+
+MEASURED, WITHOUT, WITH = "measured", "without it", "with it"
+#: Points beyond which a curve over time is drawn by the extremes of equal stretches.
+MOST_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve: ``role`` is MEASURED, WITHOUT or WITH; ``dashed`` tells a second one of the same role apart."""
+
+    role: str
+    x: FloatArray
+    y: FloatArray
+    note: str = ""
+    dashed: bool = False
+    points: bool = False
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """For the legend."""
+        return self.name or (f"{self.role}, {self.note}" if self.note else self.role)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Curves over one pair of axes; ``marks`` are values of x worth a line."""
+
+    x_name: str
+    y_name: str
+    curves: tuple[Curve, ...]
+    log_x: bool = False
+    log_y: bool = False
+    marks: tuple[float, ...] = ()
+
+
+def envelope(t: FloatArray, y: FloatArray, most: int = MOST_POINTS) -> tuple[FloatArray, FloatArray]:
+    """A long line thinned to the lowest and highest value of each stretch, so that no spike is lost."""
+    if y.size <= most:
+        return t, y
+    width = -(-y.size // (most // 2))
+    starts = np.arange(0, y.size, width)
+    low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
+    return np.repeat(t[starts], 2), np.column_stack([low, high]).ravel()
+
+
+def binned(x: FloatArray, y: FloatArray, bins: int = 60) -> tuple[FloatArray, FloatArray]:
+    """Means of y in equal bins of x; bins of few samples are left out."""
+    low, high = np.quantile(x, [0.001, 0.999])
+    edges = np.linspace(low, high, bins + 1)
+    place = np.clip(np.digitize(x, edges) - 1, 0, bins - 1)
+    count = np.bincount(place, minlength=bins)
+    mean = np.bincount(place, weights=y, minlength=bins) / np.maximum(count, 1)
+    good = count > min(20, max(2, x.size // (4 * bins)))
+    return 0.5 * (edges[1:] + edges[:-1])[good], mean[good]
+
+
+def unit(cause: Cause) -> tuple[float, str]:
+    """Factor from µm and name of the unit that suits this cause's residual."""
+    return (1.0, "µm") if float(np.quantile(np.abs(cause.before_um), 0.99)) > 3.0 else (1e3, "nm")
+
+
+def both(cause: Cause) -> tuple[tuple[str, FloatArray], tuple[str, FloatArray]]:
+    scale = unit(cause)[0]
+    return (WITHOUT, scale * cause.before_um), (WITH, scale * cause.after_um)
+
+
+def slow(r_nm: FloatArray, width: int) -> FloatArray:
+    """Moving mean over ``width`` samples, the same length, without the ends' bias."""
+    sums = np.concatenate([[0.0], np.cumsum(r_nm)])
+    half = width // 2
+    low = np.clip(np.arange(r_nm.size) - half, 0, r_nm.size)
+    high = np.clip(np.arange(r_nm.size) + half + 1, 0, r_nm.size)
+    return np.asarray((sums[high] - sums[low]) / (high - low))
+
+
+def period(setting: Setting) -> int:
+    """Samples of the drive's slowest strong period: what a mean must span to see only what is slower."""
+    u = setting.u_V - setting.u_V.mean()
+    power = np.abs(np.fft.rfft(u * np.hanning(u.size))) ** 2
+    strong = np.flatnonzero(power[3:] > 0.1 * power[3:].max())
+    lowest = (int(strong[0]) + 3) if strong.size else 3
+    return int(np.clip(u.size // lowest, 10, u.size // 8))
+
+
+# --- Pictures over time: since the record began, since a step, since a reversal, stretch by stretch.
+
+
+def over_time(cause: Cause, setting: Setting) -> Picture | None:
+    curves = tuple(Curve(role, *envelope(setting.t_s, r)) for role, r in both(cause))
+    return Picture("time / s", f"residual / {unit(cause)[1]}", curves)
+
+
+def slowly(cause: Cause, setting: Setting) -> Picture | None:
+    """A drift: the residual's mean over a period of the drive, over time."""
+    width = period(setting)
+    cut = slice(width // 2, setting.n - width // 2)
+    curves = tuple(Curve(role, *envelope(setting.t_s[cut], slow(r, width)[cut], 1500)) for role, r in both(cause))
+    return Picture("time / s", f"mean residual over {width * setting.dt_s:.3g} s / {unit(cause)[1]}", curves)
+
+
+def over_log_time(cause: Cause, setting: Setting) -> Picture | None:
+    """Creep: the residual after each long hold's step over the logarithm of time; without holds, since the start."""
+    still = np.abs(np.diff(setting.u_V, prepend=setting.u_V[0])) < 1e-9 * max(setting.swing_V, 1e-12)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
+    # A hold after a step shows creep; one that the record begins with shows nothing.
+    holds = [e for e in edges if e[0] > 0 and (e[1] - e[0]) * setting.dt_s > 0.5]
+    long = sorted(holds, key=lambda e: e[0] - e[1])[:4]
+    curves: list[Curve] = []
+    if not long:
+        width = period(setting)
+        where = np.unique(np.geomspace(width, setting.n - width // 2 - 1, 80).astype(int))
+        for role, r in both(cause):
+            mean = slow(r, width)[where]
+            curves.append(Curve(role, where * setting.dt_s, mean - mean[-1]))
+        name = f"mean residual over {width * setting.dt_s:.3g} s, less its last / {unit(cause)[1]}"
+        return Picture("time since the record began / s", name, tuple(curves), log_x=True)
+    for role, r in both(cause):
+        for i, (start, stop) in enumerate(long):
+            where = np.unique(np.geomspace(max(2, round(0.02 / setting.dt_s)), stop - start - 1, 60).astype(int))
+            ends = np.minimum(where + np.maximum(1, where // 8), stop - start)
+            sums = np.concatenate([[0.0], np.cumsum(r[start:stop])])
+            mean = (sums[ends] - sums[where]) / (ends - where)
+            # Up and down alike: creep goes on in the direction of the step.
+            before = max(0, int(start) - 2)
+            sign = float(np.sign(setting.u_V[start] - setting.u_V[before])) or 1.0
+            note = f"hold at {setting.u_V[start]:.3g} V"
+            curves.append(Curve(role, where * setting.dt_s, sign * (mean - mean[0]), note, dashed=i > 0))
+    name = f"residual in the step's direction since 20 ms / {unit(cause)[1]}"
+    return Picture("time since the step / s", name, tuple(curves), log_x=True)
+
+
+def _by_stretch(cause: Cause, setting: Setting, of: FloatArray, least: float, scale: float, name: str) -> Picture:
+    """Slope of the residual over ``of`` in forty stretches of the record."""
+    stretch = max(50, setting.n // 40)
+    curves = []
+    for role, r in ((WITHOUT, cause.before_um), (WITH, cause.after_um)):
+        t, slope = [], []
+        for start in range(0, setting.n - stretch + 1, stretch):
+            x = of[start : start + stretch]
+            d = x - x.mean()
+            if float(d @ d) > least * stretch:
+                t.append((start + 0.5 * stretch) * setting.dt_s)
+                slope.append(scale * float(d @ r[start : start + stretch]) / float(d @ d))
+        curves.append(Curve(role, np.array(t), np.array(slope), points=True))
+    return Picture("time / s", name, tuple(curves))
+
+
+def gain_over_time(cause: Cause, setting: Setting) -> Picture | None:
+    least = (0.02 * setting.range_um) ** 2
+    return _by_stretch(cause, setting, setting.y_um, least, 100.0, "gain beyond the model's / %")
+
+
+def lag_over_time(cause: Cause, setting: Setting) -> Picture | None:
+    v = np.gradient(setting.y_um, setting.dt_s)
+    return _by_stretch(cause, setting, v, 0.01 * float(np.var(v)), -1e6, "readings late by / µs")
+
+
+def after_steps(cause: Cause, setting: Setting) -> Picture | None:
+    """The mean residual after the largest steps of the drive; without steps, over the speed: late is a slope."""
+    du = np.diff(setting.u_V, prepend=setting.u_V[0])
+    span = max(8, min(round(0.03 / setting.dt_s), setting.n // 20))
+    order = np.argsort(-np.abs(du))[:20]
+    usual = float(np.quantile(np.abs(du), 0.98))
+    steps = [k for k in order if abs(du[k]) > max(0.05 * setting.swing_V, 5.0 * usual) and 2 <= k < setting.n - span]
+    if len(steps) >= 2:
+        t = np.asarray((np.arange(span + 2) - 2) * setting.dt_s * 1e3, dtype=np.float64)
+        curves = tuple(
+            Curve(role, t, _mean([r[k - 2 : k + span] * np.sign(du[k]) for k in steps]), points=True)
+            for role, r in both(cause)
+        )
+        return Picture("time since the step / ms", f"mean residual in the step's direction / {unit(cause)[1]}", curves)
+    speed = np.gradient(setting.y_um - cause.after_um, setting.dt_s)
+    curves = tuple(Curve(role, *binned(speed, r, 40)) for role, r in both(cause))
+    return Picture("speed / (µm/s)", f"mean residual / {unit(cause)[1]}", curves)
+
+
+def _mean(rows: list[FloatArray]) -> FloatArray:
+    return np.asarray(np.mean(rows, axis=0), dtype=np.float64)
+
+
+def after_reversals(cause: Cause, setting: Setting) -> Picture | None:
+    """Friction: the residual against the motion, over the way travelled since the last reversal."""
+    x = setting.y_um - cause.after_um
+    way = np.sign(np.diff(x, prepend=x[0]))
+    turns = np.flatnonzero(way[1:] * way[:-1] < 0) + 1
+    if turns.size < 2:
+        return None
+    last = np.zeros(setting.n, dtype=np.intp)
+    last[turns] = turns
+    last = np.maximum.accumulate(last)
+    travelled = np.abs(x - x[last])
+    near = (travelled > 0.0) & (travelled < 0.05 * setting.range_um) & (last > 0)
+    if near.sum() < 200:
+        return None
+    curves = tuple(Curve(role, *binned(travelled[near], (r * way)[near])) for role, r in both(cause))
+    return Picture("way since the reversal / µm", f"residual in the direction of motion / {unit(cause)[1]}", curves)
+
+
+def at_rest(cause: Cause, setting: Setting) -> Picture | None:
+    """Readings at rest, one by one: the grid they lie on."""
+    quiet = np.flatnonzero(standing(setting, 0.1))
+    start = int(quiet[0]) if quiet.size else 0
+    part = slice(start, min(setting.n, start + 400))
+    y = setting.y_um[part]
+    step = cause.parameters.get("step_um", 0.0)
+    origin = float(y[0])
+    name = f"reading / steps of {1e3 * step:.3g} nm" if step > 0.0 else "reading / nm"
+    scale = 1.0 / step if step > 0.0 else 1e3
+    return Picture("time / s", name, (Curve(MEASURED, setting.t_s[part], scale * (y - origin), points=True),))
+
+
+def picture(cause: Cause, setting: Setting) -> Picture:
+    """The picture in which this cause shows itself."""
+    for attempt in (_PICTURES.get(cause.name, over_time), over_time):
+        made = attempt(cause, setting)
+        if made is not None:
+            return made
+    raise AssertionError("a residual over time can always be drawn")  # pragma: no cover
+
+
+def _by_way(cause: Cause, setting: Setting, x: FloatArray, name: str) -> Picture | None:
+    """Mean residual over ``x``, on the way up and on the way down apart."""
+    rising = np.gradient(setting.u_V)
+    eps = 1e-6 * setting.swing_V
+    curves = []
+    for role, r in both(cause):
+        for mask, way, dashed in ((rising > eps, "rising", False), (rising < -eps, "falling", True)):
+            if mask.sum() > 100:
+                curves.append(Curve(role, *binned(x[mask], r[mask]), note=way, dashed=dashed))
+    return Picture(name, f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
+
+
+def _over_reading(cause: Cause, setting: Setting) -> Picture | None:
+    return _by_way(cause, setting, setting.y_um, "reading / µm")
+
+
+def _over_motion(cause: Cause, setting: Setting) -> Picture | None:
+    """The loop that is missing, over the displacement; across a resonance the voltage tells nothing of the way."""
+    x = setting.y_um - cause.after_um
+    speed = np.gradient(x)
+    curves = []
+    for role, r in both(cause):
+        for mask, way, dashed in ((speed > 0.0, "rising", False), (speed < 0.0, "falling", True)):
+            if mask.sum() > 100:
+                curves.append(Curve(role, *binned(x[mask], r[mask], 40), note=way, dashed=dashed))
+    return Picture("displacement / µm", f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
+
+
+def _over_voltage(cause: Cause, setting: Setting) -> Picture | None:
+    return _by_way(cause, setting, setting.u_V, "voltage / V")
+
+
+def _over_rate(cause: Cause, setting: Setting) -> Picture | None:
+    """By how much the loop is wider than the model's, over the rate of the voltage."""
+    rate, sign = setting.rate_V_per_s, np.sign(np.gradient(setting.u_V))
+    moving: BoolArray = np.asarray(rate > 1e-3 * setting.swing_V / setting.duration_s)
+    if moving.sum() < 200:
+        return None
+    curves = []
+    for role, r in both(cause):
+        x, y = binned(np.log10(rate[moving]), -2.0 * (r * sign)[moving], 25)
+        curves.append(Curve(role, 10.0**x, y))
+    return Picture(
+        "rate of the voltage / (V/s)", f"loop width beyond the model's / {unit(cause)[1]}", tuple(curves), log_x=True
+    )
+
+
+def _response(cause: Cause, setting: Setting) -> Picture | None:
+    """Readings over voltage in the frequency domain: measured, and as the model has it without and with the cause."""
+    from scipy.signal import csd, welch
+
+    # Enough pieces to average over: one alone is all speckle.
+    size = max(256, min(setting.n // 8, round(2.0 / setting.dt_s)))
+    u = setting.u_V - setting.u_V.mean()
+    rate = 1.0 / setting.dt_s
+    f, power = welch(u, rate, nperseg=size)
+    driven = power > 1e-3 * power.max()
+    driven[0] = False
+    if driven.sum() < 8:
+        return None
+    curves = []
+    y = setting.y_um - setting.y_um.mean()
+    for role, r in ((MEASURED, np.zeros_like(y)), (WITHOUT, cause.before_um), (WITH, cause.after_um)):
+        _, cross = csd(u, y - r, rate, nperseg=size)
+        curves.append(Curve(role, f[driven], np.abs(cross[driven]) / power[driven]))
+    marks = tuple(v for v in _modes(cause) if f[driven][0] < v < f[driven][-1])
+    # Little is driven far above the drive's own band; there the quotient is noise.
+    return Picture("frequency / Hz", "gain / (µm/V)", tuple(curves), log_x=True, log_y=True, marks=marks)
+
+
+def _modes(cause: Cause) -> tuple[float, ...]:
+    """Frequencies of its modes, Hz."""
+    return tuple(float(v) for name, v in cause.parameters.items() if name.startswith("f0") and name.endswith("_hz"))
+
+
+def _spectrum(cause: Cause, setting: Setting) -> Picture | None:
+    from scipy.signal import welch
+
+    modes = _modes(cause)
+    size = max(256, min(setting.n // (8 if modes else 1), round(4.0 / setting.dt_s)))
+    curves = []
+    for role, r in both(cause):
+        f, power = welch(r, 1.0 / setting.dt_s, nperseg=size)
+        curves.append(Curve(role, f[1:], np.sqrt(power[1:])))
+    mark = cause.parameters.get("frequency_hz")
+    marks = modes or ((float(mark),) if mark else ())
+    return Picture(
+        "frequency / Hz",
+        f"residual / ({unit(cause)[1]}/√Hz)",
+        tuple(curves),
+        log_y=True,
+        marks=marks,
+    )
+
+
+def _over_other_axis(cause: Cause, setting: Setting) -> Picture | None:
+    if _modes(cause):
+        return _spectrum(cause, setting)
+    if setting.other_um is None:
+        return None
+    curves = tuple(Curve(role, *binned(setting.other_um, r)) for role, r in both(cause))
+    return Picture("displacement of the other axis / µm", f"mean residual / {unit(cause)[1]}", curves)
+
+
+_PICTURES: dict[str, Callable[[Cause, Setting], Picture | None]] = {
+    "creep": over_log_time,
+    "thermal_drift": slowly,
+    "gain_drift": gain_over_time,
+    "resonance": _response,
+    "payload_change": _response,
+    "mains_hum": _spectrum,
+    "amplifier_lag": after_steps,
+    "sensor_lag": after_steps,
+    "delay": after_steps,
+    "slew_limit": after_steps,
+    "saturation": _over_voltage,
+    "hysteresis_shape": _over_motion,
+    "stick_slip": after_reversals,
+    "asymmetry": _over_reading,
+    "sensor_nonlinearity": _over_reading,
+    "rate_dependence": _over_rate,
+    "cross_talk": _over_other_axis,
+    "quantisation": at_rest,
+    "timing": lag_over_time,
+}

@@ -1,0 +1,238 @@
+"""The page that an engineer reads in two minutes: report.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sim.diagnosis.report.export import Exported
+from sim.diagnosis.report.result import TEST, Cause, Diagnosis
+from sim.effects import KINDS
+
+# --- How a diagnosis speaks of numbers.
+
+
+#: Units by the end of a number's name, as written for people.
+_UNITS = {
+    "_um_per_s": " µm/s", "_um_per_V": " µm/V", "_per_s": " /s", "_V_per_s": " V/s", "_um": " µm", "_hz": " Hz",
+    "_Hz": " Hz", "_V": " V", "_s": " s", "_ppm": " ppm", "_per_K": " /K", "_um_per_K": " µm/K",
+    "_per_um": " /µm",
+}  # fmt: skip
+
+
+def length(value_um: float) -> str:
+    """A length with the unit that suits it."""
+    return f"{1e3 * value_um:.3g} nm" if abs(value_um) < 1.0 else f"{value_um:.3g} µm"
+
+
+def with_unit(name: str, value: float) -> str:
+    """A number of a cause with the unit that its name ends in."""
+    for end in sorted(_UNITS, key=len, reverse=True):
+        if name.endswith(end):
+            return f"{value:.4g}{_UNITS[end]}"
+    return f"{value:.4g}"
+
+
+def plain(name: str) -> str:
+    """A cause's name for a sentence."""
+    return name.replace("_", " ")
+
+
+#: Held-out errors within this factor of the noise floor are as good as they get.
+AT_THE_FLOOR = 1.5
+#: Numbers of one cause on the page; the others stand in report.json.
+MOST_NUMBERS = 6
+#: A noise floor that is no more than a bound.
+DIFFERENCES = "differences"
+#: Names of the nominal stages in a sentence.
+_NOMINALS = {"bouc_wen": "the chapter's Bouc-Wen stage", "linear": "a linear stage of one mode"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the data came from: names for people. ``test`` is empty where there is no test recording."""
+
+    data: str
+    findings: tuple[str, ...] = ()
+    test: str = ""
+    nominal: str = "bouc_wen"
+
+
+def picture_name(place: int, cause: Cause) -> str:
+    """File of a cause's own picture."""
+    return f"{place + 1}-{cause.name}.png"
+
+
+def page(diagnosis: Diagnosis, exported: Exported, source: Source, *, viewer: bool = True) -> str:
+    """The whole of report.md; ``viewer``: there is a file for the viewer beside it."""
+    d = diagnosis
+    lines = [f"# {source.data}: what the simulation lacks", "", *_summary(d, source), ""]
+    lines += [*_errors(d), ""]
+    if d.causes:
+        lines += [*_causes(d), ""]
+    lines += ["![residual before and after](residual.png)", ""]
+    for place, cause in enumerate(d.causes):
+        lines += _section(place, cause)
+    if d.verdict == "unexplained":
+        lines += _left(d)
+    lines += _limits(d)
+    lines += [
+        "## Next",
+        "",
+        f"Record: {d.next_experiment}." if d.next_experiment else "Nothing is open that another drive would settle.",
+        "",
+        _file(d, exported) + (" `diagnosis.rrd` opens in the Rerun viewer." if viewer else ""),
+        "",
+    ]
+    if source.findings:
+        lines += ["## The recording itself", "", *(f"- {text}" for text in source.findings), ""]
+    return "\n".join(lines)
+
+
+def _file(d: Diagnosis, exported: Exported) -> str:
+    missing = (
+        f"the stage library has no equal of {', '.join(plain(n) for n in exported.left_out)} in the form found here."
+    )
+    if {c.name for c in d.causes} <= set(exported.left_out) and d.causes:
+        return f"`stage.toml` is the calibrated nominal stage only: {missing}"
+    kind = f"extended stage in part ({missing[:-1]})" if exported.left_out else "extended stage"
+    return (
+        f"`stage.toml` is the {kind if d.causes else 'calibrated stage'}: `dehyst stage --file stage.toml` and "
+        "`dehyst demo --stage stage.toml` run it. "
+        f"Its free run is {length(exported.rms_um)} rms from the model fitted here (the recorder's latch and hold and "
+        "the noise left out)."
+    )
+
+
+def _summary(d: Diagnosis, source: Source) -> list[str]:
+    setting = d.nominal.model.setting
+    nominal = _NOMINALS.get(source.nominal, f"the stage of `{source.nominal}`")
+    verdict = {
+        "adequate": f"{nominal[0].upper()}{nominal[1:]} explains this recording down to its noise.",
+        "effects": f"Beside {nominal} there is **{_listed(d)}**.",
+        "unexplained": "Something is in this recording that no cause of the catalogue explains.",
+    }[d.verdict]
+    tested = f", tested on `{source.test}`" if source.test else ""
+    return [
+        f"**{d.verdict}.** {verdict} {_gain(d)}",
+        "",
+        f"`{source.data}`{tested}: {setting.n} samples, {setting.duration_s:.3g} s at {1.0 / setting.dt_s:.5g} Hz, "
+        f"{setting.u_low_V:.3g} to {setting.u_high_V:.3g} V, range {length(setting.range_um)}.",
+    ]
+
+
+def _listed(d: Diagnosis) -> str:
+    names = [plain(c.name) + (f" (or {', '.join(plain(a) for a in c.alternatives)})" * bool(c.alternatives))
+             for c in d.causes]  # fmt: skip
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)
+
+
+def _gain(d: Diagnosis) -> str:
+    """What the extension is worth, in a sentence; and where it is worth nothing, that."""
+    before, after, floor = d.nominal_heldout_um, d.extended_heldout_um, d.noise_floor_um
+    where = "the test recording" if d.heldout_source == TEST else "data that was not used"
+    if not d.causes:
+        return f"Its error on {where} is {length(before)}; the noise floor is {length(floor)}."
+    if after > 0.98 * before:
+        return (
+            f"But on {where} the error does not fall by that ({length(before)} before, {length(after)} after): these "
+            "numbers hold for this recording and do not carry over."
+        )
+    return f"With it the error on {where} falls from {length(before)} to {length(after)}, {_beside_floor(after, d)}."
+
+
+def _beside_floor(error_um: float, d: Diagnosis) -> str:
+    """An error beside the noise floor, in words."""
+    floor = d.noise_floor_um
+    near = error_um <= AT_THE_FLOOR * floor
+    if near and d.floor_source == DIFFERENCES:
+        # Without rests or periods fast motion counts as noise.
+        return f"below the only bound on the noise that this recording gives ({length(floor)}, from differences)"
+    if error_um < 0.5 * floor:
+        return f"below its own noise floor ({length(floor)}): the test recording is quieter"
+    rest = "at the noise floor" if near else f"{error_um / floor:.2g} times the noise floor"
+    return f"{rest} ({length(floor)})"
+
+
+def _errors(d: Diagnosis) -> list[str]:
+    held = "on the test recording" if d.heldout_source == TEST else "held out, fold by fold"
+    bound = ", at most" if d.floor_source == DIFFERENCES else ""
+    return [
+        f"| free-run error, rms | on this recording | {held} |",
+        "|---|---|---|",
+        f"| nominal stage, calibrated | {length(d.nominal_rmse_um)} | {length(d.nominal_heldout_um)} |",
+        f"| extended stage | {length(d.extended_rmse_um)} | {length(d.extended_heldout_um)} |",
+        f"| noise floor{bound}, from {d.floor_source} | {length(d.noise_floor_um)} | |",
+    ]
+
+
+def _causes(d: Diagnosis) -> list[str]:
+    lines = ["| cause | or | number | 95 % interval | removes | by chance |", "|---|---|---|---|---|---|"]
+    for c in d.causes:
+        first = surest(c)
+        number = f"{first} = {with_unit(first, c.parameters[first])}" if first else ""
+        low, high = c.intervals.get(first, (float("nan"), float("nan")))
+        lines.append(
+            f"| **{plain(c.name)}** | {', '.join(plain(a) for a in c.alternatives) or '-'} | {number} | {low:.4g} to "
+            f"{high:.4g} | {100.0 * c.heldout_gain:.3g} % | {100.0 * c.p_value:.2g} % |"
+        )
+    lines += ["", "*Removes*: share of the held-out squared error left by those above it. *By chance*: how often noise "
+              "alone gains as much."]  # fmt: skip
+    return lines
+
+
+def surest(cause: Cause) -> str:
+    """The name of the number that is known best beside its interval: the one to put into a table."""
+
+    def sureness(name: str) -> float:
+        low, high = cause.intervals[name]
+        # An interval without width is a number at its bound: not known, but stopped.
+        return abs(cause.parameters[name]) / (high - low) if high > low else 0.0
+
+    return max(cause.parameters, key=sureness, default="")
+
+
+def _section(place: int, cause: Cause) -> list[str]:
+    kind = KINDS.get(cause.name)
+    lines = [f"## {place + 1}. {plain(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
+    numbers = []
+    for name, value in list(cause.parameters.items())[:MOST_NUMBERS]:
+        low, high = cause.intervals[name]
+        numbers.append(f"{name} = {with_unit(name, value)} ({low:.4g} to {high:.4g})")
+    more = len(cause.parameters) - len(numbers)
+    lines.append(f"{'; '.join(numbers)}{f'; and {more} more in report.json' if more > 0 else ''}.")
+    if kind is not None:
+        lines.append(f"Its signature: {kind.signature}.")
+        if kind.mistaken_for:
+            others = ", ".join(plain(n) for n in kind.mistaken_for)
+            lines.append(f"Easily mistaken for {others}; {kind.tells_apart}.")
+    if cause.alternatives:
+        lines.append(f"**This recording cannot tell it from {', '.join(plain(a) for a in cause.alternatives)}.**")
+    return [*lines, ""]
+
+
+def _left(d: Diagnosis) -> list[str]:
+    lines = ["## What is left", "", "The residual above repeats with the drive and is far above the noise."]
+    if d.partial:
+        lines.append(
+            f"Of the causes tried, {', '.join(plain(n) for n in d.partial)} came closest, but together they leave too "
+            "much of what stands above the noise: none of them is named."
+        )
+    return [*lines, ""]
+
+
+def _limits(d: Diagnosis) -> list[str]:
+    lines = ["## What this recording cannot say", ""]
+    lines.append(
+        f"Not excited, their usual size would not show here: {', '.join(plain(n) for n in d.not_excited)}."
+        if d.not_excited
+        else "Every cause of the catalogue would have shown."
+    )
+    sets = [f"{plain(c.name)} and {', '.join(plain(a) for a in c.alternatives)}" for c in d.causes if c.alternatives]
+    if sets:
+        lines.append(f"Inseparable here: {'; '.join(sets)}.")
+    if d.verdict == "effects" and d.extended_heldout_um > AT_THE_FLOOR * d.noise_floor_um:
+        lines.append(
+            f"What is left after the extension is {d.extended_heldout_um / d.noise_floor_um:.2g} times the noise "
+            "floor: the forms are approximations, or something small is still unnamed."
+        )
+    return [*lines, ""]

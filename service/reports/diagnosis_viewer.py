@@ -1,0 +1,180 @@
+"""The same diagnosis for the Rerun viewer: an ``.rrd`` with residuals over time, loops, and each cause's own curves."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, Curve, Picture, envelope, picture
+from service.reports.diagnosis_page import plain
+from service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
+from service.viewer.style import AMBER, FRAME, LABEL, WHITE, Colour
+from sim.diagnosis.report.result import Diagnosis
+
+APPLICATION, TIMELINE = "dehyst-diagnosis", "t_s"
+BLUE: Colour = (86, 180, 233)
+COLOURS: dict[str, Colour] = {MEASURED: WHITE, WITHOUT: AMBER, WITH: BLUE}
+#: Points of a curve over time; beyond, the extremes of equal stretches.
+MOST_POINTS = 40_000
+#: Turns of a loop drawn in its plane.
+LOOP_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class _Trace:
+    """One curve over time: its place, name, colour, values."""
+
+    path: str
+    name: str
+    colour: Colour
+    values: FloatArray
+
+
+def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> None:
+    """Write ``path``, overwriting it. ``page`` is the report's text. Raises InputError where it cannot be written."""
+    d = diagnosis
+    setting = d.nominal.model.setting
+    scale, unit = (1e3, "nm") if float(np.quantile(np.abs(d.nominal.residual_um), 0.99)) < 1.0 else (1.0, "µm")
+    traces = [
+        _Trace("voltage_V", "voltage", WHITE, setting.u_V),
+        _Trace("reading/measured_um", "measured", WHITE, setting.y_um),
+        _Trace("reading/nominal_um", "nominal stage", AMBER, setting.y_um - d.nominal.residual_um),
+        _Trace("reading/extended_um", "extended stage", BLUE, setting.y_um - d.extended.residual_um),
+        _Trace("residual/nominal", "nominal stage", AMBER, scale * d.nominal.residual_um),
+        _Trace("residual/extended", "extended stage", BLUE, scale * d.extended.residual_um),
+    ]
+    pictures = {f"cause/{i + 1}_{c.name}": picture(c, setting) for i, c in enumerate(d.causes)}
+    tabs = [
+        _plane_view(f"{i + 1}. {plain(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
+    ]
+    stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
+    path.unlink(missing_ok=True)
+    try:
+        stream.save(path, default_blueprint=_desk(tabs, unit))
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"--out: cannot write {path}: {error}; name a folder you may write to") from error
+    try:
+        stream.send_recording_name(title)
+        for trace in traces:
+            t, y = envelope(setting.t_s, trace.values, MOST_POINTS)
+            lines = rr.SeriesLines(names=trace.name, colors=[trace.colour], widths=[1.0])
+            stream.log(trace.path, lines, static=True)
+            stream.send_columns(trace.path, [rr.TimeColumn(TIMELINE, duration=t)], rr.Scalars.columns(scalars=y))
+        _draw(stream, "loop", _loop(d))
+        for where, shown in pictures.items():
+            _draw(stream, where, shown)
+        # Pictures stand in files of their own, which the viewer does not look for.
+        text = re.sub(r"!\[.*\]\(.*\)\n", "", page)
+        stream.log("report", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    finally:
+        stream.flush()
+        stream.disconnect()
+
+
+def _loop(d: Diagnosis) -> Picture:
+    """Reading over voltage: measured, and as both stages have it; the largest excursion's stretch of the record."""
+    setting = d.nominal.model.setting
+    middle = int(np.argmax(np.abs(setting.y_um - setting.middle_um)))
+    start = int(np.clip(middle - LOOP_POINTS // 2, 0, max(0, setting.n - LOOP_POINTS)))
+    part = slice(start, start + LOOP_POINTS)
+    u, y = setting.u_V[part], setting.y_um[part]
+    return Picture(
+        "voltage / V",
+        "reading / µm",
+        (
+            Curve(MEASURED, u, y),
+            Curve(WITHOUT, u, y - d.nominal.residual_um[part], name="nominal stage"),
+            Curve(WITH, u, y - d.extended.residual_um[part], name="extended stage"),
+        ),
+    )
+
+
+def _draw(stream: rr.RecordingStream, origin: str, shown: Picture) -> None:
+    """Curves in a plane with axes, see `service.viewer.layout`; a logarithmic axis is one of log10."""
+    x_name = f"log10 of {shown.x_name}" if shown.log_x else shown.x_name
+    y_name = f"log10 of {shown.y_name}" if shown.log_y else shown.y_name
+    curves = [(c, _scaled(c.x, shown.log_x), _scaled(c.y, shown.log_y)) for c in shown.curves]
+    x_limits, y_limits = _limits(x for _, x, _ in curves), _limits(y for _, _, y in curves)
+    plane = Plane(x_name, y_name, x_limits, y_limits)
+    stream.log(
+        f"{origin}/frame",
+        rr.LineStrips2D(plane.frame(), colors=[FRAME] * len(plane.frame()), radii=[0.15]),
+        static=True,
+    )
+    where, what = plane.labels()
+    labels = rr.Points2D(where, colors=[LABEL], radii=[0.01], labels=what, show_labels=True)
+    stream.log(f"{origin}/labels", labels, static=True)
+    names: dict[str, Colour] = {}
+    for i, (curve, x, y) in enumerate(curves):
+        places = plane.points(x, y)
+        names.setdefault(curve.name or curve.role, COLOURS[curve.role])
+        if len(places) > 1:
+            radius = 0.2 if curve.dashed else 0.35
+            strip = rr.LineStrips2D([places], colors=[COLOURS[curve.role]], radii=[radius])
+            stream.log(f"{origin}/curve_{i}", strip, static=True)
+    for i, (text, colour) in enumerate(list(names.items())[:4]):
+        place = np.array([[WIDTH - 28.0, -HEIGHT + 6.0 + 10.0 * i]])
+        legend = rr.Points2D(place, colors=[colour], radii=[1.2], labels=[text], show_labels=True)
+        stream.log(f"{origin}/legend_{i}", legend, static=True)
+
+
+def _scaled(values: FloatArray, log: bool) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log10(values) if log else values
+
+
+def _limits(arrays: Iterable[FloatArray]) -> tuple[float, float]:
+    limits: tuple[float, float] | None = None
+    for values in arrays:
+        limits = grown(limits, values)
+    return limits or (0.0, 1.0)
+
+
+def _plane_view(name: str, origin: str) -> rrb.Spatial2DView:
+    (left, right), (top, bottom) = BOUNDS
+    return rrb.Spatial2DView(
+        name=name,
+        origin=f"/{origin}",
+        background=[16, 16, 18],
+        visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
+    )
+
+
+def _desk(causes: list[rrb.Spatial2DView], unit: str) -> rrb.Blueprint:
+    """Over time on the left, the causes and the loop in the middle, the page on the right."""
+    whole = rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+
+    def over_time(name: str, *paths: str) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            name=name,
+            origin="/",
+            contents=[f"+ /{p}" for p in paths],
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+            time_ranges=whole,
+        )
+
+    left = rrb.Vertical(
+        over_time("Voltage, V", "voltage_V"),
+        over_time("Reading, µm", "reading/measured_um", "reading/nominal_um", "reading/extended_um"),
+        over_time(f"Residual of the nominal stage, {unit}", "residual/nominal"),
+        over_time(f"Residual of the extended stage, {unit}", "residual/extended"),
+    )
+    loop = _plane_view("Loop: reading over voltage", "loop")
+    middle = rrb.Vertical(rrb.Tabs(*causes, active_tab=0), loop) if causes else loop
+    page = rrb.TextDocumentView(name="Report", origin="/report")
+    return rrb.Blueprint(
+        rrb.Horizontal(left, middle, page, column_shares=(4.0, 4.0, 3.0)),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        auto_views=False,
+    )

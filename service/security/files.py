@@ -1,0 +1,227 @@
+"""Makes what an installation on several hosts needs: a small certificate authority, passwords, zenoh configurations.
+
+::
+
+    DIR/access.json        who there is: name -> role; what the other files are made from
+    DIR/ca/                key and certificate of the authority; the key signs, and stays off the other machines
+    DIR/users.txt          name:password a line, for services and routers
+    DIR/NAME.json5         zenoh's configuration of NAME, certificate and key within; for NAME's machine alone
+
+A service or router needs ``users.txt`` beside its configuration. Everything is readable by its owner only. The
+certificates are made by the ``openssl`` command.
+"""
+
+from __future__ import annotations
+
+import base64
+import ipaddress
+import json
+import os
+import secrets
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from service.protocol.errors import FieldError, ServiceError
+from service.protocol.keys import check_name
+from service.security.rules import ROLES, ROUTER, SERVICE, STAGE, access_control
+
+MANIFEST: Final = "access.json"
+USERS: Final = "users.txt"
+DEFAULT_HOSTS: Final = ("localhost", "127.0.0.1")
+_SCHEMA: Final = 1
+_CA_DAYS: Final = 3650
+_NEW_KEY: Final = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Who takes part: ``users`` name -> role; ``stages`` of a stage's user the one stage it may publish for;
+    ``hosts`` the names and addresses under which services and routers are reached."""
+
+    users: Mapping[str, str]
+    hosts: tuple[str, ...] = DEFAULT_HOSTS
+    stages: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, role in self.users.items():
+            check_name("user", name)
+            if role not in ROLES:
+                raise FieldError(f"role of {name}", repr(role), f"one of {', '.join(ROLES)}")
+        for name, stage in self.stages.items():
+            if self.users.get(name) != STAGE:
+                raise FieldError("stages", name, "a user with the role stage")
+            if stage != "*":
+                check_name(f"stage of {name}", stage)
+        if not self.hosts:
+            raise FieldError("hosts", "none", "the host names or addresses of services and routers")
+
+
+def create(folder: Path, plan: Plan, days: int = 825) -> list[Path]:
+    """Make everything in ``folder``, which may not hold an earlier one; returns the files for the machines.
+
+    Raises InputError where something is there already, ServiceError where openssl is missing or fails.
+    """
+    if (folder / MANIFEST).exists():
+        raise FieldError(str(folder), "an access folder", "a new one", "use 'dehyst access add' to let more in")
+    ca = folder / "ca"
+    ca.mkdir(parents=True, exist_ok=True, mode=0o700)
+    folder.chmod(0o700)
+    _openssl(
+        "req", "-x509", *_NEW_KEY, "-days", str(_CA_DAYS), "-subj", "/CN=dehyst authority",
+        "-addext", "basicConstraints=critical,CA:TRUE,pathlen:0", "-addext", "keyUsage=critical,keyCertSign,cRLSign",
+        "-keyout", str(ca / "ca.key"), "-out", str(ca / "ca.pem"),
+    )  # fmt: skip
+    (ca / "ca.key").chmod(0o600)
+    _write(folder / USERS, "")
+    return _write_all(folder, plan, list(plan.users), days)
+
+
+def add(folder: Path, users: Mapping[str, str], stages: Mapping[str, str], days: int = 825) -> list[Path]:
+    """Let ``users`` (name -> role) in as well; returns the files that are new or changed. Raises InputError."""
+    plan = read_plan(folder)
+    known = [name for name in users if name in plan.users]
+    if known:
+        raise FieldError("user", ", ".join(known), "a name that is not taken", "remove it first for a new certificate")
+    bigger = Plan({**plan.users, **users}, plan.hosts, {**plan.stages, **stages})
+    return _write_all(folder, bigger, list(users), days)
+
+
+def remove(folder: Path, names: Sequence[str]) -> list[Path]:
+    """Shut ``names`` out: gone from passwords and access control; returns the files that changed. Raises InputError.
+
+    Services and routers read their files at their start: they shut out when started again with the new ones.
+    """
+    plan = read_plan(folder)
+    for name in names:
+        if name not in plan.users:
+            raise FieldError("user", name, f"one of {', '.join(plan.users)}")
+    smaller = Plan(
+        {name: role for name, role in plan.users.items() if name not in names},
+        plan.hosts,
+        {name: stage for name, stage in plan.stages.items() if name not in names},
+    )
+    for name in names:
+        (folder / f"{name}.json5").unlink(missing_ok=True)
+    return _write_all(folder, smaller, [], 0)
+
+
+def read_plan(folder: Path) -> Plan:
+    """The plan of an access folder. Raises InputError where it is none."""
+    try:
+        data = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        if data["schema"] != _SCHEMA:
+            raise FieldError(f"{folder / MANIFEST}: schema", data["schema"], str(_SCHEMA))
+        return Plan(dict(data["users"]), tuple(data["hosts"]), dict(data["stages"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FieldError(str(folder), str(error), "a folder made by 'dehyst access init'") from error
+
+
+def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[Path]:
+    """Certificates for ``new``, and every file that depends on who there is."""
+    passwords = dict(
+        line.split(":", 1) for line in (folder / USERS).read_text(encoding="utf-8").splitlines() if ":" in line
+    )
+    passwords = {name: passwords.get(name) or secrets.token_urlsafe(24) for name in plan.users}
+    _write(folder / USERS, "".join(f"{name}:{word}\n" for name, word in passwords.items()))
+    control = access_control(plan.users, plan.stages)
+    changed = [folder / USERS]
+    for name, role in plan.users.items():
+        path = folder / f"{name}.json5"
+        listens = role in (SERVICE, ROUTER)
+        if name in new:
+            config = _configuration(name, listens, _certificate(folder / "ca", name, plan.hosts, days))
+            config["transport"]["auth"] = {"usrpwd": {"user": name, "password": passwords[name]}}
+        elif listens:
+            config = json.loads(path.read_text(encoding="utf-8").split("\n", 1)[1])
+        else:
+            continue
+        if listens:
+            config["transport"]["auth"]["usrpwd"]["dictionary_file"] = USERS
+            config["access_control"] = control
+        _write(path, f"// zenoh configuration of {name}: {ROLES[role]}; holds its key, keep it secret\n{_json(config)}")
+        changed.append(path)
+    manifest = {
+        "schema": _SCHEMA,
+        "users": dict(plan.users),
+        "hosts": list(plan.hosts),
+        "stages": dict(plan.stages),
+    }
+    _write(folder / MANIFEST, _json(manifest))
+    return changed
+
+
+def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str, Any]:
+    """Zenoh's settings of one user; keys and certificates within, so that one file is all a machine needs."""
+    texts = {key: base64.b64encode(pem).decode() for key, pem in pems.items()}
+    tls: dict[str, Any] = {
+        "root_ca_certificate_base64": texts["ca"],
+        "connect_certificate_base64": texts["certificate"],
+        "connect_private_key_base64": texts["key"],
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    if listens:
+        tls |= {"listen_certificate_base64": texts["certificate"], "listen_private_key_base64": texts["key"]}
+    return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
+
+
+def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int) -> dict[str, bytes]:
+    """A new key and a certificate with ``name`` as its common name, good for both ends of a connection."""
+    named = ",".join(f"{'IP' if _is_address(host) else 'DNS'}:{host}" for host in hosts)
+    with tempfile.TemporaryDirectory() as scratch:
+        at = Path(scratch)
+        (at / "extensions").write_text(
+            f"subjectAltName={named}\nextendedKeyUsage=serverAuth,clientAuth\nbasicConstraints=critical,CA:FALSE\n"
+            "keyUsage=critical,digitalSignature\n",
+            encoding="utf-8",
+        )
+        _openssl("req", *_NEW_KEY, "-subj", f"/CN={name}", "-keyout", str(at / "key"), "-out", str(at / "request"))
+        _openssl(
+            "x509", "-req", "-in", str(at / "request"), "-CA", str(ca / "ca.pem"), "-CAkey", str(ca / "ca.key"),
+            "-set_serial", f"0x{secrets.token_hex(16)}", "-days", str(days), "-extfile", str(at / "extensions"),
+            "-out", str(at / "certificate"),
+        )  # fmt: skip
+        return {
+            "ca": (ca / "ca.pem").read_bytes(),
+            "certificate": (at / "certificate").read_bytes(),
+            "key": (at / "key").read_bytes(),
+        }
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        if not host or any(mark in host for mark in ",:/\n "):
+            raise FieldError("host", repr(host), "a host name or an address, without port") from None
+        return False
+    return True
+
+
+def _openssl(*arguments: str) -> None:
+    command = shutil.which("openssl")
+    if command is None:
+        raise ServiceError("openssl is not installed: install it (the command line tool), or make certificates by hand")
+    done = subprocess.run([command, *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise ServiceError(f"openssl {arguments[0]} failed: {done.stderr.strip()[-300:]}")
+
+
+def _json(data: Any) -> str:
+    return json.dumps(data, indent=2) + "\n"
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all, and for its owner's eyes only from the first byte on."""
+    scratch = path.with_name(path.name + ".new")
+    with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    scratch.replace(path)

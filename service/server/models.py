@@ -1,0 +1,114 @@
+"""From a model file and a configuration to an axis that can be served."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from adaptive.errors import ModelFileError
+from adaptive.types import InverseModel, OnlineModel, Sample
+from service.answers import guard
+from service.answers.guard import Limits
+from service.config.config import AxisConfig
+from service.config.tables import build_settings
+from service.protocol.errors import FieldError
+from service.server.axis import Axis
+from service.server.competing import champion_of, compete
+from service.storage.model_file import Bundle, BundleMeta, read_bundle
+
+#: Share of the identified range by which a desired point may lie beyond it where the configuration sets no limit.
+RANGE_MARGIN: Final = 0.05
+#: Enough for every step of the learner to have been taken, the rarer ones too.
+_WARM_SAMPLES: Final = 400
+
+#: Makes what learns from the model it starts from and the settings of the configuration.
+LearnerFactory = Callable[[InverseModel, dict[str, Any], Limits], OnlineModel]
+
+
+def make_learner(model: InverseModel, settings: dict[str, Any], limits: Limits) -> OnlineModel:
+    """The learner of this project, started from ``model``. Raises InputError on an unknown setting."""
+    from adaptive.inverse_model import LssvmInverse
+    from adaptive.online.config import LearnerConfig
+    from adaptive.online.learner import Learner
+
+    if not isinstance(model, LssvmInverse):
+        raise FieldError("learn", f"{model.name!r}, a {type(model).__name__}", "an LSSVM model of the file, or none")
+    # The learner takes a voltage at its limit for saturated; it is told the limits unless the settings do.
+    gates = settings.get("admission", {})
+    if isinstance(gates, dict):
+        gates = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **gates}
+    config = build_settings(LearnerConfig, {**settings, "admission": gates}, "learner")
+    learner: OnlineModel = Learner.from_model(model, config)
+    return learner
+
+
+def load_axis(
+    stage: str, config: AxisConfig, factory: LearnerFactory = make_learner, bundle: Bundle | None = None
+) -> Axis:
+    """The axis that ``config`` describes. Raises ModelFileError or InputError saying what does not fit."""
+    bundle = bundle or read_bundle(config.model)
+    for name, got, wanted in (("stage", bundle.meta.stage, stage), ("axis", bundle.meta.axis, config.name)):
+        if got and got != wanted:
+            raise ModelFileError(
+                f"{config.model}: belongs to {name} {got!r}, but {wanted!r} is to be served; "
+                f"name the right file, or identify this {name}"
+            )
+    models = dict(bundle.models)
+    limits = _with_domain(config.limits, bundle.meta)
+    others = {name: models[name] for name in config.compete if name in models and name != config.learn}
+
+    def begin(model: InverseModel) -> OnlineModel:
+        return compete(
+            config.learn, model, lambda start: factory(start, config.learner, limits), others, config.competition
+        )
+
+    learner = None
+    if config.learn:
+        if config.learn not in models:
+            raise FieldError(
+                "learn", repr(config.learn), f'one of the models in {config.model}: {", ".join(models)}, or "" for none'
+            )
+        learner = begin(models[config.learn])
+        # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
+        _warm_learner(begin(models[config.learn]), limits)
+        models |= champion_of(learner)
+    axis = Axis(config, models, learner, limits, begin)
+    _warm_models(axis)
+    return axis
+
+
+def _with_domain(limits: Limits, meta: BundleMeta) -> Limits:
+    low, high = limits.y_min_um, limits.y_max_um
+    if meta.y_min_um is not None and meta.y_max_um is not None:
+        margin = RANGE_MARGIN * (meta.y_max_um - meta.y_min_um)
+        low = meta.y_min_um - margin if math.isinf(low) else low
+        high = meta.y_max_um + margin if math.isinf(high) else high
+    return replace(limits, y_min_um=low, y_max_um=high)
+
+
+def _warm_learner(learner: OnlineModel, limits: Limits) -> None:
+    middle, half = 0.5 * (limits.u_min_V + limits.u_max_V), 0.4 * (limits.u_max_V - limits.u_min_V)
+    low = limits.y_min_um if math.isfinite(limits.y_min_um) else 0.0
+    high = limits.y_max_um if math.isfinite(limits.y_max_um) else 1.0
+    dt_s = learner.snapshot().dt_s
+    for seq in range(_WARM_SAMPLES):
+        phase = math.sin(0.1 * seq)
+        y_um = 0.5 * (low + high) + 0.4 * (high - low) * phase
+        learner.handle(Sample(seq, seq * dt_s, middle + half * phase, y_um))
+    getattr(learner, "warm", lambda: None)()
+    learner.snapshot()
+
+
+def _warm_models(axis: Axis) -> None:
+    guard.warm()
+    served = axis.newest
+    for name, model in served.models.items():
+        for n in (1, 2):
+            zero = np.zeros(n)
+            memory = served.memories[name]
+            model.feedforward(zero, zero, zero, memory)
+            model.track(zero, zero, zero, zero, memory)

@@ -1,0 +1,236 @@
+"""The serving process: one zenoh session, its axes, and the thread that publishes. Never imports torch."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import zenoh
+from threadpoolctl import threadpool_limits
+
+from service.config.config import AxisConfig, ServeConfig
+from service.failover.reachability import Reach
+from service.failover.storage import Estate, of_standby
+from service.failover.succession import Succession
+from service.intake.sinks import SampleSink, SampleWatcher
+from service.protocol.errors import FieldError, SessionError
+from service.protocol.keys import Keys
+from service.runtime.memory import TRIM_S, give_back, keep_little
+from service.runtime.session import open_service
+from service.server.axis import Axis
+from service.server.endpoints import PRIMARY, STANDBY, AxisServer
+from service.server.models import LearnerFactory, load_axis, make_learner
+from service.storage.checkpoint_keeper import learn_again, restore_newest
+
+#: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
+#: would be the latency of a query that meets the learner.
+_SWITCH_S: Final = 1e-4
+#: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, one that a
+#: standby may be about to connect to, which it tries five times a second, and any other that is connected to something;
+#: and how much longer it may take until that is settled.
+STANDBY_PATIENCE_S: Final = 3.0
+PAIR_PATIENCE_S: Final = 0.6
+PATIENCE_S: Final = 0.3
+SETTLE_S: Final = 20.0
+#: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
+SYNC_S: Final = 30.0
+#: The publishing thread looks at least this often, s.
+_TICK_S: Final = 0.02
+
+
+def make_recorder(config: AxisConfig) -> SampleSink | None:
+    """The recorder of an axis, or None where the configuration names no folder."""
+    if config.recorder is None:
+        return None
+    from service.storage.recorder import Recorder, RecorderConfig
+
+    return Recorder(RecorderConfig(config.recorder, max_bytes=config.recorder_bytes))
+
+
+def make_watcher(axis: Axis) -> SampleWatcher | None:
+    """What finds out in the background what has changed, or None where the configuration switches it off."""
+    if not axis.config.diagnosis.enabled:
+        return None
+    from service.background.diagnosing.watcher import Watcher
+
+    return Watcher(axis, axis.config.diagnosis)
+
+
+def as_standby(config: ServeConfig) -> ServeConfig:
+    """``config`` for the instance that stands by: other ears, other folders. Raises InputError where it has no ears."""
+    if config.listen and not config.standby_listen:
+        raise FieldError(
+            "standby_listen",
+            "nothing",
+            "an endpoint of the standby's own",
+            "clients look for it there; or use a router",
+        )
+    axes = tuple(
+        replace(axis, recorder=of_standby(axis.recorder), checkpoints=of_standby(axis.checkpoints))
+        for axis in config.axes
+    )
+    return replace(config, axes=axes, listen=config.standby_listen, connect=(*config.connect, *config.listen))
+
+
+def _restore(server: AxisServer) -> None:
+    """Go on from the newest checkpoint, and learn again what the journal holds behind it."""
+    axis, folder, sink = server.axis, server.keeper.folder, server.intake.sink
+    if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
+        learn_again(axis, axis.config.recorder)
+    rebase = getattr(sink, "rebase", None)
+    if rebase is not None:
+        rebase(axis.sequence.received)
+
+
+class Service:
+    """A running service; use as a context manager.
+
+    Parameters
+    ----------
+    config : what to serve.
+    factory : makes what learns.
+    sinks : makes the recorder of an axis, or None.
+    standby : look longer for another that serves before serving; listen at ``standby_listen``, keep files apart.
+    stopped : ends the wait for the state of the one that serves.
+    """
+
+    def __init__(
+        self,
+        config: ServeConfig,
+        factory: LearnerFactory = make_learner,
+        sinks: Callable[[AxisConfig], SampleSink | None] = make_recorder,
+        standby: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.config = as_standby(config) if standby else config
+        # Where the other one of the two keeps its files.
+        self._estates = [
+            Estate(axis.checkpoints, axis.recorder)
+            if standby
+            else Estate(of_standby(axis.checkpoints), of_standby(axis.recorder))
+            for axis in config.axes
+        ]
+        self.standby = standby
+        self._stopped = stopped
+        self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
+        self.axes: list[AxisServer] = []
+        self._successions: list[Succession] = []
+        self._factory = factory
+        self._sinks = sinks
+        self._session: zenoh.Session | None = None
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._publisher = threading.Thread(target=self._publish, name="publish")
+
+    def __enter__(self) -> Service:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Load the models, open the session, declare; a standby waits until it holds the model of the one that serves.
+
+        Raises ModelFileError, InputError, SessionError.
+        """
+        config = self.config
+        # Everything that can be refused is looked at before anything can be seen on the wire.
+        loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
+        # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
+        # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
+        # (1.10) left the two without half of what they had declared to each other, for good: both served.
+        self._session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
+        alone_s = PATIENCE_S if config.connect else 0.0
+        patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else alone_s
+        try:
+            for axis, estate in zip(loaded, self._estates, strict=True):
+                server = AxisServer(
+                    self._session,
+                    Keys(config.stage, axis.config.name),
+                    axis,
+                    self.instance,
+                    self._wake.set,
+                    self._sinks(axis.config),
+                    make_watcher(axis),
+                )
+                self.axes.append(server)
+                _restore(server)
+                reach = Reach(self._session, behind_routers=not config.listen)
+                succession = Succession(self._session, server, patience_s, reach, estate)
+                self._successions.append(succession)
+                server.listen()
+                succession.start()
+            for succession in self._successions:
+                if not succession.settled.wait(patience_s + SETTLE_S):
+                    raise SessionError(f"axis {succession.server.keys.axis}: it could not be declared; see its events")
+            self._publisher.start()
+            until = time.monotonic() + SYNC_S
+            for succession in self._successions:
+                while not succession.ready.wait(0.1) and time.monotonic() < until and not self._stopped():
+                    pass
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Undeclare, end the threads, close the session; in that order, or the interpreter hangs at its end."""
+        self._stopping.set()
+        self._wake.set()
+        if self._publisher.is_alive():
+            self._publisher.join()
+        for succession in self._successions:
+            succession.close()
+        self._successions = []
+        for axis in self.axes:
+            axis.undeclare()
+            if axis.intake.sink is not None:
+                axis.intake.sink.close()
+        self.axes = []
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
+            self._session = None
+
+    def ready(self) -> dict[str, Any]:
+        """What a caller needs to know to reach this service."""
+        return {
+            "ready": True,
+            "instance": self.instance,
+            "role": PRIMARY if any(axis.role == PRIMARY for axis in self.axes) else STANDBY,
+            "epoch": max(axis.epoch for axis in self.axes),
+            "synced": all(axis.synced for axis in self.axes),
+            "listen": list(self.config.listen),
+            "connect": list(self.config.connect),
+            "stage": self.config.stage,
+            "axes": {axis.keys.axis: list(axis.axis.newest.models) for axis in self.axes},
+            "key": self.axes[0].keys.base if len(self.axes) == 1 else f"dehyst/v1/{self.config.stage}/*",
+        }
+
+    def _publish(self) -> None:
+        trimmed_at = time.monotonic()
+        while not self._stopping.is_set():
+            self._wake.wait(_TICK_S)
+            self._wake.clear()
+            if time.monotonic() - trimmed_at >= TRIM_S:
+                trimmed_at = time.monotonic()
+                give_back()
+            for axis in self.axes:
+                try:
+                    axis.tick(time.monotonic())
+                except Exception as error:
+                    # Publishing informs; it must not end because one message could not be made.
+                    axis.axis.note("internal_error", f"publishing: {type(error).__name__}: {error}")
+                    self._stopping.wait(_TICK_S)
+
+
+def tune_process() -> None:
+    """One BLAS thread (two stall for tens of ms now and then), quick changes between Python's threads, few heaps."""
+    keep_little()
+    threadpool_limits(1)
+    sys.setswitchinterval(_SWITCH_S)

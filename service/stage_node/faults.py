@@ -1,0 +1,209 @@
+"""Faults of a stage on command: readings that lie, samples that never come, come twice or out of order.
+
+Only a stage that was started to be hurt (``dehyst stage --inject``) listens. A fault is JSON on ``.../stage_fault``:
+``{"fault": NAME, "duration_s": 1.0, "value": 0.0}``, or ``{"fault": "change", "values": {"gain_drift.gain": -0.06}}``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from service.protocol.errors import FieldError
+from service.protocol.keys import Keys
+
+#: What a reading suffers, and what ``value`` is for it.
+READING: Final = {
+    "nan": "not used: the reading is not a number",
+    "spike": "µm added to every 25th reading",
+    "freeze": "not used: the last reading is repeated",
+    "saturate": "µm beyond which the reading does not go",
+    "offset": "µm added to every reading",
+}
+#: What a sample suffers on its way, and what ``value`` is for it.
+DELIVERY: Final = {
+    "gap": "not used: nothing is sent",
+    "duplicate": "not used: every message is sent twice",
+    "reorder": "not used: the messages come in pairs, the later one first",
+    "clock": "s added to the time of every sample",
+}
+CHANGE: Final = "change"
+SPIKE_EVERY: Final = 25
+MAX_DURATION_S: Final = 3600.0
+_EXPECTED: Final = 'an object such as {"fault": "nan", "duration_s": 1}'
+
+#: (seq, t_s, u_V, y_um), each (n,).
+Rows = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+
+
+def fault_key(stage: str, axis: str) -> str:
+    """Where a stage that was started to be hurt takes its faults."""
+    return f"{Keys(stage, axis).base}/stage_fault"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault: its kind, how long it lasts in s, and what its kind says of ``value``; ``values`` for a change."""
+
+    kind: str
+    duration_s: float = 0.0
+    value: float = 0.0
+    values: tuple[tuple[str, float], ...] = ()
+
+
+def decode_fault(payload: bytes) -> Fault:
+    """The fault in a message. Raises InputError naming what does not fit."""
+    try:
+        data = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise FieldError(
+            "payload", f"no JSON ({error})", 'an object such as {"fault": "nan", "duration_s": 1}'
+        ) from None
+    if not isinstance(data, dict):
+        raise FieldError("payload", repr(data)[:80], 'an object such as {"fault": "nan", "duration_s": 1}')
+    kind = data.get("fault")
+    if kind == CHANGE:
+        values = data.get("values")
+        if not isinstance(values, dict) or not values:
+            raise FieldError("values", repr(values)[:80], "parameters of the stage by path, with their new values")
+        return Fault(CHANGE, values=tuple((str(name), _number(f"values.{name}", v)) for name, v in values.items()))
+    if not isinstance(kind, str) or (kind not in READING and kind not in DELIVERY):
+        raise FieldError("fault", repr(kind)[:80], f"one of {', '.join((*READING, *DELIVERY, CHANGE))}")
+    duration_s = _number("duration_s", data.get("duration_s"))
+    if not 0.0 < duration_s <= MAX_DURATION_S:
+        raise FieldError("duration_s", duration_s, f"above 0 and at most {MAX_DURATION_S:g} s")
+    return Fault(str(kind), duration_s, _number("value", data.get("value", 0.0)))
+
+
+def _number(field: str, value: Any) -> float:
+    try:
+        if not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # an integer beyond all doubles
+        pass
+    raise FieldError(field, repr(value)[:80], "a finite number")
+
+
+@dataclass(frozen=True, slots=True)
+class _Active:
+    fault: Fault
+    first: int
+    stop: int
+
+
+class Injector:
+    """The faults of one axis: given by any thread, suffered by the loop (readings) and by the sender (messages).
+
+    Parameters
+    ----------
+    dt_s : sample time, s.
+    apply : applies changed parameters to the stage, from the loop; raises InputError on names and ranges.
+    """
+
+    def __init__(self, dt_s: float, apply: Callable[[dict[str, float]], None]) -> None:
+        self.counts = {kind: 0 for kind in (*READING, *DELIVERY, CHANGE, "refused")}
+        self.error = ""
+        self._dt_s = dt_s
+        self._apply = apply
+        self._lock = threading.Lock()
+        self._waiting: list[Fault] = []
+        #: Replaced whole, so that the sender reads it without the lock.
+        self._active: tuple[_Active, ...] = ()
+        self._frozen_um = math.nan
+        self._last_um = 0.0
+        self._held: Rows | None = None
+
+    def receive(self, payload: bytes) -> None:
+        """A message of the wire; what is malformed is counted, and the last one's fault is kept."""
+        try:
+            self.add(decode_fault(payload))
+        except InputError as error:
+            self.counts["refused"] += 1
+            self.error = str(error)
+
+    def add(self, fault: Fault) -> None:
+        """Suffer ``fault`` from the next tick on."""
+        with self._lock:
+            self._waiting.append(fault)
+
+    def reading(self, k: int, y_um: float) -> float:
+        """What the sensor says at tick k where it would have said ``y_um``. Called by the loop, tick by tick."""
+        if self._waiting:
+            self._begin(k)
+        for active in self._active:
+            if not active.first <= k < active.stop:
+                continue
+            kind, value = active.fault.kind, active.fault.value
+            if kind == "nan":
+                y_um = math.nan
+            elif kind == "freeze":
+                # What it said last before the fault began.
+                y_um = self._last_um if k == active.first else self._frozen_um
+                self._frozen_um = y_um
+            elif kind == "spike" and (k - active.first) % SPIKE_EVERY == 0:
+                y_um += value
+            elif kind == "saturate":
+                y_um = min(y_um, value)
+            elif kind == "offset":
+                y_um += value
+            else:
+                continue
+            self.counts[kind] += 1
+        self._last_um = y_um
+        return y_um
+
+    def deliver(self, rows: Rows) -> list[Rows]:
+        """The messages that leave in place of one of ``rows``. Called by the sender, in order."""
+        sent = [rows]
+        reordering = False
+        for active in self._active:
+            kind = active.fault.kind
+            hit = (rows[0] >= active.first) & (rows[0] < active.stop)
+            n = int(np.count_nonzero(hit))
+            if kind not in DELIVERY or not n:
+                continue
+            self.counts[kind] += n
+            if kind == "gap":
+                sent = [(r[0][~hit], r[1][~hit], r[2][~hit], r[3][~hit]) for r in sent]
+            elif kind == "duplicate":
+                sent = [*sent, *sent]
+            elif kind == "clock":
+                sent = [(r[0], r[1] + active.fault.value * hit, r[2], r[3]) for r in sent]
+            else:
+                reordering = True
+        if self._held is not None:
+            sent, self._held = [*sent, self._held], None
+        elif reordering and len(sent) == 1:
+            self._held, sent = sent[0], []
+        return [r for r in sent if r[0].size]
+
+    def flush(self) -> list[Rows]:
+        """What is still held back, at the end."""
+        held, self._held = self._held, None
+        return [] if held is None else [held]
+
+    def _begin(self, k: int) -> None:
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+        # What is over stays for a while: the sender may be behind the loop by as much as the ring holds.
+        active = [a for a in self._active if a.stop > k - 65_536]
+        for fault in waiting:
+            if fault.kind == CHANGE:
+                try:
+                    self._apply(dict(fault.values))
+                    self.counts[CHANGE] += 1
+                except InputError as error:
+                    self.counts["refused"] += 1
+                    self.error = str(error)
+                continue
+            active.append(_Active(fault, k, k + max(1, round(fault.duration_s / self._dt_s))))
+        self._active = tuple(active)

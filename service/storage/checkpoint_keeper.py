@@ -1,0 +1,145 @@
+"""Keeps checkpoints of an axis: a copy of its state in the thread that handles samples, the rest in one of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from adaptive.errors import DehystError, ModelFileError
+from adaptive.types import StateDict
+from service.intake.intake import Intake
+from service.protocol.samples import SampleBatch
+from service.server.axis import Axis
+from service.server.axis_state import restore_axis
+from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
+from service.storage.segments import rows_behind
+
+#: Samples that a restart learns again at most, and in what portions: those of a minute at 1 kHz, which takes 3 s.
+_MOST_AGAIN = 60_000
+_PORTION = 100
+
+
+class Keeper:
+    """Writes the checkpoints of one axis. A disk that fails costs checkpoints, which are counted, and nothing else."""
+
+    def __init__(self, axis: Axis, intake: Intake, stage: str, instance: str, folder: CheckpointFolder | None) -> None:
+        self.folder = folder
+        self._axis = axis
+        self._intake = intake
+        self._names = (stage, axis.config.name, instance)
+        self._copied: tuple[CheckpointMeta, StateDict] | None = None
+        self._ready = threading.Condition()
+        self._closing = False
+        self._due_at = 0.0
+        self._written_at_s: float | None = None
+        self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
+        self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
+        if folder is not None:
+            self._thread.start()
+
+    def tick(self, now_s: float) -> None:
+        """Ask for a checkpoint where one is due; called often, on a clock that never goes back."""
+        if self.folder is not None and now_s >= self._due_at and self._axis.at_snapshot is None:
+            self._due_at = now_s + self._axis.config.checkpoint_s
+            self._axis.at_snapshot = self._copy
+
+    def now(self, timeout_s: float = 2.0) -> None:
+        """Have a checkpoint written of the state as it is. Raises ServiceError where the learner is too far behind."""
+        if self.folder is not None:
+            self._intake.call(self._copy, timeout_s)
+
+    def at_once(self) -> None:
+        """The same, from the thread that handles samples."""
+        if self.folder is not None:
+            self._copy()
+
+    def state(self, timeout_s: float = 2.0) -> tuple[CheckpointMeta, StateDict]:
+        """(meta, copy of the state), for a standby. Raises ServiceError where the learner is too far behind."""
+        return self._intake.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
+
+    def counters(self) -> dict[str, Any] | None:
+        """Checkpoints written, age of the newest, and failures of the disk; None where none are kept."""
+        if self.folder is None:
+            return None
+        at = self._written_at_s
+        return {**self._counts, "age_s": None if at is None else time.monotonic() - at}
+
+    def close(self) -> None:
+        """Write the last state and end; after the thread that handles samples has ended."""
+        if self.folder is None:
+            return
+        self._axis.at_snapshot = None
+        self._copy()
+        with self._ready:
+            self._closing = True
+            self._ready.notify()
+        self._thread.join(10.0)
+
+    def _meta(self) -> CheckpointMeta:
+        stage, name, instance = self._names
+        axis = self._axis
+        meta = CheckpointMeta(stage, name, axis.dt_s, axis.handled_seq, axis.sequence.received, instance=instance)
+        return replace(meta, time_unix_s=time.time())
+
+    def _copy(self) -> None:
+        meta = self._meta()
+        copied = (meta, self._axis.state_dict())
+        with self._ready:
+            # One that was not yet written is out of date.
+            self._copied = copied
+            self._ready.notify()
+
+    def _run(self) -> None:
+        assert self.folder is not None
+        while True:
+            with self._ready:
+                while self._copied is None and not self._closing:
+                    self._ready.wait()
+                if self._copied is None:
+                    return
+                (meta, state), self._copied = self._copied, None
+            try:
+                self.folder.write(meta, state)
+                self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
+                self._written_at_s = time.monotonic()
+            except (OSError, DehystError, ValueError) as error:
+                words = getattr(error, "strerror", None) or str(error)
+                if not self._counts["degraded"]:
+                    self._axis.note("checkpoint_failed", f"{words}; tried again")
+                self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
+
+
+def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
+    """Let ``axis`` go on from the newest checkpoint that is whole and matches; its number, None where there is none.
+
+    Those that are refused become events with the reason, and the one before is tried.
+    """
+    for number in folder.numbers():
+        try:
+            meta, state = folder.read(number)
+            restore_axis(axis, state)
+        except ModelFileError as error:
+            axis.note("checkpoint_refused", f"checkpoint {number}: {error}")
+            continue
+        axis.note("restored", f"from checkpoint {number}, sample {meta.seq}", checkpoint=number)
+        return number
+    return None
+
+
+def learn_again(axis: Axis, recordings: Path) -> int:
+    """Learn again, from the journals in the folder ``recordings``, what came after the state that was restored.
+
+    Returns the number of samples; nothing of it is recorded a second time.
+    """
+    rows = rows_behind(recordings, axis.sequence.received)
+    if rows is None:
+        return 0
+    first = max(0, len(rows) - _MOST_AGAIN)
+    for start in range(first, len(rows), _PORTION):
+        part = rows.part(start, start + _PORTION)
+        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
+    axis.note("learnt_again", f"{len(rows) - first} samples from the journal")
+    return len(rows) - first

@@ -1,0 +1,192 @@
+"""The journal: samples appended as rows of fixed size, whole up to the last row whatever kills the process.
+
+A file is 16 bytes of header, then records of 40 bytes: seq (i64), t_s, u_V, y_um (f64), index (u32), reason (u16)
+and a mark (u16) by which a torn or empty row is told. ``index`` counts the samples of the axis in the order in which
+they were handled, modulo 2^32: a restart goes on behind a checkpoint by it. A record of reason 65535 defines a word:
+its number stands in ``seq``, its UTF-8 text in the 24 bytes after. All little-endian.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.types import FloatArray
+from service.protocol.errors import FieldError
+
+HEADER: Final = b"dehyst journal 1"
+RECORD: Final = np.dtype(
+    [
+        ("seq", "<i8"), ("t_s", "<f8"), ("u_V", "<f8"), ("y_um", "<f8"),
+        ("index", "<u4"), ("reason", "<u2"), ("mark", "<u2"),
+    ]
+)  # fmt: skip
+_MARK: Final = 0xD5A7
+_WORD: Final = 0xFFFF
+_WORD_BYTES: Final = 24
+INDEX_MODULUS: Final = 2**32
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """n samples as they are recorded; ``reason`` is what the learner did with each (``learnt``, or the gate)."""
+
+    seq: NDArray[np.int64]
+    t_s: FloatArray
+    u_V: FloatArray
+    y_um: FloatArray
+    reason: list[str]
+
+    def __post_init__(self) -> None:
+        n = len(self.seq)
+        for name in ("t_s", "u_V", "y_um", "reason"):
+            if len(getattr(self, name)) != n:
+                raise FieldError(name, f"{len(getattr(self, name))} values", f"{n}, as many as seq")
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """All rows of some, one behind the other; at least one part."""
+        if len(parts) == 1:  # nearly always
+            return parts[0]
+        seq = np.concatenate([part.seq for part in parts])
+        t_s, u_V, y_um = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t_s", "u_V", "y_um"))
+        return cls(seq, t_s, u_V, y_um, [word for part in parts for word in part.reason])
+
+    def part(self, start: int, stop: int) -> Rows:
+        """Rows ``start`` up to ``stop``."""
+        if start == 0 and stop == len(self):
+            return self
+        cut = slice(start, stop)
+        return Rows(self.seq[cut], self.t_s[cut], self.u_V[cut], self.y_um[cut], self.reason[cut])
+
+
+class Journal:
+    """A journal being written. Every method raises OSError as the disk does."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows = 0
+        self._words: dict[str, int] = {}
+        self._size = 0
+        self._fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND, 0o644)
+        try:
+            self._put(HEADER)
+            self._size = len(HEADER)
+        except BaseException:
+            os.close(self._fd)
+            path.unlink(missing_ok=True)
+            raise
+
+    def write(self, rows: Rows, index: NDArray[np.int64]) -> None:
+        """Append rows with the (n,) ``index`` of each, all or none, and hand them over to the operating system.
+
+        A killed process loses nothing of what was handed over.
+        """
+        words = dict(self._words)
+        new = [word for word in dict.fromkeys(rows.reason) if word not in words]
+        for word in new:
+            words[word] = len(words) % _WORD
+        records = np.zeros(len(new) + len(rows), dtype=RECORD)
+        for at, word in enumerate(new):
+            records[at] = _definition(words[word], word)
+        body = records[len(new) :]
+        body["seq"], body["t_s"], body["u_V"], body["y_um"] = rows.seq, rows.t_s, rows.u_V, rows.y_um
+        body["index"] = index % INDEX_MODULUS
+        body["reason"] = [words[word] for word in rows.reason]
+        records["mark"] = _MARK
+        self._put(records.tobytes())
+        self._size += records.nbytes
+        self._words = words
+        self.rows += len(rows)
+
+    def handle(self) -> int:
+        """Another descriptor of the file, which whoever asks for it closes."""
+        return os.dup(self._fd)
+
+    def close(self) -> None:
+        """Let go of the file; never raises."""
+        with contextlib.suppress(OSError):
+            os.close(self._fd)
+
+    def _put(self, data: bytes) -> None:
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._fd, view) :]
+        except OSError:
+            # A disk that filled up in the middle has taken a part: rows after it would not be found.
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self._size)
+            raise
+
+
+class Syncer:
+    """Has a journal on the disk itself every so often, beside the thread that writes: a disk may take its time, and
+    what waits for it in memory would be lost with the process.
+    """
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self._at = time.monotonic()
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+
+    def look(self, journal: Journal) -> None:
+        """Begin where it is due. Raises OSError where the last time failed."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+        now = time.monotonic()
+        if now - self._at < self._every_s or (self._thread is not None and self._thread.is_alive()):
+            return
+        self._at = now
+        self._thread = threading.Thread(target=self._sync, args=(journal.handle(),), name="sync", daemon=True)
+        self._thread.start()
+
+    def _sync(self, handle: int) -> None:
+        try:
+            os.fsync(handle)
+        except OSError as error:
+            self._error = error
+        finally:
+            os.close(handle)
+
+
+def _definition(number: int, word: str) -> Any:
+    text = word.encode()[:_WORD_BYTES].ljust(_WORD_BYTES, b"\0")
+    numbers = np.frombuffer(text, dtype="<f8")
+    return (number, *numbers, 0, _WORD, _MARK)
+
+
+def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
+    """(rows, (n,) index of each), up to the first record that is not whole. Raises OSError as the disk does."""
+    data = path.read_bytes()
+    if data[: len(HEADER)] != HEADER:
+        data = HEADER
+    count = (len(data) - len(HEADER)) // RECORD.itemsize
+    records = np.frombuffer(data, dtype=RECORD, count=count, offset=len(HEADER))
+    whole = records["mark"] == _MARK
+    if not whole.all():
+        records = records[: int(np.argmin(whole))]
+    definitions = records["reason"] == _WORD
+    words = {
+        int(record["seq"]): record.tobytes()[8 : 8 + _WORD_BYTES].rstrip(b"\0").decode(errors="replace")
+        for record in records[definitions]
+    }
+    body = records[~definitions]
+    reason = [words.get(number, "unknown") for number in body["reason"].tolist()]
+    t_s, u_V, y_um = (body[name].astype(np.float64) for name in ("t_s", "u_V", "y_um"))
+    rows = Rows(body["seq"].astype(np.int64), t_s, u_V, y_um, reason)
+    return rows, body["index"].astype(np.int64)

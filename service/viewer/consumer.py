@@ -1,0 +1,223 @@
+"""Listens to a stage and its service over zenoh and hands what it hears to the outputs, in batches.
+
+Nobody waits for this process: callbacks only put a payload into a bounded inbox; one thread decodes it and offers
+batches to outputs that drop what they cannot take. All that is lost on the way is counted.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeGuard
+
+import numpy as np
+import zenoh
+
+from adaptive.errors import InputError
+from service.protocol import samples as wire
+from service.protocol.keys import Keys
+from service.viewer.feed import Diagnostics, Event, Health, Record, Status, event_record
+from service.viewer.join import ReferenceRing, UnitJoin
+
+#: What is said of a sample may come so long before that sample, s of the stage's time: it has another key.
+_AHEAD_S = 1.0
+
+
+class Taker(Protocol):
+    """What takes batches: an `Output`."""
+
+    dropped: int
+
+    def offer(self, batch: Sequence[Record]) -> bool: ...
+
+
+@dataclass(frozen=True, slots=True)
+class ConsumerConfig:
+    """What to listen to.
+
+    Attributes
+    ----------
+    stage, axis : the unit that the service teaches and serves. model : what steers it.
+    twins : pairs (axis of the same stage, model that steers it), for comparison.
+    changes_s : times of the stage at which it is known to change, s; loops are drawn before and after.
+    batch_s : how often the outputs get a batch, s. inbox : messages that may wait for that, at most.
+    """
+
+    stage: str
+    axis: str
+    model: str = "lssvm_adaptive"
+    twins: tuple[tuple[str, str], ...] = ()
+    changes_s: tuple[float, ...] = ()
+    batch_s: float = 0.2
+    inbox: int = 20_000
+
+    def __post_init__(self) -> None:
+        if not 0.05 <= self.batch_s <= 5.0:
+            raise InputError(f"batch_s: got {self.batch_s!r} s, expected 0.05 to 5")
+        axes = [self.axis, *(axis for axis, _ in self.twins)]
+        if len(set(axes)) != len(axes) or len(set(self.models)) != len(axes):
+            raise InputError(
+                f"twins: got {self.twins!r}, expected other axes and models than each other's and {axes[0]!r}"
+            )
+        for axis in axes:
+            Keys(self.stage, axis)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """All models shown, the main one first."""
+        return (self.model, *(model for _, model in self.twins))
+
+
+class Consumer:
+    """Runs from its construction until `close`; declares its subscribers on ``session``, which stays the caller's."""
+
+    def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[Taker]) -> None:
+        self.config = config
+        self.counts: Counter[str] = Counter()
+        self._outputs = outputs
+        self._inbox: deque[tuple[str, str, bytes]] = deque()
+        main = ReferenceRing()
+        self._rings = {config.model: main}
+        self._joins = {config.model: UnitJoin(config.model, main)}
+        for _, model in config.twins:
+            self._rings[model] = ReferenceRing()
+            self._joins[model] = UnitJoin(model, self._rings[model], fallback=main)
+        self._t_s, self._seq, self._dt_s = 0.0, 0, 0.0
+        self._next_health = 0.0
+        self._changes_s = sorted(config.changes_s)
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._subscribers = [
+            session.declare_subscriber(key, self._callback(kind, model)) for kind, model, key in _subscriptions(config)
+        ]
+        self._thread = threading.Thread(target=self._run, name="view-batches")
+        self._thread.start()
+
+    def pump(self) -> None:
+        """Decode what waits and offer it as one batch; the thread does this every ``batch_s``."""
+        with self._lock:
+            self._offer(everything=False)
+
+    def close(self) -> None:
+        """Stop listening, hand on the rest, end the thread. May be called twice."""
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._subscribers = []
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+            with self._lock:
+                self._next_health = 0.0
+                self._offer(everything=True)
+
+    def _callback(self, kind: str, model: str) -> Callable[[zenoh.Sample], None]:
+        def take(sample: zenoh.Sample) -> None:
+            self.counts["messages"] += 1
+            if len(self._inbox) >= self.config.inbox:
+                self.counts["inbox_full"] += 1
+            else:
+                self._inbox.append((kind, model, sample.payload.to_bytes()))
+
+        return take
+
+    def _run(self) -> None:
+        while not self._stop.wait(self.config.batch_s):
+            self.pump()
+
+    def _offer(self, everything: bool) -> None:
+        said: list[Record] = []
+        # Only what waits now: a flood must not keep us here.
+        for _ in range(len(self._inbox)):
+            kind, model, payload = self._inbox.popleft()
+            try:
+                record = self._decode(kind, model, payload)
+            except Exception:  # Whatever a peer may have sent: it must not end the stream.
+                self.counts["malformed"] += 1
+                continue
+            if record is not None:
+                said.append(record)
+        tracking = [t for join in self._joins.values() if (t := join.take(everything)) is not None]
+        while self._changes_s and self._changes_s[0] <= self._t_s:
+            change_s = self._changes_s.pop(0)
+            ago = round((self._t_s - change_s) / self._dt_s) if self._dt_s else 0
+            said.append(Event(change_s, max(0, self._seq - ago), "change, as announced", "WARN", change=True))
+        # Events first: a change is known before the samples that follow it are drawn.
+        batch: list[Record] = [r for r in said if isinstance(r, Event)]
+        batch += tracking
+        batch += [r for r in said if not isinstance(r, Event)]
+        if time.monotonic() >= self._next_health:
+            self._next_health = time.monotonic() + 1.0
+            self.counts["restarts"] = sum(join.restarts for join in self._joins.values())
+            self.counts["dropped_batches"] = sum(output.dropped for output in self._outputs)
+            batch.append(Health(self._t_s, self._seq, dict(self.counts)))
+        if batch:
+            for output in self._outputs:
+                output.offer(batch)
+
+    def _decode(self, kind: str, model: str, payload: bytes) -> Record | None:
+        if kind == "sample":
+            samples = wire.decode_samples(payload)
+            self.counts["samples"] += len(samples)
+            self._joins[model].put(samples.seq, samples.t_s, samples.u_V, samples.y_um)
+            if model == self.config.model:
+                self._clock(samples)
+            return None
+        if kind == "reference":
+            block = wire.decode_reference(payload)
+            self._rings[model].put(block.seq + np.arange(len(block), dtype=np.int64), block.values)
+            return None
+        fields = json.loads(payload)
+        if not isinstance(fields, dict):
+            raise ValueError("not an object")
+        self.counts[kind] += 1
+        t_s, seq = self._when(fields)
+        if kind == "diagnostics":
+            return Diagnostics(t_s, seq, fields)
+        if kind == "status":
+            return Status(t_s, seq, fields)
+        return event_record(t_s, seq, fields)
+
+    def _clock(self, samples: wire.SampleBatch) -> None:
+        """Keep the newest pair of number and time of the stage, and how far apart its samples are."""
+        t_s, seq = float(samples.t_s[-1]), int(samples.seq[-1])
+        if not _is_time(t_s):
+            return
+        if seq > self._seq and t_s > self._t_s:
+            self._dt_s = (t_s - self._t_s) / (seq - self._seq)
+        self._t_s, self._seq = t_s, seq
+
+    def _when(self, fields: Mapping[str, Any]) -> tuple[float, int]:
+        """When a message speaks of: its own words, what its sequence number tells, else the newest sample heard."""
+        t_s, seq = fields.get("t_s"), fields.get("seq")
+        if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq <= wire.MAX_SEQ:
+            return (float(t_s) if _is_time(t_s) else self._t_s), self._seq
+        if _is_time(t_s):
+            return float(t_s), seq
+        ago_s = (self._seq - seq) * self._dt_s
+        # A number from another life of the stage says nothing about its time; one that is a little ahead does.
+        return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), seq
+
+
+def _is_time(value: Any) -> TypeGuard[float]:
+    """Whether this can be drawn as a time: Rerun holds nanoseconds in 64 bits."""
+    return isinstance(value, (int, float)) and -9e9 < value < 9e9
+
+
+def _subscriptions(config: ConsumerConfig) -> list[tuple[str, str, str]]:
+    """(kind, model, key) of everything that is listened to."""
+    main = Keys(config.stage, config.axis)
+    found = [
+        ("sample", config.model, main.sample),
+        ("reference", config.model, main.reference),
+        ("status", config.model, main.status),
+        ("diagnostics", config.model, main.diagnostics),
+        ("event", config.model, main.event),
+    ]
+    for axis, model in config.twins:
+        keys = Keys(config.stage, axis)
+        found += [("sample", model, keys.sample), ("reference", model, keys.reference)]
+    return found

@@ -1,0 +1,170 @@
+"""A sink in a process of its own behind a bounded queue: a viewer that is slow, gone or stuck costs nobody anything.
+
+The stream to a viewer that has gone blocks whoever writes to it, for ever. So the writer is a child process; the
+queue to it holds a bounded number of batches; what does not fit is dropped and counted; and at the end the child
+gets a bounded time to finish before it is ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import queue
+import re
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Final
+
+from adaptive.errors import InputError
+from service.background.priority import step_back
+from service.protocol.errors import ServiceError
+from service.viewer.feed import Record, SceneConfig
+
+#: How long a child may take to start: Rerun and numpy are imported anew in it.
+START_S = 60.0
+_NICE: Final = 5
+_URL = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """Where to draw: ``rrd``, a file, or ``connect``, the URL of a viewer; exactly one of them.
+
+    ``queue_batches`` bounds what waits; at 0.2 s a batch, 100 of them are 20 s.
+    """
+
+    scene: SceneConfig
+    rrd: Path | None = None
+    connect: str | None = None
+    recording_id: str | None = None
+    queue_batches: int = 100
+
+    def __post_init__(self) -> None:
+        if (self.rrd is None) == (self.connect is None):
+            raise InputError(f"rrd, connect: got {self.rrd!r} and {self.connect!r}, expected exactly one of them")
+        if self.connect is not None and not _URL.match(self.connect):
+            raise InputError(f"connect: got {self.connect!r}, expected such as rerun+http://127.0.0.1:9876/proxy")
+        if self.queue_batches < 1:
+            raise InputError(f"queue_batches: got {self.queue_batches}, expected at least 1")
+
+    @property
+    def name(self) -> str:
+        return str(self.rrd) if self.rrd is not None else str(self.connect)
+
+
+class Output:
+    """A running sink. Raises InputError if it cannot be had: a file in no folder, a URL that is none."""
+
+    def __init__(self, config: OutputConfig) -> None:
+        self.config = config
+        self.dropped = 0
+        # A fresh interpreter: zenoh's threads of this one do not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        self._queue: Queue[Sequence[Record] | None] = context.Queue(config.queue_batches)
+        ours, theirs = context.Pipe(duplex=False)
+        self._process = context.Process(target=_draw, args=(config, self._queue, theirs), name="view", daemon=True)
+        self._process.start()
+        theirs.close()
+        trouble = self._greeting(ours)
+        ours.close()
+        if trouble is not None:
+            self.close(timeout_s=0.0)
+            raise trouble
+
+    @property
+    def alive(self) -> bool:
+        """Whether the child still draws."""
+        return self._process.is_alive()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child."""
+        return self._process.pid
+
+    def offer(self, batch: Sequence[Record]) -> bool:
+        """Hand a batch over, or drop and count it; never waits. Returns whether it was taken."""
+        if self._process.is_alive():
+            with contextlib.suppress(queue.Full):
+                self._queue.put_nowait(batch)
+                return True
+        self.dropped += 1
+        return False
+
+    def close(self, timeout_s: float = 10.0) -> bool:
+        """Finish what waits, for at most ``timeout_s``; then end the child. Returns whether all was drawn."""
+        until = time.monotonic() + timeout_s
+        try:
+            self._queue.put(None, timeout=max(timeout_s, 1e-3))
+        except queue.Full:
+            pass
+        else:
+            self._process.join(max(0.0, until - time.monotonic()))
+        finished = self._process.exitcode == 0
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join(1.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        # What still waits has nobody to read it: without this the interpreter would wait for ever at its end.
+        self._queue.cancel_join_thread()
+        self._queue.close()
+        self._process.close()
+        return finished
+
+    def _greeting(self, ours: Connection) -> Exception | None:
+        if not ours.poll(START_S):
+            return ServiceError(f"the viewer stream to {self.config.name} did not start within {START_S:g} s")
+        try:
+            message = ours.recv()
+        except EOFError:
+            return ServiceError(f"the viewer stream to {self.config.name} ended before it began")
+        return InputError(message) if message else None
+
+
+def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greeting: Connection) -> None:
+    """The child: draws batches until None comes or its parent is gone."""
+    # An interrupt at the terminal reaches the whole group; the parent decides when to stop.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Drawing must never take the processor from those it watches: in a session of its own, which is nice as a whole.
+    with contextlib.suppress(OSError, AttributeError):
+        os.setsid()
+    step_back(_NICE)
+    from service.viewer.rerun_sink import RerunSink
+    from service.viewer.scene import Scene
+
+    if config.connect is not None:
+        greeting.send("")  # A viewer that is stuck blocks whoever connects to it, so nobody waits for that.
+    try:
+        sink = RerunSink(config.scene, rrd=config.rrd, connect=config.connect, recording_id=config.recording_id)
+    except InputError as error:
+        if config.connect is not None:
+            raise
+        greeting.send(str(error))
+        return
+    if config.rrd is not None:
+        greeting.send("")
+    greeting.close()
+    scene = Scene(sink, config.scene)
+    parent = multiprocessing.parent_process()
+    while True:
+        try:
+            batch = batches.get(timeout=1.0)
+        except queue.Empty:
+            if parent is not None and not parent.is_alive():
+                break
+            continue
+        if batch is None:
+            break
+        scene.take_all(batch)
+    try:
+        sink.close()
+    except ServiceError:
+        sys.exit(1)  # The parent says so; Rerun has already said why.

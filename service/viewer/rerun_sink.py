@@ -1,0 +1,188 @@
+"""The one module that knows Rerun: a canvas that draws into a viewer or an ``.rrd`` file.
+
+Not safe against blocking: a stream to a viewer that has gone blocks the caller once its buffers are full. Whatever
+must not wait stands behind `service.viewer.output`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from service.protocol.errors import ServiceError
+from service.viewer import style
+from service.viewer.feed import IntArray, SceneConfig
+from service.viewer.layout import Box, Part, PlaneView, Plot, layout
+
+APPLICATION = "dehyst"
+TIMELINE, SEQUENCE = "t_s", "seq"
+DEFAULT_PORT = 9876
+#: Of the viewer that is spawned: its own store and its server's buffer of messages.
+VIEWER_MEMORY, SERVER_MEMORY = "1GiB", "64MiB"
+
+
+class RerunSink:
+    """Draws into one place: the file ``rrd`` or the viewer at ``connect``. Close it, or the end may be missing.
+
+    Raises
+    ------
+    InputError : both or neither of ``rrd`` and ``connect`` given, or the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        config: SceneConfig,
+        *,
+        rrd: Path | None = None,
+        connect: str | None = None,
+        recording_id: str | None = None,
+    ) -> None:
+        if (rrd is None) == (connect is None):
+            raise InputError(f"rrd, connect: got {rrd!r} and {connect!r}, expected exactly one of them")
+        desk = blueprint(config)
+        # The live stream and the file of one run carry the same id, so that the viewer knows them for the same.
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id or str(uuid.uuid4()))
+        if rrd is not None:
+            try:
+                rrd.parent.mkdir(parents=True, exist_ok=True)
+                rrd.open("ab").close()
+                self._stream.save(rrd, default_blueprint=desk)
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"rrd: cannot write {rrd}: {error}; name a file in a folder you may write to"
+                ) from error
+        else:
+            self._stream.connect_grpc(connect, default_blueprint=desk)
+        self._stream.send_recording_name(config.title)
+        for path, line in style.lines(config).items():
+            self._stream.log(
+                path,
+                rr.SeriesLines(names=line.name, colors=[line.colour], widths=[line.width]),
+                static=True,
+            )
+        for name, text in config.notes.items():
+            self._stream.send_property(name, rr.AnyValues(text=text))
+
+    def scalars(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None:
+        indexes = [rr.TimeColumn(TIMELINE, duration=t_s), rr.TimeColumn(SEQUENCE, sequence=seq)]
+        self._stream.send_columns(path, indexes, rr.Scalars.columns(scalars=values))
+
+    def strips(
+        self, path: str, t_s: float, seq: int, strips: Sequence[FloatArray], colour: style.Colour, radius: float
+    ) -> None:
+        self._at(t_s, seq)
+        drawn = [s for s in strips if len(s) > 1]
+        self._stream.log(path, rr.LineStrips2D(drawn, colors=[colour] * len(drawn), radii=[radius] * len(drawn)))
+
+    def points(
+        self,
+        path: str,
+        t_s: float,
+        seq: int,
+        positions: FloatArray,
+        colour: style.Colour,
+        radius: float,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        self._at(t_s, seq)
+        shown = None if labels is None else True
+        self._stream.log(
+            path, rr.Points2D(positions, colors=[colour], radii=[radius], labels=labels, show_labels=shown)
+        )
+
+    def text(self, path: str, t_s: float, seq: int, text: str, level: str) -> None:
+        self._at(t_s, seq)
+        self._stream.log(path, rr.TextLog(text, level=level))
+
+    def document(self, path: str, t_s: float, seq: int, markdown: str) -> None:
+        self._at(t_s, seq)
+        self._stream.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def close(self) -> None:
+        """Flush and let go of file or viewer; a file is complete afterwards. Raises ServiceError if it is not."""
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise ServiceError(f"not everything was drawn: {error}") from error
+        finally:
+            self._stream.disconnect()
+
+    def _at(self, t_s: float, seq: int) -> None:
+        self._stream.set_time(TIMELINE, duration=t_s)
+        self._stream.set_time(SEQUENCE, sequence=seq)
+
+
+def blueprint(config: SceneConfig) -> rrb.Blueprint:
+    """The layout of `service.viewer.layout` in Rerun's words."""
+    start = (
+        rrb.TimeRangeBoundary.infinite()
+        if config.history_s is None
+        else rrb.TimeRangeBoundary.cursor_relative(seconds=-config.history_s)
+    )
+    ranges = rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0))
+    return rrb.Blueprint(
+        _part(layout(config), ranges),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_views=False,
+    )
+
+
+def _part(part: Part, ranges: rrb.VisibleTimeRange) -> rrb.Container | rrb.View:
+    if isinstance(part, Box):
+        inner = [_part(p, ranges) for p in part.parts]
+        if part.kind == "row":
+            return rrb.Horizontal(*inner, column_shares=part.shares)
+        if part.kind == "column":
+            return rrb.Vertical(*inner, row_shares=part.shares)
+        return rrb.Tabs(*inner, active_tab=0)
+    if isinstance(part, Plot):
+        axis = None if part.range is None else rrb.ScalarAxis(range=part.range, zoom_lock=False)
+        return rrb.TimeSeriesView(
+            name=part.name,
+            origin="/",
+            contents=[f"+ /{path}" for path in part.paths],
+            axis_y=axis,
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+            time_ranges=ranges,
+        )
+    if isinstance(part, PlaneView):
+        (left, right), (top, bottom) = part.bounds
+        return rrb.Spatial2DView(
+            name=part.name,
+            origin=f"/{part.origin}",
+            background=[16, 16, 18],
+            visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom]),
+        )
+    if part.document:
+        return rrb.TextDocumentView(name=part.name, origin=f"/{part.path}")
+    columns = rrb.TextLogColumns(
+        timeline_columns=[rrb.encodings.TimelineColumn(TIMELINE, visible=False)], text_log_columns=["LogLevel", "Body"]
+    )
+    return rrb.TextLogView(name=part.name, origin=f"/{part.path}", columns=columns)
+
+
+def viewer_command(port: int, *, headless: bool = False) -> list[str]:
+    """The command that starts a viewer of one's own, bound to the loopback alone (Rerun's default is every host)."""
+    # The program itself, not its Python wrapper, which would leave a child behind.
+    binary = Path(rr.__file__).parents[1] / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
+    command = [
+        str(binary), "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen",
+        "--memory-limit", VIEWER_MEMORY, "--server-memory-limit", SERVER_MEMORY,
+    ]  # fmt: skip
+    return [*command, "--headless"] if headless else command
+
+
+def spawn_viewer(port: int = DEFAULT_PORT, *, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
+    """Start a viewer; returns its process and the URL to connect to. It outlives us unless it is ended."""
+    process = subprocess.Popen(viewer_command(port, headless=headless), start_new_session=True)
+    return process, f"rerun+http://127.0.0.1:{port}/proxy"

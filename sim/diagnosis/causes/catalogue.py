@@ -1,0 +1,84 @@
+"""The causes that a diagnosis may name, in the forms in which they are fitted."""
+
+from __future__ import annotations
+
+from sim.diagnosis.causes.drive import AmplifierLag, Saturation, SlewLimit
+from sim.diagnosis.causes.linear import Delay, Resonance, SensorLag
+from sim.diagnosis.causes.modal import CrossModes, StructureModes
+from sim.diagnosis.causes.motion import Creep, CrossTalk, GainDrift, StickSlip, ThermalDrift
+from sim.diagnosis.causes.payload import PayloadChange
+from sim.diagnosis.causes.reading import MainsHum, SensorNonlinearity, Timing
+from sim.diagnosis.causes.restoring_force import RestoringLoop
+from sim.diagnosis.causes.slips import Slips
+from sim.diagnosis.causes.static import Asymmetry, HysteresisShape, RateDependence
+from sim.diagnosis.model.forms import Form
+
+#: Every form that is tried; forms of one name are variants of one cause.
+FORMS: tuple[Form, ...] = (
+    HysteresisShape(),
+    HysteresisShape(variant="restoring"),
+    RestoringLoop(),
+    Asymmetry(),
+    RateDependence(),
+    RateDependence(felt_s=0.04),
+    RateDependence(variant="thresholds"),
+    RateDependence(variant="added"),
+    RateDependence(variant="added", felt_s=0.04),
+    Creep(),
+    ThermalDrift(),
+    ThermalDrift(variant="temperature", of_one_recording=False),
+    GainDrift(),
+    GainDrift(variant="temperature", of_one_recording=False),
+    Resonance(),
+    StructureModes(),
+    PayloadChange(),
+    PayloadChange(variant="midway"),
+    AmplifierLag(),
+    SlewLimit(),
+    Saturation(),
+    Delay(),
+    SensorLag(),
+    SensorNonlinearity(),
+    CrossTalk(),
+    CrossModes(),
+    MainsHum(variant="50"),
+    MainsHum(variant="60"),
+    StickSlip(),
+    Timing(),
+    Slips(),
+)
+
+#: Causes that are one set for a voltage and a sensor: beside one of them another is its form's remainder, not news.
+SETS: tuple[frozenset[str], ...] = (
+    frozenset({"asymmetry", "sensor_nonlinearity"}),
+    frozenset({"amplifier_lag", "sensor_lag"}),
+)
+
+
+def same_set(names: set[str]) -> set[str]:
+    """The names with those that are inseparable from one of them."""
+    return names.union(*(s for s in SETS if s & names))
+
+
+#: The names of the catalogue; quantisation is found by means of its own.
+NAMES: tuple[str, ...] = (
+    "hysteresis_shape",
+    "asymmetry",
+    "rate_dependence",
+    "creep",
+    "thermal_drift",
+    "gain_drift",
+    "resonance",
+    "payload_change",
+    "amplifier_lag",
+    "slew_limit",
+    "saturation",
+    "delay",
+    "sensor_lag",
+    "sensor_nonlinearity",
+    "cross_talk",
+    "mains_hum",
+    "quantisation",
+    "stick_slip",
+    "timing",
+)

@@ -1,0 +1,318 @@
+"""The extended stage in the effects library's own terms: a stage file that `dehyst stage` runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from sim.diagnosis.causes.restoring_force import RestoringLoop
+from sim.diagnosis.model.chain import Model
+from sim.diagnosis.model.fit import Fit
+from sim.diagnosis.model.forms import Form
+from sim.diagnosis.model.measured import At, Setting
+from sim.diagnosis.model.nominal import Linear, loop_numbers
+from sim.diagnosis.model.nominal_stage import StageNominal
+from sim.diagnosis.report.result import Diagnosis
+from sim.effects import KINDS, Chain, Effect, effect, simulate
+from sim.stage.config import StageConfig
+
+# --- The calibrated nominal stage and each fitted cause in the effects library's own terms.
+
+
+#: Label of the effect that carries the sensor's offset.
+OFFSET = "sensor_offset"
+
+
+def _clip(name: str, **values: float) -> dict[str, float]:
+    kind = KINDS[name]
+    return {key: float(np.clip(v, kind.parameter(key).low, kind.parameter(key).high)) for key, v in values.items()}
+
+
+def make(name: str, label: str = "", **values: float) -> Effect:
+    return effect(name, label=label, **_clip(name, **values))
+
+
+def nominal_effects(fit: Fit) -> list[Effect]:
+    """The calibrated nominal stage in the library's effects. The recorder's latch is no part of the stage."""
+    p = fit.model.part(fit.p, -1)
+    nominal = fit.model.nominal
+    # After the mechanics: an offset before them would be travelled to, lag and all, from a start at zero.
+    drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
+    offset = make("thermal_drift", OFFSET, offset_um=nominal.offset_um(p), **drift)
+    if isinstance(nominal, StageNominal):
+        return [*nominal.effects(p), offset]
+    if nominal.name == "linear":
+        f, z = float(np.exp(p[1])), float(np.exp(p[2]))
+        return [
+            make("linear_actuator", gain_um_per_V=float(p[0])),
+            offset,
+            make("resonance", label="nominal_mode", frequency_Hz=f, damping_ratio=z),
+        ]
+    slope, beta, gamma = loop_numbers(p)
+    d = float(p[0])
+    k = KINDS["mechanics"].parameter("stiffness_N_per_m").default
+    return [
+        make("bouc_wen", d_um_per_V=d, alpha=slope / d, beta_per_V=beta, gamma_per_V=gamma),
+        offset,
+        make("mechanics", damping_N_s_per_m=float(p[4]) * k, stiffness_N_per_m=k),
+    ]
+
+
+def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Effect], bool]:
+    """One fitted cause in the library's effects, and whether their numbers still want fitting."""
+    v = {name: value for name, (value, _) in form.physical(p, setting).items()}
+    swing, duration = setting.swing_V, setting.duration_s
+    match form.name:
+        case "amplifier_lag" | "sensor_lag":
+            return [make(form.name, tau_s=v["tau_s"])], False
+        case "slew_limit":
+            return [make("slew_limit", rate_V_per_s=v["slew_V_per_s"])], False
+        case "saturation":
+            return [make("saturation", high_V=v["u_max_V"], low_V=min(v["u_min_V"], 0.0) - 1e-3 * swing)], False
+        case "delay":
+            return [make("delay", delay_s=v["tau_s"])], False
+        case "resonance":
+            return [make("resonance", frequency_Hz=v["f0_hz"], damping_ratio=v["damping"])], False
+        case "payload_change":
+            return [make("payload_change", payload_ratio=v["payload_ratio"])], False
+        case "creep":
+            return [make("creep", gain_per_decade=v["gain_per_decade"])], True
+        case "cross_talk":
+            if form.variant == "modes":
+                return [], False
+            return [make("cross_talk", static=v["static"], rate_s=v["rate_s"])], False
+        case "mains_hum":
+            phase = float(np.arctan2(p[2], p[1]) / (2.0 * np.pi))
+            return [
+                make(
+                    "mains_hum",
+                    amplitude_um=v["amplitude_um"],
+                    frequency_Hz=v["frequency_hz"],
+                    phase_cycles=phase,
+                    third_share=float(np.hypot(*p[-2:]) / max(v["amplitude_um"], 1e-12)) if p.size >= 7 else 0.0,
+                )
+            ], False
+        case "timing":
+            return [make("timing", repeat_probability=0.0, slow_ppm=max(0.0, -v["clock_ppm"]))], False
+        case "stick_slip":
+            return [make("stick_slip", width_um=v["width_um"], sliding_share=v["sliding_share"])], False
+        case "thermal_drift":
+            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
+            tau = 0.3 * duration
+            return [make("thermal_drift", amplitude_um=1e-3, tau_s=tau, ramp_um_per_min=ramp)], True
+        case "gain_drift":
+            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
+            tau = 0.3 * duration
+            return [make("gain_drift", ramp_per_min=ramp, amplitude=1e-4, tau_s=tau)], True
+        case "sensor_nonlinearity":
+            return [
+                make("sensor_nonlinearity", square=v["quadratic"], cubic=v["cubic"], range_um=setting.range_um)
+            ], True
+        case "asymmetry":
+            slope = v["bend"] * setting.range_um / swing
+            where = setting.u_low_V
+            return [
+                make(
+                    "asymmetry",
+                    "asymmetry",
+                    slope_um_per_V=slope,
+                    dead_zone_V=where + 0.35 * swing,
+                    threshold_V=0.02 * swing,
+                ),
+                make(
+                    "asymmetry",
+                    "asymmetry_2",
+                    slope_um_per_V=0.1 * slope,
+                    dead_zone_V=where + 0.65 * swing,
+                    threshold_V=0.15 * swing,
+                ),
+            ], True
+        case "rate_dependence":
+            return [
+                make(
+                    "rate_dependence",
+                    growth_per_decade=0.1,
+                    corner_V_per_s=v["corner_V_per_s"],
+                    width_um=0.1 * setting.range_um,
+                    largest_V=0.35 * swing,
+                )
+            ], True
+        case "hysteresis_shape":
+            width = 0.05 * setting.range_um
+            return [
+                make("hysteresis_shape", "hysteresis_shape", width_um=width, largest_V=0.5 * swing, fading=1.0),
+                make(
+                    "hysteresis_shape", "hysteresis_shape_2", width_um=0.2 * width, largest_V=0.15 * swing, fading=1.0
+                ),
+            ], True
+    return [], False
+
+
+def in_force(e: Effect, form: RestoringLoop, p: FloatArray, setting: Setting) -> Effect:
+    """A mode of the nominal stage with the loop in its restoring force; any other effect as it is."""
+    if e.name != "resonance":
+        return e
+    v = {name: value for name, (value, _) in form.physical(p, setting).items()}
+    mode = {name: e.values[name] for name in ("frequency_Hz", "damping_ratio")}
+    return make("mechanical_hysteresis", e.label, **mode, **v)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A stage configuration and how far (rms, µm) its free run is from the extended model that was fitted.
+
+    ``left_out``: causes that the library's chain has no equal of, such as hysteresis in the restoring force.
+    """
+
+    config: StageConfig
+    rms_um: float
+    rms_before_um: float
+    left_out: tuple[str, ...] = ()
+
+
+def export(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> Exported:
+    """The extended stage as a configuration. Where a cause's form and the library's differ, the library's numbers
+    are fitted by simulating the library's own chain against the extended model, latch and noise left out.
+    """
+    fit = diagnosis.extended
+    setting = fit.model.setting
+    own, loose = nominal_effects(fit), {"bouc_wen", "linear_actuator", OFFSET}
+    effects, named, missing = list(own), list[str](), list[str]()
+    for i, form in enumerate(fit.model.forms):
+        if not any(c.form == i for c in diagnosis.causes):
+            continue
+        if isinstance(form, RestoringLoop):
+            effects = [in_force(e, form, fit.model.part(fit.p, i), setting) for e in effects]
+            named.append(form.name)
+            continue
+        mine, wants = cause_effects(form, fit.model.part(fit.p, i), setting)
+        if not mine:
+            missing.append(form.name)
+        mine = [_apart(e, effects) for e in mine]
+        effects += mine
+        named.append(form.name)
+        if wants:
+            loose |= {e.label for e in mine}
+    step = next((c.parameters["step_um"] for c in diagnosis.causes if c.name == "quantisation"), 0.0)
+    clean = Chain(tuple(effects))
+    target, skip = _target(fit), _settling(fit)
+    before = _rms((_free_run(clean, setting) - target)[skip:])
+    fitted, after = clean, before
+    if not loose <= {"bouc_wen", "linear_actuator", OFFSET}:
+        fitted, after = _fit(clean, loose, setting, target, skip)
+    left_out = tuple(missing)
+    plain = Chain(tuple(own))
+    if named and not after < _rms((_free_run(plain, setting) - target)[skip:]):
+        # The library puts it elsewhere in the chain: such an extension would be further off than none.
+        fitted, left_out = plain, tuple(dict.fromkeys(named))
+        after = _rms((_free_run(plain, setting) - target)[skip:])
+    extras: list[Effect] = [make("sensor_noise", rms_um=_noise(diagnosis, step))]
+    if step > 0.0:
+        extras.append(make("quantisation", step_um=step))
+    repeat = next((c.parameters.get("repeat_probability", 0.0) for c in diagnosis.causes if c.name == "timing"), 0.0)
+    if repeat > 0.0 and "timing" not in fitted:
+        extras.append(make("timing", repeat_probability=repeat))
+    margin = 0.05 * setting.swing_V
+    config = StageConfig(
+        name,
+        Chain((*fitted, *extras)),
+        dt_s=setting.dt_s,
+        seed=seed,
+        u_min_V=min(0.0, setting.u_low_V - margin),
+        u_max_V=max(0.0, setting.u_high_V + margin),
+    )
+    return Exported(config, after, before, left_out)
+
+
+def _apart(e: Effect, others: list[Effect]) -> Effect:
+    """The effect under a label that none of ``others`` has: a stage file may hold one of its kind already."""
+    taken = {other.label for other in others}
+    if e.label not in taken:
+        return e
+    number = next(k for k in range(2, len(taken) + 3) if f"{e.label}_{k}" not in taken)
+    return effect(e.name, label=f"{e.label}_{number}", **e.values)
+
+
+def _settling(fit: Fit) -> int:
+    """Samples in which a stage that was at rest at 0 V before, as a simulated one is, forgets that it was."""
+    u = fit.model.setting.u_V
+    at_rest = abs(float(u[0])) < 1e-3 * fit.model.setting.swing_V and not getattr(
+        fit.model.nominal, "free_memory", False
+    )
+    return 0 if at_rest else fit.model.setting.n // 5
+
+
+def _noise(diagnosis: Diagnosis, step_um: float) -> float:
+    return float(np.sqrt(max(diagnosis.noise_floor_um**2 - step_um**2 / 12.0, 0.0)))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _target(fit: Fit) -> FloatArray:
+    """The extended model's reading without the recorder's own latch and, of a linear stage, hold."""
+    model: Model = fit.model
+    if isinstance(model.nominal, Linear):
+        # A stage is driven by a converter that holds.
+        model = Model(model.setting, replace(model.nominal, hold="zero"), model.forms)
+    p = fit.p.copy()
+    for i, slot in enumerate(model.slots[: model.n_nominal]):
+        if slot.name == "latch_samples":
+            p[i] = 0.0
+    return model.simulate(p, At.DRIVE).reading_um
+
+
+def _free_run(chain: Chain, setting: Setting) -> FloatArray:
+    return simulate(chain, setting.u_V, setting.dt_s, other_um=setting.other_um)
+
+
+def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray, skip: int = 0) -> tuple[Chain, float]:
+    """Levenberg-Marquardt on the loose effects' numbers, each on its own natural scale, but for ``skip`` samples."""
+    paths: list[str] = []
+    for e in chain:
+        if e.label in loose:
+            fixed = ("walk", "range_um") if e.label == OFFSET else ("walk", "range_um", "offset_um")
+            names = [p.name for p in e.kind.parameters if not p.name.startswith(fixed)]
+            paths += [f"{e.label}.{name}" for name in names if e.label != OFFSET or name == "offset_um"]
+    spec: dict[str, Any] = {
+        path: chain[path.rpartition(".")[0]].kind.parameter(path.rpartition(".")[2]) for path in paths
+    }
+    now = chain.parameters
+    run = _free_run(chain, setting)
+    error = (target - run)[skip:]
+    best = float(error @ error)
+    damping = 1e-3
+    for _ in range(12):
+        scale = np.array([max(abs(now[path]), 0.02 * abs(spec[path].default), 1e-6) for path in paths])
+        rows = np.empty((len(paths), setting.n - skip))
+        for i, path in enumerate(paths):
+            h = 1e-3 * scale[i] * (1.0 if now[path] + 1e-3 * scale[i] <= spec[path].high else -1.0)
+            moved = _free_run(chain.replace({path: now[path] + h}), setting)
+            rows[i] = (moved - run)[skip:] / h * scale[i]
+        gram, slope = rows @ rows.T, rows @ error
+        size = np.maximum(np.diag(gram), 1e-9 * float(np.max(np.diag(gram))))
+        improved = False
+        for _ in range(5):
+            move = np.linalg.lstsq(gram + np.diag(damping * size), slope, rcond=1e-12)[0] * scale
+            values = {
+                path: float(np.clip(now[path] + move[i], spec[path].low, spec[path].high))
+                for i, path in enumerate(paths)
+            }
+            trial = chain.replace(values)
+            there = _free_run(trial, setting)
+            left = (target - there)[skip:]
+            sse = float(left @ left)
+            if np.isfinite(sse) and sse < best:
+                gained = 1.0 - sse / best
+                chain, run, error, best, now = trial, there, left, sse, trial.parameters
+                damping = max(0.2 * damping, 1e-8)
+                improved = gained > 1e-3
+                break
+            damping *= 10.0
+        if not improved:
+            break
+    return chain, float(np.sqrt(best / (setting.n - skip)))

@@ -1,0 +1,187 @@
+"""Voltages and references: the chapter's signals, triangles, sines, diagnosis excitation.
+
+All return ``(t_s, values)`` as (n,) arrays; times are ``k dt_s``, computed from the count. Voltages are in V at the
+command's scale. The reference that no model has seen comes from `sim.signals.unseen_reference`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from sim.signals.unseen_reference import DemoReference, Reference, demo_reference
+from sim.stage.timebase import times
+
+#: The chapter prints an amplitude of 5 in (2.37) and (2.45), which peaks at 9.8 V. Its tables and ranges
+#: (thresholds (2.38) up to 7.2434 V = 12/13 of 7.847 V, 89.306 µm) belong to a peak of 7.85 V: an amplitude of 4.
+CHAPTER_AMPLITUDE_V = 4.0
+
+
+def training_input(
+    dt_s: float = 0.02, duration_s: float = 10.0, amplitude_V: float = CHAPTER_AMPLITUDE_V
+) -> tuple[FloatArray, FloatArray]:
+    """(2.37): ``u = A e^(-0.11 t) [sin(6 pi t e^(-0.345 t) - 1.55) + 1]``; 500 samples at 0.02 s by default.
+
+    The printed A is 5; see `CHAPTER_AMPLITUDE_V` for why 4 is the default.
+    """
+    t = times(duration_s, dt_s)
+    wave = np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 1.55) + 1.0
+    return t, amplitude_V * np.exp(-0.11 * t) * wave
+
+
+def generalisation_input(
+    dt_s: float = 0.02, duration_s: float = 10.0, amplitude_V: float = CHAPTER_AMPLITUDE_V
+) -> tuple[FloatArray, FloatArray]:
+    """(2.45): ``u = A e^(-0.14 t) [cos(3 pi t e^(-0.092 t) - 3.15) + 1]``; 500 samples at 0.02 s by default."""
+    t = times(duration_s, dt_s)
+    wave = np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - 3.15) + 1.0
+    return t, amplitude_V * np.exp(-0.14 * t) * wave
+
+
+def growing_triangles(
+    dt_s: float = 1e-3, amplitudes_V: tuple[float, ...] = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), rate_V_per_s: float = 6.0
+) -> tuple[FloatArray, FloatArray]:
+    """Triangles from 0 V of growing amplitude at a constant rate, as in Fig. 2.2."""
+    if not amplitudes_V or min(amplitudes_V) <= 0.0 or rate_V_per_s <= 0.0:
+        raise InputError(f"amplitudes_V, rate_V_per_s: got {amplitudes_V}, {rate_V_per_s}, expected positive numbers")
+    corners_V = [0.0]
+    for amplitude in amplitudes_V:
+        corners_V += [amplitude, 0.0]
+    corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
+    t = times(float(corners_s[-1]), dt_s)
+    return t, np.interp(t, corners_s, corners_V)
+
+
+def triangle(
+    low_V: float, high_V: float, frequency_Hz: float, cycles: float, dt_s: float = 1e-3
+) -> tuple[FloatArray, FloatArray]:
+    """A triangle wave from ``low_V`` up to ``high_V`` and back, ``cycles`` times."""
+    t = times(cycles / frequency_Hz, dt_s)
+    phase = np.mod(t * frequency_Hz, 1.0)
+    return t, low_V + (high_V - low_V) * (1.0 - np.abs(1.0 - 2.0 * phase))
+
+
+def sine(
+    low_V: float, high_V: float, frequency_Hz: float, cycles: float, dt_s: float = 1e-3
+) -> tuple[FloatArray, FloatArray]:
+    """A sine from ``low_V`` up to ``high_V`` and back, ``cycles`` times, beginning at the bottom (Fig. 2.3)."""
+    t = times(cycles / frequency_Hz, dt_s)
+    return t, low_V + (high_V - low_V) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t))
+
+
+def minor_loops(
+    low_V: float = 1.0,
+    high_V: float = 7.0,
+    loops: int = 4,
+    inner_V: float = 1.5,
+    rate_V_per_s: float = 6.0,
+    dt_s: float = 1e-3,
+) -> tuple[FloatArray, FloatArray]:
+    """One large loop from 0 V with ``loops`` minor loops of depth ``inner_V`` on the way up and on the way down."""
+    levels = np.linspace(low_V, high_V, loops + 2)[1:-1]
+    corners_V = [0.0, low_V]
+    for level in levels:
+        corners_V += [float(level), float(level) - inner_V]
+    corners_V.append(high_V)
+    for level in levels[::-1]:
+        corners_V += [float(level), float(level) + inner_V]
+    corners_V += [low_V, 0.0]
+    corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
+    t = times(float(corners_s[-1]), dt_s)
+    return t, np.interp(t, corners_s, corners_V)
+
+
+def multitone(
+    duration_s: float, dt_s: float = 1e-3, low_V: float = 0.5, high_V: float = 7.5, seed: int = 0, tones: int = 6
+) -> tuple[FloatArray, FloatArray]:
+    """A sum of sines between 0.5 and 20 Hz, amplitudes falling as 1/f, all within the given voltages."""
+    rng = np.random.default_rng(seed)
+    t = times(duration_s, dt_s)
+    frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), tones))
+    phase = rng.uniform(0.0, 2.0 * np.pi, tones)
+    weight = 1.0 / frequency
+    weight /= weight.sum()
+    wave = np.sin(2.0 * np.pi * frequency * t[:, None] + phase) @ weight
+    return t, 0.5 * (low_V + high_V) + 0.5 * (high_V - low_V) * wave
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """A recording's commands: time, both axes' voltages, and where each part lies."""
+
+    t_s: FloatArray
+    u_V: FloatArray
+    u2_V: FloatArray
+    parts: tuple[tuple[str, int, int], ...]
+    """(name, first sample, sample after the last) in order."""
+
+
+def diagnosis_excitation(dt_s: float = 5e-4, full_V: float = 8.0) -> Excitation:
+    """About 65 s that make every cause of the catalogue visible: rests, steps with holds, nested triangles, sines
+    of 1 to 20 Hz, a small chirp, the chapter's decaying sine, the other axis alone.
+    """
+    half = 0.5 * full_V
+    rate = full_V / 1.0
+
+    def rest(seconds: float, level: float = 0.0) -> FloatArray:
+        return np.full(times(seconds, dt_s).size, level)
+
+    def path(corners: tuple[float, ...]) -> FloatArray:
+        at = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners)) / rate)))
+        return np.interp(times(float(at[-1]), dt_s), at, corners)
+
+    t_chirp = times(4.0, dt_s)
+    top_Hz = min(600.0, 0.35 / dt_s)
+    growth = math.log(top_Hz / 2.0)
+    sweep = 2.0 * np.pi * 2.0 * 4.0 / growth * np.expm1(t_chirp / 4.0 * growth)
+    # faded in and out, so that the chirp begins and ends without a step
+    fade = np.clip(np.minimum(t_chirp, 4.0 - t_chirp) / 0.2, 0.0, 1.0)
+    other = sine(0.0, 0.75 * full_V, 1.0, 4.0, dt_s)[1]
+    sections: list[tuple[str, FloatArray]] = [
+        ("rest", rest(3.0)),
+        ("decaying_sine", training_input(dt_s, 10.0, half)[1]),
+        ("rest", rest(1.0)),
+        ("steps", np.concatenate((rest(9.0, 0.75 * full_V), rest(2.0, 0.25 * full_V), rest(4.0, half), rest(1.0)))),
+        ("triangles", path((0, 1.0 * full_V, 0.2 * full_V, 0.8 * full_V, 0.35 * full_V, 0.6 * full_V, 0.0))),
+        ("sine_1Hz", sine(0.0, 0.9 * full_V, 1.0, 4.0, dt_s)[1]),
+        ("sine_5Hz", sine(0.0, 0.9 * full_V, 5.0, 10.0, dt_s)[1]),
+        ("sine_5Hz_small", sine(0.0, 0.2 * full_V, 5.0, 10.0, dt_s)[1]),
+        ("sine_20Hz", sine(0.0, 0.5 * full_V, 20.0, 40.0, dt_s)[1]),
+        ("to_middle", path((0.0, half))),
+        ("chirp", half + 0.02 * full_V * fade * np.sin(sweep)),
+        ("to_rest", path((half, 0.0))),
+        ("rest", rest(2.0)),
+        ("other_axis", np.zeros(other.size)),
+        ("slow_triangle", triangle(0.0, 0.9 * full_V, 0.125, 1.0, dt_s)[1]),
+        ("rest", rest(3.0)),
+    ]
+    ends = np.cumsum([values.size for _, values in sections])
+    parts = tuple((name, int(end) - values.size, int(end)) for (name, values), end in zip(sections, ends, strict=True))
+    u = np.concatenate([values for _, values in sections])
+    u2 = np.zeros_like(u)
+    for name, first, last in parts:
+        if name == "other_axis":
+            u2[first:last] = other
+    return Excitation(np.arange(u.size, dtype=np.float64) * dt_s, u, u2, parts)
+
+
+__all__ = [
+    "CHAPTER_AMPLITUDE_V",
+    "DemoReference",
+    "Excitation",
+    "Reference",
+    "demo_reference",
+    "diagnosis_excitation",
+    "generalisation_input",
+    "growing_triangles",
+    "minor_loops",
+    "multitone",
+    "sine",
+    "times",
+    "training_input",
+    "triangle",
+]

@@ -1,0 +1,229 @@
+"""Feedforward, feedback and both on a simulated stage, and the gains that Ziegler and Nichols would take.
+
+The controller reads ``y(t_k)``, computes ``u_k`` from the error at ``t_k`` and applies it until ``t_(k+1)``; nothing
+of a sample is used before it could be known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.errors import InputError, NumericsError
+from adaptive.types import FloatArray, InverseModel
+from sim.signals.unseen_reference import Reference
+from sim.stage.stage import Stage, StageState
+
+
+@dataclass(frozen=True, slots=True)
+class PID:
+    """Incremental PID, (2.46), with continuous gains.
+
+    ``u_FB(k) = u_FB(k-1) + k_p (e_k - e_(k-1)) + k_i T e_k + (k_d/T) (e_k - 2 e_(k-1) + e_(k-2))``.
+    The chapter's K_i = 31.104 is the continuous gain: taken per sample it would be unstable on 11 µm/V.
+
+    Attributes
+    ----------
+    k_p : V/µm. k_i : V/(µm s). k_d : V s/µm. dt_s : sample time T, s.
+    """
+
+    k_p: float
+    k_i: float
+    k_d: float = 0.0
+    dt_s: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("k_p", "k_i", "k_d"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InputError(f"{name}: got {value!r}, expected a finite gain from 0 on")
+        if not (math.isfinite(self.dt_s) and self.dt_s > 0.0):
+            raise InputError(f"dt_s: got {self.dt_s!r}, expected a sample time above 0 s")
+
+    def initial_state(self) -> PIDState:
+        return PIDState()
+
+    def step(self, state: PIDState, error_um: float) -> float:
+        """The feedback's voltage u_FB(k) in V; changes ``state``."""
+        e, e1, e2 = error_um, state.e1_um, state.e2_um
+        state.u_V += self.k_p * (e - e1) + self.k_i * self.dt_s * e + self.k_d / self.dt_s * (e - 2.0 * e1 + e2)
+        state.e1_um, state.e2_um = e, e1
+        return state.u_V
+
+
+#: The chapter's gains, section 2.5.3: 0.0864 V/µm and 31.104 V/(µm s).
+CHAPTER_GAINS = PID(k_p=0.0864, k_i=31.1040)
+
+
+@dataclass
+class PIDState:
+    """What (2.46) remembers: its output and the last two errors."""
+
+    u_V: float = 0.0
+    e1_um: float = 0.0
+    e2_um: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A closed-loop run, arrays of (n,)."""
+
+    t_s: FloatArray
+    reference_um: FloatArray
+    y_um: FloatArray
+    u_V: FloatArray
+    feedforward_V: FloatArray
+    feedback_V: FloatArray
+
+    @property
+    def error_um(self) -> FloatArray:
+        return self.reference_um - self.y_um
+
+    def errors_pct(self, range_um: float) -> dict[str, float]:
+        """MAE (2.43), RMSE (2.44) and largest error in percent of ``range_um``."""
+        e = np.abs(self.error_um) * (100.0 / range_um)
+        return {
+            "mae_pct": float(e.mean()),
+            "rmse_pct": float(np.sqrt(np.mean(e * e))),
+            "max_pct": float(e.max()),
+        }
+
+
+def track(
+    stage: Stage,
+    reference: Reference,
+    *,
+    model: InverseModel | None = None,
+    pid: PID | None = None,
+    state: StageState | None = None,
+    memory: FloatArray | None = None,
+    u2_V: FloatArray | None = None,
+) -> Run:
+    """Let the stage follow a reference with feedforward (``model``), feedback (``pid``) or both.
+
+    The feedforward is computed for the whole reference at once: it depends on the reference alone. ``state`` and
+    ``memory`` continue an earlier run (``state`` is changed); without them the stage is at rest and the model's memory
+    that of a stage at rest at 0 µm. Where limits clamp the voltage, the feedback holds its integral (it is set back
+    by what was clamped), so that it does not wind up. Raises InputError where sample times differ or neither is given.
+    """
+    dt_s = stage.config.dt_s
+    if model is None and pid is None:
+        raise InputError("model, pid: got neither, expected a feedforward model, feedback gains or both")
+    for name, other in (("model", model), ("pid", pid)):
+        if other is not None and not math.isclose(other.dt_s, dt_s, rel_tol=1e-9):
+            raise InputError(f"{name}: got a sample time of {other.dt_s} s, expected that of the stage, {dt_s} s")
+    if state is None:
+        state = stage.initial_state()
+    n = reference.y_um.size
+    forward = np.zeros(n)
+    if model is not None:
+        start = model.rest_memory(0.0) if memory is None else memory
+        forward = np.asarray(
+            model.feedforward(reference.y_um, reference.v_um_per_s, reference.a_um_per_s2, start).u_V, dtype=np.float64
+        )
+    low, high = stage.config.u_min_V, stage.config.u_max_V
+    u = np.clip(forward, low, high)
+    first = state.k
+    if pid is None:
+        y, _ = stage.run(state, u, u2_V)
+        feedback = np.zeros(n)
+    else:
+        y, feedback = np.empty(n), np.empty(n)
+        memory_pid = pid.initial_state()
+        for k in range(n):
+            reading = stage.read(state)[0]
+            back = pid.step(memory_pid, float(reference.y_um[k]) - reading)
+            wanted = float(forward[k]) + back
+            applied = min(max(wanted, low), high)
+            memory_pid.u_V += applied - wanted
+            stage.step(state, applied, 0.0 if u2_V is None else float(u2_V[k]))
+            y[k], u[k], feedback[k] = reading, applied, back
+    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
+    return Run(t_s, reference.y_um, y, u, forward, feedback)
+
+
+@dataclass(frozen=True, slots=True)
+class UltimateGain:
+    """Ziegler and Nichols' experiment: the proportional gain at the edge of stability, and the period there."""
+
+    gain_V_per_um: float
+    period_s: float
+
+    def pi_gains(self, dt_s: float, share: float = 1.0) -> PID:
+        """Their table's PI gains: ``k_p = 0.45 K_u``, ``k_i = k_p/(T_u/1.2)``; ``share`` scales both down."""
+        k_p = 0.45 * self.gain_V_per_um * share
+        return PID(k_p=k_p, k_i=1.2 * k_p / self.period_s, dt_s=dt_s)
+
+    def pid_gains(self, dt_s: float, share: float = 1.0) -> PID:
+        """Their table's PID gains: ``k_p = 0.6 K_u``, ``T_i = T_u/2``, ``T_d = T_u/8``."""
+        k_p = 0.6 * self.gain_V_per_um * share
+        return PID(k_p=k_p, k_i=2.0 * k_p / self.period_s, k_d=k_p * self.period_s / 8.0, dt_s=dt_s)
+
+
+def ultimate_gain(
+    stage: Stage, *, level_um: float = 45.0, kick_um: float = 1.0, settle_s: float = 0.5, watch_s: float = 0.5
+) -> UltimateGain:
+    """Search the proportional gain at which a kick neither grows nor decays, and the period of that oscillation.
+
+    The stage is brought near ``level_um`` by its mean gain and left to settle; then proportional feedback acts about
+    where it stands, with a set-point kick of ``kick_um``. Bisection on whether the oscillation of the second half of
+    ``watch_s`` exceeds that of the first. Raises NumericsError if no gain below 10 V/µm oscillates.
+    """
+    dt_s = stage.config.dt_s
+    state = stage.initial_state()
+    probe = 0.5 * stage.config.u_max_V
+    settle = max(2, round(settle_s / dt_s))
+    slope = stage.run_traced(state.copy(), np.full(settle, probe)).true_um[-1] / probe
+    u0 = float(np.clip(level_um / slope, stage.config.u_min_V, stage.config.u_max_V))
+    # up by a ramp: a step would leave the mode ringing
+    stage.run(state, u0 * np.minimum(1.0, np.arange(2 * settle) / settle))
+    n = max(40, round(watch_s / dt_s))
+
+    def response(gain: float) -> FloatArray:
+        s = state.copy()
+        centre = stage.true(s)[0]
+        error = np.empty(n)
+        for k in range(n):
+            y = stage.read(s)[0]
+            error[k] = centre + (kick_um if k < 3 else 0.0) - y
+            u = u0 + gain * float(error[k])
+            # linear oscillation is looked for, not that of the limits
+            if not stage.config.u_min_V < u < stage.config.u_max_V or abs(error[k]) > 20.0 * kick_um:
+                return error[: k + 1]
+            stage.step(s, u)
+        return error
+
+    def grows(gain: float) -> bool:
+        error = response(gain)
+        if error.size < n:
+            return True
+        first = float(np.std(np.diff(error[n // 8 : n // 2])))
+        second = float(np.std(np.diff(error[n // 2 :])))
+        # by themselves noise and creep never grow: below a share of the kick nothing is an oscillation
+        return second > max(0.99 * first, 0.03 * kick_um)
+
+    return _bisect(grows, response, dt_s)
+
+
+def _bisect(grows: Callable[[float], bool], response: Callable[[float], FloatArray], dt_s: float) -> UltimateGain:
+    """Between a gain that decays and one that grows, to 0.1 %; the period from the zero crossings there."""
+    low, high = 0.0, 1e-4
+    while not grows(high):
+        low, high = high, 1.5 * high
+        if high > 10.0:
+            raise NumericsError("ultimate gain: none below 10 V/µm makes the stage oscillate; give gains by hand")
+    while high - low > 1e-3 * high:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if grows(middle) else (middle, high)
+    wave = response(high)
+    wave = wave[wave.size // 4 :]
+    wave = np.diff(wave) - np.mean(np.diff(wave))
+    at = np.flatnonzero((wave[:-1] < 0.0) & (wave[1:] >= 0.0))
+    if at.size < 2:
+        raise NumericsError("ultimate gain: no oscillation to take a period from; lengthen watch_s")
+    # crossings between samples, by straight lines
+    exact = at + wave[at] / (wave[at] - wave[at + 1])
+    return UltimateGain(high, float((exact[-1] - exact[0]) / (at.size - 1)) * dt_s)

@@ -1,0 +1,509 @@
+"""Glitch, knock, ringing, jump: what a run of surprising readings is taken for, and how often wrongly.
+
+First the decision alone, on readings about a place that is known, at four sample rates. Then through the learner, on
+the simulated stage: the readings of a stage that is struck, or that has changed, are those of the simulation with the
+swing of a damped mode added.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.dead_reckoning import Reckoning
+from adaptive.online.envelope import EnvelopeConfig
+from adaptive.online.gates import AdmissionConfig
+from adaptive.online.glitch_or_jump import Circumstances, Hold, Verdict, judge
+from adaptive.online.learner import Learner
+from adaptive.types import FloatArray, Sample, StateDict
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT_S = 1e-3
+Recording = tuple[FloatArray, FloatArray]
+#: Instants at which something happens, in slow strokes and in fast ones.
+ATS = tuple(range(2000, 6500, 150))
+HELD = frozenset({"glitch", "ringing"})
+
+
+# ---- the decision alone
+
+RANGE_UM, PLACE_UM = 100.0, 40.0
+
+
+def circumstances(dt_s: float = DT_S, trusted: bool = True) -> Circumstances:
+    """Those of a healthy axis with a range of 100 µm."""
+    config = AdmissionConfig().at(dt_s)
+    usual_um = config.surprise_share * RANGE_UM
+    return Circumstances(
+        config=config, envelope=EnvelopeConfig(), dt_s=dt_s, range_um=RANGE_UM,
+        noise_um=usual_um / config.surprise_sigma, usual_um=usual_um, stuck_um=usual_um, rest_um=0.0, low_um=-5.0,
+        high_um=105.0, trusted=trusted,
+    )  # fmt: skip
+
+
+def hold_at(model: LssvmInverse, place_um: float = PLACE_UM) -> Hold:
+    """A hold that begins at a place that was known."""
+    none = np.zeros(0)
+    return Hold(Reckoning.begin(model, (place_um, 0.0, 0.0), 4.0, none, none, model.rest_memory(place_um)), place_um)
+
+
+def put(hold: Hold, old_um: float, y_um: float) -> None:
+    """One sample, with the place that the reckoning is to have come to."""
+    hold.u_V.append(4.0)
+    hold.old_um.append(old_um)
+    hold.y_um.append(y_um)
+
+
+def outcome(
+    model: LssvmInverse, away: Callable[[float], float], dt_s: float, rng: np.random.Generator, over_s: float = 0.15
+) -> tuple[Verdict, float, float]:
+    """(first decision but BACK, when, s, and how far away), for readings ``away(t)``, µm, and noise at one place.
+
+    Readings that are back begin another hold when they surprise again. WAIT where nothing is decided.
+    """
+    now, hold = circumstances(dt_s), hold_at(model)
+    for k in range(1, round(over_s / dt_s)):
+        off_um = away(k * dt_s) + 0.5 * now.noise_um * rng.standard_normal()
+        if not hold.y_um and abs(off_um) <= now.usual_um:
+            continue
+        put(hold, PLACE_UM, PLACE_UM + off_um)
+        verdict = judge(hold, now)
+        if verdict is Verdict.BACK:
+            hold = hold_at(model)
+        elif verdict is not Verdict.WAIT:
+            return verdict, k * dt_s, hold.away_um
+    return Verdict.WAIT, over_s, 0.0
+
+
+class Mode:
+    """A damped mode of a random frequency and damping that swings by ``size_um``."""
+
+    def __init__(self, rng: np.random.Generator, dt_s: float, size_um: float, phase: float = 0.0) -> None:
+        self.omega = 2.0 * math.pi * rng.uniform(100.0, min(450.0, 0.45 / dt_s))
+        self.damping = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))
+        self.size_um, self.phase = size_um, phase
+
+    def __call__(self, t_s: float) -> float:
+        swing = math.sin(self.omega * math.sqrt(1.0 - self.damping**2) * t_s + self.phase)
+        return self.size_um * math.exp(-self.damping * self.omega * t_s) * swing
+
+
+@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 5e-4, 1e-4])
+@pytest.mark.parametrize("modes", [1, 2])
+def test_looked_at_again_and_again_a_knock_is_no_jump(model: LssvmInverse, dt_s: float, modes: int) -> None:
+    """None of 150 a sample rate, at swings of 0.5 to 5 % of the range, with a look at each reading."""
+    rng, said = np.random.default_rng([modes, round(1.0 / dt_s)]), Counter[Verdict]()
+    for _ in range(150 if dt_s > 2e-4 else 40):
+        sizes = rng.uniform(0.005, 0.05) * RANGE_UM * np.array([1.0, rng.uniform(0.1, 0.5)])
+        struck = [Mode(rng, dt_s, float(size)) for size in sizes[:modes]]
+        said[outcome(model, lambda t, struck=struck: sum(mode(t) for mode in struck), dt_s, rng)[0]] += 1
+    assert said[Verdict.JUMP] == 0
+    # It is waited for; that the sensor is wrong is not thought of but where two modes are beyond four coefficients.
+    assert said[Verdict.LOST] <= (0 if modes == 1 else 0.1 * said.total())
+
+
+@pytest.mark.parametrize("dt_s", [2e-3, 1e-3, 5e-4, 1e-4])
+@pytest.mark.parametrize("ringing", [0.0, 0.5, 1.0])
+def test_a_jump_is_found_by_its_level_and_soon(model: LssvmInverse, dt_s: float, ringing: float) -> None:
+    """Plain ones always within 20 ms or 16 readings; ringing ones in 97 % or more, within 60 ms, to 0.1 of it."""
+    rng, found, latest_s, cases = np.random.default_rng([int(10 * ringing), round(1.0 / dt_s)]), 0, 0.0, 100
+    for _ in range(cases):
+        step_um = rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.1) * RANGE_UM
+        mode = Mode(rng, dt_s, ringing * step_um, -0.5 * math.pi)
+        verdict, at_s, away_um = outcome(model, lambda t, mode=mode, to=step_um: to + mode(t), dt_s, rng)
+        found += verdict is Verdict.JUMP and abs(away_um - step_um) < 0.1 * abs(step_um)
+        latest_s = max(latest_s, at_s if verdict is Verdict.JUMP else 0.0)
+    assert found >= (0.97 if ringing else 1.0) * cases
+    assert latest_s <= (0.06 if ringing else max(0.02, 17.0 * dt_s))
+
+
+def test_no_jump_claims_more_than_the_readings_have_moved(model: LssvmInverse) -> None:
+    """The reckoning goes 8 µm away at once, the readings stay: that is no jump of theirs."""
+    rng, now = np.random.default_rng(5), circumstances()
+    for moves_um, verdict in ((0.0, None), (8.0, Verdict.JUMP)):
+        hold = hold_at(model)
+        said = []
+        for _ in range(39):
+            # Where the readings themselves have moved by as much, the same distance is one.
+            put(hold, PLACE_UM - (8.0 - moves_um), PLACE_UM + moves_um + 0.5 * now.noise_um * rng.standard_normal())
+            said.append(judge(hold, now))
+            if said[-1] is Verdict.JUMP:
+                break
+        assert (said[-1] if verdict else None) is verdict
+        assert (Verdict.JUMP in said) == (verdict is not None)
+
+
+@pytest.mark.parametrize("share", [0.13, 0.2, -0.5])
+def test_no_jump_is_larger_than_the_envelope_allows(model: LssvmInverse, share: float) -> None:
+    rng = np.random.default_rng(6)
+    verdict, at_s, _ = outcome(model, lambda _: share * RANGE_UM, DT_S, rng)
+    assert verdict is Verdict.LOST
+    assert at_s <= 0.05
+    inside = 0.9 * EnvelopeConfig().jump * RANGE_UM
+    assert outcome(model, lambda _: math.copysign(inside, share), DT_S, rng)[0] is Verdict.JUMP
+
+
+def test_outside_the_identified_range_nothing_is_believed_at_once(model: LssvmInverse) -> None:
+    now, rng = circumstances(), np.random.default_rng(7)
+    for low_um, high_um in ((50.0, 105.0), (-5.0, 30.0)):
+        hold = hold_at(model)
+        for _ in range(39):
+            put(hold, PLACE_UM, PLACE_UM + 4.0 + 0.5 * now.noise_um * rng.standard_normal())
+            assert judge(hold, now._replace(low_um=low_um, high_um=high_um)) is Verdict.WAIT
+
+
+def test_readings_at_another_level_that_do_not_follow_the_stage_are_no_jump(model: LssvmInverse) -> None:
+    """The stage moves by 2 % of the range, the readings stand 3 µm away with noise."""
+    now, rng = circumstances(), np.random.default_rng(8)
+    hold, said = hold_at(model), set()
+    for k in range(60):
+        put(hold, PLACE_UM + 2.0 * math.sin(0.1 * k), PLACE_UM + 3.0 + 0.3 * now.noise_um * rng.standard_normal())
+        said.add(judge(hold, now))
+        if Verdict.LOST in said:
+            break
+    assert said == {Verdict.WAIT, Verdict.LOST}
+    # Those that go with it are one.
+    hold, verdict = hold_at(model), Verdict.WAIT
+    while verdict is Verdict.WAIT:
+        old_um = PLACE_UM + 2.0 * math.sin(0.1 * len(hold.y_um))
+        put(hold, old_um, old_um + 3.0 + 0.3 * now.noise_um * rng.standard_normal())
+        verdict = judge(hold, now)
+    assert verdict is Verdict.JUMP
+    assert hold.away_um == pytest.approx(3.0, abs=0.05)
+
+
+# ---- through the learner
+
+
+@pytest.fixture(scope="module")
+def fast() -> Recording:
+    """(u_V, y_um) of 8 s on the rich stage: strokes of all sizes up to 7.7 Hz, without a rest."""
+    stage = Stage(preset("rich", seed=6))
+    t_s = np.arange(8000) * DT_S
+    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
+    u = np.minimum(t_s / 0.5, 1.0) * (4.0 + sum(size * np.sin(2 * np.pi * hz * t_s + hz) for size, hz in tones))
+    return u, stage.run(stage.initial_state(), u)[0]
+
+
+@pytest.fixture(scope="module")
+def still() -> Recording:
+    """(u_V, y_um) of 3 s of strokes, 2 s of rest and 3 s of strokes."""
+    stage = Stage(preset("rich", seed=8))
+    t_s = np.arange(3000) * DT_S
+    stroke = np.minimum(t_s / 0.5, 1.0) * (4.0 + 2.5 * np.sin(2 * np.pi * 0.9 * t_s))
+    # From the end of the first strokes, at 4 V or near it, on.
+    rest = np.full(2000, stroke[-1])
+    again = stroke[-1] + 2.0 * np.sin(2 * np.pi * 0.9 * t_s)
+    u = np.concatenate([stroke, rest, again])
+    return u, stage.run(stage.initial_state(), u)[0]
+
+
+def feed(learner: Learner, recording: Recording, start: int, stop: int) -> list[str]:
+    u, y = recording
+    return [learner.handle(Sample(k, k * DT_S, float(u[k]), float(y[k]))) for k in range(start, stop)]
+
+
+def states_of(model: LssvmInverse, recording: Recording, ats: tuple[int, ...] = ATS) -> dict[int, StateDict]:
+    """States of a learner at some instants."""
+    learner, states, before = Learner.from_model(model), {}, 0
+    for at in ats:
+        feed(learner, recording, before, at)
+        states[at], before = learner.state_dict(), at
+    return states
+
+
+@pytest.fixture(scope="module")
+def slow_states(model: LssvmInverse, recording: Recording) -> dict[int, StateDict]:
+    return states_of(model, recording)
+
+
+@pytest.fixture(scope="module")
+def fast_states(model: LssvmInverse, fast: Recording) -> dict[int, StateDict]:
+    return states_of(model, fast)
+
+
+def range_of(model: LssvmInverse) -> float:
+    return model.features.y_max_um - model.features.y_min_um
+
+
+def swing(n: int, mode_Hz: float, damping: float, size_um: float, phase: float = 0.0) -> FloatArray:
+    """(n,) µm of a damped mode, from a sample after it was struck."""
+    t_s, omega = (np.arange(n) + 1.0) * DT_S, 2.0 * math.pi * mode_Hz
+    wave: FloatArray = np.sin(omega * math.sqrt(1.0 - damping**2) * t_s + phase)
+    return size_um * np.exp(-damping * omega * t_s) * wave
+
+
+def struck(recording: Recording, at: int, mode_Hz: float, damping: float, size_um: float) -> Recording:
+    u, y = recording[0], recording[1].copy()
+    y[at:] += swing(y.size - at, mode_Hz, damping, size_um)
+    return u, y
+
+
+def answers(learner: Learner, memory: FloatArray) -> FloatArray:
+    """(50,) V that it serves at rest all over the range."""
+    motion = np.linspace(10.0, 70.0, 50)
+    return learner.snapshot().feedforward(motion, np.zeros(50), np.zeros(50), memory).u_V
+
+
+def events(learner: Learner, before: StateDict | None = None) -> dict[str, int]:
+    """What the learner has decided, since the state ``before``."""
+    names = ("jumps", "jumps_undone", "trials", "restarts", "rollbacks", "distrusts")
+    since = Learner.from_state(before).counters() if before else dict.fromkeys(names, 0)
+    return {name: learner.counters()[name] - since[name] for name in names}
+
+
+NOTHING = dict.fromkeys(("jumps", "jumps_undone", "trials", "restarts", "rollbacks", "distrusts"), 0)
+
+
+@pytest.mark.parametrize("share", [0.005, 0.015, 0.03])
+@pytest.mark.parametrize(
+    ("mode_Hz", "damping"),
+    [(100.0, 0.03), (100.0, 0.1), (173.0, 0.01), (291.0, 0.01), (291.0, 0.03), (450.0, 0.01), (450.0, 0.03)],
+)
+def test_a_knock_is_waited_for_and_teaches_nothing(
+    model: LssvmInverse, recording: Recording, slow_states: dict[int, StateDict], mode_Hz: float, damping: float,
+    share: float,
+) -> None:  # fmt: skip
+    """No jump, no doubt of the sensor; no step of the filter while it is held; then learning goes on as without it."""
+    at = ATS[round(mode_Hz + 1e3 * (damping + share)) % len(ATS)]
+    knocked = struck(recording, at, mode_Hz, damping, share * range_of(model))
+    learner, twin = (Learner.from_state(slow_states[at]) for _ in range(2))
+    said = []
+    for k in range(at, at + 900):
+        updates = learner.parts.filter.state.updates
+        said += feed(learner, knocked, k, k + 1)
+        if learner.parts.front.holds:
+            assert learner.parts.filter.state.updates == updates
+            assert said[-1] in HELD
+        assert learner.trouble == ""
+    feed(twin, recording, at, at + 900)
+    # While the swing is more than 0.4 % of the range nearly all readings are held back; half a percent is hardly more.
+    loud = int(math.log(share / 0.004) / (damping * 2.0 * math.pi * mode_Hz) / DT_S)
+    if share > 0.01:
+        assert sum(word in HELD for word in said[:loud]) >= 0.9 * loud
+        assert "ringing" in said or damping > 0.05
+    assert events(learner, slow_states[at]) == NOTHING
+    assert learner.features == twin.features
+    assert not HELD & set(said[-400:])
+    assert said[-400:].count("learnt") >= 190
+    off_V = np.abs(answers(learner, twin.memory()) - answers(twin, twin.memory()))
+    assert off_V.max() < 4e-3 * model.span_V
+
+
+@pytest.mark.parametrize(("strokes", "jumps", "off"), [("slow", 0.01, 0.004), ("fast", 0.03, 0.012)])
+def test_a_knock_at_any_time_leaves_the_model_as_it_was(
+    model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, jumps: float, off: float
+) -> None:
+    """Of 100 at random: at most that share is taken for a small jump, none has a name, and all answers stay.
+
+    The error of what is reckoned grows with the way gone: in strokes of up to 7.7 Hz some tenths of a percent of the
+    range after 50 ms, and that is taken for a jump now and then.
+    """
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    states = request.getfixturevalue(f"{strokes}_states")
+    rng, happened, worst_V, moved_um = np.random.default_rng(7), Counter[str](), 0.0, 0.0
+    twins = {at: Learner.from_state(state) for at, state in states.items()}
+    for at, twin in twins.items():
+        feed(twin, recording, at, at + 300)
+    for i in range(100):
+        at = ATS[i % len(ATS)]
+        damping = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))
+        size_um = range_of(model) * rng.uniform(0.005, 0.03)
+        knocked = struck(recording, at, rng.uniform(100.0, 450.0), damping, size_um)
+        learner, twin = Learner.from_state(states[at]), twins[at]
+        for k in range(at, at + 300):
+            feed(learner, knocked, k, k + 1)
+            assert learner.trouble == ""
+        happened.update(name for name, count in events(learner, states[at]).items() if count)
+        worst_V = max(worst_V, np.abs(answers(learner, twin.memory()) - answers(twin, twin.memory())).max())
+        f, g = learner.features, twin.features
+        moved_um = max(moved_um, *(abs((f.gain - g.gain) * y + f.offset_um - g.offset_um) for y in (10.0, 70.0)))
+    assert happened["jumps"] <= jumps * 100
+    assert happened["trials"] <= 1
+    assert worst_V < off * model.span_V
+    assert moved_um < 0.02 * range_of(model)
+
+
+@pytest.mark.parametrize("ringing", [0.5, 1.0])
+@pytest.mark.parametrize("gain", [-0.12, -0.06, 0.04, 0.08, 0.12])
+@pytest.mark.parametrize("strokes", ["slow", "fast"])
+def test_a_gain_step_with_ringing_is_believed_once(
+    model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, gain: float, ringing: float
+) -> None:
+    """Within 40 readings, and the frame shows the place within 1 % of the range."""
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    states = request.getfixturevalue(f"{strokes}_states")
+    rng = np.random.default_rng(round(1e4 + 1e3 * gain + 10 * ringing))
+    u, y = recording
+    for at in ATS[::5]:
+        step_um = gain * y[at]
+        if abs(step_um) < 0.008 * range_of(model):
+            continue
+        damping, mode_Hz = math.exp(rng.uniform(math.log(0.02), math.log(0.1))), rng.uniform(150.0, 450.0)
+        changed = y.copy()
+        changed[at:] *= 1.0 + gain
+        changed[at:] += swing(y.size - at, mode_Hz, damping, ringing * step_um, -0.5 * math.pi)
+        learner = Learner.from_state(states[at])
+        before = learner.features
+        feed(learner, (u, changed), at, at + 40)
+        assert events(learner, states[at])["jumps"] == 1
+        place = (y[at + 39] - before.offset_um) / before.gain
+        shown_um = learner.features.offset_um + learner.features.gain * place
+        assert shown_um == pytest.approx((1.0 + gain) * y[at + 39], abs=0.01 * range_of(model))
+        feed(learner, (u, changed), at + 40, at + 600)
+        assert events(learner, states[at])["jumps"] == 1
+        assert events(learner, states[at])["jumps_undone"] == 0
+        assert learner.trouble == ""
+
+
+@pytest.mark.parametrize("ringing", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("strokes", ["slow", "fast"])
+def test_a_zero_step_with_ringing_is_found_and_kept(
+    model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, ringing: float
+) -> None:
+    """Of 1 to 8 % of the range. It may be taken for a gain, and be put right by further jumps while it rings.
+
+    After half a second the model is off by less than 0.4 % of the voltage span, in the median. Hardly any goes
+    on trial: at most one in 30 in slow strokes, one in 10 in fast ones that ring by the whole step.
+    """
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    states = request.getfixturevalue(f"{strokes}_states")
+    rng = np.random.default_rng([9, round(10 * ringing)])
+    u, y = recording
+    trials, off_pct = 0, []
+    for i in range(30):
+        at = ATS[i % len(ATS)]
+        step_um = rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.08) * range_of(model)
+        damping, mode_Hz = math.exp(rng.uniform(math.log(0.02), math.log(0.1))), rng.uniform(150.0, 450.0)
+        changed = y.copy()
+        changed[at:] += step_um + swing(y.size - at, mode_Hz, damping, ringing * step_um, -0.5 * math.pi)
+        learner = Learner.from_state(states[at])
+        feed(learner, (u, changed), at, at + 500)
+        assert events(learner, states[at])["jumps"] >= 1
+        assert learner.trouble == ""
+        trials += events(learner, states[at])["trials"] > 0
+        off_pct.append(learner.diagnostics()["recent_rms_error_pct"])
+    assert np.median(off_pct) < 0.4
+    assert max(off_pct) < 2.0
+    assert trials <= {"slow": 2, "fast": 8}[strokes] * (ringing > 0.0)
+
+
+def test_a_jump_of_a_fifth_is_not_believed_from_readings_at_one_level(model: LssvmInverse, still: Recording) -> None:
+    """As long as the stage rests it stays undecided; motion shows that the readings follow, and then it is."""
+    u, clean = still
+    shift_um = 0.2 * range_of(model)
+    y = clean.copy()
+    y[3500:] += shift_um
+    learner = Learner.from_model(model)
+    feed(learner, (u, y), 0, 3500)
+    frame, updates, before = learner.features, learner.parts.filter.state.updates, learner.state_dict()
+    feed(learner, (u, y), 3500, 5000)
+    assert events(learner, before)["jumps"] == 0
+    assert learner.features == frame
+    assert learner.parts.filter.state.updates == updates
+    said = feed(learner, (u, y), 5000, 6000)
+    assert events(learner, before)["jumps"] == 1
+    assert learner.trouble == ""
+    assert "learnt" in said[-100:]
+    for place in (20.0, 60.0):
+        shown_um = learner.features.offset_um + learner.features.gain * (place - frame.offset_um) / frame.gain
+        assert shown_um - place == pytest.approx(shift_um, abs=0.02 * range_of(model))
+
+
+@pytest.mark.parametrize("noise_share", [1e-9, 3e-6, 1e-5, 1e-4, 3e-4])
+@pytest.mark.parametrize("strokes", ["slow", "fast"])
+def test_a_sensor_that_sticks_with_noise_makes_no_jump(
+    model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, noise_share: float
+) -> None:
+    """From 1e-9 to 3e-4 of the range: for one second no frame moves."""
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    states = request.getfixturevalue(f"{strokes}_states")
+    u, clean = recording
+    rng = np.random.default_rng(2)
+    for at in ATS[::6]:
+        y = clean.copy()
+        y[at : at + 1000] = clean[at - 1] + noise_share * range_of(model) * rng.standard_normal(1000)
+        learner = Learner.from_state(states[at])
+        frame = learner.features
+        feed(learner, (u, y), at, at + 1000)
+        assert events(learner, states[at])["jumps"] == 0
+        assert learner.features == frame
+
+
+@pytest.mark.parametrize("at_ms", [1, 7, 25, 60])
+def test_state_goes_on_to_the_last_bit_while_it_rings(
+    recording: Recording, slow_states: dict[int, StateDict], at_ms: int
+) -> None:
+    at = ATS[10]
+    knocked = struck(recording, at, 220.0, 0.01, 2.0)
+    one = Learner.from_state(slow_states[at])
+    said = feed(one, knocked, at, at + at_ms)
+    assert said[-1] in HELD
+    assert one.parts.front.holds
+    assert_goes_on(one, knocked, at + at_ms, at + 700)
+
+
+def test_state_goes_on_to_the_last_bit_while_it_rings_about_a_new_level(
+    recording: Recording, slow_states: dict[int, StateDict]
+) -> None:
+    at = ATS[10]
+    u, y = struck(recording, at, 220.0, 0.01, 2.0)
+    y[at:] += 3.0
+    one = Learner.from_state(slow_states[at])
+    feed(one, (u, y), at, at + 30)
+    assert events(one, slow_states[at])["jumps"] == 1
+    assert one.parts.front.holds
+    assert_goes_on(one, (u, y), at + 30, at + 700)
+
+
+@pytest.mark.parametrize("kind", ["stuck", "foreign"])
+def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
+    fast: Recording, fast_states: dict[int, StateDict], kind: str
+) -> None:
+    at = ATS[10]
+    u, y = fast[0], fast[1].copy()
+    rng = np.random.default_rng(4)
+    y[at : at + 600] = y[at] + 1e-4 * rng.standard_normal(600) if kind == "stuck" else y[1000:1600]
+    one = Learner.from_state(fast_states[at])
+    feed(one, (u, y), at, at + 400)
+    assert events(one, fast_states[at])["trials"] >= 1
+    assert one.trouble
+    assert one.parts.front.holds
+    assert_goes_on(one, (u, y), at + 400, at + 1500)
+
+
+def test_all_of_a_hold_is_in_its_state(model: LssvmInverse) -> None:
+    """Each of its fields with a value of its own."""
+    hold = hold_at(model)
+    for k in range(5):
+        put(hold, PLACE_UM + 0.1 * k, math.nan if k == 2 else PLACE_UM - 0.2 * k)
+    plain = [field for field in fields(Hold) if field.name not in ("reckoning", "u_V", "y_um", "old_um")]
+    values = {
+        field.name: {"int": 7 + i, "float": 0.5 + i, "bool": True}[str(field.type)] for i, field in enumerate(plain)
+    }
+    one = replace(hold, **values)
+    two = Hold.from_state(one.state_dict())
+    for field in fields(Hold):
+        if field.name != "reckoning":
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(one.reckoning.numbers, two.reckoning.numbers)
+
+
+def assert_goes_on(one: Learner, recording: Recording, start: int, stop: int) -> None:
+    """A learner from its state does the same as the learner itself, to the last bit."""
+    two = Learner.from_state(one.state_dict())
+    assert two.trouble == one.trouble
+    assert feed(one, recording, start, stop) == feed(two, recording, start, stop)
+    assert one.counters() == two.counters()
+    assert one.features == two.features
+    assert one.trouble == two.trouble
+    np.testing.assert_array_equal(one.memory(), two.memory())
+    for name, value in one.snapshot().state_dict().items():
+        np.testing.assert_array_equal(two.snapshot().state_dict()[name], value, err_msg=name)

@@ -1,0 +1,576 @@
+"""A sensor that is wrong has a name within half a second, teaches nothing, and earns its trust back; a good one has it.
+
+The readings are those of the simulated stage under a voltage of its own, made wrong from outside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.dead_reckoning import Reckoning
+from adaptive.online.envelope import EnvelopeConfig
+from adaptive.online.gates import AdmissionConfig
+from adaptive.online.glitch_or_jump import Circumstances
+from adaptive.online.learner import Learner
+from adaptive.online.sensor_trial import (
+    LOOKS,
+    SENSOR_FAULTS,
+    SENSOR_FOREIGN,
+    SENSOR_GAIN,
+    SENSOR_SIGN,
+    SENSOR_STUCK,
+    VALUES,
+    Decision,
+    Outcome,
+    Trial,
+)
+from adaptive.types import FloatArray, Sample, StateDict
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT_S = 1e-3
+Recording = tuple[FloatArray, FloatArray]
+#: When a sensor goes wrong, and for how many samples.
+ATS, WRONG = (2500, 3133, 3766), 600
+#: Samples of motion within which it has its name, and within which good readings are learnt from again.
+NAMED, BACK = 500, 1000
+#: Samples from one look at what was learnt to the next; steps of the window are counted, so that none is missed.
+EVERY = 20
+FAULTS = {
+    "stuck_1e-9": {SENSOR_STUCK},
+    "stuck_1e-5": {SENSOR_STUCK},
+    "stuck_3e-4": {SENSOR_STUCK},
+    "gain_0.01": {SENSOR_GAIN},
+    "gain_0.3": {SENSOR_GAIN},
+    "gain_2.0": {SENSOR_GAIN},
+    "gain_3.0": {SENSOR_GAIN},
+    "sign_rest": {SENSOR_SIGN},
+    "sign_middle": {SENSOR_SIGN},
+    # By chance another stage goes the other way, or further, for a while.
+    "foreign": {SENSOR_FOREIGN, SENSOR_SIGN, SENSOR_GAIN, SENSOR_STUCK},
+}
+
+
+def simulated(seed: int, u_V: FloatArray) -> Recording:
+    stage = Stage(preset("rich", seed=seed))
+    return u_V, stage.run(stage.initial_state(), u_V)[0]
+
+
+@pytest.fixture(scope="module")
+def motions() -> dict[str, Recording]:
+    """(u_V, y_um) of 7 s each: strokes of all sizes up to 7.7 Hz, a sine, and a triangle with its turning points."""
+    t_s = np.arange(7000) * DT_S
+    begin = np.minimum(t_s / 0.5, 1.0)
+    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
+    return {
+        "tones": simulated(6, begin * (4.0 + sum(v * np.sin(2 * np.pi * hz * t_s + hz) for v, hz in tones))),
+        "sine": simulated(5, begin * (4.0 - 3.0 * np.cos(2 * np.pi * t_s))),
+        "triangle": simulated(9, begin * (1.0 + 6.0 * np.abs((0.7 * t_s) % 1.0 * 2.0 - 1.0))),
+    }
+
+
+@pytest.fixture(scope="module")
+def warm(model: LssvmInverse, motions: dict[str, Recording]) -> dict[tuple[str, int], StateDict]:
+    """States of a learner by motion and instant."""
+    states = {}
+    for name, recording in motions.items():
+        learner, before = Learner.from_model(model), 0
+        for at in ATS:
+            feed(learner, recording, before, at)
+            assert learner.trouble == ""
+            states[name, at], before = learner.state_dict(), at
+    return states
+
+
+def feed(learner: Learner, recording: Recording, start: int, stop: int) -> list[str]:
+    u, y = recording
+    return [learner.handle(Sample(k, k * DT_S, float(u[k]), float(y[k]))) for k in range(start, stop)]
+
+
+def range_of(model: LssvmInverse) -> float:
+    return model.features.y_max_um - model.features.y_min_um
+
+
+def wrong(fault: str, clean: FloatArray, at: int, range_um: float, n: int = WRONG) -> FloatArray:
+    """(N,) readings with ``n`` of them, from ``at`` on, as a sensor with that fault shows them."""
+    y, part, rng = clean.copy(), slice(at, at + n), np.random.default_rng([at, len(fault)])
+    kind, _, size = fault.partition("_")
+    if kind == "stuck":
+        y[part] = clean[at - 1] + float(size) * range_um * rng.standard_normal(n)
+    elif kind == "gain":
+        y[part] *= float(size)
+    elif kind == "sign":
+        y[part] = (range_um if size == "middle" else 0.0) - y[part]
+    else:
+        t_s = np.arange(n) * DT_S
+        tones_Hz, phase = np.exp(rng.uniform(math.log(0.5), math.log(5.0), 4)), rng.uniform(0.0, 6.3, 4)
+        wave = np.sin(2.0 * math.pi * np.multiply.outer(t_s, tones_Hz) + phase).mean(axis=1)
+        y[part] = range_um * (0.5 + 0.6 * wave + 1e-4 * rng.standard_normal(n))
+    return y
+
+
+def shown(learner: Learner, place_um: float) -> float:
+    """What the sensor shows at a place that it showed as ``place_um`` when the model was identified, µm."""
+    return learner.features.offset_um + learner.features.gain * place_um
+
+
+def learnt(learner: Learner) -> tuple[bytes, ...]:
+    """All that the readings may teach: the filter's estimate, the window, and the frame."""
+    window = learner.parts.window
+    return (
+        learner.parts.filter.beta.tobytes(), *(array.tobytes() for array in learner.window_samples()),
+        str(window.counters()["steps"]).encode(), repr(learner.features).encode(),
+    )  # fmt: skip
+
+
+# ---- what is wrong has a name
+
+
+@pytest.mark.parametrize("motion", ["tones", "sine", "triangle"])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_has_its_name_teaches_nothing_and_good_readings_lead_back(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], motion: str, fault: str
+) -> None:
+    u, clean = motions[motion]
+    for at in ATS:
+        y = wrong(fault, clean, at, range_of(model))
+        learner = Learner.from_state(warm[motion, at])
+        before, frame = learner.counters(), learner.features
+        named = -1
+        kept: tuple[bytes, ...] = ()
+        for k in range(at, at + WRONG):
+            feed(learner, (u, y), k, k + 1)
+            if learner.trouble:
+                named = k - at if named < 0 else named
+                assert learner.trouble in FAULTS[fault]
+            # From the moment on at which the readings are distrusted; that is looked at now and then.
+            if learner.parts.front.trials > before["trials"] and (not kept or k % EVERY == 0):
+                kept = kept or learnt(learner)
+                assert learnt(learner) == kept
+        assert learnt(learner) == kept
+        assert 0 <= named < NAMED
+        assert learner.trouble
+        assert learner.counters()["trials"] == before["trials"] + 1
+        assert learner.features == frame
+        assert not learner.snapshot().valid
+        said = feed(learner, (u, clean), at + WRONG, at + WRONG + BACK)
+        assert learner.trouble == ""
+        assert "learnt" in said
+        assert said[-100:].count("learnt") >= 45
+        assert learner.counters()["jumps"] == before["jumps"]
+        assert learner.snapshot().valid
+        assert learner.diagnostics()["recent_rms_error_pct"] < 0.6
+
+
+@pytest.mark.parametrize("fault", ["stuck_1e-5", "gain_0.3", "sign_rest", "foreign"])
+def test_what_is_served_meanwhile_is_the_model_from_before(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], fault: str
+) -> None:
+    """Of the filter nothing is kept that was learnt just before the fault was found: its first readings are in it."""
+    at = ATS[1]
+    u, clean = motions["tones"]
+    learner = Learner.from_state(warm["tones", at])
+    place = np.linspace(10.0, 70.0, 50)
+    still, memory = np.zeros(50), learner.memory()
+    before_V = learner.snapshot().feedforward(place, still, still, memory).u_V
+    feed(learner, (u, wrong(fault, clean, at, range_of(model))), at, at + WRONG)
+    after_V = learner.snapshot().feedforward(place, still, still, memory).u_V
+    assert np.abs(after_V - before_V).max() < 4e-3 * model.span_V
+    # And where the stage is, is known by the voltage.
+    reckoned = learner.memory_for(learner.snapshot())
+    assert reckoned is not None
+    assert abs(reckoned[0] - clean[at + WRONG - 1]) < 0.03 * range_of(model)
+
+
+@pytest.mark.parametrize(("motion", "at"), [("sine", 2500), ("triangle", 3133), ("tones", 2500)])
+def test_what_was_learnt_since_readings_certainly_followed_is_forgotten(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], motion: str, at: int
+) -> None:
+    """A sensor that stops gently, within 0.3 s: its first readings have taught something. The filter goes back."""
+    u, clean = motions[motion]
+    fading = np.clip((np.arange(clean.size) - at) * DT_S / 0.3, 0.0, 1.0)
+    y = clean[at] + (1.0 - fading) * (clean - clean[at])
+    learner = Learner.from_state(warm[motion, at])
+    trials = learner.counters()["trials"]
+    for k in range(at, at + 900):
+        confirmed, last = learner.parts.confirmed[0][0].copy(), learner.parts.filter.beta
+        feed(learner, (u, y), k, k + 1)
+        if learner.counters()["trials"] > trials:
+            break
+    np.testing.assert_array_equal(learner.parts.filter.beta, confirmed)
+    assert not np.array_equal(last, confirmed)
+    assert learner.counters()["distrusts"] == 1
+
+
+def test_a_fault_that_lasts_keeps_its_name(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict]
+) -> None:
+    u, clean = motions["sine"]
+    at = ATS[0]
+    learner = Learner.from_state(warm["sine", at])
+    y = wrong("gain_0.3", clean, at, range_of(model), 4000)
+    feed(learner, (u, y), at, at + NAMED)
+    names = set()
+    for k in range(at + NAMED, at + 4000):
+        feed(learner, (u, y), k, k + 1)
+        names.add(learner.trouble)
+    assert names == {SENSOR_GAIN}
+
+
+def test_one_fault_after_another_leads_back_too(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict]
+) -> None:
+    u, y = motions["tones"][0], motions["tones"][1]
+    at, mixed = ATS[0], motions["tones"][1]
+    for i, fault in enumerate(("sign_rest", "stuck_1e-5", "gain_3.0", "foreign")):
+        mixed = np.where(np.arange(y.size) >= at + 300 * i, wrong(fault, y, at + 300 * i, range_of(model), 300), mixed)
+    mixed[at + 1200 :] = y[at + 1200 :]
+    learner = Learner.from_state(warm["tones", at])
+    feed(learner, (u, mixed), at, at + 1200)
+    assert learner.trouble in SENSOR_FAULTS
+    said = feed(learner, (u, mixed), at + 1200, at + 1200 + BACK)
+    assert learner.trouble == ""
+    assert "learnt" in said[-50:]
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.6
+
+
+# ---- what is sound is never called wrong
+
+
+def assert_never_in_trouble(learner: Learner, recording: Recording, start: int = 0) -> None:
+    u, y = recording
+    for k in range(start, u.size):
+        learner.handle(Sample(k, k * DT_S, float(u[k]), float(y[k])))
+        assert learner.trouble == "", f"at {k * DT_S:g} s"
+
+
+@pytest.mark.parametrize("motion", ["tones", "sine", "triangle"])
+@pytest.mark.parametrize("noise_share", [0.0, 5e-4])
+def test_turning_points_and_noise_are_no_trouble(
+    model: LssvmInverse, motions: dict[str, Recording], motion: str, noise_share: float
+) -> None:
+    """Noise of 0.05 % of the range; the readings of the same stage without it are from -2 to 90 µm."""
+    u, y = motions[motion]
+    learner = Learner.from_model(model)
+    assert_never_in_trouble(
+        learner, (u, y + noise_share * range_of(model) * np.random.default_rng(1).standard_normal(y.size))
+    )
+    assert learner.counters()["trials"] == 0
+    assert learner.counters()["learnt"] > 2500
+
+
+@pytest.mark.parametrize("gain", [-0.12, -0.06, 0.06, 0.12])
+@pytest.mark.parametrize("motion", ["tones", "sine", "triangle"])
+def test_a_step_of_the_gain_is_no_trouble(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], motion: str, gain: float
+) -> None:
+    u, clean = motions[motion]
+    for at in ATS[1:]:
+        y = clean.copy()
+        y[at:] *= 1.0 + gain
+        learner = Learner.from_state(warm[motion, at])
+        assert_never_in_trouble(learner, (u[: at + 1200], y), at)
+        assert "learnt" in feed(learner, (u, y), at + 1200, at + 1250)
+        assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
+
+
+@pytest.mark.parametrize("place", [0.3, 0.8])
+def test_twenty_seconds_in_one_place_are_no_trouble_nor_is_what_comes_after(model: LssvmInverse, place: float) -> None:
+    """A closed loop holds the stage: it creeps, so the voltage goes on slowly, and readings stand still."""
+    stage = Stage(preset("rich", seed=12))
+    state = stage.initial_state()
+    rng, noise_um = np.random.default_rng(3), 1e-4 * range_of(model)
+    learner = Learner.from_model(model)
+    per_um = 0.02 * model.span_V / range_of(model)
+    u_V, read_um, held_V = 0.0, 0.0, []
+    for k in range(26_000):
+        if k < 2500:
+            u_V = min(k / 500.0, 1.0) * (4.0 + 2.0 * math.sin(2.0 * math.pi * 0.9 * k * DT_S))
+        elif k < 23_000:
+            u_V = min(u_V + per_um * max(-1.0, min(1.0, place * range_of(model) - read_um)), 8.0)
+        else:
+            u_V += 0.012 * math.sin(2.0 * math.pi * 1.1 * (k - 23_000) * DT_S)
+        read_um = float(stage.run(state, np.array([u_V]))[0][0]) + noise_um * rng.standard_normal()
+        learner.handle(Sample(k, k * DT_S, u_V, read_um))
+        assert learner.trouble == "", f"at {k * DT_S:g} s"
+        if k in (4000, 22_999):
+            held_V.append(u_V)
+    # The voltage has gone on, and learning too.
+    assert abs(held_V[1] - held_V[0]) > 0.002 * model.span_V
+    assert learner.counters()["trials"] == 0
+    assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.04])
+def test_a_stage_that_creeps_much_under_a_loop_that_holds_it_is_no_trouble(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], share: float
+) -> None:
+    """For 20 s the readings stand still but for noise; the voltage goes away by up to 4 % of the span, ever slower."""
+    at = ATS[2]
+    u, y = motions["sine"]
+    passed_s = np.arange(20_000) * DT_S
+    creep_V = share * model.span_V * np.log1p(passed_s) / math.log(21.0)
+    stays = y[at - 1] + 1e-4 * range_of(model) * np.random.default_rng(5).standard_normal(passed_s.size)
+    held = np.concatenate([u[:at], u[at - 1] + creep_V]), np.concatenate([y[:at], stays])
+    learner = Learner.from_state(warm["sine", at])
+    assert_never_in_trouble(learner, held, at)
+
+
+# ---- the trial itself
+
+
+def circumstances(model: LssvmInverse) -> Circumstances:
+    range_um = range_of(model)
+    config = AdmissionConfig().at(DT_S)
+    usual_um = config.surprise_share * range_um
+    f = model.features
+    return Circumstances(
+        config=config, envelope=EnvelopeConfig(), dt_s=DT_S, range_um=range_um,
+        noise_um=usual_um / config.surprise_sigma, usual_um=usual_um, stuck_um=usual_um, rest_um=f.y_rest_um,
+        low_um=f.y_min_um, high_um=f.y_max_um, trusted=True,
+    )  # fmt: skip
+
+
+def begun(model: LssvmInverse, recording: Recording, at: int, off_um: float = 0.0) -> Trial:
+    """A trial that begins at ``at``, from where the stage then is, or with a place that is off by so much."""
+    learner = Learner.from_model(model)
+    feed(learner, recording, 0, at)
+    track = learner.parts.front.track
+    assert track is not None
+    (y, v, a), u_before_V, u_V, y_um = track.since_motion()
+    reckoning = Reckoning.begin(model, (y + off_um, v, a), u_before_V, u_V, y_um + off_um, track.memory)
+    return Trial.begin(reckoning, model, track.memory_now(True))
+
+
+def reckoned_by(wild: LssvmInverse, trial: Trial, recording: Recording, at: int) -> Trial:
+    """The same trial, its place reckoned by another model."""
+    n = trial.reckoning
+    begin = Reckoning.begin(wild, (n.y_um, 0.0, 0.0), float(recording[0][at - 1]), np.zeros(0), np.zeros(0), n.memory)
+    return replace(trial, reckoning=begin)
+
+
+def judged(trial: Trial, recording: Recording, start: int, stop: int, now: Circumstances) -> tuple[Decision, int]:
+    """The first decision that is not OPEN, and after how many samples."""
+    u, y = recording
+    for k in range(start, stop):
+        decision = trial.put(float(u[k]), float(y[k]), now)
+        if decision.outcome is not Outcome.OPEN:
+            return decision, k - start + 1
+    return Decision(Outcome.OPEN), stop - start
+
+
+def test_readings_that_are_where_they_were_are_the_same(model: LssvmInverse, motions: dict[str, Recording]) -> None:
+    at, now = 3000, circumstances(model)
+    for recording in motions.values():
+        decision, after = judged(begun(model, recording, at), recording, at, at + 1000, now)
+        assert decision == Decision(Outcome.SAME, credit=1)
+        assert after <= round(EnvelopeConfig().follow_s / DT_S) + VALUES // LOOKS
+
+
+@pytest.mark.parametrize(("gain", "shift"), [(1.0, 0.15), (1.0, -0.2), (0.8, 0.0), (1.25, 0.0), (0.9, 0.1)])
+def test_readings_that_follow_otherwise_have_changed(
+    model: LssvmInverse, motions: dict[str, Recording], gain: float, shift: float
+) -> None:
+    """Slope and shift are those of the change, to some percent: it is the same in one window and the next."""
+    at, now = 3000, circumstances(model)
+    for u, clean in (motions["tones"], motions["sine"]):
+        y = gain * clean + shift * range_of(model)
+        decision, after = judged(begun(model, (u, clean), at), (u, y), at, at + 1500, now)
+        if decision.outcome is Outcome.SAME:
+            # The identified model explains them too: then the learner finds the change itself.
+            assert abs(shift) < 0.15
+            continue
+        assert decision.outcome is Outcome.CHANGED
+        # After a window, and another one in which it is the same; after half a one where it is plain.
+        window = round(EnvelopeConfig().follow_s / DT_S)
+        assert window // 2 <= after < 5 * window
+        off_um = decision.slope * clean[at : at + 700] + decision.shift_um - y[at : at + 700]
+        assert np.abs(off_um).max() < 0.04 * range_of(model)
+
+
+@pytest.mark.parametrize("off", [-0.25, 0.2])
+def test_a_reckoning_that_is_wrong_does_not_shut_out_a_good_sensor(
+    model: LssvmInverse, motions: dict[str, Recording], off: float
+) -> None:
+    """It begins a quarter of the range away from the stage; the identified model says that the readings are right."""
+    at, now = 3000, circumstances(model)
+    for recording in motions.values():
+        trial = begun(model, recording, at, off * range_of(model))
+        decision, after = judged(trial, recording, at, at + 1000, now)
+        assert decision.outcome is Outcome.SAME
+        assert after < 600
+        assert trial.fault == ""
+
+
+def test_a_reckoning_that_goes_elsewhere_does_not_shut_out_a_good_sensor(
+    model: LssvmInverse, motions: dict[str, Recording]
+) -> None:
+    """By its model the stage goes not half as far as it does: no reading follows that. The identified model knows."""
+    at, now = 3000, circumstances(model)
+    wild = replace(model, beta=2.4 * model.beta, alpha=2.4 * model.alpha)
+    for recording in motions.values():
+        trial = reckoned_by(wild, begun(model, recording, at), recording, at)
+        decision, after = judged(trial, recording, at, at + 1500, now)
+        assert decision.outcome is Outcome.SAME
+        assert after < 1000
+        assert trial.fault == ""
+
+
+def test_a_stage_at_rest_shows_that_its_readings_are_where_they_were(model: LssvmInverse) -> None:
+    """And those steady near by are believed after some windows; those far away, or of a sensor with a name, are not."""
+    at, now = 3500, circumstances(model)
+    t_s = np.arange(7000) * DT_S
+    sine = np.minimum(t_s / 0.5, 1.0) * (4.0 - 3.0 * np.cos(2.0 * np.pi * np.minimum(t_s, 2.8)))
+    u, y = simulated(5, sine)
+    for off, outcome in ((0.0, Outcome.SAME), (0.05, Outcome.CHANGED), (-0.1, Outcome.CHANGED), (0.3, Outcome.OPEN)):
+        readings = y + off * range_of(model)
+        decision, after = judged(begun(model, (u, y), at), (u, readings), at, at + 1500, now)
+        assert decision.outcome is outcome
+        assert decision.slope == 1.0
+        assert decision.shift_um == pytest.approx(
+            off * range_of(model) if outcome is Outcome.CHANGED else 0.0, abs=now.usual_um
+        )
+        assert after > (0.3 / DT_S if off else 0.0)
+        named = replace(begun(model, (u, y), at), fault=SENSOR_STUCK)
+        decision, _ = judged(named, (u, readings), at, at + 1500, now)
+        assert decision.outcome is Outcome.OPEN
+        assert named.fault == SENSOR_STUCK
+
+
+def test_samples_without_a_reading_decide_nothing(model: LssvmInverse, motions: dict[str, Recording]) -> None:
+    at, now = 3000, circumstances(model)
+    u, y = motions["tones"]
+    trial = begun(model, (u, y), at)
+    decision, _ = judged(trial, (u, np.full(y.size, math.nan)), at, at + 1000, now)
+    assert decision.outcome is Outcome.OPEN
+    assert trial.fault == ""
+    assert trial.count == 0
+    # What comes after is judged by where the stage has gone meanwhile.
+    decision, _ = judged(trial, (u, y), at + 1000, at + 1600, now)
+    assert decision.outcome is Outcome.SAME
+
+
+def test_all_of_it_is_in_its_state(model: LssvmInverse, motions: dict[str, Recording]) -> None:
+    at, now = 3000, circumstances(model)
+    u, clean = motions["tones"]
+    y = wrong("sign_rest", clean, at, range_of(model))
+    one = begun(model, (u, clean), at)
+    judged(one, (u, y), at, at + 200, now)
+    assert one.fault
+    changed: dict[str, Any] = {
+        "fault": SENSOR_GAIN, "suspected": SENSOR_SIGN, "count": 301, "since": 302, "looked": 283, "times": 2,
+        "rested": 3, "obeyed": 4, "followed": 5, "agreed": 6, "slope": 1.25, "shift_um": -3.5,
+    }  # fmt: skip
+    one = replace(one, **changed)
+    two = Trial.from_state(one.state_dict(), model)
+    for field in fields(Trial):
+        mine, its = getattr(one, field.name), getattr(two, field.name)
+        if field.name in ("memory", "window"):
+            np.testing.assert_array_equal(mine, its)
+        elif field.name not in ("reckoning", "base"):
+            assert mine == its, field.name
+    rest = range(at + 200, at + 600)
+    for k in rest:
+        assert one.put(float(u[k]), float(y[k]), now) == two.put(float(u[k]), float(y[k]), now)
+    assert one.fault == two.fault
+    state = one.state_dict() | {"window": np.zeros((4, 3))}
+    with pytest.raises(ValueError, match="window"):
+        Trial.from_state(state, model)
+
+
+# ---- what a trial takes back, what is served meanwhile, and when no trial is held
+
+
+def test_jumps_that_no_motion_bore_out_are_taken_back_with_the_first_of_them(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict]
+) -> None:
+    """Two steps of the zero, 40 ms apart, and then the sign: the frame is again that from before both."""
+    at = ATS[0]
+    u, clean = motions["sine"]
+    y = clean.copy()
+    y[at:] += 0.03 * range_of(model)
+    y[at + 40 :] += 0.03 * range_of(model)
+    y[at + 80 :] = range_of(model) - y[at + 80 :]
+    learner = Learner.from_state(warm["sine", at])
+    frame, jumps = learner.features, learner.counters()["jumps"]
+    place = clean[at + 60]
+    feed(learner, (u, y), at, at + 80)
+    assert learner.counters()["jumps"] == jumps + 2
+    assert shown(learner, place) - place > 0.04 * range_of(model)
+    kept = Learner.from_state(learner.state_dict())
+    for one in (learner, kept):
+        feed(one, (u, y), at + 80, at + NAMED)
+        assert one.trouble == SENSOR_SIGN
+        assert one.features == frame
+
+
+def test_a_jump_that_motion_bore_out_stays(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict]
+) -> None:
+    at = ATS[0]
+    u, clean = motions["sine"]
+    y = clean.copy()
+    y[at:] += 0.05 * range_of(model)
+    y[at + 1500 :] = range_of(model) - y[at + 1500 :]
+    learner = Learner.from_state(warm["sine", at])
+    feed(learner, (u, y), at, at + 1500 + NAMED)
+    assert learner.trouble == SENSOR_SIGN
+    assert shown(learner, clean[at]) - clean[at] > 0.03 * range_of(model)
+
+
+@pytest.mark.parametrize("fault", ["sign_rest", "stuck_1e-5"])
+def test_the_longer_without_readings_the_more_the_identified_model_is_served(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], fault: str
+) -> None:
+    """At first the last estimate; then the identified one, where it was good; the learner's own when trust is back."""
+    at = ATS[0]
+    u, clean = motions["tones"]
+    learner = Learner.from_state(warm["tones", at])
+    served = []
+    y = wrong(fault, clean, at, range_of(model), 1500)
+    for k in range(at, at + 1500):
+        feed(learner, (u, y), k, k + 1)
+        if learner.distrusts:
+            served.append(np.array_equal(learner.snapshot().beta, model.beta))
+    assert not any(served[:250])
+    assert all(served[-300:])
+    feed(learner, (u, y), at + 1500, at + 1500 + BACK)
+    assert not learner.distrusts
+    assert not np.array_equal(learner.snapshot().beta, model.beta)
+
+
+def test_a_model_that_has_lost_its_credit_judges_no_sensor_until_it_reckons_right_again(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict]
+) -> None:
+    at = ATS[0]
+    u, clean = motions["tones"]
+    y = wrong("sign_rest", clean, at, range_of(model), 600)
+    doubtful = warm["tones", at] | {"front.credit": 0, "front.until_control": 0}
+    learner = Learner.from_state(doubtful)
+    for k in range(at, at + 600):
+        feed(learner, (u, y), k, k + 1)
+        assert learner.trouble not in SENSOR_FAULTS
+    # Of good readings it is as good as ever, and then it judges again.
+    learner = Learner.from_state(doubtful)
+    feed(learner, (u, clean), at, at + 1500)
+    assert learner.state_dict()["front.credit"] > 0
+    feed(learner, (u, wrong("sign_rest", clean, at + 1500, range_of(model), 600)), at + 1500, at + 1500 + NAMED)
+    assert learner.trouble == SENSOR_SIGN
+
+
+def test_readings_that_only_the_identified_model_explains_cost_the_reckoning_its_credit(
+    model: LssvmInverse, motions: dict[str, Recording]
+) -> None:
+    at, now = 3000, circumstances(model)
+    recording = motions["tones"]
+    decision, _ = judged(begun(model, recording, at), recording, at, at + 1000, now)
+    assert decision.credit == 1
+    wild = replace(model, beta=2.4 * model.beta, alpha=2.4 * model.alpha)
+    decision, _ = judged(reckoned_by(wild, begun(model, recording, at), recording, at), recording, at, at + 1500, now)
+    assert decision == Decision(Outcome.SAME, credit=-1)

@@ -1,0 +1,137 @@
+"""Evidence: the reference values, every gradient against differences, the search against a grid."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaptive import kernels, lssvm
+from adaptive.errors import InputError, NumericsError
+from adaptive.tuning import evidence
+from adaptive.tuning import search as inference
+from adaptive.tuning.search import InferenceConfig
+
+DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "lssvm-reference"
+needs_reference = pytest.mark.skipif(not DATA.is_dir(), reason=f"reference values not found at {DATA}; set DEHYST_DATA")
+
+
+def reference_problem() -> evidence.Problem:
+    table = np.genfromtxt(DATA / "bw500.csv", delimiter=",", names=True)
+    return evidence.problem(np.column_stack([table["u_n"], table["udot_n"]]), table["y_n"])
+
+
+def small_problem(linear: tuple[int, ...] = (), n: int = 70) -> evidence.Problem:
+    rng = np.random.default_rng(3)
+    X = rng.random((n, 3))
+    y = np.sin(6 * X[:, 0]) + 0.5 * X[:, 1] + 0.05 * rng.standard_normal(n)
+    return evidence.problem(X, y, rng.random(n) + 0.5, linear)
+
+
+@needs_reference
+def test_level_one_and_two_reference_values() -> None:
+    found = evidence.evaluate(reference_problem(), 741.0, np.array([0.4, 0.4]))
+    assert pytest.approx(1.54823814914, rel=1e-10) == found.E_W
+    assert pytest.approx(0.0180020412047, rel=1e-10) == found.E_D
+    assert found.effective == pytest.approx(33.161494249, rel=1e-10)
+    assert found.mu == pytest.approx(10.3864816, rel=1e-8)
+    assert found.zeta == pytest.approx(12966.2659, rel=1e-8)
+
+
+@needs_reference
+def test_level_two_optimum_reference_values() -> None:
+    found = inference.level_two(reference_problem(), np.array([0.4, 0.4]))
+    assert found.gamma == pytest.approx(2899.888, rel=1e-5)
+    assert found.effective == pytest.approx(37.9146, rel=1e-5)
+    assert pytest.approx(-1799.74692, rel=1e-8) == found.J2
+    assert found.mu == pytest.approx(4.8107448, rel=1e-5)
+    assert found.zeta == pytest.approx(13950.622, rel=1e-6)
+
+
+def test_at_the_optimum_of_gamma_it_is_the_ratio_of_zeta_and_mu() -> None:
+    found = inference.level_two(small_problem(), np.array([0.5, 1.0, 2.0]))
+    assert found.zeta / found.mu == pytest.approx(found.gamma, rel=1e-4)
+
+
+@pytest.mark.parametrize("linear", [(), (1,), (0, 2)])
+def test_gradients(linear: tuple[int, ...]) -> None:
+    data = small_problem(linear)
+    theta, h = np.log([60.0, 0.4, 0.9, 1.7]), 1e-5
+
+    def j2(at: np.ndarray) -> float:
+        return evidence.evaluate(data, np.exp(at[0]), np.exp(at[1:])).J2
+
+    numeric = [(j2(theta + h * e) - j2(theta - h * e)) / (2 * h) for e in np.eye(4)]
+    np.testing.assert_allclose(evidence.evaluate(data, 60.0, np.exp(theta[1:])).J2_gradient, numeric, rtol=1e-5)
+
+
+@pytest.mark.parametrize("linear", [(), (1,)])
+def test_third_level_gradient_follows_the_optimum_of_gamma(linear: tuple[int, ...]) -> None:
+    data, theta, h = small_problem(linear), np.log([0.4, 0.9, 1.7]), 1e-3
+
+    def at_optimum(at: np.ndarray) -> evidence.Evidence:
+        gamma = inference.level_two(data, np.exp(at)).gamma
+        return evidence.evaluate(data, gamma, np.exp(at), third_level=True)
+
+    numeric = [(at_optimum(theta + h * e).J3 - at_optimum(theta - h * e).J3) / (2 * h) for e in np.eye(3)]
+    np.testing.assert_allclose(at_optimum(theta).J3_gradient, numeric, rtol=2e-3, atol=1e-3)
+
+
+def test_effective_parameters_by_eigenvalues() -> None:
+    data = evidence.problem(*_unweighted())
+    widths = np.array([0.5, 0.5, 0.5])
+    found = evidence.evaluate(data, 30.0, widths)
+    centre = np.eye(data.size) - 1.0 / data.size
+    eigenvalues = np.linalg.eigvalsh(centre @ kernels.gram(data.X, None, widths) @ centre)
+    assert found.effective == pytest.approx(1 + np.sum(30 * eigenvalues / (1 + 30 * eigenvalues)), rel=1e-9)
+
+
+def _unweighted() -> tuple[np.ndarray, np.ndarray]:
+    data = small_problem()
+    return data.X, data.y
+
+
+@pytest.mark.parametrize("method", ["joint", "three_level"])
+def test_search_finds_what_matters(method: str) -> None:
+    data = small_problem(n=90)
+    found = inference.infer(data, InferenceConfig(method=method))  # type: ignore[arg-type]
+    widths = found.best.widths
+    assert widths[2] > 5 * widths[0], "the third feature carries nothing, its width must grow"
+    X, y = np.random.default_rng(9).random((300, 3)), None
+    y = np.sin(6 * X[:, 0]) + 0.5 * X[:, 1]
+    model = lssvm.fit(data.X, data.y, widths, found.best.gamma, data.weights).model
+    assert np.sqrt(np.mean((model.predict(X) - y) ** 2)) < 0.04
+
+
+def test_joint_search_ends_at_a_stationary_point_below_all_starts() -> None:
+    data = small_problem()
+    found = inference.infer(data, InferenceConfig(width_range=(0.05, 5.0)))
+    interior = (found.best.widths > 0.051) & (found.best.widths < 4.9)
+    assert np.all(np.abs(found.best.J2_gradient[1:][interior]) < 0.05)
+    for gamma, sigma in InferenceConfig().starts:
+        assert found.best.J2 <= evidence.evaluate(data, gamma, np.full(3, min(sigma, 5.0))).J2
+
+
+def test_one_width_for_all() -> None:
+    found = inference.infer(small_problem(), InferenceConfig(ard=False))
+    assert np.unique(found.best.widths).size == 1
+
+
+def test_the_search_is_deterministic() -> None:
+    first, second = (inference.infer(small_problem()) for _ in range(2))
+    assert first.best.gamma == second.best.gamma
+    np.testing.assert_array_equal(first.best.widths, second.best.widths)
+
+
+def test_bad_input() -> None:
+    X, y = _unweighted()
+    with pytest.raises(InputError, match="equal"):
+        evidence.problem(X, np.ones(y.size))
+    with pytest.raises(InputError, match="samples"):
+        evidence.problem(X[:3], y[:3])
+    with pytest.raises(InputError, match="starts"):
+        InferenceConfig(starts=())
+    with pytest.raises(NumericsError):
+        evidence.evaluate(evidence.problem(np.ones((20, 2)), np.arange(20.0)), 1e19, np.ones(2))

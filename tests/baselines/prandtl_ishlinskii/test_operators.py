@@ -1,0 +1,182 @@
+"""Play and dead-zone operators, PI and MPI models and their inverses: exactness."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError
+from baselines.prandtl_ishlinskii import dead_zone as dead_zone_module
+from baselines.prandtl_ishlinskii import play as play_module
+from baselines.prandtl_ishlinskii.dead_zone import dead_zone, dead_zone_sum, ramps, slopes_to_weights
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import (
+    MpiParameters,
+    from_inverse_saturation,
+    inverse_thresholds,
+    inverse_weights,
+    pi_parameters,
+    states_from_inverse,
+    states_to_inverse,
+)
+from baselines.prandtl_ishlinskii.play import play_run, play_start
+from baselines.validation import Domain
+
+WIDE = Domain(-1e6, 1e6, 1e9)
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.mark.parametrize("module", [play_module, dead_zone_module])
+def test_documented_walks(module: object) -> None:
+    result = doctest.testmod(module)  # type: ignore[arg-type]
+    assert result.attempted >= 4
+    assert result.failed == 0
+
+
+def random_mpi(rng: np.random.Generator, n: int, m: int) -> MpiParameters:
+    """Random weights of either sign with positive partial sums, random offsets."""
+    r = np.concatenate([[0.0], np.cumsum(rng.uniform(0.05, 1.0, n))])
+    d = np.concatenate([[0.0], np.cumsum(rng.uniform(1.0, 15.0, m))])
+    w_h = np.diff(rng.uniform(2.0, 20.0, n + 1), prepend=0.0)
+    w_s = np.diff(rng.uniform(0.3, 3.0, m + 1), prepend=0.0)
+    c, y_ref = rng.normal(0.0, 10.0, 2)
+    return MpiParameters(tuple(r), tuple(w_h), tuple(d), tuple(w_s), float(c), float(y_ref))
+
+
+def test_pi_follows_the_equations_step_by_step() -> None:
+    rng = np.random.default_rng(3)
+    u, r, w = rng.uniform(0, 8, 50), np.array([0.0, 0.5, 2.0]), np.array([5.0, 3.0, 1.0])
+    state = [0.0, 0.0, 0.0]
+    expected = []
+    for value in u:  # (2.4), (2.7) in their own words
+        state = [max(value - r[i], min(value + r[i], state[i])) for i in range(3)]
+        expected.append(sum(w[i] * state[i] for i in range(3)))
+    np.testing.assert_allclose(pi_parameters(r, w).simulate(u, 1.0), expected, rtol=1e-14)
+
+
+def test_dead_zones_against_the_definition() -> None:
+    y = np.linspace(-5.0, 20.0, 101)
+    d, w = np.array([0.0, 3.0, 7.0]), np.array([1.0, -0.5, 2.0])
+    expected = y - 0.5 * np.maximum(y - 3.0, 0.0) + 2.0 * np.maximum(y - 7.0, 0.0)
+    np.testing.assert_allclose(dead_zone(y, d) @ w, expected, atol=1e-13)
+    np.testing.assert_allclose([dead_zone_sum(v, d, w) for v in y], expected, atol=1e-13)
+    slopes = np.cumsum(w)
+    np.testing.assert_allclose(ramps(y, d) @ slopes, expected, atol=1e-13)
+    np.testing.assert_allclose(slopes_to_weights(slopes), w)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=seeds, n=st.integers(0, 14), m=st.integers(0, 8))
+def test_inverse_of_forward_is_the_identity(seed: int, n: int, m: int) -> None:
+    """Random walks with minor loops, random weights, random initial states reached by a random past."""
+    rng = np.random.default_rng(seed)
+    model = random_mpi(rng, n, m)
+    past = rng.uniform(-9.0, 9.0, 7)
+    state = model.start(float(past[0]))
+    play_run(past, model.r_, state)
+    turns = rng.uniform(-9.0, 9.0, 30)
+    u = np.interp(np.linspace(0, 29, 400), np.arange(30), turns)
+    y = model.simulate(u, 1e-3, state)
+    inverse = MpiInverse(model, 1e-3, WIDE)
+    zero = np.zeros(u.size)
+    answer = inverse.feedforward(y, zero, zero, state)
+    scale = float(np.sum(np.abs(model.w_h_)) / np.min(np.cumsum(model.w_h_)))
+    assert np.max(np.abs(answer.u_V - u)) < 1e-12 * scale
+    # The memory after is that of the forward model, and what track makes of the voltages.
+    after = state.copy()
+    play_run(u, model.r_, after)
+    np.testing.assert_allclose(answer.memory, after, atol=1e-11 * scale)
+    np.testing.assert_allclose(inverse.track(y, zero, zero, u, state), after, atol=0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds, n=st.integers(0, 14), m=st.integers(0, 8))
+def test_inverting_twice_gives_the_model_back(seed: int, n: int, m: int) -> None:
+    model = random_mpi(np.random.default_rng(seed), n, m)
+    for w, r in ((model.w_h_, model.r_), (model.w_s_, model.d_)):
+        twice_w, twice_r = (
+            inverse_weights(inverse_weights(w)),
+            inverse_thresholds(inverse_weights(w), inverse_thresholds(w, r)),
+        )
+        np.testing.assert_allclose(twice_w, w, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(twice_r, r, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds)
+def test_initial_states_convert_both_ways(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = random_mpi(rng, 6, 0)
+    state, there, back = rng.normal(0, 3, 7), np.empty(7), np.empty(7)
+    states_to_inverse(model.w_h_, state, there)
+    w = model.w_h_
+    expected = [w[: i + 1].sum() * state[i] + (w[i + 1 :] * state[i + 1 :]).sum() for i in range(7)]  # (2.15)
+    np.testing.assert_allclose(there, expected, atol=1e-11)
+    states_from_inverse(np.cumsum(w), there, back)
+    np.testing.assert_allclose(back, state, atol=1e-11)
+
+
+def test_tables_2_2_and_2_3_agree() -> None:
+    """The chapter's own numbers: (2.12)-(2.18) take Table 2.2 to Table 2.3."""
+    r = 0.6036 * np.arange(13)
+    w_h = np.array([0.0677, 0.0228, 6.5979e-6, 0.0196, 0.0037, 4.0252e-6, 1.0681e-6, 6.7711e-8, 6.1372e-8, 3.8439e-8])
+    w_h = np.concatenate([w_h, [2.9690e-8, 8.4374e-9, 0.0]])
+    np.testing.assert_allclose(inverse_weights(w_h)[[0, 1, 3, 4]], [14.7797, -3.7195, -1.9672, -0.2980], rtol=1.4e-2)
+    expected = [0.0, 0.0408, 0.0954, 0.1500, 0.2164, 0.2850, 0.3537]
+    np.testing.assert_allclose(inverse_thresholds(w_h, r)[:7], expected, atol=3e-4)
+    w_s, d = np.array([99.9999, -1.0010e-5, -3.3798e-5]), np.array([0.0, 0.1276, 0.2552])
+    np.testing.assert_allclose(inverse_weights(w_s), [0.0100, 1.0010e-9, 3.3798e-9], rtol=1e-3)
+    np.testing.assert_allclose(inverse_thresholds(w_s, d), [0.0, 12.7581, 25.5163], rtol=2e-4)
+
+
+def test_wiping_out_and_congruency() -> None:
+    model = random_mpi(np.random.default_rng(5), 8, 0)
+    walk = np.array([0.0, 6.0, 2.0, 4.0, 2.0, 6.0, 1.0])
+    short = np.array([0.0, 6.0, 1.0])
+    assert model.simulate(walk, 1.0)[-1] == pytest.approx(model.simulate(short, 1.0)[-1], abs=1e-12)
+    first = model.simulate(np.array([0.0, 6.0, 2.0, 4.0, 2.0]), 1.0)
+    second = model.simulate(np.array([0.0, 8.0, 2.0, 4.0, 2.0]), 1.0)
+    assert first[3] - first[4] == pytest.approx(second[3] - second[4], abs=1e-12)
+
+
+def test_lag_is_led_by_the_inverse() -> None:
+    model = MpiParameters((0.0, 0.4), (8.0, 3.0), y_ref_um=2.0, lag_s=5e-3)
+    t = np.arange(4000) * 1e-3
+    y, v = 40 - 30 * np.cos(2 * np.pi * t), 60 * np.pi * np.sin(2 * np.pi * t)
+    inverse = MpiInverse(model, 1e-3, WIDE)
+    u = inverse.feedforward(y, v, 0 * v, inverse.rest_memory(10.0)).u_V
+    assert np.max(np.abs(model.simulate(u, 1e-3) - y)) < 2e-3
+    without = MpiInverse(MpiParameters((0.0, 0.4), (8.0, 3.0), y_ref_um=2.0), 1e-3, WIDE)
+    late = without.feedforward(y, v, 0 * v, without.rest_memory(10.0)).u_V
+    assert np.max(np.abs(model.simulate(late, 1e-3) - y)) > 0.5
+
+
+def test_saturation_given_by_its_inverse() -> None:
+    d_star, w_star = np.array([0.0, 10.0, 30.0]), np.array([1.0, 0.2, -0.1])
+    model = from_inverse_saturation(np.array([0.0]), np.array([1.0]), d_star, w_star, 0.0, 0.0)
+    y = np.array([5.0, 20.0, 50.0])
+    x = dead_zone(y, d_star) @ w_star
+    np.testing.assert_allclose(model.simulate(x, 1.0), y, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"r_V": (0.0, 1.0), "w_h": (1.0,)}, "w_h"),
+        ({"r_V": (0.1, 1.0), "w_h": (1.0, 1.0)}, "r_V"),
+        ({"r_V": (0.0, 1.0), "w_h": (1.0, -1.5)}, "w_h"),
+        ({"r_V": (0.0,), "w_h": (1.0,), "d_um": (0.0, 2.0), "w_s": (1.0, -1.0)}, "w_s"),
+        ({"r_V": (0.0,), "w_h": (1.0,), "c_um": float("nan")}, "c_um"),
+    ],
+)
+def test_models_without_an_inverse_are_refused(arguments: dict[str, object], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        MpiParameters(**arguments)  # type: ignore[arg-type]
+
+
+def test_play_start_is_the_initial_condition() -> None:
+    np.testing.assert_array_equal(play_start(3.0, np.array([0.0, 1.0, 5.0]), y0_V=1.0), [3.0, 2.0, 1.0])

@@ -1,0 +1,39 @@
+"""The demonstration on a machine that does not keep up: it says so, and is late no longer than it must be."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lab.demo.controller import blocks_now
+from lab.demo.plan import Plan
+from lab.demo.result import MOST_LATE, clock_missed
+
+
+@pytest.mark.parametrize("late", [0, 1, round(60_000 * MOST_LATE)])
+def test_a_machine_that_keeps_up_is_not_worth_a_word(late: int) -> None:
+    assert clock_missed({"count": 60_000, "late": late, "bare_late": 5000}) == ""
+    assert clock_missed({"count": 0, "late": 0, "bare_late": 0}) == ""
+
+
+def test_a_machine_that_does_not_is_told_of_with_what_to_do() -> None:
+    told = clock_missed({"count": 60_000, "late": 30_714, "bare_late": 0})
+    assert "51 % of the ticks" in told
+    assert "--fast" in told
+    assert clock_missed({"count": 60_000, "late": round(60_000 * MOST_LATE) + 1, "bare_late": 0})
+
+
+@given(st.integers(0, 599), st.integers(0, 12_000))
+def test_a_controller_that_is_late_goes_on_where_one_in_time_would_be(block: int, seen: int) -> None:
+    plan = Plan(run_s=12.0)
+    size, last = plan.block, plan.ticks // plan.block
+    fresh, stop = blocks_now(plan, block, seen)
+    assert block <= fresh < stop <= last
+    if seen <= block * size:
+        assert (fresh, stop) == (block, block + 1)
+        return
+    assert fresh > block or fresh == last - 1
+    assert fresh * size >= seen or fresh == last - 1, "what is due already is not asked for"
+    assert stop * size > seen + plan.lead or stop == last, "and all that a controller in time has asked for is"
+    assert plan.as_of(fresh) < seen, "by what the stage has told"

@@ -1,0 +1,156 @@
+"""``dehyst rehearse``: from a file with a plant to a table, a picture and JSON, and what it says where that fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lab.cli import main
+from lab.commands.rehearse import failed, load_plant
+
+ROOT = Path(__file__).resolve().parents[3]
+#: Rate-dependent in nothing, and fast: two plays in a line, a sample late.
+PLANT = """
+import numpy as np
+
+class Stage:
+    dt_s, u_min_V, u_max_V = 0.001, 0.0, 10.0
+
+    def __init__(self):
+        self.play = np.zeros(2)
+        self.y = 0.0
+
+    def run(self, u_V):
+        true = np.empty(len(u_V))
+        for k, u in enumerate(u_V):
+            true[k] = self.y
+            self.play = np.clip(self.play, u - np.array([0.5, 1.5]), u + np.array([0.5, 1.5]))
+            self.y = 5.0 * u + self.play.sum()
+        return true, true + 1e-3 * np.sin(np.arange(len(u_V)) * 7.0)
+
+def memoryless(u_V):
+    return 3.0 * u_V, 3.0 * u_V
+
+def short(u_V):
+    return u_V[1:], u_V
+
+def endless(u_V):
+    return u_V / 0.0 * 0.0, u_V
+
+number = 7
+"""
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.py"
+    path.write_text(PLANT)
+    return path
+
+
+def test_table_json_and_picture_of_a_plant(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    arguments = ["rehearse", "--plant", f"{plant}:Stage", "--events", "none,gain_at_once", "--out", str(out)]
+    status = main([*arguments, "--settle", "2", "--after", "4"])
+    told = capsys.readouterr()
+    assert status == 0
+    assert "nothing happens" in told.out
+    assert "the stage's gain changes" in told.out
+    assert "identifying" in told.err
+    assert "[2/2]" in told.err
+    summary = json.loads((out / "rehearsal.json").read_text())
+    assert [run["event"]["name"] for run in summary["runs"]] == ["none", "gain_at_once"]
+    assert summary["runs"][0]["adaptive"]["settled_pct"] < 0.5
+    assert summary["runs"][0]["range_um"] > 10.0
+    assert (out / "rehearsal.png").stat().st_size > 10_000
+    assert (out / "rehearsal.md").read_text().startswith("| what happens")
+
+
+def test_json_is_all_there_is_on_standard_output(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["--plant", f"{plant}:Stage", "--events", "none", "--settle", "2", "--after", "4", "--out", str(out)]
+    assert main(["rehearse", *arguments, "--json", "--no-picture"]) == 0
+    assert json.loads(capsys.readouterr().out)["schema"] == 1
+    assert not (out / "rehearsal.png").exists()
+
+
+def test_the_classes_of_events_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rehearse", "--plant", "-", "--events", "list"]) == 0
+    told = capsys.readouterr().out
+    assert "knock" in told
+    assert "sensor" in told
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [
+        ("missing.py:Stage", (), "which is not there"),
+        ("mine.py", (), "expected FILE.py:NAME"),
+        ("mine.py:Other", (), "'Other', which is not in"),
+        ("mine.py:number", (), "an object with run"),
+        ("mine.py:memoryless", (), "plant.dt_s: got nothing"),
+        ("mine.py:memoryless", ("--rate", "-1"), "--rate"),
+        ("mine.py:memoryless", ("--rate", "1000", "--u-min", "3", "--u-max", "2"), "more than u_min_V"),
+        ("mine.py:short", ("--rate", "1000", "--u-min", "0", "--u-max", "2"), "shape"),
+        ("mine.py:endless", ("--rate", "1000", "--u-min", "0", "--u-max", "2"), "a finite displacement"),
+        ("mine.py:Stage", ("--events", "thunder"), "some of none"),
+        ("mine.py:Stage", ("--seed", "-1"), "--seed"),
+        ("mine.py:Stage", ("--settle", "0"), "at least 2 s before"),
+        ("broken.py:Stage", (), "ZeroDivisionError"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_is_wrong_is_told_by_name(
+    plant: Path, capsys: pytest.CaptureFixture[str], name: str, more: tuple[str, ...], words: str
+) -> None:
+    (plant.parent / "broken.py").write_text("1 / 0\n")
+    where = str(plant.parent / name)
+    assert main(["rehearse", "--plant", where, "--out", str(plant.parent / "out"), *more]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert "got" in told
+    assert "expected" in told
+
+
+def test_the_example_is_a_plant() -> None:
+    import numpy as np
+
+    from lab.rehearsal import factory_of
+
+    made = factory_of(load_plant(f"{ROOT / 'examples' / 'plant.py'}:Stage"))()
+    true_um, read_um = made.run(np.linspace(0.0, 50.0, 200))
+    assert 25.0 < true_um[-1] < 35.0
+    assert 0.0 < np.abs(read_um - true_um).max() < 0.03
+
+
+def test_only_what_went_wrong_makes_it_fail() -> None:
+    assert not failed([])
+    assert not failed(["said: sensor_frozen"])
+    assert failed(["said: sensor_frozen", "ENDS AT A RAIL"])
+
+
+def test_ctrl_c_ends_it_at_once_and_without_a_traceback(plant: Path, tmp_path: Path) -> None:
+    arguments = ["rehearse", "--plant", f"{plant}:Stage", "--out", str(tmp_path / "out"), "--settle", "1000"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "lab.cli", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        said = ""
+        while "[1/" not in said:
+            said += process.stderr.readline()
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        said += process.stderr.read()
+        assert process.wait(timeout=30) == 130
+    assert "interrupted" in said
+    assert "Traceback" not in said

@@ -1,0 +1,148 @@
+"""What a soak does to others: every kind that was promised, and messages that nobody can use."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from lab.soak.faults import bad_client as rubbish_module
+from lab.soak.faults.bad_client import AIMS, PAYLOADS, RATE_HZ, bad_query, bad_request, bad_samples
+from lab.soak.faults.catalogue import KINDS
+from lab.soak.processes.controller import StageClock
+from lab.soak.verdict.settling import TELLERS, settle
+from service.operating.request import decode_request
+from service.protocol import query as wire_query
+from service.protocol import samples as wire
+from tests.lab.soak.soaked import healthy
+
+#: What the promise names, and by which kind it is kept.
+PROMISED = {
+    "kill -9": "kill_primary",
+    "SIGSTOP for seconds": "stop_primary",
+    "a standby that is killed": "kill_standby",
+    "a killed viewer": "kill_viewer",
+    "dead viewers": "kill_viewer",
+    "slow viewers": "slow_viewer",
+    "a dead stage": "restart_stage",
+    "a restarted router": "restart_router",
+    "a clock set back": "clock_back",
+    "a stage's clock set back": "stage_clock",
+    "gaps": "gap",
+    "duplicates": "duplicate",
+    "reordering": "reorder",
+    "NaN": "nan",
+    "spikes": "spike",
+    "saturation": "saturate",
+    "dwell": "dwell",
+    "sensor frozen": "freeze",
+    "gain changes": "gain",
+    "payload changes": "payload",
+    "bursts of bad queries": "bad_queries",
+    "disk full": "disk_full",
+    "CPU stolen": "cpu_stolen",
+}
+
+
+def test_every_kind_that_was_promised_is_there_and_no_other() -> None:
+    assert set(PROMISED.values()) == set(KINDS)
+    assert set(TELLERS) <= set(KINDS)
+
+
+DECODERS: dict[str, Callable[[bytes], object]] = {"sample": wire.decode_samples, "operate": decode_request}
+
+
+@pytest.mark.parametrize("key", sorted(DECODERS))
+def test_rubbish_is_refused_by_whoever_reads_it(key: str) -> None:
+    """Samples that could be read would be believed, and a verb that could be read would be done."""
+    rng = np.random.default_rng(7)
+    kinds = set()
+    for _ in range(1500):
+        with pytest.raises(InputError) as caught:
+            DECODERS[key](PAYLOADS[key](rng))
+        kinds.add(str(caught.value).split(":")[0])
+    assert len(kinds) >= 3, "of several sorts"
+
+
+def test_rubbish_goes_to_every_key_in_turns() -> None:
+    assert set(AIMS) == set(PAYLOADS) == {"feedforward", "sample", "model", "status", "operate"}
+    assert (PAYLOADS["feedforward"], PAYLOADS["sample"], PAYLOADS["operate"]) == (bad_query, bad_samples, bad_request)
+    rng = np.random.default_rng(3)
+    # Some of the queries can be read, and ask what cannot be answered.
+    read = 0
+    for _ in range(300):
+        try:
+            wire_query.decode_query(bad_query(rng))
+            read += 1
+        except InputError:
+            pass
+    assert 50 < read < 250
+
+
+class Session:
+    """Takes what is sent to it, and answers nothing."""
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def put(self, key: str, payload: bytes, congestion_control: object) -> None:
+        self.sent.append(key)
+
+    def get(self, key: str, payload: bytes, timeout: float) -> list[Any]:
+        self.sent.append(key)
+        return []
+
+
+def test_rubbish_comes_at_a_bounded_rate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    session, until = Session(), time.monotonic() + 0.5
+    monkeypatch.setattr(rubbish_module, "open_client", lambda *_: session)
+
+    class Stop:
+        @property
+        def reason(self) -> str:
+            return "over" if time.monotonic() > until else ""
+
+    monkeypatch.setattr(rubbish_module, "StopSignal", Stop)
+    assert rubbish_module.rubbish("nowhere", 1) == 0
+    assert 8 < len(session.sent) <= 0.5 * RATE_HZ + 5
+    assert {key.rsplit("/", 1)[1].split("?")[0] for key in session.sent} == set(AIMS)
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["published"] == sum(key.endswith("/sample") for key in session.sent)
+    assert told["nothing"] == len(session.sent) - told["published"]
+
+
+def test_a_controller_follows_the_stage_through_rubbish() -> None:
+    session = SimpleNamespace(declare_subscriber=lambda *_: None)
+    clock = StageClock(session)  # type: ignore[arg-type]
+
+    def message(payload: bytes) -> Any:
+        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+
+    clock._status(message(b'{"state": "running", "first": 5, "tick": 7}'))
+    clock._sample(message(b"rubbish"))
+    clock._sample(message(wire.encode_samples([8], [0.008], [1.0], [2.0])))
+    assert clock.newest == 8
+
+
+def test_bad_messages_are_told_where_queries_and_samples_are_counted() -> None:
+    """Of both: a service that counts the queries alone has not told of the samples."""
+    for names, told in ((("queries.errors", "samples.malformed"), True), (("queries.errors",), False)):
+        ledger = healthy()
+        ledger.faults[0].kind = "bad_queries"
+        for t_s, _, counters in ledger.counters:
+            for name in names:
+                counters[name] = 5.0 if t_s > 10.0 else 0.0  # type: ignore[index]
+        settle(ledger)
+        assert bool(ledger.faults[0].told) is told

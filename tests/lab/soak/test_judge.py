@@ -1,0 +1,296 @@
+"""The judge of a soak, and the track that it judges from: every invariant is broken by what it is there for."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from lab.soak.faults.catalogue import KINDS
+from lab.soak.faults.plan import make_plan
+from lab.soak.processes.control import Control
+from lab.soak.run import _excused
+from lab.soak.verdict.judge import TRACKING_PCT
+from lab.soak.verdict.ledger import Happened, Ledger, Row, flat, probe_of
+from lab.soak.verdict.outcome import verdict_line
+from lab.soak.verdict.report import report
+from lab.soak.verdict.settling import settle
+from lab.soak.verdict.track import Track
+from service.protocol.samples import SampleBatch
+from tests.lab.soak.soaked import broken, healthy, verdict
+
+CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
+
+
+def batch(first: int, u_V: list[float], y_um: list[float]) -> SampleBatch:
+    seq = np.arange(first, first + len(u_V), dtype=np.int64)
+    return SampleBatch(seq, seq * 1e-3, np.array(u_V), np.array(y_um))
+
+
+def test_track_measures_errors_steps_and_holds() -> None:
+    now = 0.0
+    track = Track(CONTROL, lambda: now)
+    track.want(0, np.array([1.0, 2.0, 3.0, 4.0]))
+    track.command(0, np.array([0.0, 1.0, 1.5]))
+    track.take(batch(0, [0.0, 1.0], [1.5, 2.0]))
+    track.take(batch(2, [1.5, 1.5], [math.nan, 3.0]))
+    track.take(batch(2, [9.0], [3.0]))
+    now = 1.5
+    track.take(batch(6, [11.0, math.nan], [0.0, 0.0]))
+    first, second = track.seconds
+    assert (first.samples, first.judged, first.held, track.repeated) == (5, 4, 2, 1)
+    assert first.error_sum_um == pytest.approx(0.5 + 0.0 + 1.0 + 0.0)
+    assert first.step_max_V == pytest.approx(1.0), "neither the repeated sample nor the gap makes a step"
+    assert second.beyond_V == pytest.approx(1.0)
+    assert second.not_finite == 1
+    assert track.seen.spans == [(0, 4), (6, 8)]
+
+
+def test_a_healthy_run_holds_and_has_the_promised_form() -> None:
+    found = verdict(healthy())
+    assert broken(found) == set()
+    assert found["verdict"] == "held"
+    assert list(found) == [
+        "verdict", "not_judged", "duration_s", "faults", "invariants", "latency", "memory_slope_kb_per_hour", "samples"
+    ]  # fmt: skip
+    assert list(found["latency"]) == ["p50_us", "p99_us", "p999_us", "echo_p50_us", "echo_p99_us"]
+    assert found["faults"]["gap"]["told_by"] == ["samples.lost"]
+    assert found["faults"]["gap"]["worst_recovery_s"] == pytest.approx(0.9, abs=1.0)
+    assert found["invariants"]["tracking"]["worst"] == pytest.approx(100 * 0.03 / 76.0, rel=1e-3)
+    json.dumps(found, allow_nan=False)
+
+
+def spoil(ledger: Ledger, what: str) -> None:
+    second = ledger.seconds[30]
+    if what == "voltages_finite":
+        second.not_finite = 1
+    elif what == "voltages_within_limits":
+        second.beyond_V = 0.01
+    elif what == "voltages_within_slew":
+        second.step_max_V = 4.1
+    elif what == "answers_safe":
+        ledger.probes[5].unsafe = 1
+    elif what == "queries_answered":
+        ledger.probes[30].silent_s = 0.4
+    elif what == "follower_age":
+        ledger.probes[30].ages_s = [0.3]
+    elif what == "answered_again":
+        ledger.probes[11].silent_s = 2.0
+    elif what == "recovers_by_itself":
+        for late in ledger.seconds[12:25]:
+            late.error_sum_um = 1000.0
+    elif what == "faults_told":
+        for _, _, counters in ledger.counters:
+            counters["samples.received"] += counters["samples.lost"]
+            counters["samples.gates.learnt"] = counters["samples.received"]
+            counters["samples.lost"] = 0.0
+    elif what == "samples_accounted":
+        ledger.counters[30][2]["samples.gates.learnt"] -= 100.0
+    elif what == "processes_alive":
+        ledger.ended.append((3.0, "viewer"))
+    elif what == "tracking":
+        for late in ledger.seconds[20:]:
+            late.error_sum_um = 1000.0 * 2.0 * TRACKING_PCT / 100.0 * 76.0
+    elif what == "memory":
+        t = np.arange(0.0, 900.0, 1.0)
+        ledger.memory["a"] = [(float(s), 200_000.0 + 60.0 * s, 17) for s in t]
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["voltages_finite", "voltages_within_limits", "voltages_within_slew", "answers_safe", "queries_answered",
+     "answered_again", "follower_age", "recovers_by_itself", "faults_told", "samples_accounted",
+     "processes_alive", "tracking", "memory"],
+)  # fmt: skip
+def test_every_invariant_is_broken_by_what_it_is_there_for(what: str) -> None:
+    ledger = healthy()
+    spoil(ledger, what)
+    found = verdict(ledger)
+    assert what in broken(found)
+    assert found["verdict"] == "broken"
+
+
+def late_machine(ledger: Ledger, late_s: float, others: float = 0.0) -> Ledger:
+    ledger.bare = [(k + 0.95, late_s) for k in range(int(ledger.duration_s))]
+    ledger.others = [(k + 0.95, others) for k in range(int(ledger.duration_s))]
+    return ledger
+
+
+def test_a_fault_of_which_there_was_no_time_to_tell_is_not_judged() -> None:
+    for duration_s, held in ((17.9, True), (18.1, False)):
+        ledger = healthy()
+        spoil(ledger, "faults_told")
+        ledger.duration_s = duration_s
+        told = verdict(ledger)["invariants"]["faults_told"]
+        assert told["held"] is held
+        assert ("1 of 1 not judged: the run was over" in told["text"]) is held
+
+
+@pytest.mark.parametrize(("late_s", "held"), [(0.001, False), (0.02, True)])
+def test_on_a_busy_machine_a_fault_is_told_of_later(late_s: float, held: bool) -> None:
+    ledger = late_machine(healthy(), late_s)
+    for _, _, counters in ledger.counters[:20]:
+        lost, counters["samples.lost"] = counters["samples.lost"], 0.0
+        counters["samples.received"] += lost
+        counters["samples.gates.learnt"] = counters["samples.received"]
+    assert verdict(ledger)["invariants"]["faults_told"]["held"] is held
+
+
+@pytest.mark.parametrize(("late_s", "silent_s", "held"), [(0.001, 0.3, False), (0.02, 0.3, True), (0.02, 0.5, False)])
+def test_a_time_is_judged_beside_that_of_the_bare_loop(late_s: float, silent_s: float, held: bool) -> None:
+    ledger = late_machine(healthy(), late_s)
+    ledger.probes[30].silent_s = silent_s
+    assert verdict(ledger)["invariants"]["queries_answered"]["held"] is held
+
+
+@pytest.mark.parametrize(("late_s", "others"), [(0.2, 0.0), (0.001, 0.9)])
+def test_what_a_machine_that_stood_still_shows_is_not_judged(late_s: float, others: float) -> None:
+    ledger = late_machine(healthy(), late_s, others)
+    ledger.probes[30].silent_s = 5.0
+    for second in ledger.seconds[12:]:
+        second.error_sum_um = 1000.0
+        second.held = 1
+    found = verdict(ledger)
+    assert [name for name, said in found["invariants"].items() if said["held"] is None] == [
+        "queries_answered",
+        "answered_again",
+        "follower_age",
+        "recovers_by_itself",
+        "memory",
+        "memory_resident",
+    ]
+    assert found["not_judged"] == [name for name, said in found["invariants"].items() if said["held"] is None]
+    assert "not judged" in found["invariants"]["queries_answered"]["text"]
+    assert found["verdict"] == "held"
+    # What is not about time is judged as ever.
+    ledger.seconds[30].beyond_V = 0.01
+    assert verdict(ledger)["verdict"] == "broken"
+
+
+def test_a_snapshot_that_is_followed_may_be_old_during_a_fault_and_as_late_as_the_machine() -> None:
+    ledger = healthy()
+    for probe in ledger.probes[11:14]:
+        probe.ages_s = [5.0]
+    ledger = late_machine(ledger, 0.01)
+    for probe in ledger.probes[20:]:
+        probe.ages_s = [0.12]
+    found = verdict(ledger)["invariants"]["follower_age"]
+    assert (found["held"], found["worst"], found["limit"]) == (True, pytest.approx(0.04), 0.05)
+    # One look in a hundred may be worse.
+    ledger = late_machine(healthy(240), 0.0)
+    ledger.probes[200].ages_s = [0.4, 0.01]
+    assert verdict(ledger)["invariants"]["follower_age"]["held"] is True
+    for probe in ledger.probes[200:210]:
+        probe.ages_s = [0.4, 0.01]
+    assert verdict(ledger)["invariants"]["follower_age"]["worst"] == pytest.approx(0.4)
+    assert "follower_age" in broken(verdict(ledger))
+    # A second that began before the run, when no samples came yet, says nothing of it.
+    early = late_machine(healthy(), 0.0)
+    early.probes[0].ages_s = [0.6] * 100
+    assert verdict(early)["invariants"]["follower_age"]["held"] is True
+    early.probes[2].ages_s = [0.6] * 100
+    assert "follower_age" in broken(verdict(early))
+    # Where others have the processor a learner waits for it, though a loop that only wakes up does not.
+    assert "follower_age" in verdict(late_machine(ledger, 0.001, 0.3))["not_judged"]
+
+
+def test_what_a_run_does_not_tell_is_named_with_the_reason() -> None:
+    found = verdict(healthy())
+    assert (found["verdict"], found["not_judged"]) == ("held", ["memory", "memory_resident"])
+    assert found["invariants"]["memory"]["held"] is None
+    assert verdict_line(found) == "held; not judged: memory (too short a run), memory_resident (too short a run)"
+    ledger = healthy()
+    ledger.seconds[30].sent_step_V = 9.0
+    for second in ledger.seconds:
+        second.held = 1
+    line = verdict_line(verdict(ledger))
+    assert line.startswith("broken; not judged: tracking (no such second), memory (too short a run)")
+    plan = make_plan(40.0, 1, ("gap",))
+    assert report(verdict(ledger), ledger, plan, [], False).startswith(f"# Soak: {line}\n")
+    assert verdict_line({"verdict": "held", "not_judged": [], "invariants": {}}) == "held"
+    # Where every second is one of a fault nobody can say how soon queries are answered without one.
+    ledger.faults = [Happened("gain", 0.0, 30.0)]
+    assert {"queries_answered", "follower_age"} <= set(verdict(ledger)["not_judged"])
+
+
+@given(
+    starts=st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 20.0), st.sampled_from(sorted(KINDS))), max_size=8),
+    t_s=st.floats(-5.0, 400.0),
+)
+@example(starts=[(5.0, 0.0, "gain"), (0.5, 0.1, "bad_queries")], t_s=14.0)
+def test_a_time_is_quiet_where_no_fault_is_near(starts: list[tuple[float, float, str]], t_s: float) -> None:
+    ledger, at_s = healthy(), 0.0
+    ledger.faults = []
+    for pause_s, lasts_s, kind in starts:
+        ledger.faults.append(Happened(kind, at_s + pause_s, at_s + pause_s + lasts_s))
+        at_s += pause_s + lasts_s
+    windows = [fault.window_s for fault in ledger.faults]
+    assert ledger.quiet(t_s) is not any(begin - 1.0 <= t_s <= end for begin, end in windows)
+
+
+def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
+    ledger = healthy()
+    for second in ledger.seconds[36:]:
+        second.error_sum_um = 1000.0
+    ledger.faults.append(Happened("gap", 36.0, 38.5))
+    found = verdict(ledger)
+    assert found["invariants"]["recovers_by_itself"]["held"] is True
+    assert "1 of 2 faults not judged" in found["invariants"]["recovers_by_itself"]["text"]
+    ledger = healthy()
+    for second in ledger.seconds[32:]:
+        second.error_sum_um = 1000.0
+    ledger.faults.append(Happened("gap", 32.0, 33.0))
+    assert "recovers_by_itself" in broken(verdict(ledger))
+
+
+def test_a_silence_belongs_to_the_fault_that_made_it() -> None:
+    ledger = healthy()
+    ledger.faults.append(Happened("restart_router", 16.0, 16.3))
+    ledger.probes[16].silent_s = 2.7
+    settle(ledger)
+    assert [fault.silent_s for fault in ledger.faults] == [0.02, 2.7]
+
+
+def test_a_plan_of_which_nothing_happened_proves_nothing() -> None:
+    ledger = healthy()
+    ledger.faults = []
+    ledger.planned = 3
+    assert "faults_happened" in broken(verdict(ledger))
+
+
+def test_a_lost_record_breaks_the_run() -> None:
+    assert broken(verdict(healthy(), missing=1)) == {"no_record_lost"}
+
+
+def test_what_was_seen_just_before_the_router_went_proves_nothing() -> None:
+    """The second in which 640 samples never came has fewer samples than numbers; all its numbers are excused."""
+    ledger = healthy()
+    first = 0
+    for k, second in enumerate(ledger.seconds):
+        first += 1640 if k == 10 else 1000
+        second.seq = first - 1
+    ledger.faults = [Happened("restart_router", 10.4, 10.5)]
+    ((start, stop),) = _excused(ledger).spans
+    # From what was not written yet before the fault to the end of the time in which all must be well again.
+    assert start == 9_000
+    assert stop == 10_000 + 1640 + 1000 * (math.floor(10.5 + KINDS["restart_router"].recover_s) - 10)
+    ledger.faults = [Happened("gap", 10.4, 10.5)]
+    assert len(_excused(ledger)) == 0
+
+
+def test_status_is_flattened() -> None:
+    told = {"seq": 5, "samples": {"received": 6, "gates": {"learnt": 4}}, "recorder": None, "stage": "x"}
+    assert flat(told) == {"samples.received": 6.0, "samples.gates.learnt": 4.0, "seq": 5.0, "serves": 1.0}
+
+
+def test_packed_counters_are_those_that_were_given() -> None:
+    rows = [Row({"a": 1.0, "b": 2.0}), Row({"a": 3.0, "b": 4.0}), Row({"c": 5.0})]
+    assert [dict(row) for row in rows] == [{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 4.0}, {"c": 5.0}]
+    assert rows[2].get("a", 0.0) == 0.0
+    probe = probe_of({"service_us": [1.5], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.1, "ages_s": [0.5],
+                      "error": ""}, 3.0)  # fmt: skip
+    assert (list(probe.service_us), len(probe.echo_us), probe.t_s) == ([1.5], 0, 3.0)

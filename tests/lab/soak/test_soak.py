@@ -1,0 +1,264 @@
+"""The soak's parts: plans, references, intervals, faults of a stage, what others take of the processor."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError
+from lab.commands.soak import seconds
+from lab.soak.faults.catalogue import KINDS
+from lab.soak.faults.plan import TAIL_S, WARM_S, known_kinds, make_plan
+from lab.soak.processes.control import Control
+from lab.soak.processes.machine import Others, taken_s
+from lab.soak.reference import PERIOD_S, SoakReference
+from lab.soak.verdict.track import Intervals
+from service.stage_node.faults import Fault, Injector, decode_fault
+
+CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
+
+
+# ---- the plan
+
+
+@given(seed=st.integers(0, 2**31), duration_s=st.floats(15.0, 4000.0))
+@settings(max_examples=30, deadline=None)
+def test_faults_follow_one_another_with_time_to_recover(seed: int, duration_s: float) -> None:
+    plan = make_plan(duration_s, seed, tuple(KINDS))
+    assert plan == make_plan(duration_s, seed, tuple(KINDS))
+    last = WARM_S
+    for fault in plan.faults:
+        assert fault.at_s >= last
+        low, high = KINDS[fault.kind].duration_s
+        assert low <= fault.duration_s <= high + 1e-3
+        last = fault.window_s[1]
+    assert not plan.faults or last <= duration_s - TAIL_S
+    assert set(plan.left_out) | {fault.kind for fault in plan.faults} == set(KINDS)
+
+
+def test_what_ends_a_service_comes_early_in_a_long_run() -> None:
+    plan = make_plan(1800.0, 1, tuple(KINDS))
+    assert not plan.left_out
+    ends = [fault.at_s for fault in plan.faults if KINDS[fault.kind].ends_service]
+    assert len(ends) >= 4
+    assert max(ends) <= 0.4 * 1800.0
+    assert make_plan(1800.0, 2, tuple(KINDS)).faults != plan.faults
+    gains = [fault.value for fault in plan.faults if fault.kind == "gain"]
+    assert gains[0] < 0.0 == gains[1], "there and back again"
+
+
+def test_unknown_kinds_and_odd_durations_are_refused() -> None:
+    with pytest.raises(InputError, match="--faults: got 'fire', expected none, or some of: kill_primary"):
+        known_kinds(["nan", "fire"])
+    assert known_kinds([]) == tuple(KINDS)
+    asked = {"90s": 90.0, "30m": 1800.0, "2h": 7200.0, "3d": 259_200.0, "45": 45.0}
+    assert {text: seconds(text) for text in asked} == asked
+    for text in ("3s", "abc", "10x", "1e9h", ""):
+        with pytest.raises(InputError, match="--duration: got"):
+            seconds(text)
+
+
+# ---- the reference
+
+
+@given(first=st.integers(0, 300_000), start=st.integers(1000, 200_000), ticks=st.integers(1500, 6000))
+@settings(max_examples=25, deadline=None)
+def test_reference_repeats_rests_and_its_derivatives_belong_together(first: int, start: int, ticks: int) -> None:
+    reference = SoakReference(1e-3, 4.0, 80.0, 3, [(start, ticks)])
+    for at in (first, start - 200, start + ticks - 500, round(PERIOD_S / 1e-3) - 300):
+        y, v, a = reference.rows(at, 1200)
+        assert y.min() >= 4.0 - 1e-9
+        assert y.max() <= 80.0 + 1e-9
+        np.testing.assert_allclose(np.gradient(y, 1e-3)[1:-1], v[1:-1], atol=0.5)
+        np.testing.assert_allclose(np.gradient(v, 1e-3)[1:-1], a[1:-1], atol=60.0)
+    rest = reference.rows(start + 650, ticks - 1300)
+    np.testing.assert_allclose(rest[0], 42.0, atol=1e-9)
+    plain = SoakReference(1e-3, 4.0, 80.0, 3)
+    np.testing.assert_array_equal(plain.rows(5, 100), plain.rows(5 + round(PERIOD_S / 1e-3), 100))
+
+
+# ---- which numbers were seen
+
+
+@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 12)), max_size=25), st.sets(st.integers(0, 70)))
+def test_intervals_are_a_set_of_integers(parts: list[tuple[int, int]], others: set[int]) -> None:
+    found, expected = Intervals(), set()
+    for start, n in parts:
+        found.add(start, start + n)
+        expected |= set(range(start, start + n))
+    assert {k for a, b in found.spans for k in range(a, b)} == expected
+    assert len(found) == len(expected)
+    assert all(b < c for (_, b), (c, _) in zip(found.spans, found.spans[1:], strict=False))
+    other = Intervals()
+    other.add_all(np.array(sorted(others, reverse=True), dtype=np.int64))
+    assert {k for a, b in other.spans for k in range(a, b)} == others
+    assert {k for a, b in found.minus(other) for k in range(a, b)} == expected - others
+
+
+# ---- faults of a stage
+
+
+def rows(first: int, n: int) -> Any:
+    seq = np.arange(first, first + n, dtype=np.int64)
+    return seq, seq * 1e-3, np.full(n, 1.0), seq * 0.1
+
+
+def test_readings_lie_for_as_long_as_they_are_told_to() -> None:
+    injector = Injector(1e-3, lambda _: None)
+    said = {}
+    for kind, value in (("nan", 0.0), ("freeze", 0.0), ("saturate", 2.5), ("offset", 7.0)):
+        injector.add(Fault(kind, 0.01, value))
+        said[kind] = np.array([injector.reading(k, 0.1 * k) for k in range(100, 120)])
+        for k in range(120, 122):
+            assert injector.reading(k, 5.0) == 5.0, kind
+        injector = Injector(1e-3, lambda _: None)
+        injector.reading(99, 9.9)
+    honest = 0.1 * np.arange(100, 120)
+    assert np.isnan(said["nan"][:10]).all()
+    np.testing.assert_array_equal(said["nan"][10:], honest[10:])
+    np.testing.assert_array_equal(said["freeze"], [*[9.9] * 10, *honest[10:]])
+    np.testing.assert_array_equal(said["saturate"], [*[2.5] * 10, *honest[10:]])
+    np.testing.assert_allclose(said["offset"], [*(honest[:10] + 7.0), *honest[10:]])
+    injector.add(Fault("spike", 0.1, 30.0))
+    spiky = np.array([injector.reading(k, 0.0) for k in range(200, 400)])
+    assert np.count_nonzero(spiky == 30.0) == 4
+    assert injector.counts["spike"] == 4
+
+
+def test_deliveries_are_withheld_repeated_and_exchanged() -> None:
+    def sent(kind: str, value: float = 0.0) -> tuple[list[int], list[float], Injector]:
+        injector = Injector(1e-3, lambda _: None)
+        injector.add(Fault(kind, 0.012, value))
+        injector.reading(4, 0.0)
+        messages = [m for first in range(0, 30, 5) for m in injector.deliver(rows(first, 5))] + injector.flush()
+        return (
+            [int(k) for m in messages for k in m[0]],
+            [float(t) for m in messages for t in m[1]],
+            injector,
+        )
+
+    every = list(range(30))
+    seq, _, injector = sent("gap")
+    assert seq == [k for k in every if not 4 <= k < 16]
+    assert injector.counts["gap"] == 12
+    seq, _, _ = sent("duplicate")
+    assert sorted(set(seq)) == every
+    assert len(seq) == 30 + 20, "the four messages that the fault touches"
+    seq, _, _ = sent("reorder")
+    assert sorted(seq) == every
+    assert seq != every
+    seq, t_s, _ = sent("clock", -3600.0)
+    assert seq == every
+    assert [k for k, t in zip(seq, t_s, strict=True) if t < 0.0] == list(range(4, 16))
+
+
+def test_a_change_is_made_once_and_a_bad_one_is_counted() -> None:
+    changes: list[dict[str, float]] = []
+
+    def apply(values: dict[str, float]) -> None:
+        if "nothing" in values:
+            raise InputError("nothing: unknown")
+        changes.append(values)
+
+    injector = Injector(1e-3, apply)
+    injector.receive(b'{"fault": "change", "values": {"gain_drift.gain": -0.05}}')
+    injector.receive(b'{"fault": "change", "values": {"nothing": 1}}')
+    for k in range(5):
+        injector.reading(k, 0.0)
+    assert changes == [{"gain_drift.gain": -0.05}]
+    assert injector.counts["refused"] == 1
+    assert "unknown" in injector.error
+
+
+@pytest.mark.parametrize(
+    ("payload", "named"),
+    [
+        (b"\xff", "payload"),
+        (b"[1]", "payload"),
+        (b'{"fault": "fire"}', "fault"),
+        (b'{"fault": "nan"}', "duration_s"),
+        (b'{"fault": "nan", "duration_s": -1}', "duration_s"),
+        (b'{"fault": "nan", "duration_s": 1, "value": "x"}', "value"),
+        (b'{"fault": "change"}', "values"),
+        (b'{"fault": "change", "values": {"a": true}}', "values.a"),
+    ],
+)
+def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
+    with pytest.raises(InputError, match=f"^{named}: got"):
+        decode_fault(payload)
+
+
+def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> None:
+    others = Others()
+    assert others.share({1: 0.0}) is None, "a moment ago"
+    time.sleep(0.25)
+    assert others.share({1: 0.0}) is None, "the first look only begins"
+    time.sleep(0.25)
+    assert others.share({1: 1e6}) == 0.0, "all of it was one's own"
+    until = time.monotonic() + 0.3
+    while time.monotonic() < until:
+        pass
+    share = others.share({1: 1e6})
+    assert share is not None
+    assert 0.0 < share <= 1.0, "this very loop is none of them"
+
+
+#: Uses up 0.4 s of processor (told in hundredths), tells when it has, and ends when told to.
+CHILD = """
+import sys, time
+while time.process_time() < 0.4:
+    pass
+print("burnt", flush=True)
+sys.stdin.readline()
+"""
+#: Has such a child, and reaps it when told to.
+PARENT = f"""
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", {CHILD!r}], stdin=subprocess.PIPE, text=True, start_new_session=True)
+sys.stdin.readline()
+child.communicate("")
+print("reaped", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_what_a_process_has_begun_is_its_own_while_it_lives_and_after() -> None:
+    """A service diagnoses and draws in processes of their own: taken for others, its own work would excuse it."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdin=pipe, stdout=pipe, text=True) as parent:
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "burnt\n"
+        living = taken_s([parent.pid, os.getpid()])
+        assert living[parent.pid] >= 0.3
+        (child,) = psutil.Process(parent.pid).children()
+        apart = taken_s([parent.pid, child.pid])
+        assert apart[child.pid] >= 0.3
+        assert apart[parent.pid] < living[parent.pid], "one that is a root itself is not counted twice"
+        parent.stdin.write("\n")
+        parent.stdin.flush()
+        assert parent.stdout.readline() == "reaped\n"
+        # In ticks of a hundredth: sums of the same ticks in another order differ in the last bit.
+        alive, reaped = (round(100.0 * took[parent.pid]) for took in (living, taken_s([parent.pid])))
+        assert alive <= reaped < alive + 30
+    before = taken_s([os.getpid()])[os.getpid()]
+    assert before == pytest.approx(sum(psutil.Process().cpu_times()[:2]), abs=0.2), "none that it has outlived"
+    assert parent.pid not in taken_s([parent.pid])
+
+
+def test_control_goes_through_its_file(tmp_path: Path) -> None:
+    CONTROL.write(tmp_path / "c.json")
+    assert Control(**json.loads((tmp_path / "c.json").read_text())) == CONTROL
+    assert replace(CONTROL, seed=4) != CONTROL

@@ -1,0 +1,227 @@
+"""What the re-tuning costs those who answer: its process has the lowest priority, the learner only copies."""
+
+from __future__ import annotations
+
+import os
+import time
+import weakref
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.tuning import proposal as retune
+from adaptive.tuning.config import RetuneConfig
+from adaptive.tuning.samples import Hyperparameters, WindowData
+from adaptive.types import FloatArray
+from service.answers.guard import Limits
+from service.background.retuning.job import Job, pack
+from service.background.retuning.retuner import Retuner
+from service.background.retuning.settings import RetuningConfig
+from service.background.retuning.worker import tuned
+from service.config.config import AxisConfig
+from service.protocol.samples import SampleBatch
+from service.server import models
+from service.server.axis import Axis
+from service.storage.model_file import Bundle, BundleMeta
+from sim.signals.signals import multitone, training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT_S, BLOCK = 1e-3, 20
+NARROW = Hyperparameters(1e5, (0.12, 0.12))
+
+
+def window_data(n: int, seed: int = 1) -> WindowData:
+    """A smooth target of two inputs, V, with kernels far too narrow for it."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1.0, 1.0, (n, 2))
+    target_V = 0.1 * np.sin(3.0 * X[:, 0]) + 0.05 * np.tanh(4.0 * X[:, 1]) + 0.7 + 0.004 * rng.normal(size=n)
+    return WindowData(X, target_V, np.ones(n), np.arange(n, 0, -1.0) - 1.0, NARROW)
+
+
+def order(search: RetuneConfig, torch: bool = False) -> dict[str, Any]:
+    return {"kind": "propose", "search": asdict(search), "torch": torch}
+
+
+# ---- the process
+
+
+def test_the_working_process_has_the_lowest_priority_and_one_thread() -> None:
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    job = Job(order(RetuneConfig(starts=8, rows=300)), pack("before", window_data(300)), 120.0)
+    seen: list[int] = []
+    environment: dict[str, str] = {}
+    try:
+        until = time.monotonic() + 60.0
+        while job.running and time.monotonic() < until:
+            if job._process is not None and job._process.poll() is None:
+                try:
+                    process = psutil.Process(job._process.pid)
+                    seen.append(process.nice())
+                    environment = process.environ() or environment  # one that is ending has none any more
+                    group = Path(f"/proc/{process.pid}/autogroup")
+                    session = group.read_text() if group.exists() else ""
+                except (psutil.Error, OSError):  # it has just ended, and its result is on its way
+                    pass
+            time.sleep(0.01)
+    finally:
+        job.cancel()
+    assert seen, "the process was never seen"
+    assert seen[-1] == 19
+    # It is so before anything heavy: nearly all of its life.
+    assert np.mean([nice == 19 for nice in seen]) > 0.5
+    assert os.getpriority(os.PRIO_PROCESS, 0) == own < 19
+    # Elsewhere than on Linux, or where it does not share by sessions, there is nothing to tell.
+    assert not session or session.strip().endswith("nice 19")
+    for library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
+        assert environment[f"{library}_NUM_THREADS"] == "1"
+    assert job.result is not None
+    assert "error" not in job.result
+    assert job.result["changed"] is True
+    assert job.result["J2"] < job.result["J2_before"] - 100.0
+
+
+def test_torch_gives_the_starts_where_it_is_wanted_and_installed() -> None:
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    threads = torch.get_num_threads()
+    arrays = pack("before", window_data(80))
+    search = RetuneConfig(starts=2, rows=60, iterations=15)
+    try:
+        with_torch = tuned(order(search, torch=True), arrays)
+        # A working process has one thread, torch's own pool included.
+        assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(threads)
+    without = tuned(order(search), arrays)
+    assert with_torch["search"].startswith("torch on ")
+    assert without["search"] == "starts around the present"
+    assert with_torch["changed"] is True
+    assert with_torch["J2"] < with_torch["J2_before"] - 30.0
+    # Where both find the same basin they agree; torch's starts lead to none that is worse.
+    assert with_torch["J2"] <= without["J2"] + 0.1
+
+
+# ---- the thread that learns
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[FloatArray, FloatArray, int]:
+    """(u_V, y_um, number of samples to identify by) on the rich stage at 1 kHz: training signal, then tones."""
+    stage = Stage(preset("rich", seed=4))
+    tones = multitone(6.0, DT_S, seed=4)[1]
+    tones[:500] *= np.linspace(0.0, 1.0, 500)
+    u_V = np.concatenate([training_input(DT_S, 6.0)[1], tones])
+    return u_V, np.asarray(stage.run(stage.initial_state(), u_V)[0]), 6000
+
+
+@pytest.fixture(scope="module")
+def axis(recorded: tuple[FloatArray, FloatArray, int]) -> Axis:
+    """An axis with a full window of 500 and nothing beside the learner, which is the cheapest there is."""
+    u_V, y_um, n = recorded
+    model = identify_lssvm(u_V[:n], y_um[:n], DT_S, config=IdentifyConfig(tune=False, n=500))[0]
+    config = AxisConfig("x", Path("x.npz"), Limits(-2.0, 10.0, 4000.0), compete=())
+    return models.load_axis("demo", config, bundle=Bundle({"lssvm_adaptive": model}, BundleMeta("demo", "x", DT_S)))
+
+
+class Working:
+    """Stands in for a job: the first proposes at once, the trial is never done."""
+
+    made = 0
+
+    def __init__(self, given: dict[str, Any], arrays: dict[str, FloatArray], timeout_s: float) -> None:
+        Working.made += 1
+        self.result = {"changed": True, "gamma": 50.0, "widths": [2.0] * 5} if given["kind"] == "propose" else None
+
+    def cancel(self) -> None: ...
+
+
+@pytest.fixture
+def retuner(monkeypatch: pytest.MonkeyPatch) -> Iterator[Retuner]:
+    Working.made = 0
+    monkeypatch.setattr("service.background.retuning.retuner.Job", Working)
+    made = Retuner(RetuningConfig(period_s=0.0, fresh=100))
+    yield made
+    made.close()
+
+
+def test_one_that_stands_down_lets_go_of_its_learner(retuner: Retuner) -> None:
+    """It takes the state of the one that serves: two learners are megabytes that nobody needs."""
+
+    class Teaching:
+        seq = 5000
+
+        def counters(self) -> dict[str, int]:
+            return {"learnt": 900}
+
+        def window_data(self) -> WindowData:
+            return window_data(50)
+
+    axis: Any = SimpleNamespace(dt_s=DT_S, learner=Teaching(), learning=True, frozen=False)
+    retuner.request({})
+    retuner.step(axis)
+    assert retuner.status()["state"] == "proposing"
+    before = weakref.ref(axis.learner)
+    axis.learner = Teaching()
+    retuner.leave()
+    assert before() is None
+    # Serving again it drops what was under way, and can begin anew.
+    retuner.step(axis)
+    assert (retuner.status()["state"], retuner.status()["dropped"]) == ("idle", 1)
+    assert retuner.request({})["started"] is True
+
+
+def test_the_thread_that_learns_only_copies(
+    axis: Axis, recorded: tuple[FloatArray, FloatArray, int], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """200 steps from the proposal through the wait for fresh samples into the trial: a few copies of the window."""
+
+    def forbidden(*_: Any, **__: Any) -> Any:
+        raise AssertionError("computed in the thread that learns")
+
+    for name in ("propose", "compare"):
+        monkeypatch.setattr(retune, name, forbidden)
+    learner: Any = axis.learner
+    copy, copies = learner.window_data, []
+
+    def counted() -> WindowData:
+        copies.append(learner.seq)
+        data: WindowData = copy()
+        return data
+
+    monkeypatch.setattr(learner, "window_data", counted)
+    u_V, y_um, n = recorded
+    states, learnt_s, steps_s = [], 0.0, []
+    for block in range(250):
+        k = np.arange(block * BLOCK, (block + 1) * BLOCK)
+        begin_s = time.thread_time()
+        axis.handle(SampleBatch(k, k * DT_S, u_V[n + k], y_um[n + k]))
+        learnt_s += time.thread_time() - begin_s if block >= 50 else 0.0
+        if block < 50:
+            continue
+        if block == 50:
+            retuner.request({})
+        begin_s = time.thread_time()
+        retuner.step(axis)
+        steps_s.append(time.thread_time() - begin_s)
+        states.append(retuner.status()["state"])
+    assert len(steps_s) == 200
+    # All of its states were gone through: what follows is no measurement of doing nothing.
+    assert list(dict.fromkeys(states)) == ["proposing", "waiting for fresh samples", "trying"]
+    assert (Working.made, retuner.status()["started"]) == (2, 1)
+    # The window is looked at every quarter of a second of samples at most, and not at all while others work.
+    waited = states.count("waiting for fresh samples") * BLOCK
+    assert 2 <= len(copies) <= 2 + waited // 250
+    assert min(np.diff(copies)) >= 250
+    assert copies[-1] == 1000 + (states.index("trying") + 1) * BLOCK - 1
+    total_s = sum(steps_s)
+    assert total_s < 0.05 * learnt_s, f"{1e3 * total_s:.1f} ms beside {1e3 * learnt_s:.1f} ms of learning"
+    assert np.median(steps_s) < 100e-6
+    # The dearest is a copy with its bytes to compare: a fraction of what a block of samples lasts.
+    assert max(steps_s) < 0.25 * BLOCK * DT_S

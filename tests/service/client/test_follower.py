@@ -1,0 +1,176 @@
+"""A followed model tells of each voltage what the service would: flags, deviation, and which model it came from."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from baselines.competition.champion import ChampionInverse
+from service.answers.guard import Limits
+from service.client.follower import Follower
+from service.config.config import AxisConfig
+from service.protocol.model import Safety, decode_model, encode_model
+from service.protocol.query import FeedforwardQuery
+from service.protocol.reply import (
+    BLENDED,
+    LIMITED_SLEW,
+    LIMITED_VOLTAGE,
+    NOT_FINITE_REPLACED,
+    OUTSIDE_DOMAIN,
+    STALE,
+    STAND_IN,
+    FeedforwardReply,
+)
+from service.server.axis import Axis
+from tests.service.conftest import make_models
+
+LIMITS = Limits(0.0, 7.0, 2000.0, -50.0, 150.0)
+
+
+class Session:
+    """A session on which nothing is sent: what is published here is handed over by the test."""
+
+    def declare_subscriber(self, key: str, heard: Any) -> Any:
+        self.heard = heard
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def publish(self, payload: bytes) -> None:
+        self.heard(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
+
+
+def make_axis(served: str = "lssvm_adaptive") -> Axis:
+    return Axis(AxisConfig("x", Path("x.npz"), LIMITS, served=served, learn=""), make_models(), None, LIMITS)
+
+
+def payload_of(axis: Axis, name: str) -> bytes:
+    model, seq, memory = axis.model(name)
+    return encode_model(name, model, seq, memory, axis.safety(name))
+
+
+def one_by_one(axis: Axis, name: str, motion: tuple[FloatArray, FloatArray]) -> tuple[Follower, list[Any]]:
+    """What the follower tells of each of the points, and what the service answers to them all."""
+    follower = Follower(Session(), None, name, lambda: payload_of(axis, name), LIMITS)  # type: ignore[arg-type]
+    told = []
+    for y_um, v_um_per_s in zip(*(column.tolist() for column in motion), strict=True):
+        u_V = follower.point(y_um, v_um_per_s)
+        told.append((u_V, follower.last_flags, follower.last_std_V, follower.source))
+    return follower, told
+
+
+def asked(axis: Axis, name: str, motion: tuple[FloatArray, FloatArray]) -> FeedforwardReply:
+    return axis.answer(FeedforwardQuery(*motion, np.zeros(motion[0].size), model=name))
+
+
+#: From within the learnt domain through all of the blend to the stand-in alone; and from one end of the range, where
+#: the voltage limit lies, to the other faster than the slew limit.
+MOTIONS = {
+    "out of the domain": (np.full(60, 40.0), np.linspace(0.0, 70_000.0, 60)),
+    "against the limits": (np.array([20.0, 20.0, 89.0, 89.0, 89.0, 3.0, 3.0, 60.0]), np.zeros(8)),
+    "beyond the range": (np.linspace(60.0, 140.0, 50), np.zeros(50)),
+}
+#: What must have happened on the way, by model and motion; a line has no bounds of its own in velocity.
+EXPECTED = {
+    ("lssvm_adaptive", "out of the domain"): OUTSIDE_DOMAIN | BLENDED | STAND_IN,
+    ("lssvm_adaptive", "against the limits"): LIMITED_VOLTAGE | LIMITED_SLEW,
+    ("lssvm_adaptive", "beyond the range"): OUTSIDE_DOMAIN | BLENDED,
+    ("linear", "out of the domain"): 0,
+    ("linear", "against the limits"): LIMITED_VOLTAGE | LIMITED_SLEW,
+    ("linear", "beyond the range"): OUTSIDE_DOMAIN | LIMITED_VOLTAGE,
+}
+
+
+@pytest.mark.parametrize("name", ["lssvm_adaptive", "linear"])
+@pytest.mark.parametrize("motion", list(MOTIONS))
+def test_each_point_is_flagged_as_the_service_flags_it(name: str, motion: str) -> None:
+    axis = make_axis()
+    reply = asked(axis, name, MOTIONS[motion])
+    _, told = one_by_one(axis, name, MOTIONS[motion])
+    np.testing.assert_array_equal([u for u, *_ in told], reply.u_V)
+    np.testing.assert_array_equal([flags for _, flags, *_ in told], reply.flags)
+    np.testing.assert_array_equal([std for *_, std, _ in told], reply.std_V)
+    for _, flags, _, source in told:
+        expected = "linear" if flags & STAND_IN else f"{name}+linear" if flags & BLENDED else name
+        assert source == expected
+    seen = int(np.bitwise_or.reduce(reply.flags))
+    assert seen & EXPECTED[name, motion] == EXPECTED[name, motion]
+
+
+def test_a_trajectory_leaves_all_of_its_answer_behind() -> None:
+    axis = make_axis()
+    motion = MOTIONS["out of the domain"]
+    follower, _ = one_by_one(axis, "lssvm_adaptive", (np.empty(0), np.empty(0)))
+    assert (follower.last_flags, follower.source, follower.last_trajectory) == (0, "", None)
+    assert math.isnan(follower.last_std_V)
+    u_V, flags = follower.trajectory(*motion, np.zeros(60))
+    reply, got = asked(axis, "lssvm_adaptive", motion), follower.last_trajectory
+    assert got is not None
+    assert got.u_V is u_V
+    assert got.flags is flags
+    np.testing.assert_array_equal(got.std_V, reply.std_V)
+    assert got.stand_in == reply.stand_in == "linear"
+    assert (follower.last_flags, follower.last_std_V) == (reply.flags[-1], reply.std_V[-1])
+    assert follower.source == "linear"
+
+
+def test_of_a_competition_the_champion_is_named() -> None:
+    models = make_models()
+    for index, name in enumerate(models):
+        champion = ChampionInverse(tuple(models), tuple(models.values()), index)
+        payload = encode_model("auto", champion, 5, champion.rest_memory(40.0))
+        follower = Follower(Session(), None, "auto", payload.__bytes__, LIMITS)  # type: ignore[arg-type]
+        u_V = follower.point(40.0)
+        assert follower.source == name
+        assert follower.last_std_V == models[name].feedforward(
+            np.array([40.0]), np.zeros(1), np.zeros(1), models[name].rest_memory(40.0)
+        ).std_V.item(0)
+        assert math.isfinite(u_V)
+
+
+def test_a_snapshot_that_is_no_longer_renewed_is_told_point_by_point() -> None:
+    model = make_models()["lssvm_adaptive"]
+    safety = Safety(True, stale_s=2.0, last_good_s=60.0, stand_in=None)
+    payload = encode_model("lssvm_adaptive", model, 5, model.rest_memory(40.0), safety)
+    session = Session()
+    follower = Follower(session, "key", "lssvm_adaptive", lambda: payload, LIMITS)  # type: ignore[arg-type]
+    session.publish(payload)
+    fresh = follower.point(40.0)
+    assert (follower.received, follower.stale, follower.last_flags) == (2, False, 0)
+    follower._newest = (decode_model(payload), time.monotonic() - 5.0)
+    assert follower.stale
+    assert follower.point(40.0) == pytest.approx(fresh, abs=0.1)
+    assert follower.last_flags == STALE
+    assert follower.source == "lssvm_adaptive"
+    _, flags = follower.trajectory([40.0])
+    assert flags.tolist() == [STALE]
+    session.publish(payload)
+    follower.point(40.0)
+    assert follower.last_flags == 0
+
+
+def test_what_is_refused_leaves_what_was_told_as_it_was() -> None:
+    follower, _ = one_by_one(make_axis(), "linear", (np.array([149.0, 149.0]), np.zeros(2)))
+    before = (follower.last_flags, follower.last_std_V, follower.source)
+    assert before[0] & LIMITED_VOLTAGE
+    with pytest.raises(InputError):
+        follower.point(200.0)
+    assert (follower.last_flags, follower.last_std_V, follower.source) == before
+
+
+def test_a_voltage_that_nobody_gave_has_no_source() -> None:
+    """A model whose answer is not finite, and nobody to stand in: the voltage before is held."""
+    model = make_models()["lssvm_adaptive"]
+    payload = encode_model("lssvm_adaptive", model, 5, model.rest_memory(40.0), Safety(True))
+    follower = Follower(Session(), None, "lssvm_adaptive", lambda: payload, LIMITS)  # type: ignore[arg-type]
+    held = follower.point(40.0)
+    follower.memory = np.full(model.memory_size, math.nan)
+    assert follower.point(41.0) == held
+    assert follower.last_flags & NOT_FINITE_REPLACED
+    assert follower.source == ""

@@ -1,0 +1,182 @@
+"""What is under way: a query goes on from where the samples say that the stage has been, along what was commanded."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.types import FloatArray, InverseModel
+from service.answers.fallback import FADE_S
+from service.client.answers import UNDER_WAY, Trajectory, as_trajectory, continued, extended, under_way
+from service.client.client import Client
+from service.protocol.errors import FieldError
+from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
+from service.protocol.reply import FeedforwardReply
+from tests.service.server.test_axis import make_axis, parts, recording
+
+FINITE = st.floats(-1e6, 1e6)
+
+
+@settings(deadline=None)
+@given(
+    first=st.integers(0, 2**62),
+    rows=st.lists(st.tuples(FINITE, FINITE), min_size=1, max_size=40),
+    model=st.sampled_from(["", "mpi", "größe"]),
+    n=st.integers(1, 5),
+)
+def test_it_comes_back_to_the_last_bit(first: int, rows: list[tuple[float, float]], model: str, n: int) -> None:
+    y, u = (np.array(column) for column in zip(*rows, strict=True))
+    query = decode_query(encode_query(np.ones(n), np.ones(n), None, None, model, pending=Pending(first, y, u)))
+    assert query.pending is not None
+    assert (query.pending.first, query.model, query.memory) == (first, model, None)
+    np.testing.assert_array_equal(query.pending.y_um, y)
+    np.testing.assert_array_equal(query.pending.u_V, u)
+    assert decode_query(encode_query(np.ones(n), np.ones(n))).pending is None
+
+
+GOOD = encode_query(1.0, 2.0, 3.0, model="mpi", pending=Pending(7, np.array([4.0, 5.0]), np.array([0.4, 0.5])))
+
+
+def test_the_layout_is_that_of_the_page() -> None:
+    head = struct.pack("<BBHIqdII", 1, 4, 5, 1, -1, math.nan, 0, 3) + struct.pack("<ddd", 1.0, 2.0, 3.0) + b"mpi"
+    assert head + struct.pack("<qIdddd", 7, 2, 4.0, 5.0, 0.4, 0.5) == GOOD
+
+
+@pytest.mark.parametrize(
+    ("payload", "field"),
+    [
+        (GOOD[:-1], "payload"),
+        (GOOD + b"\0", "payload"),
+        (GOOD[:-40], "payload"),
+        (GOOD[:-44] + struct.pack("<qI", 7, 0) + GOOD[-32:], "pending"),
+        (GOOD[:-44] + struct.pack("<qI", 7, 2**31) + GOOD[-32:], "pending"),
+        (GOOD[:-44] + struct.pack("<qI", -1, 2) + GOOD[-32:], "pending.first"),
+        (GOOD[:-8] + struct.pack("<d", math.nan), "pending.u_V[1]"),
+        (GOOD[:-32] + struct.pack("<d", math.inf) + GOOD[-24:], "pending.y_um[0]"),
+        (GOOD[:2] + struct.pack("<H", 7) + GOOD[4:], "pending"),
+    ],
+)
+def test_what_is_malformed_is_refused_by_field(payload: bytes, field: str) -> None:
+    with pytest.raises(FieldError) as refused:
+        decode_query(payload)
+    assert refused.value.field == field
+
+
+def test_unequal_columns_are_refused_before_they_are_sent() -> None:
+    with pytest.raises(FieldError, match=r"pending.u_V"):
+        encode_query(1.0, 2.0, pending=Pending(0, np.zeros(3), np.zeros(2)))
+
+
+def motion(first: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """As ``recording`` moves."""
+    t = 1e-3 * np.arange(first, first + n)
+    w = 2 * np.pi * 3.0
+    return 45.0 + 30.0 * np.sin(w * t), 30.0 * w * np.cos(w * t), -30.0 * w * w * np.sin(w * t)
+
+
+@pytest.mark.parametrize("name", ["lssvm_adaptive", "auto"])
+def test_the_memory_is_that_of_the_samples_carried_along_what_is_under_way(
+    models: dict[str, InverseModel], name: str
+) -> None:
+    """Of what is under way only that counts which the answering snapshot has not seen; the age is then of no matter."""
+    axis = make_axis(models, compete=("linear",))
+    for part in parts(recording(1001), 20):
+        axis.handle(part)
+    assert axis.newest.seq == 1000
+    y, v, a = motion(1060, 20)
+    under = motion(961, 99)[0]
+    pending = Pending(961, under, (under - 1.0) / 10.45 + 0.02)
+    got = axis.answer(FeedforwardQuery(y, v, a, None, name, pending=pending))
+    assert got.tracked_memory
+    model, _, memory = axis.model(name)
+    # From the last point under way on: what the model asks for more there than was commanded fades.
+    still = np.zeros(58)
+    carried = model.track(under[40:-1], still, still, pending.u_V[40:-1], memory)
+    last = np.concatenate([[under[-1]], y]), np.concatenate([[v[0] - 1e-3 * a[0]], v]), np.concatenate([[a[0]], a])
+    asked = model.feedforward(*last, carried).u_V
+    more_V = pending.u_V[-1] - asked[0]
+    assert abs(more_V) > 1e-3
+    expected = asked[1:] + more_V * np.exp(-np.arange(1, 21) * (1e-3 / FADE_S))
+    np.testing.assert_allclose(got.u_V, expected, atol=1e-12)
+    # What was all seen, or nothing, changes nothing.
+    old = Pending(900, *(column[:20] for column in pending[1:]))
+    for none in (None, old):
+        plain = axis.answer(FeedforwardQuery(y, v, a, None, name, pending=none))
+        np.testing.assert_array_equal(plain.u_V, axis.answer(FeedforwardQuery(y, v, a, memory, name)).u_V)
+
+
+@pytest.mark.parametrize(
+    ("y", "u", "field"), [([40.0, 99.0], [4.0, 4.0], "pending.y_um[1]"), ([40.0], [-1.0], "pending.u_V[0]")]
+)
+def test_what_no_answer_can_have_been_is_refused(
+    models: dict[str, InverseModel], y: list[float], u: list[float], field: str
+) -> None:
+    axis = make_axis(models)
+    with pytest.raises(FieldError) as refused:
+        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(0, np.array(y), np.array(u))))
+    assert refused.value.field == field
+
+
+def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None) -> Trajectory:
+    reply = FeedforwardReply(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, 0, "m", tracked_memory=True)
+    return as_trajectory(reply, extended(under_way(before, begin), begin, y, reply.u_V))
+
+
+def test_answers_put_what_is_under_way_together() -> None:
+    one = answer_of(100, np.arange(20.0))
+    two = answer_of(120, 20.0 + np.arange(20.0), one)
+    assert two.pending is not None
+    assert two.pending.first == 100
+    np.testing.assert_array_equal(two.pending.y_um, np.arange(40.0))
+    np.testing.assert_allclose(two.pending.u_V, 0.1 * np.arange(40.0))
+    # Where nothing was commanded the stage holds its voltage.
+    after_a_hole = under_way(two, 145)
+    assert after_a_hole is not None
+    assert after_a_hole.y_um.tolist()[-6:] == [39.0] * 6
+    # An answer that replaces the end of another one goes on from there.
+    replaced = under_way(two, 130)
+    assert replaced is not None
+    assert replaced.y_um.tolist() == list(range(30))
+    assert under_way(two, 100) is under_way(two, 7) is under_way(None, 5) is under_way(two, 10_000) is None
+    long = one
+    for k in range(60):
+        long = answer_of(120 + 20 * k, np.full(20, float(k)), long)
+    kept = under_way(long, 1320)
+    assert kept is not None
+    assert (kept.first, kept.y_um.size) == (1320 - UNDER_WAY, UNDER_WAY)
+
+
+def test_a_query_with_a_beginning_takes_the_voltage_before_from_what_is_under_way() -> None:
+    one = answer_of(100, np.arange(1.0, 21.0))
+    asked = continued(None, "", math.nan, one, 110)
+    assert (asked["memory"], asked["model"], asked["u_before_V"]) == (None, "m", pytest.approx(1.0))
+    assert continued(None, "", 5.0, one, 110)["u_before_V"] == 5.0
+    assert math.isnan(continued(None, "", math.nan, None, 0)["u_before_V"])
+    with pytest.raises(FieldError, match="begin"):
+        continued(np.zeros(3), "", math.nan, one, 110)
+
+
+@pytest.mark.e2e
+def test_a_client_that_says_when_its_points_are_due(shared_service: Any) -> None:
+    with Client.connect(shared_service.endpoint, timeout_s=5.0) as client:
+        first = (int(client.status()["seq"]) // 20 + 100) * 20
+        y, v, a = motion(first, 60)
+        one = client.trajectory(y[:20], v[:20], a[:20], begin=first)
+        two = client.trajectory(y[20:], v[20:], a[20:], begin=first + 20, after=one)
+        assert one.tracked_memory
+        assert two.tracked_memory
+        # Nothing of it was seen: as if the memory had travelled.
+        same = client.trajectory(y[20:], v[20:], a[20:], after=one)
+        np.testing.assert_allclose(two.u_V, same.u_V, atol=5e-4)
+        point = client.point(y[59], v[59], a[59], begin=first + 59, after=two)
+        assert point.pending is not None
+        assert point.pending.y_um.size == 60
+        assert point.u_V == pytest.approx(two.u_V[-1], abs=5e-4)
+        with pytest.raises(FieldError, match="begin"):
+            client.point(40.0, begin=first, memory=one.memory)

@@ -1,0 +1,202 @@
+"""A service that is killed and started again goes on where it was: no record is lost, nothing learnt, no jump.
+
+How soon it serves again is measured by ``python -m benchmarks.restart``.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.client.client import Client
+from service.protocol.reply import STALE
+from service.runtime.session import open_service
+from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
+from sim.recordings import read
+from tests.service.conftest import unused_port, write_config
+from tests.service.living import Asker, Process, Stage, eventually
+
+pytestmark = pytest.mark.e2e
+ROOT = Path(__file__).resolve().parents[3]
+EXTRA = 'recorder = "rec"\ncheckpoints = "kept"\ncheckpoint_s = 0.5\nstale_s = 0.4\nserved = "lssvm_adaptive"\n'
+#: What was handled is in the journal after about a millisecond: it is looked so long before a kill what was told, s.
+WRITTEN_S = 0.005
+#: Loaded before anything else: a clock of the wall that stands a day earlier and runs backwards.
+BACKWARDS = "import time\n_now = time.time\n_start = _now()\ntime.time = lambda: 2 * _start - _now() - 86400.0\n"
+
+
+@pytest.fixture
+def processes() -> Iterator[list[Process]]:
+    started: list[Process] = []
+    yield started
+    for process in started:
+        process.kill()
+
+
+def test_a_killed_service_goes_on_with_all_that_it_had(tmp_path: Path, processes: list[Process]) -> None:
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    (tmp_path / "clock").mkdir()
+    (tmp_path / "clock" / "sitecustomize.py").write_text(BACKWARDS)
+    serve = ("serve", "--config", str(config))
+    processes.append(Process(*serve))
+    with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0, retry_s=20.0) as client:
+        with Stage([endpoint]) as stage:
+            eventually(lambda: client.status()["seq"] > 2500)
+        first_sent = stage.sent
+        # A dead stage: answers go on, and say how old they are; a query that names its snapshot is as ever.
+        eventually(lambda: client.status()["stale"], 5.0)
+        assert client.point(40.0).flags & STALE
+        seq = client.status()["snapshot_seq"]
+        assert not client.point(40.0, as_of=seq).flags & STALE
+        before = client.status()
+        assert before["seq"] == first_sent - 1
+        asker = Asker(client)
+        memory = asker.last.memory
+        then = client.trajectory(40.0 + np.arange(20.0), memory=memory, as_of=seq)
+        assert eventually(lambda: client.status()["recorder"]["written"]) == first_sent
+
+        # Killed, and started again by a clock of the wall that has gone mad.
+        processes[0].process.kill()
+        processes[0].process.wait(10)
+        start = time.monotonic()
+        processes.append(Process(*serve, path=tmp_path / "clock"))
+        asker.ask_for(0.2)
+        after = client.status()
+        assert after["instance"] != before["instance"]
+        print(f"serving {processes[1].start_s:.2f} s after the start, {time.monotonic() - start:.2f} s with the client")
+        assert after["snapshot_seq"] == seq
+        assert after["fingerprint"] == before["fingerprint"]
+        assert (after["samples"]["received"], after["samples"]["learnt"]) == (
+            before["samples"]["received"],
+            before["samples"]["learnt"],
+        )
+        # Not only within the slew limit: to the last bit.
+        now = client.trajectory(40.0 + np.arange(20.0), memory=memory, as_of=seq)
+        np.testing.assert_array_equal(now.u_V, then.u_V)
+        assert asker.step_V < 0.01
+
+        # The stage goes on where it was, and so does the learning; nothing is stale any more.
+        with Stage([endpoint], first=first_sent) as stage:
+            eventually(lambda: client.status()["samples"]["learnt"] > before["samples"]["learnt"] + 200)
+            assert not client.status()["stale"]
+            assert client.status()["samples"]["lost"] == 0
+    processes[1].send(signal.SIGTERM)
+    assert processes[1].process.wait(30) == 0
+    recorded = read(tmp_path / "rec")
+    assert recorded.seq is not None
+    np.testing.assert_array_equal(recorded.seq, np.arange(recorded.seq[-1] + 1))
+    assert recorded.seq[-1] >= first_sent
+
+    # The newest checkpoint is cut off, and one of another axis lies there: the one before is taken, with the reasons.
+    kept = sorted((tmp_path / "kept").glob("*.ckpt"))
+    meta, state = decode_checkpoint(kept[-2].read_bytes())
+    kept[-1].write_bytes(kept[-1].read_bytes()[:-100])
+    of_y = CheckpointFolder(tmp_path / "kept", "demo", "y", meta.dt_s, 1000).write(replace(meta, axis="y"), state)
+    assert of_y > kept[-1]
+    # What is told at a start is told to whoever listens already.
+    ear = f"tcp/127.0.0.1:{unused_port()}"
+    config.write_text(config.read_text().replace("listen = ", f'connect = ["{ear}"]\nlisten = '))
+    events: list[dict[str, Any]] = []
+    with open_service([ear]) as listening:
+        listening.declare_subscriber(
+            "dehyst/v1/demo/x/event", lambda sample: events.append(json.loads(sample.payload.to_bytes()))
+        )
+        processes.append(Process(*serve))
+        eventually(lambda: "learnt_again" in [event["event"] for event in events], 10.0)
+        told = [(event["event"], event["detail"]) for event in events]
+        assert [name for name, _ in told[:3]] == ["checkpoint_refused", "checkpoint_refused", "restored"]
+        assert "axis is 'y', expected 'x'" in told[0][1]
+        assert "damaged or cut off" in told[1][1]
+        assert told[2][1].endswith(f"sample {meta.seq}")
+        with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0) as client:
+            # What came behind it is in the journal.
+            assert client.status()["seq"] == recorded.seq[-1]
+
+
+def test_killed_while_samples_flow_it_loses_no_record_and_next_to_no_learning(
+    tmp_path: Path, processes: list[Process]
+) -> None:
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA.replace("checkpoint_s = 0.5\n", ""))
+    endpoint = f"tcp/127.0.0.1:{port}"
+    serve = ("serve", "--config", str(config))
+    processes.append(Process(*serve))
+    first = 0
+    # What was under way at each kill: behind what had been told, up to what had been sent.
+    under_way: list[int] = []
+    with Client.connect(endpoint, timeout_s=2.0, wait_s=20.0, retry_s=20.0) as client:
+        for goes_on in (False, False, False, True):
+            with Stage([endpoint], first=first) as stage:
+                learnt = client.status()["samples"]["learnt"]
+                eventually(lambda least=learnt + 1500: client.status()["samples"]["learnt"] > least)
+                pause_s = WRITTEN_S + late_s()
+                before = client.status()
+                told = max(before["seq"], client.point(40.0).snapshot_seq)
+                time.sleep(pause_s)
+                sent = stage.sent - 1
+                processes[-1].process.kill()
+                processes[-1].process.wait(10)
+                if goes_on:
+                    processes.append(Process(*serve))
+                    eventually(lambda least=sent: client.point(40.0) and client.status()["seq"] > least + 500)
+                    sent = client.status()["seq"]
+            first = stage.sent
+            if not goes_on:
+                processes.append(Process(*serve))
+                client.point(40.0)
+                after = client.status()
+                print(f"told {told} {1e3 * pause_s:.1f} ms before the kill, sent {sent}, going on from {after['seq']}")
+                assert after["instance"] != before["instance"]
+                assert told <= after["seq"]
+                assert sent - after["seq"] <= 1000
+                assert after["samples"]["learnt"] >= before["samples"]["learnt"]
+                sent = first - 1
+            under_way += range(told + 1, sent + 1)
+        eventually(lambda: client.status()["seq"] == first - 1)
+        last = client.status()
+    processes[-1].send(signal.SIGTERM)
+    assert processes[-1].process.wait(30) == 0
+    recorded = read(tmp_path / "rec")
+    assert recorded.seq is not None
+    assert len(np.unique(recorded.seq)) == len(recorded)
+    # What is missing was under way, or came while there was nobody to take it; and it is counted.
+    missing = np.setdiff1d(np.arange(first), recorded.seq)
+    assert np.setdiff1d(missing, under_way).size == 0
+    assert last["samples"]["lost"] == missing.size
+
+
+def late_s() -> float:
+    """The most that this machine lets a bare loop wait now, s."""
+    worst_s = 0.0
+    for _ in range(100):
+        begin = time.monotonic()
+        time.sleep(1e-3)
+        worst_s = max(worst_s, time.monotonic() - begin - 1e-3)
+    return worst_s
+
+
+def test_the_wall_clock_decides_nothing() -> None:
+    """It may be told to people, under a name that says so; every other use of it is a bug waiting for a leap."""
+    found = []
+    # Those of the soak are the ones that set the clock back.
+    for path in sorted(p for p in (ROOT / "service").rglob("*.py") if "soak" not in p.parts):
+        source = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in (
+                "time.time",
+                "datetime.now",
+                "datetime.datetime.now",
+            ):
+                line = source.splitlines()[node.lineno - 1]
+                if "unix" not in line and "wall_s" not in line:
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {line.strip()}")
+    assert not found

@@ -1,0 +1,478 @@
+"""The numbers of the samples: one that is absurd changes nothing, and from every count good samples lead back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from adaptive.types import InverseModel
+from service.intake.intake import Intake
+from service.intake.sequence import (
+    AHEAD,
+    ANEW,
+    IN_ORDER,
+    JUMPED,
+    LATE,
+    RESTART_AFTER,
+    RESTARTED,
+    WITNESSES,
+    Seldom,
+    SequenceTracker,
+)
+from service.protocol.samples import MAX_SEQ, SampleBatch
+from service.replay.replay import sequence
+from service.server.axis import Axis
+from service.server.axis_state import axis_state, fingerprint, restore_axis
+from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
+from sim.recordings import Recording
+from tests.service.server.test_axis import make_axis, recording
+from tests.service.storage.test_checkpoint import make_axis as make_competing
+from tests.service.storage.test_checkpoint import meta
+
+DT_S = 1e-3
+Row = tuple[int, float]
+
+
+def rows(first: int, n: int, ahead_s: float = 0.0, dt_s: float = DT_S) -> list[Row]:
+    """n samples in a row, with the time of their numbers and ``ahead_s``, s."""
+    return [(k, k * dt_s + ahead_s) for k in range(first, first + n)]
+
+
+def taken(tracker: SequenceTracker, samples: list[Row]) -> list[str]:
+    return [tracker.take(*row) for row in samples]
+
+
+def begun(n: int = 1000, dt_s: float = DT_S) -> SequenceTracker:
+    tracker = SequenceTracker(dt_s)
+    assert taken(tracker, rows(0, n, dt_s=dt_s)) == [IN_ORDER] * n
+    return tracker
+
+
+def number(tracker: SequenceTracker) -> int:
+    return tracker.number(tracker.last)
+
+
+@pytest.mark.parametrize("ahead", [1002, 100_000, 2**53, MAX_SEQ - 1000])
+@pytest.mark.parametrize("time_of", ["the true number", "its number", "nothing"])
+@pytest.mark.parametrize("count", [1, WITNESSES - 1])
+def test_numbers_far_ahead_are_refused_and_the_true_ones_go_on(ahead: int, time_of: str, count: int) -> None:
+    tracker = begun()
+    false = [(k + ahead, {"the true number": k, "its number": k + ahead, "nothing": math.nan}[time_of] * DT_S)
+             for k in range(1000, 1000 + count)]  # fmt: skip
+    assert taken(tracker, false) == [AHEAD] * count
+    assert taken(tracker, rows(1000, 500)) == [IN_ORDER] * 500
+    assert tracker.counters() == {"received": 1500 + count, "lost": 0, "late": count, "restarts": 0}
+    assert number(tracker) == tracker.last == 1499
+
+
+def test_a_gap_is_taken_at_once_where_the_time_tells_of_it_or_is_none() -> None:
+    for t_s in (2.0, math.nan, math.inf):
+        tracker = begun()
+        assert tracker.take(2000, t_s) == IN_ORDER
+        assert tracker.lost == 1000
+    for missing, expected in ((WITNESSES, IN_ORDER), (WITNESSES + 1, AHEAD)):
+        tracker = begun()
+        assert tracker.take(1000 + missing, 1.0) == expected
+
+
+@pytest.mark.parametrize("outage_s", [1.002, 30.0, 86_000.0])
+def test_a_real_outage_is_borne_out_by_some_samples_and_its_numbers_are_lost(outage_s: float) -> None:
+    tracker = begun()
+    first = 1000 + round(outage_s / DT_S)
+    assert taken(tracker, rows(first, 100)) == [AHEAD] * (WITNESSES - 1) + [IN_ORDER] * (101 - WITNESSES)
+    assert tracker.counters() == {"received": 1100, "lost": first - 1000, "late": 0, "restarts": 0}
+    assert number(tracker) == tracker.last == first + 99
+
+
+def test_lossy_samples_bear_a_claim_out_too_and_doubled_ones_do_not() -> None:
+    tracker = begun()
+    claim = [(k, k * DT_S) for k in range(50_000, 50_500, 5)]
+    doubled = [row for row in claim for _ in range(2)]
+    said = taken(tracker, doubled)
+    assert said.index(IN_ORDER) == 2 * (WITNESSES - 1)
+    assert tracker.last == claim[-1][0]
+    # Each number was received, is late, or was lost.
+    assert tracker.received - tracker.late + tracker.lost == tracker.last + 1
+
+
+@pytest.mark.parametrize("to", [100_000, 2**50, MAX_SEQ - 1000])
+def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to: int) -> None:
+    tracker = begun()
+    jumped = [(to + k, (1000 + k) * DT_S) for k in range(100)]
+    said = taken(tracker, jumped)
+    assert said == [AHEAD] * (WITNESSES - 1) + [JUMPED] + [IN_ORDER] * (100 - WITNESSES)
+    assert number(tracker) == 999 + 1000 + 99
+    assert tracker.restarts == 1
+    assert tracker.lost == 0
+    # And back again, which takes no longer than the false count had lasted four times over.
+    said = taken(tracker, rows(1100, 600))
+    assert said.index(RESTARTED) == RESTART_AFTER - 1
+    assert set(said[RESTART_AFTER:]) == {IN_ORDER}
+    assert number(tracker) == 2098 + 1000 + 599
+
+
+@pytest.mark.parametrize("count", [WITNESSES, 100, 1000])
+def test_a_false_outage_that_was_believed_does_not_hold_for_long(count: int) -> None:
+    tracker = begun()
+    taken(tracker, rows(101_000, count))
+    assert tracker.last == 101_000 + count - 1
+    said = taken(tracker, rows(1000, 2000))
+    assert said.index(RESTARTED) + 1 == {WITNESSES: 200, 100: 4 * 85, 1000: 1501}[count]
+    assert said[-1] == IN_ORDER
+
+
+def test_a_first_number_that_is_absurd_gives_way_to_the_next_ones() -> None:
+    tracker = SequenceTracker(DT_S)
+    assert tracker.take(MAX_SEQ, 0.0) == IN_ORDER
+    said = taken(tracker, rows(7, 100))
+    assert said == [LATE] * (WITNESSES - 1) + [RESTARTED] + [IN_ORDER] * (100 - WITNESSES)
+    assert number(tracker) == 1000 + 99
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "restart", "jump"), [(1e-4, 200, 16), (2e-3, 200, 16), (1e-2, 50, 5), (0.1, 16, 4), (2.0, 16, 4)]
+)
+def test_slow_samples_are_believed_sooner(dt_s: float, restart: int, jump: int) -> None:
+    tracker = begun(dt_s=dt_s)
+    assert taken(tracker, rows(0, 300, dt_s=dt_s)).index(RESTARTED) == restart - 1
+    tracker, outage = begun(dt_s=dt_s), rows(1100 + round(2.0 / dt_s), 300, dt_s=dt_s)
+    assert taken(tracker, outage).index(IN_ORDER) == jump - 1
+
+
+def test_a_stage_that_counts_anew_is_noticed_over_a_line_that_loses_samples() -> None:
+    tracker = begun(100_000)
+    kept = np.random.default_rng(1).random(1000) > 0.1
+    said = taken(tracker, [row for row, keep in zip(rows(0, 1000), kept, strict=True) if keep])
+    assert said.index(RESTARTED) == RESTART_AFTER - 1
+    assert said[-1] == IN_ORDER
+
+
+def test_it_goes_on_from_its_state_in_the_middle_of_a_claim() -> None:
+    for claim in (
+        rows(100_000, WITNESSES - 1),
+        rows(0, RESTART_AFTER - 1),
+        [(MAX_SEQ - 20 + k, 1.0) for k in range(15)],
+    ):
+        one, two = begun(), SequenceTracker(DT_S)
+        taken(one, claim)
+        two.restore(one.state_dict())
+        follows = rows(claim[-1][0] + 1, 5, claim[-1][1] - claim[-1][0] * DT_S)
+        assert taken(two, follows) == taken(one, follows)
+        assert number(one) == number(two)
+        for name, value in one.state_dict().items():
+            np.testing.assert_array_equal(value, two.state_dict()[name])
+    with pytest.raises(KeyError):
+        one.restore({"last": 3})
+    assert one.last == two.last
+
+
+OLD = ("since", "t_s", "run_first", "run_t_s")
+
+
+@pytest.mark.parametrize("last", [101_000, 2**62])
+def test_a_state_that_was_locked_up_leads_back(last: int) -> None:
+    """One sample numbered so was taken in order, and all that followed were late."""
+    tracker = begun()
+    state = {name: value for name, value in tracker.state_dict().items() if name not in OLD}
+    state |= {"last": last, "lost": last - 1000, "gaps": np.array([[1000, last - 1]])}
+    tracker = SequenceTracker(DT_S)
+    tracker.restore(state)
+    said = taken(tracker, rows(1000, 1000))
+    assert said.index(RESTARTED) == RESTART_AFTER - 1
+    assert said[-1] == IN_ORDER
+    assert last < number(tracker) < 2**63 - 2**61
+
+
+def test_of_a_flood_one_event_is_told() -> None:
+    seldom = Seldom(calm=100)
+    told = [k for k in range(1000) if k % 50 == 0 and seldom.tells("a", k)]
+    assert told == [0]
+    assert seldom.tells("b", 1000)
+    assert not seldom.tells("a", 1050)
+    assert seldom.tells("a", 1151)
+
+
+# ---- whatever happens
+
+Stage = dict[str, Any]
+
+
+def absurd(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    """Numbers ahead, in a row, with a time that is true, that of the number, or none."""
+    first = min(stage["seq"] + 1 + value, MAX_SEQ - size)
+    for k in range(size):
+        yield first + k, (stage["t_s"], (first + k) * DT_S, math.nan, 1e300)[value % 4]
+
+
+def gap(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    missing = value % 200_000
+    stage["seq"], stage["t_s"] = stage["seq"] + missing, stage["t_s"] + missing * DT_S
+    yield from ()
+
+
+def jump(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    stage["seq"] = value % (MAX_SEQ // 2)
+    yield from ()
+
+
+def restart(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    stage["seq"], stage["t_s"] = 0, float(value % 1000)
+    yield from ()
+
+
+def clock_set(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    stage["t_s"] += float(value % 10**9) - 5e8
+    yield from ()
+
+
+def wrong_times(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    for row in good(stage, size, value):
+        yield row[0], (math.nan, 1e300, -1e18, 2.0**62, math.inf, float(value % 10**7))[value % 6]
+
+
+def doubled(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    for row in good(stage, size, value):
+        yield row
+        yield row
+
+
+def again(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    sent = list(good(stage, size, value))
+    yield from sent
+    yield from sent
+
+
+def reversed_(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    yield from reversed(list(good(stage, size, value)))
+
+
+def lossy(stage: Stage, size: int, value: int) -> Iterator[Row]:
+    for k, row in enumerate(good(stage, size, value)):
+        if (k * 7919 + value) % 3:
+            yield row
+
+
+def good(stage: Stage, size: int, value: int = 0) -> Iterator[Row]:
+    for _ in range(size):
+        stage["seq"], stage["t_s"] = stage["seq"] + 1, stage["t_s"] + DT_S
+        yield stage["seq"], stage["t_s"]
+
+
+EVENTS: tuple[Callable[[Stage, int, int], Iterator[Row]], ...] = (
+    absurd, gap, jump, restart, clock_set, wrong_times, doubled, again, reversed_, lossy, good,
+)  # fmt: skip
+happenings = st.lists(
+    st.tuples(
+        st.sampled_from(EVENTS),
+        st.one_of(st.just(1), st.integers(2, 40), st.integers(100, 700)),
+        st.one_of(st.integers(0, 3000), st.integers(0, 10**6), st.integers(0, MAX_SEQ)),
+    ),
+    max_size=12,
+)
+#: Good samples that are to lead back from anything: two seconds at 1 kHz, and more than is needed at any time.
+BACK = 2000
+
+
+@settings(max_examples=300)
+@given(happenings, st.integers(0, 2**31))
+def test_whatever_happened_good_samples_lead_back(events: list[tuple[Any, int, int]], cut: int) -> None:
+    stage: Stage = {"seq": -1, "t_s": 0.0}
+    sent = [row for happens, size, value in events for row in happens(stage, size, value)]
+    sent += good(stage, BACK)
+    one, two = SequenceTracker(DT_S), SequenceTracker(DT_S)
+    cut %= len(sent)
+    internal, accounted = -1, None
+    for k, (seq, t_s) in enumerate(sent):
+        if k == cut:
+            two.restore(one.state_dict())
+        lost = one.lost
+        said = one.take(seq, t_s)
+        if k >= cut:
+            assert two.take(seq, t_s) == said
+        assert one.received == k + 1
+        if said in ANEW:
+            accounted = None
+        if said in (IN_ORDER, *ANEW):
+            now = one.number(seq)
+            # It never goes back, and goes on by what came and what was lost, or by the gap before another count.
+            assert 0 <= now < 2**53
+            assert 0 < now - internal <= one.lost - lost + WITNESSES * RESTART_AFTER or internal < 0 or said in ANEW
+            assert internal < now <= internal + 1000 + WITNESSES * 1501 or internal < 0 or said not in ANEW
+            internal = now
+        if said == IN_ORDER:
+            # Every number is accounted for: it was received, is late, or was lost.
+            account = seq - (one.received - one.late + one.lost)
+            assert account == accounted or accounted is None
+            accounted = account
+    assert said == IN_ORDER
+    assert one.last == stage["seq"]
+    for name, value in one.state_dict().items():
+        np.testing.assert_array_equal(value, two.state_dict()[name])
+
+
+def motion(samples: list[Row]) -> SampleBatch:
+    """These numbers and times, with what a stage that moves at 3 Hz shows; 5 % less gain than the models believe."""
+    y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * np.arange(len(samples)) * DT_S)
+    seq, t_s = (np.array(column) for column in zip(*samples, strict=True))
+    return SampleBatch(seq.astype(np.int64), t_s.astype(float), (y_um - 1.0) / (11.0 * 0.95), y_um)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(happenings, st.integers(0, 5))
+def test_whatever_happened_a_learner_learns_again(
+    models: dict[str, InverseModel], events: list[tuple[Any, int, int]], first_is_wrong: int
+) -> None:
+    stage: Stage = {"seq": -1, "t_s": 0.0}
+    sent = list(wrong_times(stage, 1, first_is_wrong))
+    sent += [row for happens, size, value in events for row in happens(stage, size, value)]
+    sent += good(stage, BACK)
+    axis = make_axis(models)
+    verdicts = axis.handle(motion(sent))
+    assert not {AHEAD, "out_of_order", "duplicate", "timing", "not_finite", "gap"} & set(verdicts[-300:])
+    assert "learnt" in verdicts[-300:]
+    assert axis.handled_seq == stage["seq"]
+    assert axis.newest.seq == stage["seq"] // 20 * 20
+    assert axis.sequence.number(axis.handled_seq) == axis.clock.state_dict()["number_last"]
+
+
+# ---- through an axis
+
+
+def with_rows(batch: SampleBatch, at: int, *rows: tuple[int, float, float, float]) -> SampleBatch:
+    """``batch`` with samples put in before its row ``at``."""
+    columns = zip(*rows, strict=True)
+    names = ("seq", "t_s", "u_V", "y_um")
+    return SampleBatch(*(np.insert(getattr(batch, n), at, c) for n, c in zip(names, columns, strict=True)))
+
+
+def model_of(axis: Axis) -> str:
+    return fingerprint(axis.newest.models["lssvm_adaptive"])
+
+
+@pytest.mark.parametrize("its_own_time", [False, True])
+def test_learning_goes_on_at_once_as_if_nothing_had_happened_and_an_event_tells(
+    models: dict[str, InverseModel], its_own_time: bool
+) -> None:
+    """It was silent for ever: no snapshot, no event, and not even a restart of the service helped."""
+    axis, plain = make_axis(models), make_axis(models)
+    false = [(n, n * DT_S if its_own_time else 1.0, 4.0, 45.0) for n in (101_000, 2**62)]
+    verdicts = axis.handle(with_rows(recording(3000), 1000, *false))
+    assert verdicts[1000:1002] == [AHEAD] * 2
+    assert verdicts[:1000] + verdicts[1002:] == plain.handle(recording(3000))
+    assert (axis.handled_seq, axis.newest.seq, model_of(axis)) == (2999, 2980, model_of(plain))
+    (event,) = axis.take_events()
+    assert (event["event"], event["seq"]) == ("numbers_ahead", 999)
+    assert "101000 after 999" in event["detail"]
+    assert axis.gates[AHEAD] == axis.tally.samples["late"] == 2
+    np.testing.assert_array_equal(axis.newest.memories["lssvm_adaptive"], plain.newest.memories["lssvm_adaptive"])
+    # A second of quiet later it is told again.
+    axis.handle(with_rows(recording(10, first=3000), 5, (2**62, 0.0, 4.0, 45.0)))
+    assert [e["event"] for e in axis.take_events()] == ["numbers_ahead"]
+
+
+def test_a_count_that_really_jumps_is_told_and_learnt_on(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(2000))
+    batch = recording(1000, first=2000)
+    verdicts = axis.handle(SampleBatch(batch.seq + 2**61, batch.t_s, batch.u_V, batch.y_um))
+    assert verdicts[: WITNESSES - 1] == [AHEAD] * (WITNESSES - 1)
+    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[WITNESSES:]) > 900
+    assert "timing" not in verdicts
+    assert [e["event"] for e in axis.take_events()] == ["numbers_jumped"]
+    assert axis.handled_seq == 2**61 + 2999
+    assert axis.newest.seq // 20 == axis.handled_seq // 20
+    # The same stage is started again.
+    axis.handle(recording(RESTART_AFTER))
+    assert axis.handled_seq == axis.newest.seq == RESTART_AFTER - 1
+    # No speed is taken from two counts.
+    assert axis.tracker.state_dict()["v"] == 0.0
+    axis.handle(recording(1000 - RESTART_AFTER, first=RESTART_AFTER))
+    assert (axis.handled_seq, axis.newest.seq) == (999, 980)
+    assert [e["event"] for e in axis.take_events()] == ["stage_restarted"]
+
+
+@pytest.mark.parametrize("make", [make_axis, make_competing])
+@pytest.mark.parametrize("what_learns_believed_it", [False, True])
+def test_a_checkpoint_that_was_locked_up_heals(
+    make: Callable[..., Axis], what_learns_believed_it: bool, models: dict[str, InverseModel]
+) -> None:
+    """As an earlier version left it behind: 2^62 taken in order, with its snapshot, and all that followed late."""
+    axis = make(models)
+    axis.handle(recording(2000))
+    state = axis_state(axis)
+    for name in (*(f"sequence.{name}" for name in OLD), "clock.anew", "clock.unheard"):
+        del state[name]
+    state |= {"sequence.last": MAX_SEQ, "sequence.gaps": np.array([[2000, MAX_SEQ - 1]]), "seq": MAX_SEQ}
+    state |= {"served.seq": MAX_SEQ, "clock.number_other": float(MAX_SEQ), "clock.t_other_s": 2.0, "clock.others": 1.0}
+    state |= {"clock.number_last": 1999.0}
+    if what_learns_believed_it:
+        state |= {"clock.number_last": float(MAX_SEQ), "clock.t_last_s": MAX_SEQ * DT_S, "clock.others": 0.0}
+        gates = [name for name in state if name.startswith("learner.") and name.endswith(("gates.seq", "gates.t_s"))]
+        assert len(gates) == 2
+        state |= {name: MAX_SEQ if name.endswith("seq") else MAX_SEQ * DT_S for name in gates}
+    again = make(models)
+    restore_axis(again, decode_checkpoint(b"".join(encode_checkpoint(meta(again), state)))[1])
+    verdicts = again.handle(recording(1000, first=2000))
+    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[RESTART_AFTER + 100 :]) > 600
+    assert (again.handled_seq, again.newest.seq) == (2999, 2980)
+    events = [e["event"] for e in again.take_events()]
+    assert events == ["stage_restarted", "learner_resynced"]
+    # It goes on from there as any does, to the last bit.
+    other = make(models)
+    restore_axis(other, decode_checkpoint(b"".join(encode_checkpoint(meta(again), axis_state(again))))[1])
+    more = recording(1000, first=3000)
+    assert again.handle(more) == other.handle(more)
+    assert model_of(again) == model_of(other)
+
+
+def test_an_outage_is_no_event(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(1000))
+    axis.handle(recording(1000, first=31_000))
+    assert axis.take_events() == []
+    assert (axis.handled_seq, axis.tally.samples["lost"], axis.gates[AHEAD]) == (31_999, 30_000, WITNESSES - 1)
+
+
+def test_a_standby_and_a_replay_make_the_same_of_it(models: dict[str, InverseModel]) -> None:
+    batch = with_rows(recording(3000), 1000, *((2**62 - k, math.nan, 4.0, 45.0) for k in range(7)))
+    batch = with_rows(batch, 2000, *((500_000 + k, 1.0, 4.0, 45.0) for k in range(40)))
+    live, pieces, standby = make_axis(models), make_axis(models), make_axis(models)
+    said = live.handle(batch)
+    told = [verdict for k in range(len(batch)) for verdict in pieces.handle(batch.where(np.arange(len(batch)) == k))]
+    assert told == said
+    first = make_axis(models)
+    first.handle(batch.where(np.arange(len(batch)) < 2010))
+    restore_axis(standby, axis_state(first))
+    assert standby.handle(batch.where(np.arange(len(batch)) >= 2010)) == said[2010:]
+    assert model_of(live) == model_of(pieces) == model_of(standby)
+    assert live.handled_seq == pieces.handled_seq == standby.handled_seq
+
+
+def test_who_watches_does_not_see_numbers_far_ahead(models: dict[str, InverseModel]) -> None:
+    class Watcher:
+        def __init__(self) -> None:
+            self.seen: list[int] = []
+
+        def take(self, batch: SampleBatch) -> None:
+            assert len(batch)
+            self.seen += batch.seq.tolist()
+
+    axis = make_axis(models)
+    intake, watcher = Intake(axis, lambda: None), Watcher()
+    intake.watcher = watcher  # type: ignore[assignment]
+    intake.handle(with_rows(recording(100), 50, (2**62, 0.05, 4.0, 45.0)))
+    intake.handle(with_rows(recording(0), 0, (2**62, 0.05, 4.0, 45.0)))
+    assert watcher.seen == list(range(100))
+
+
+def test_a_recording_without_numbers_has_some_for_a_time_that_is_absurd_too() -> None:
+    batch = recording(100)
+    batch.t_s[[30, 60, 90]] = 1e300, math.nan, -1e19
+    seq = sequence(Recording(t_s=batch.t_s, u_V=batch.u_V, y_um=batch.y_um, dt_s=DT_S, source="test"))
+    np.testing.assert_array_equal(seq, np.arange(100))

@@ -1,0 +1,395 @@
+"""The operator's verbs: read strictly, applied between batches, written down, and shown in a table."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy import arange, pi, sin
+
+from adaptive.errors import InputError
+from lab.cli import main
+from service.client.client import Client
+from service.operating.journal import Journal
+from service.operating.remote import operate, statuses
+from service.operating.request import MAX_BYTES, Request, decode_request, encode_request
+from service.operating.server import OperationsServer
+from service.operating.table import screen, table
+from service.operating.verbs import Verbs
+from service.protocol import samples as wire
+from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
+from service.protocol.keys import Keys
+from service.runtime.session import open_client, open_service
+
+KEYS = Keys("demo", "x")
+
+
+def samples(first: int, n: int) -> bytes:
+    k = arange(first, first + n)
+    y = 45.0 + 30.0 * sin(2 * pi * 3.0 * k * 1e-3)
+    return wire.encode_samples(k, k * 1e-3, (y - 1.0) / (11.0 * 0.95), y)
+
+
+class FakeAxis:
+    """Remembers what was done to it, and in which thread."""
+
+    def __init__(self) -> None:
+        self.handled_seq = 41
+        self.done: list[tuple[Any, ...]] = []
+        self.hold = threading.Event()
+        self.hold.set()
+
+    def freeze(self, by: str = "") -> int:
+        self.hold.wait(10.0)
+        self.done.append(("freeze", by))
+        return self.handled_seq
+
+    def thaw(self, by: str = "") -> int:
+        self.done.append(("thaw", by))
+        return self.handled_seq
+
+    def select(self, model: str, by: str = "") -> int:
+        if model != "linear":
+            raise FieldError("model", repr(model), "one of linear")
+        self.done.append(("select", model, by))
+        return self.handled_seq
+
+    def rollback(self, checkpoint: int, by: str = "") -> int:
+        if checkpoint == 666:
+            raise RuntimeError("something within")
+        self.done.append(("rollback", checkpoint, by))
+        return self.handled_seq
+
+    def checkpoints(self) -> list[dict[str, Any]]:
+        return [{"checkpoint": 3, "seq": 30, "samples": 20, "time_unix_s": 1.0, "bytes": 999}]
+
+
+def make(axis: FakeAxis, folder: Path | None, role: str = "primary") -> tuple[OperationsServer, list[tuple[str, str]]]:
+    events: list[tuple[str, str]] = []
+    verbs = Verbs(
+        axis,
+        lambda work: work(axis),
+        {"retune": lambda: lambda arguments: {"started": True, "job": 3}, "diagnose": lambda: None},
+    )
+    journal = Journal(folder, wall_s=lambda: 1234.5)
+    return OperationsServer(
+        KEYS, "i1-00", verbs, journal, lambda name, detail: events.append((name, detail)), lambda: role
+    ), events
+
+
+def ask(verb: str, who: str = "alice", **arguments: Any) -> bytes:
+    return encode_request(Request(verb, who, arguments))
+
+
+def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
+    axis = FakeAxis()
+    server, events = make(axis, tmp_path)
+    for payload in (ask("freeze"), ask("thaw"), ask("select", model="linear"), ask("rollback", checkpoint=3)):
+        answer = json.loads(server.handle(payload))
+        assert (answer["ok"], answer["seq"], answer["who"], answer["instance"]) == (True, 41, "alice", "i1-00")
+    assert axis.done == [
+        ("freeze", "alice"),
+        ("thaw", "alice"),
+        ("select", "linear", "alice"),
+        ("rollback", 3, "alice"),
+    ]
+    assert json.loads(server.handle(ask("checkpoints")))["result"]["checkpoints"][0]["checkpoint"] == 3
+    assert json.loads(server.handle(ask("retune")))["result"] == {"started": True, "job": 3}
+    assert events == [("operation", "alice: retune {}")]  # the others tell an event of their own
+    lines = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
+    assert [line["verb"] for line in lines] == ["freeze", "thaw", "select", "rollback", "checkpoints", "retune"]
+    assert lines[2] == {
+        "time_unix_s": 1234.5, "who": "alice", "verb": "select", "arguments": {"model": "linear"},
+        "instance": "i1-00", "ok": True, "seq": 41,
+    }  # fmt: skip
+    assert server.counters() == {"done": 6, "refused": 0, "unlogged": 0}
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        (None, "payload"),
+        (b"", "no JSON"),
+        (b"[]", "JSON object"),
+        (b'{"verb": "freeze"}', "who"),
+        (b'{"verb": "freeze", "who": "a\\u001b[2J"}', "printable"),
+        (b'{"verb": "freeze", "who": "%s"}' % (b"a" * 65), "who"),
+        (b'{"verb": "freeze", "who": "a", "arguments": []}', "arguments"),
+        (b'{"verb": "freeze", "who": "a", "sudo": true}', "sudo"),
+        (b'{"verb": 3, "who": "a"}', "verb"),
+        (b'{"verb": "freeze", "who": "a", "arguments": {"x": NaN}}', "NaN"),
+        (b'{"verb": "freeze", "who": "%s"}' % (b"a" * MAX_BYTES), "at most"),
+        (b"[" * 10_000, "no JSON"),
+        (ask("explode"), "one of freeze"),
+        (ask("freeze", hard=True), "arguments.hard"),
+        (ask("rollback"), "arguments.checkpoint"),
+        (ask("rollback", checkpoint="3"), "an integer"),
+        (ask("rollback", checkpoint=True), "an integer"),
+        (ask("select", model=3), "a text"),
+        (ask("select", model="sorcery"), "'sorcery'"),
+        (ask("diagnose"), "switched off"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_words_and_counted(
+    payload: bytes | None, words: str, tmp_path: Path
+) -> None:
+    axis = FakeAxis()
+    server, _ = make(axis, tmp_path)
+    with pytest.raises((InputError, ServiceError), match=words.replace("[", r"\[")):
+        server.handle(payload)
+    assert (axis.done, server.counters()["refused"], server.counters()["done"]) == ([], 1, 0)
+
+
+def test_a_refusal_that_names_somebody_is_written_down_too(tmp_path: Path) -> None:
+    server, events = make(FakeAxis(), tmp_path)
+    with pytest.raises(InputError):
+        server.handle(ask("select", "bob", model="sorcery"))
+    with pytest.raises(InputError):
+        server.handle(b"junk")
+    (line,) = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
+    assert (line["who"], line["ok"]) == ("bob", False)
+    assert "sorcery" in line["error"]
+    assert [name for name, _ in events] == ["operation_refused"]
+
+
+def test_a_standby_takes_no_commands() -> None:
+    axis = FakeAxis()
+    server, _ = make(axis, None, role="standby")
+    with pytest.raises(ServiceError, match="only a primary"):
+        server.handle(ask("freeze"))
+    assert axis.done == []
+
+
+def test_a_journal_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
+    (tmp_path / "full").write_text("a file where a folder should be")
+    axis = FakeAxis()
+    server, events = make(axis, tmp_path / "full")
+    server.handle(ask("freeze"))
+    server.handle(ask("thaw"))
+    assert [verb for verb, *_ in axis.done] == ["freeze", "thaw"]
+    assert server.counters()["unlogged"] == 2
+    assert [name for name, _ in events] == ["journal_failed"]
+
+
+def test_the_journal_is_bounded_and_keeps_the_one_before(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, max_bytes=1000)
+    for i in range(40):
+        assert journal.write({"verb": "freeze", "number": i})
+    sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    assert set(sizes) == {"operations.jsonl", "operations.1.jsonl"}
+    assert max(sizes.values()) <= 1000
+    newest = [json.loads(line)["number"] for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
+    assert newest[-1] == 39
+
+
+@given(
+    st.text(min_size=1, max_size=32),
+    st.text(min_size=1, max_size=64),
+    st.dictionaries(st.text(max_size=9), st.integers() | st.text(max_size=9) | st.booleans(), max_size=3),
+)
+def test_a_request_comes_back_or_is_not_sent(verb: str, who: str, arguments: dict[str, Any]) -> None:
+    request = Request(verb, who, arguments)
+    try:
+        payload = encode_request(request)
+    except InputError:
+        assert not who.isprintable() or not who.strip()
+        return
+    assert decode_request(payload) == request
+
+
+@pytest.fixture
+def wire_axis(free_port: int, tmp_path: Path) -> Iterator[tuple[FakeAxis, zenoh.Session, OperationsServer]]:
+    """An operations server on the wire, and a client's session to it."""
+    axis = FakeAxis()
+    server, _ = make(axis, tmp_path)
+    with open_service([f"tcp/127.0.0.1:{free_port}"]) as session:
+        entities = server.declare(session)
+        with open_client(f"tcp/127.0.0.1:{free_port}") as client:
+            yield axis, client, server
+        axis.hold.set()
+        for entity in entities:
+            entity.undeclare()
+
+
+def test_over_the_wire(wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer]) -> None:
+    axis, client, server = wire_axis
+    assert operate(client, KEYS, "freeze", "alice")["seq"] == 41
+    assert axis.done == [("freeze", "alice")]
+    with pytest.raises(RefusedError, match="sorcery") as refused:
+        operate(client, KEYS, "select", "alice", {"model": "sorcery"})
+    assert (refused.value.field, refused.value.kind) == ("model", "InputError")
+    with pytest.raises(RefusedError, match="something within"):
+        operate(client, KEYS, "rollback", "alice", {"checkpoint": 666})
+    with pytest.raises(NoReplyError, match="dehyst/v1/demo/y"):
+        operate(client, Keys("demo", "y"), "freeze", "alice", timeout_s=0.5)
+    for payload in (b"", b"junk", b"x" * 2**20, None):
+        (reply,) = list(client.get(KEYS.operate, payload=payload, timeout=5.0))
+        assert json.loads(reply.err.payload.to_bytes())["error"] == "InputError"
+    assert server.counters() == {"done": 1, "refused": 6, "unlogged": 0}
+
+
+def test_more_than_can_wait_is_refused_at_once(
+    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer],
+) -> None:
+    axis, client, _ = wire_axis
+    operate(client, KEYS, "thaw", "warm")
+    axis.hold.clear()
+    waiting = [client.get(KEYS.operate, payload=ask("freeze", f"a{i}"), timeout=10.0) for i in range(40)]
+    time.sleep(0.2)
+    axis.hold.set()
+    replies = [reply for handler in waiting for reply in handler]
+    refused = [json.loads(reply.err.payload.to_bytes()) for reply in replies if reply.err is not None]
+    assert len(replies) == 40
+    # 32 wait, and one is being done if it was taken before the last of them came.
+    assert 40 - 33 <= len(refused) <= 40 - 32
+    assert all("wait already" in error["message"] for error in refused)
+
+
+STATUS: dict[str, Any] = {
+    "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "served": "lssvm_adaptive",
+    "learning": "lssvm_adaptive", "seq": 12345, "sample_age_s": 0.01, "refused": {"messages": 3},
+    "samples": {"learnt": 9000, "lost": 2, "dropped": 0, "gates": {"learnt": 9000, "saturated": 70, "late": 5}},
+    "queries": {"count": 88, "errors": 1, "p50_us": 101.4, "p99_us": 240.0},
+}  # fmt: skip
+
+
+def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing() -> None:
+    frozen = {**STATUS, "axis": "y", "frozen": True, "role": "standby"}
+    lines = table([STATUS, frozen, {"stage": "a", "axis": "b", "instance": "c"}]).splitlines()
+    assert len(lines) == 4
+    for word in ("demo/x", "i1-ab", "primary", "ok", "lssvm_adaptive", "12345", "9000", "101", "240", "saturated:70"):
+        assert word in lines[1]
+    assert "frozen" in lines[2]
+    assert "standby" in lines[2]
+    assert table([]).splitlines()[-1] == "nobody serves here"
+
+
+def test_what_others_say_moves_no_cursor() -> None:
+    shown = screen([{**STATUS, "served": "\x1b[2Jboo\n"}], "tcp/\x1b:1", ["\x1b[31mred"])
+    assert "\x1b[2Jboo" not in shown
+    assert "\x1b[31mred" not in shown
+
+
+def test_statuses_of_two_instances_on_one_key_are_both_heard(free_port: int) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+
+    def answer(name: str) -> Callable[[zenoh.Query], None]:
+        def callback(query: zenoh.Query) -> None:
+            with query:
+                query.reply(KEYS.status, json.dumps({**STATUS, "instance": name}))
+
+        return callback
+
+    with open_service([endpoint]) as hub, open_client(endpoint) as other, open_client(endpoint) as client:
+        entities = [hub.declare_queryable(KEYS.status, answer("a")), other.declare_queryable(KEYS.status, answer("b"))]
+        until = time.monotonic() + 5.0
+        while len(found := statuses(client)) < 2 and time.monotonic() < until:
+            time.sleep(0.05)
+        assert [status["instance"] for status in found] == ["a", "b"]
+        assert statuses(client, axis="nobody") == []
+        for entity in entities:
+            entity.undeclare()
+
+
+@dataclass
+class Ended:
+    """What a command printed and how it ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def dehyst(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
+    """The command line, in this process: a start of the interpreter costs more than all that is looked at here."""
+
+    def run(*args: str) -> Ended:
+        status = main(args)
+        return Ended(status, *capsys.readouterr())
+
+    return run
+
+
+@pytest.mark.e2e
+def test_the_commands_against_a_real_service(
+    serve: Callable[..., Any], dehyst: Callable[..., Ended], tmp_path: Path
+) -> None:
+    process = serve(
+        ("x", "y"), extra=f'recorder = "{tmp_path / "rec"}"\ncheckpoints = "{tmp_path / "ckpt"}"\ncheckpoint_s = 0.1'
+    )
+    at = ("--endpoint", process.endpoint, "--who", "alice")
+    began_at = time.time()
+    with Client.connect(process.endpoint, axis="y", timeout_s=5.0) as client, open_client(process.endpoint) as stage:
+        for first in range(0, 1000, 20):
+            stage.put(client.keys.sample, samples(first, 20), congestion_control=zenoh.CongestionControl.BLOCK)
+        until = time.monotonic() + 30.0
+        while client.status()["seq"] < 999:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        frozen = dehyst("freeze", *at, "--axis", "y", "--json")
+        assert json.loads(frozen.stdout)["seq"] == 999
+        learnt = client.status()["samples"]["learnt"]
+        stage.put(client.keys.sample, samples(1000, 100))
+        while client.status()["seq"] < 1099:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        status = client.status()
+        assert (status["frozen"], status["samples"]["learnt"]) == (True, learnt)
+        assert dehyst("thaw", *at, "--axis", "y").stdout == "demo/y: thaw from sample 1099 on\n"
+        assert client.point(40.0).model != "linear"
+        assert "served linear" in dehyst("select", "linear", *at, "--axis", "y").stdout
+        assert client.point(40.0).model == "linear"
+        listed = json.loads(dehyst("checkpoints", *at, "--axis", "y", "--json").stdout)["result"]["checkpoints"]
+        assert len(listed) > 1
+        # Older ones may give way to one that is being written; the newest few do not.
+        back = dehyst("rollback", str(listed[1]["checkpoint"]), *at, "--axis", "y")
+        assert back.returncode == 0, back.stderr
+        refused = dehyst("rollback", "987654321", *at, "--axis", "y")
+        assert refused.returncode == 2
+        assert "checkpoint" in refused.stderr
+        status = client.status()
+        assert status["operations"]["refused"] == 1
+        assert status["operations"]["done"] == 5
+    journal = [json.loads(line) for line in (tmp_path / "rec" / "operations.jsonl").read_text().splitlines()]
+    assert {line["who"] for line in journal} == {"alice"}
+    assert [line["verb"] for line in journal] == ["freeze", "thaw", "select", "checkpoints", "rollback", "rollback"]
+    times = [began_at, *(line["time_unix_s"] for line in journal), time.time()]
+    assert times == sorted(times)
+    assert [line["ok"] for line in journal] == [True] * 5 + [False]
+    once = dehyst("status", "--endpoint", process.endpoint, "--once")
+    assert [line.split()[0] for line in once.stdout.splitlines()] == ["stage/axis", "demo/x", "demo/y"]
+    axes = json.loads(dehyst("status", "--endpoint", process.endpoint, "--once", "--json", "--axis", "y").stdout)[
+        "axes"
+    ]
+    assert [(status["axis"], status["role"]) for status in axes] == [("y", "primary")]
+    assert axes[0]["memory"]["resident_bytes"] > 5e7
+    assert axes[0]["checkpoints"]["age_s"] is not None
+    assert dehyst("status", "--endpoint", process.endpoint, "--once", "--stage", "none").returncode == 1
+
+
+@pytest.mark.e2e
+def test_the_live_table_goes_on_until_ctrl_c_and_ends_cleanly(serve: Callable[..., Any]) -> None:
+    process = serve()
+    live = subprocess.Popen(
+        [sys.executable, "-m", "lab.cli", "status", "--endpoint", process.endpoint, "--period", "0.2", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert live.stdout is not None
+    lines = [json.loads(live.stdout.readline()) for _ in range(3)]
+    assert [line["axes"][0]["axis"] for line in lines] == ["x", "x", "x"]
+    live.send_signal(signal.SIGINT)
+    _, err = live.communicate(timeout=20)
+    assert (live.returncode, err) == (0, "")

@@ -1,0 +1,198 @@
+"""Payloads: what is encoded comes back, and nothing malformed gets through."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.types import InverseModel
+from service.protocol import query as wire_query
+from service.protocol import reply as wire_flags
+from service.protocol import samples as wire
+from service.protocol.errors import FieldError
+from service.protocol.model import decode_model, encode_model
+from service.protocol.query import decode_query, encode_query
+from service.protocol.reply import FeedforwardReply, decode_reply, encode_reply
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+ANY = st.floats()
+DECODERS = [wire.decode_samples, wire.decode_command, wire.decode_reference, decode_query, decode_reply, decode_model]
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(0, wire.MAX_SEQ), ANY, ANY, ANY), min_size=1, max_size=20))
+def test_samples_come_back_to_the_last_bit(rows: list[tuple[int, float, float, float]]) -> None:
+    seq, t, u, y = (np.array(column) for column in zip(*rows, strict=True))
+    batch = wire.decode_samples(wire.encode_samples(seq, t, u, y))
+    assert batch.seq.tolist() == seq.tolist()
+    for got, sent in ((batch.t_s, t), (batch.u_V, u), (batch.y_um, y)):
+        np.testing.assert_array_equal(got, sent)
+
+
+@settings(deadline=None)
+@given(st.integers(0, wire.MAX_SEQ), st.lists(FINITE, min_size=1, max_size=50))
+def test_blocks_come_back(seq: int, values: list[float]) -> None:
+    command = wire.decode_command(wire.encode_command(seq, values))
+    assert (command.seq, command.values.tolist()) == (seq, values)
+    reference = wire.decode_reference(wire.encode_reference(seq, values))
+    assert (reference.seq, reference.values.tolist()) == (seq, values)
+
+
+@settings(deadline=None)
+@given(
+    n=st.integers(1, 30),
+    memory=st.none() | st.lists(FINITE, max_size=9),
+    acceleration=st.booleans(),
+    model=st.sampled_from(["", "mpi", "größe"]),
+    as_of=st.integers(-1, wire.MAX_SEQ),
+    before=FINITE | st.just(math.nan),
+)
+def test_queries_come_back(
+    n: int, memory: list[float] | None, acceleration: bool, model: str, as_of: int, before: float
+) -> None:
+    y, v, a = np.arange(3.0 * n).reshape(3, n)
+    query = decode_query(encode_query(y, v, a if acceleration else None, memory, model, as_of, before))
+    np.testing.assert_array_equal(query.y_um, y)
+    np.testing.assert_array_equal(query.v_um_per_s, v)
+    np.testing.assert_array_equal(query.a_um_per_s2, a if acceleration else np.zeros(n))
+    assert (None if query.memory is None else query.memory.tolist()) == memory
+    assert (query.model, query.as_of) == (model, as_of)
+    assert query.u_before_V == before or (math.isnan(before) and math.isnan(query.u_before_V))
+    assert query.y_um.flags.writeable  # compiled loops would be compiled once more for what is read-only
+
+
+def test_replies_come_back() -> None:
+    sent = FeedforwardReply(
+        np.array([1.0, 2.0]), np.array([0.1, math.nan]), np.array([0, 6], dtype=np.uint8), np.array([3.0]), 77, "mpi",
+        behind=True, tracked_memory=False, fallback=True,
+    )  # fmt: skip
+    got = decode_reply(encode_reply(sent))
+    for name in ("u_V", "std_V", "flags", "memory"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
+    assert (got.snapshot_seq, got.model, got.behind, got.tracked_memory, got.fallback) == (77, "mpi", True, False, True)
+    assert wire_flags.flag_names(6) == ["limited_slew", "outside_domain"]
+
+
+def test_the_layout_is_that_of_the_page() -> None:
+    """Byte by byte, so that a change of the format cannot go unnoticed."""
+    assert wire.encode_samples(7, 0.5, 1.0, 2.0) == struct.pack("<BBHIqddd", 1, 1, 0, 1, 7, 0.5, 1.0, 2.0)
+    assert wire.encode_command(9, [1.0, 2.0]) == struct.pack("<BBHIqdd", 1, 2, 0, 2, 9, 1.0, 2.0)
+    assert wire.encode_reference(9, 1.5) == struct.pack("<BBHIqd", 1, 3, 0, 1, 9, 1.5)
+    assert encode_query(1.0, 2.0, 3.0, [4.0], "mpi", 5, 6.0) == (
+        struct.pack("<BBHIqdII", 1, 4, 3, 1, 5, 6.0, 1, 3) + struct.pack("<dddd", 4.0, 1.0, 2.0, 3.0) + b"mpi"
+    )
+    reply = FeedforwardReply(
+        np.ones(1), np.zeros(1), np.full(1, 4, np.uint8), np.full(1, 9.0), 5, "a", tracked_memory=True
+    )
+    assert encode_reply(reply) == (
+        struct.pack("<BBHIqII", 1, 5, 2, 1, 5, 1, 1) + struct.pack("<ddd", 1.0, 0.0, 9.0) + b"\x04a"
+    )
+
+
+@pytest.mark.parametrize(
+    ("payload", "field"),
+    [
+        (b"", "payload"),
+        (struct.pack("<BBHIqd", 2, 2, 0, 1, 0, 1.0), "version"),
+        (struct.pack("<BBHIqd", 1, 3, 0, 1, 0, 1.0), "kind"),
+        (struct.pack("<BBHIqd", 1, 2, 1, 1, 0, 1.0), "options"),
+        (struct.pack("<BBHIqd", 1, 2, 0, 0, 0, 1.0), "n"),
+        (struct.pack("<BBHIqd", 1, 2, 0, 2**32 - 1, 0, 1.0), "n"),
+        (struct.pack("<BBHIqd", 1, 2, 0, 2, 0, 1.0), "payload"),
+        (struct.pack("<BBHIqd", 1, 2, 0, 1, 0, 1.0) + b"\0", "payload"),
+        (struct.pack("<BBHIqd", 1, 2, 0, 1, -1, 1.0), "seq"),
+        (struct.pack("<BBHIqdd", 1, 2, 0, 2, 0, 1.0, math.nan), "u_V[1]"),
+    ],
+)
+def test_malformed_commands_are_refused_by_field(payload: bytes, field: str) -> None:
+    with pytest.raises(FieldError) as refused:
+        wire.decode_command(payload)
+    assert refused.value.field == field
+    assert refused.value.expected
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"y_um": [1.0, math.nan]}, "y_um[1]"),
+        ({"v_um_per_s": [math.inf, 0.0]}, "v_um_per_s[0]"),
+        ({"a_um_per_s2": [0.0, math.nan]}, "a_um_per_s2[1]"),
+        ({"memory": [math.nan]}, "memory[0]"),
+        ({"as_of": -2}, "as_of"),
+        ({"u_before_V": math.inf}, "u_before_V"),
+    ],
+)
+def test_bad_values_in_a_query_are_refused_by_field(change: dict[str, object], field: str) -> None:
+    fields: dict[str, object] = {
+        "y_um": [1.0, 2.0],
+        "v_um_per_s": [0.0, 0.0],
+        "a_um_per_s2": [0.0, 0.0],
+        "memory": [0.0],
+    }
+    with pytest.raises(FieldError) as refused:
+        decode_query(encode_query(**{**fields, **change}))  # type: ignore[arg-type]
+    assert refused.value.field == field
+
+
+def test_huge_but_finite_values_are_not_taken_for_infinite() -> None:
+    assert decode_query(encode_query(1e300, -1e300)).y_um[0] == 1e300
+
+
+def test_unequal_lengths_and_long_blocks_are_refused_before_they_are_sent() -> None:
+    with pytest.raises(InputError, match="u_V"):
+        wire.encode_samples([1, 2], [0.0, 1.0], [0.0], [0.0, 1.0])
+    with pytest.raises(InputError, match="v_um_per_s"):
+        encode_query([1.0, 2.0], [0.0])
+    with pytest.raises(InputError, match="65536"):
+        wire.encode_command(0, np.zeros(wire.MAX_COUNT + 1))
+    with pytest.raises(InputError, match="one-dimensional"):
+        wire.encode_command(0, np.zeros((2, 2)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_no_bytes_do_more_than_raise_input_error(data: st.DataObject) -> None:
+    """Random bytes, and honest payloads with bytes changed, cut or added."""
+    decode = data.draw(st.sampled_from(DECODERS))
+    honest = data.draw(st.sampled_from(HONEST))
+    payload = bytearray(data.draw(st.one_of(st.binary(max_size=120), st.just(honest))))
+    for _ in range(data.draw(st.integers(0, 4))):
+        if payload:
+            payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    payload = payload[: data.draw(st.integers(0, len(payload) + 1))]
+    # Anything else than these two, a crash included, fails the test.
+    with contextlib.suppress(InputError, ModelFileError):
+        decode(bytes(payload))
+
+
+def test_a_model_comes_back_and_answers_the_same(models: dict[str, InverseModel]) -> None:
+    for name, model in models.items():
+        memory = model.rest_memory(20.0)
+        got = decode_model(encode_model(name, model, 41, memory))
+        assert (got.name, got.snapshot_seq) == (name, 41)
+        y = np.linspace(10.0, 60.0, 30)
+        mine, theirs = (m.feedforward(y, 0 * y, 0 * y, memory) for m in (got.model, model))
+        np.testing.assert_array_equal(mine.u_V, theirs.u_V)
+        np.testing.assert_array_equal(got.memory, memory)
+
+
+def test_a_model_with_a_memory_of_another_size_is_refused(models: dict[str, InverseModel]) -> None:
+    model = models["lssvm_adaptive"]
+    with pytest.raises(ModelFileError, match="memory"):
+        decode_model(encode_model("lssvm_adaptive", model, 0, np.zeros(model.memory_size + 1)))
+
+
+HONEST = [
+    wire.encode_samples([1, 2], [0.0, 1e-3], [1.0, 2.0], [3.0, 4.0]),
+    wire.encode_command(3, [1.0, 2.0]),
+    encode_query([1.0, 2.0], [0.0, 0.0], [0.0, 0.0], [0.5], "mpi"),
+    encode_query([1.0], [0.0], model="mpi", pending=wire_query.Pending(3, np.ones(2), np.ones(2))),
+    encode_reply(FeedforwardReply(np.ones(2), np.ones(2), np.zeros(2, np.uint8), np.ones(1), 5, "mpi")),
+]

@@ -1,0 +1,101 @@
+"""Freed memory goes back to the system."""
+
+from __future__ import annotations
+
+import gc
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from service.runtime.memory import in_use, starting
+
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library is left as it is")
+
+_CODE = """
+import sys, threading
+import numpy as np, psutil
+from service.runtime.memory import give_back, keep_little
+little = sys.argv[1] == "little"
+if little:
+    assert keep_little()
+def work():
+    kept = []
+    for k in range(300):
+        large = [np.ones(40_000) for _ in range(8)]
+        kept.append(np.ones(3000))
+        del large
+    return kept
+threads = [threading.Thread(target=work) for _ in range(8)]
+for t in threads: t.start()
+for t in threads: t.join()
+if little:
+    assert give_back()
+print(psutil.Process().memory_info().rss)
+"""
+
+
+def resident(how: str) -> int:
+    run = subprocess.run([sys.executable, "-c", _CODE, how], capture_output=True, text=True, timeout=120, check=True)
+    return int(run.stdout)
+
+
+@glibc
+def test_many_threads_and_large_blocks_leave_nothing_behind() -> None:
+    assert resident("little") < resident("as it is")
+
+
+_IN_USE = """
+import numpy as np
+from service.runtime.memory import in_use
+before = in_use()
+large, small, objects = np.ones(2_000_000), [np.ones(1000) for _ in range(1000)], [[] for _ in range(10_000)]
+while_held = in_use()
+del large, small, objects
+after = in_use()
+print(*(now[name] - before[name] for now in (while_held, after) for name in ("malloc_bytes", "python_blocks")))
+"""
+
+
+def test_asking_what_is_in_use_leaves_nothing_behind() -> None:
+    """A service asks once a second for months."""
+    in_use()
+    gc.collect()
+    before = sys.getallocatedblocks()
+    gc.disable()
+    try:
+        for _ in range(100):
+            in_use()
+        assert sys.getallocatedblocks() - before < 100
+    finally:
+        gc.enable()
+
+
+@glibc
+def test_what_is_in_use_is_what_was_asked_for_and_not_given_back() -> None:
+    run = subprocess.run([sys.executable, "-c", _IN_USE], capture_output=True, text=True, timeout=120, check=True)
+    held, blocks, left, blocks_left = map(int, run.stdout.split())
+    assert held == pytest.approx(24_000_000, rel=0.02)
+    assert blocks >= 10_000
+    assert abs(left) < 100_000
+    assert abs(blocks_left) < 1000
+
+
+def test_what_is_there_after_the_start_is_never_looked_through_again() -> None:
+    try:
+        with starting() as started:
+            assert not gc.isenabled()
+            started()
+            assert gc.isenabled()
+            assert gc.get_freeze_count() > 10_000
+            assert len(gc.get_objects(2)) < 0.01 * gc.get_freeze_count()
+    finally:
+        gc.unfreeze()
+
+
+def test_a_start_that_fails_leaves_collections_as_they_were() -> None:
+    with pytest.raises(RuntimeError), starting():
+        raise RuntimeError
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0

@@ -1,0 +1,364 @@
+"""One axis without wire or threads: snapshots, as_of, memory, numbers that go wrong, models that go wrong."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from adaptive.types import Feedforward, FloatArray, InverseModel, OnlineModel, Sample
+from service.answers.guard import Limits
+from service.config.config import AxisConfig
+from service.intake.intake import Intake
+from service.intake.sequence import RESTART_AFTER
+from service.protocol.query import FeedforwardQuery
+from service.protocol.reply import NOT_FINITE_REPLACED, FeedforwardReply
+from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
+from service.server.axis import Axis
+from service.server.models import load_axis, make_learner
+from service.storage.model_file import Bundle, BundleMeta
+
+DT_S = 1e-3
+LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
+CONFIG = AxisConfig("x", Path("x.npz"), LIMITS, compete=())
+META = BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0)
+
+
+def recording(n: int, first: int = 0) -> SampleBatch:
+    """n samples of a stage with 5 % less gain than the models believe, moving at 3 Hz."""
+    k = np.arange(first, first + n)
+    y = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * k * DT_S)
+    return SampleBatch(k, k * DT_S, (y - 1.0) / (11.0 * 0.95), y)
+
+
+def parts(batch: SampleBatch, size: int) -> list[SampleBatch]:
+    cuts = range(0, len(batch), size)
+    return [SampleBatch(*(getattr(batch, f)[i : i + size] for f in ("seq", "t_s", "u_V", "y_um"))) for i in cuts]
+
+
+def make_axis(models: dict[str, InverseModel], **changes: Any) -> Axis:
+    return load_axis("demo", replace(CONFIG, **changes), make_learner, Bundle(models, META))
+
+
+def ask(axis: Axis, y: float = 40.0, n: int = 20, **fields: Any) -> FeedforwardReply:
+    t = np.arange(n) * DT_S
+    return axis.answer(FeedforwardQuery(y + 100.0 * t, np.full(n, 100.0), np.zeros(n), **fields))
+
+
+def test_the_same_samples_give_the_same_voltages_to_the_last_bit_however_they_arrive(
+    models: dict[str, InverseModel],
+) -> None:
+    def answers(size: int) -> list[FloatArray]:
+        axis = make_axis(models)
+        got = []
+        for part in parts(recording(700), size):
+            axis.handle(part)
+        for as_of in (0, 19, 20, 350, 699):
+            reply = ask(axis, as_of=as_of)
+            got.append(np.concatenate([reply.u_V, reply.std_V, reply.memory, [reply.snapshot_seq]]))
+        return got
+
+    ones, many = answers(1), answers(137)
+    for a, b in zip(ones, many, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert [int(a[-1]) for a in ones] == [0, 0, 20, 340, 680]
+    # It did learn: or all of this would hold of a model that never changes.
+    assert abs(ones[0][0] - ones[-1][0]) > 0.02
+
+
+def test_as_of_answers_as_it_would_have_then(models: dict[str, InverseModel]) -> None:
+    live, later = make_axis(models), make_axis(models)
+    for part in parts(recording(600), 10):
+        live.handle(part)
+        if live.handled_seq == 409:
+            then = ask(live)
+    for part in parts(recording(600), 50):
+        later.handle(part)
+    now = ask(later, as_of=409)
+    np.testing.assert_array_equal(then.u_V, now.u_V)
+    assert (then.snapshot_seq, now.snapshot_seq) == (400, 400)
+
+
+def test_as_of_says_when_it_is_behind_and_when_it_is_gone(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models, snapshots_kept=3)
+    for part in parts(recording(111), 1):
+        axis.handle(part)
+    assert not ask(axis, as_of=110).behind
+    assert not ask(axis, as_of=119).behind  # nothing up to 119 can change the answer
+    assert ask(axis, as_of=120).behind
+    axis.handle(recording(9, first=111))
+    assert ask(axis, as_of=120).behind
+    axis.handle(recording(1, first=120))
+    assert not ask(axis, as_of=120).behind
+    assert ask(axis, as_of=80).snapshot_seq == 80
+    with pytest.raises(InputError, match="snapshots_kept"):
+        ask(axis, as_of=79)
+
+
+def test_memory_travels_and_a_cut_trajectory_is_the_same_trajectory(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(200))
+    y = 45.0 + 20.0 * np.sin(np.linspace(0.0, 6.0, 60))
+    zero = np.zeros(60)
+    whole = axis.answer(FeedforwardQuery(y, zero, zero))
+    memory, u, before = None, [], math.nan
+    for i in range(0, 60, 15):
+        s = slice(i, i + 15)
+        reply = axis.answer(FeedforwardQuery(y[s], zero[s], zero[s], memory, u_before_V=before))
+        assert reply.tracked_memory is (memory is None)
+        memory, before = reply.memory, float(reply.u_V[-1])
+        u.append(reply.u_V)
+    np.testing.assert_array_equal(np.concatenate(u), whole.u_V)
+    np.testing.assert_array_equal(memory, whole.memory)
+
+
+def test_tracked_memory_is_that_of_the_samples(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models, learn="", snapshot_every=50)
+    batch = recording(300)
+    for part in parts(batch, 7):
+        axis.handle(part)
+    model = models["lssvm_adaptive"]
+    zero = np.zeros(251)
+    expected = model.track(batch.y_um[:251], zero, zero, batch.u_V[:251], model.rest_memory(float(batch.y_um[0])))
+    np.testing.assert_array_equal(axis.model("lssvm_adaptive")[2], expected)
+
+
+def test_sequence_numbers_that_go_wrong_are_counted(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    batch = recording(100)
+    axis.handle(batch)
+    axis.handle(parts(batch, 30)[1])  # twice
+    axis.handle(recording(50, first=110))  # ten never came
+    assert axis.sequence.counters() == {"received": 180, "lost": 10, "late": 30, "restarts": 0}
+    assert axis.handled_seq == 159
+    assert axis.newest.seq == 140
+    assert axis.gates["learnt"] > 0
+
+
+def test_what_was_lost_and_comes_late_after_all_is_no_restart(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(1000))
+    axis.handle(recording(500, first=2500))
+    # A process that was stopped passes on at once what it had not passed on.
+    axis.handle(recording(1500, first=1000))
+    assert axis.sequence.counters() == {"received": 3000, "lost": 1500, "late": 1500, "restarts": 0}
+    assert axis.handled_seq == 2999
+
+
+def test_a_stage_that_counts_anew_goes_on_being_learnt(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(5000))
+    model_before = axis.model("lssvm_adaptive")[0]
+    began_at = time.time()
+    verdicts = axis.handle(recording(2000))
+    ended_at = time.time()
+    assert axis.sequence.restarts == 1
+    assert axis.handled_seq == 1999
+    (event,) = axis.take_events()
+    assert event["event"] == "stage_restarted"
+    # When it happened, not when somebody asks: a standby tells its events only once it serves.
+    assert began_at <= event["time_unix_s"] <= ended_at
+    assert axis.newest.seq == 1980
+    # What came before the restart was noticed is refused as late; from then on it is learnt.
+    assert verdicts[: RESTART_AFTER - 1] == ["out_of_order"] * (RESTART_AFTER - 1)
+    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[RESTART_AFTER:]) > 1500
+    after = axis.model("lssvm_adaptive")[0]
+    zero = np.zeros(1)
+    u = [m.feedforward(zero + 45.0, zero, zero, m.rest_memory(45.0)).u_V[0] for m in (model_before, after)]
+    assert abs(u[0] - u[1]) < 0.2  # nothing of what was learnt is lost
+
+
+def test_what_is_told_while_samples_are_handled_belongs_together(models: dict[str, InverseModel]) -> None:
+    """A status that was made half way through a restart had the new count of restarts with the old number."""
+    axis = make_axis(models)
+    axis.handle(recording(5000))
+    before = axis.tally
+    assert (before.seq, before.samples, sum(before.gates.values())) == (4999, axis.sequence.counters(), 5000)
+    told = []
+    axis.at_snapshot = lambda: told.append((axis.tally, axis.sequence.restarts))
+    axis.handle(recording(400))
+    assert told == [(before, 1)]
+    assert (axis.tally.seq, axis.tally.samples["restarts"], sum(axis.tally.gates.values())) == (399, 1, 5400)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_bad_samples_change_no_model(bad: float, models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    axis.handle(recording(400))
+    reference = ask(axis, memory=np.zeros(models["lssvm_adaptive"].memory_size))
+    k = np.arange(400, 404)
+    for field in ("t_s", "u_V", "y_um"):
+        columns = {"t_s": k * DT_S, "u_V": np.full(4, 4.0), "y_um": np.full(4, 45.0), field: np.full(4, bad)}
+        verdicts = axis.handle(SampleBatch(k, **columns))
+        k = k + 4
+        assert all(verdict not in ("learnt", "not_learning") for verdict in verdicts) or field == "u_V"
+    reply = ask(axis, memory=np.zeros(models["lssvm_adaptive"].memory_size))
+    assert np.isfinite(reply.u_V).all()
+    np.testing.assert_allclose(reply.u_V, reference.u_V, atol=0.2)
+    assert np.isfinite(ask(axis).memory).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"model": "sorcery"}, "model: got 'sorcery', expected one of linear, lssvm_adaptive"),
+        ({"memory": np.zeros(77)}, "memory: got 77 values"),
+        ({"y": 80.0, "n": 200}, r"y_um\[101\]"),
+    ],
+)
+def test_queries_that_cannot_be_answered_say_why(
+    fields: dict[str, Any], words: str, models: dict[str, InverseModel]
+) -> None:
+    axis = make_axis(models)
+    with pytest.raises(InputError, match=words):
+        ask(axis, **fields)
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A model that answers NaN for every second point."""
+
+    inner: InverseModel
+    name: str = "lssvm_adaptive"
+    dt_s: float = DT_S
+    memory_size: int = 2
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        return np.zeros(2)
+
+    def feedforward(self, y: FloatArray, v: FloatArray, a: FloatArray, memory: FloatArray) -> Feedforward:
+        answer = self.inner.feedforward(y, v, a, np.zeros(self.inner.memory_size))
+        u = answer.u_V.copy()
+        u[::2] = np.nan
+        return Feedforward(u, answer.std_V, answer.inside, np.full(2, np.nan))
+
+    def track(self, y: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, memory: FloatArray) -> FloatArray:
+        return np.full(2, np.nan)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+
+def test_a_model_gone_bad_still_gives_safe_voltages(models: dict[str, InverseModel]) -> None:
+    line = models["linear"]
+    axis = Axis(replace(CONFIG, learn=""), {"linear": line, "lssvm_adaptive": Broken(line)}, None, LIMITS)
+    axis.handle(recording(100))
+    reply = ask(axis)
+    good = ask(axis, model="linear")
+    np.testing.assert_array_equal(reply.u_V, good.u_V)
+    assert reply.fallback
+    assert not good.fallback
+    assert (reply.flags[::2] & NOT_FINITE_REPLACED).all()
+    assert not (reply.flags[1::2] & NOT_FINITE_REPLACED).any()
+    np.testing.assert_array_equal(reply.memory, [0.0, 0.0])  # what came in goes back rather than NaN
+    # Without a line to stand in: the voltage before, or mid-range where there is none.
+    alone = Axis(replace(CONFIG, learn=""), {"lssvm_adaptive": Broken(line)}, None, LIMITS)
+    alone_reply = ask(alone)
+    assert alone_reply.u_V[0] == 5.0
+    assert np.isfinite(alone_reply.u_V).all()
+
+
+class Failing:
+    """A learner that raises after a while, which none may."""
+
+    def __init__(self, inner: OnlineModel) -> None:
+        self.inner = inner
+
+    @property
+    def seq(self) -> int:
+        return self.inner.seq
+
+    def handle(self, sample: Sample) -> str:
+        if sample.seq > 450:
+            raise ZeroDivisionError("no")
+        return self.inner.handle(sample)
+
+    def snapshot(self) -> InverseModel:
+        return self.inner.snapshot()
+
+    def counters(self) -> dict[str, int]:
+        return self.inner.counters()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+
+def test_a_learner_that_fails_leaves_its_last_good_model_in_service(models: dict[str, InverseModel]) -> None:
+    axis = load_axis("demo", CONFIG, lambda m, s, lim: Failing(make_learner(m, s, lim)), Bundle(models, META))
+    axis.handle(recording(650))
+    assert not axis.learning
+    assert [e["event"] for e in axis.take_events()] == ["learner_failed"]
+    assert axis.gates["not_learning"] == 199
+    assert np.isfinite(ask(axis).u_V).all()
+    assert axis.newest.seq == 640  # memory is still tracked
+
+
+def test_learner_settings_are_checked_by_name(models: dict[str, InverseModel]) -> None:
+    for settings, words in (
+        ({"windw": 3}, r"learner\.windw.*window"),
+        ({"window": "many"}, r"learner\.window"),
+        ({"window": 1}, "window"),
+        ({"admission": {"setle": 1}}, r"learner\.admission\.setle"),
+        ({"admission": 5}, r"learner\.admission.*a table"),
+    ):
+        with pytest.raises(InputError, match=words):
+            make_axis(models, learner=settings)
+    with pytest.raises(InputError, match="learn"):
+        make_axis(models, learn="linear")
+    with pytest.raises(InputError, match="served"):
+        make_axis(models, served="mpi")
+
+
+def test_the_domain_comes_from_the_recording_where_the_configuration_gives_none(
+    models: dict[str, InverseModel],
+) -> None:
+    axis = make_axis(models, limits=Limits(0.0, 10.0, 2000.0))
+    assert (axis.limits.y_min_um, axis.limits.y_max_um) == (-4.5, 94.5)
+    axis = make_axis(models, limits=Limits(0.0, 10.0, 2000.0, y_max_um=50.0))
+    assert (axis.limits.y_min_um, axis.limits.y_max_um) == (-4.5, 50.0)
+
+
+def test_queries_are_answered_while_samples_are_handled(models: dict[str, InverseModel]) -> None:
+    """Thousands of queries beside a thread that learns: every one safe, snapshots only ever newer."""
+    axis = make_axis(models)
+    intake = Intake(axis, lambda: None)
+    intake.start()
+    try:
+        last, count = -1, 0
+        for part in parts(recording(6000), 10):
+            assert intake.offer(part)
+        until = threading.Event()
+        while intake.waiting and not until.wait(0):
+            reply = ask(axis, n=3)
+            assert np.isfinite(reply.u_V).all()
+            assert reply.snapshot_seq >= last
+            last, count = reply.snapshot_seq, count + 1
+    finally:
+        intake.close()
+    assert axis.handled_seq == 5999
+    assert count > 20
+
+
+def test_the_model_does_not_depend_on_how_samples_were_gathered(models: dict[str, InverseModel]) -> None:
+    one, many = make_axis(models), make_axis(models)
+    whole = recording(600)
+    for part in parts(whole, 1):
+        one.handle(part)
+    for first in range(0, 600, 50):
+        many.handle(joined(parts(whole, 1)[first : first + 50]))
+    assert one.newest.seq == many.newest.seq
+    assert one.gates == many.gates
+    np.testing.assert_array_equal(ask(one, n=5).u_V, ask(many, n=5).u_V)
+
+
+def test_samples_through_the_wire_are_those_that_were_sent() -> None:
+    batch = recording(5)
+    got = decode_samples(encode_samples(batch.seq, batch.t_s, batch.u_V, batch.y_um))
+    np.testing.assert_array_equal(got.y_um, batch.y_um)

@@ -1,0 +1,448 @@
+"""The competition and the re-tuning as an axis has them: a degraded learner is replaced, tuned again, and replayed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from adaptive.tuning.proposal import RetuneConfig
+from adaptive.tuning.samples import Hyperparameters
+from adaptive.types import FloatArray, InverseModel, OnlineModel
+from baselines.fit import fit_linear, fit_mpi
+from service.answers.guard import Limits
+from service.background.retuning import adoption
+from service.background.retuning.adoption import Adoptions, Retuned
+from service.background.retuning.job import Job
+from service.background.retuning.retuner import Retuner
+from service.background.retuning.settings import RetuningConfig
+from service.config.config import AxisConfig, parse_config
+from service.protocol.errors import FieldError
+from service.protocol.query import FeedforwardQuery
+from service.protocol.samples import SampleBatch
+from service.server import competing, models
+from service.server.axis import Axis
+from service.server.axis_state import restore_axis
+from service.storage.model_file import Bundle, BundleMeta
+from sim.signals.signals import training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT_S = 1e-3
+LIMITS = Limits(-2.0, 10.0, 4000.0)
+ABSURD = Hyperparameters(1e7, (0.02,) * 5)
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[np.ndarray, np.ndarray]:
+    """(u_V, y_um) of 14 s on the rich stage: the chapter's signal, then tones."""
+    stage = Stage(preset("rich", seed=4))
+    t_s = np.arange(8000) * DT_S
+    tones = 3.4 + 1.1 * np.sin(2 * np.pi * 1.7 * t_s) + 0.9 * np.sin(2 * np.pi * 4.3 * t_s + 1.0)
+    u_V = np.concatenate([training_input(DT_S, 6.0)[1], tones])
+    y_um, _ = stage.run(stage.initial_state(), u_V)
+    return u_V, y_um
+
+
+@pytest.fixture(scope="module")
+def bundle(recorded: tuple[np.ndarray, np.ndarray]) -> Bundle:
+    from adaptive.identification import IdentifyConfig, identify_lssvm
+
+    u_V, y_um = (column[:6000] for column in recorded)
+    found: dict[str, InverseModel] = {
+        "lssvm_adaptive": identify_lssvm(u_V, y_um, DT_S, config=IdentifyConfig(tune=False, n=200))[0],
+        "mpi": fit_mpi(u_V, y_um, DT_S)[0],
+        "linear": fit_linear(u_V, y_um, DT_S)[0],
+    }
+    return Bundle(found, BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0))
+
+
+def axis_of(bundle: Bundle, **more: Any) -> Axis:
+    config = AxisConfig("x", Path("x.npz"), LIMITS, learner={"window": 200}, **more)
+    return models.load_axis("demo", config, bundle=bundle)
+
+
+def give(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: int, stop: int, size: int = 20) -> None:
+    u_V, y_um = recorded
+    for k in range(start, stop, size):
+        seq = np.arange(k, min(stop, k + size))
+        t_s: FloatArray = (seq * DT_S).astype(np.float64)
+        axis.handle(SampleBatch(seq, t_s, u_V[seq], y_um[seq]))
+        if axis.retuner is not None:
+            axis.retuner.step(axis)
+
+
+def ask(axis: Axis, name: str = "") -> Any:
+    zero = np.zeros(5)
+    return axis.answer(FeedforwardQuery(np.full(5, 40.0), zero, zero, None, name))
+
+
+def degrade(axis: Axis, by_V: float) -> None:
+    """Poison the learner: what its linear part gives is off by ``by_V``, whatever it learns."""
+    learner: Any = axis.learner
+    favourite = learner.favourite
+    inner = favourite.snapshot
+
+    def snapshot() -> InverseModel:
+        model = inner()
+        beta = model.beta.copy()
+        beta[0] += by_V
+        worse: InverseModel = replace(model, beta=beta)
+        return worse
+
+    favourite.snapshot = inner if by_V == 0.0 else snapshot
+
+
+def test_the_champion_answers_by_default_and_is_the_learner_while_that_is_best(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray]
+) -> None:
+    axis = axis_of(bundle)
+    assert axis.served == "auto"
+    give(axis, recorded, 0, 4000)
+    default, own = ask(axis), ask(axis, "lssvm_adaptive")
+    assert default.model == "auto"
+    np.testing.assert_array_equal(default.u_V, own.u_V)
+    learner: Any = axis.learner
+    standing = learner.standing()
+    assert standing["champion"] == "lssvm_adaptive"
+    assert set(standing["contestants"]) == {"lssvm_adaptive", "linear", "mpi"}
+    assert "competition_mpi_rms_pct" in learner.diagnostics()
+    json.dumps(standing)
+
+
+def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray]
+) -> None:
+    axis = axis_of(bundle)
+    give(axis, recorded, 0, 3000)
+    learner: Any = axis.learner
+    inner = learner.favourite.snapshot
+    degrade(axis, 0.6)
+    give(axis, recorded, 3000, 5000)
+    assert learner.champion == "mpi"
+    assert [event["event"] for event in axis.take_events()].count("champion_changed") == 1
+    bad, served, baseline = (ask(axis, name).u_V[-1] for name in ("lssvm_adaptive", "", "mpi"))
+    assert abs(served - baseline) < 0.15 < 0.4 < abs(bad - served)
+    learner.favourite.snapshot = inner
+    give(axis, recorded, 5000, 9000)
+    assert learner.champion == "lssvm_adaptive"
+    np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
+
+
+def test_alone_the_learner_answers(bundle: Bundle) -> None:
+    axis = axis_of(bundle, compete=())
+    assert axis.served == "lssvm_adaptive"
+    assert "auto" not in axis.newest.models
+    with pytest.raises(InputError):
+        ask(axis, "auto")
+
+
+def test_a_state_goes_on_to_the_last_bit_with_adoptions_to_come(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray]
+) -> None:
+    one = axis_of(bundle)
+    give(one, recorded, 0, 2500)
+    hyper = Hyperparameters(500.0, tuple(1.3 * w for w in one.learner.hyper.widths))  # type: ignore[union-attr]
+    one.adopt_at(Retuned(2800, hyper.gamma, hyper.widths))
+    state = one.state_dict()
+    two = axis_of(bundle)
+    restore_axis(two, state)
+    for axis in (one, two):
+        give(axis, recorded, 2500, 4000)
+    assert [e["event"] for e in one.take_events() if e["event"].startswith("retun")] == [
+        e["event"] for e in two.take_events() if e["event"].startswith("retun")
+    ]
+    for name in ("auto", "lssvm_adaptive"):
+        np.testing.assert_array_equal(ask(one, name).u_V, ask(two, name).u_V)
+
+
+# ---- re-tuning
+
+
+@pytest.fixture
+def retuner(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Retuner]:
+    settings: dict[str, Any] = {"period_s": 0.0, "fresh": 80, "lead_s": 0.1, "torch": False}
+    # A short search: where kernels are far too wide, any descent finds it.
+    settings["search"] = RetuneConfig(starts=2, rows=100, iterations=15)
+    made = Retuner(RetuningConfig(**{**settings, **getattr(request, "param", {})}), tmp_path)
+    yield made
+    made.close()
+
+
+def wait_for(retuner: Retuner) -> None:
+    until = time.monotonic() + 120.0
+    while retuner._job is not None and retuner._job.result is None and time.monotonic() < until:
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def rippled(recorded: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The same with what a sensor's interpolation error adds: a ripple that kernels as wide as the range can't follow,
+    and that the linear part does not span. What was identified knows nothing of it."""
+    u_V, y_um = recorded
+    return u_V, y_um + 0.3 * np.sin(2.0 * np.pi * y_um / 15.0)
+
+
+def tunable(bundle: Bundle) -> Axis:
+    """An axis whose model was identified without tuning: the same wide kernel for all inputs."""
+    config = AxisConfig("x", Path("x.npz"), LIMITS, learner={"window": 200, "learn_every": 5}, compete=())
+    return models.load_axis("demo", config, bundle=bundle)
+
+
+def hyper_of(axis: Axis) -> Hyperparameters:
+    learner: Any = axis.learner
+    hyper: Hyperparameters = learner.hyper
+    return hyper
+
+
+def retuned_from_7500(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner) -> list[dict[str, Any]]:
+    """Ask at sample 7500, go on to 12500; the events."""
+    axis.retuner = retuner
+    give(axis, recorded, 6000, 7500)
+    assert retuner.request({}) == {"started": True, "job": 1}
+    assert retuner.request({})["started"] is False
+    for k in range(7500, 12500, 100):
+        give(axis, recorded, k, k + 100)
+        wait_for(retuner)
+    return axis.take_events()
+
+
+def prequential_mV(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: int, stop: int) -> float:
+    """rms error, mV, of what was served, at the age of an answer, on samples that had taught nothing."""
+    learner: Any = axis.learner
+    errors_V = []
+    for k in range(start, stop, 2):
+        give(axis, recorded, k, k + 2)
+        errors_V.append(learner.parts.judgement.error_V)
+    return 1e3 * float(np.sqrt(np.mean(np.square(errors_V))))
+
+
+def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_same(
+    bundle: Bundle, rippled: tuple[np.ndarray, np.ndarray], retuner: Retuner, tmp_path: Path
+) -> None:
+    axis = tunable(bundle)
+    before = hyper_of(axis)
+    events = {event["event"]: event for event in retuned_from_7500(axis, rippled, retuner)}
+    last = retuner.status()["last"]
+    assert last["outcome"] == "better", last
+    assert last["after_V"] < 0.9 * last["before_V"]
+    assert min(last["widths"]) < 0.1 * min(before.widths)
+    assert "retuning_refused" not in events
+    announced, done = events["retuning_adopted"], events["retuned"]
+    assert announced["retuned"] == done["retuned"]
+    # Announced a lead ahead, taken over right after the sample that was named.
+    at = announced["retuned"]["seq"]
+    assert (at - announced["seq"], done["seq"]) == (100, at)
+    assert hyper_of(axis) == Retuned.from_json(done["retuned"]).hyper != before
+    tuned_mV = prequential_mV(axis, rippled, 12500, 14000)
+    until = time.monotonic() + 10.0
+    while not adoption.read(tmp_path) and time.monotonic() < until:
+        time.sleep(0.01)
+    again, without = tunable(bundle), tunable(bundle)
+    again.adoptions.add(*adoption.read(tmp_path))
+    for other in (again, without):
+        give(other, rippled, 6000, 12500, size=37)
+    untuned_mV = prequential_mV(without, rippled, 12500, 14000)
+    assert tuned_mV < 0.75 * untuned_mV
+    assert prequential_mV(again, rippled, 12500, 14000) == tuned_mV
+    for key, value in axis.newest.models["lssvm_adaptive"].state_dict().items():
+        np.testing.assert_array_equal(value, again.newest.models["lssvm_adaptive"].state_dict()[key])
+
+
+def test_a_bad_proposal_is_found_out_by_its_trial(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Misled:
+        """Proposes nonsense; the trial is the real one."""
+
+        def __init__(self) -> None:
+            self.result = {"changed": True, "gamma": ABSURD.gamma, "widths": list(ABSURD.widths)}
+
+        def cancel(self) -> None: ...
+
+    def job(order: dict[str, Any], *rest: Any) -> Any:
+        return Misled() if order["kind"] == "propose" else Job(order, *rest)
+
+    monkeypatch.setattr("service.background.retuning.retuner.Job", job)
+    axis = tunable(bundle)
+    before = hyper_of(axis)
+    events = [event["event"] for event in retuned_from_7500(axis, recorded, retuner)]
+    last = retuner.status()["last"]
+    assert last["outcome"] == "worse", last
+    assert last["after_V"] > last["before_V"]
+    assert not [event for event in events if event.startswith("retun")]
+    assert hyper_of(axis) == before
+    assert retuner.status()["state"] == "idle"
+
+
+def test_a_bad_adoption_is_refused_by_the_learner_and_changes_nothing(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray]
+) -> None:
+    told, quiet = tunable(bundle), tunable(bundle)
+    told.adopt_at(Retuned(7000, ABSURD.gamma, ABSURD.widths))
+    for axis in (told, quiet):
+        give(axis, recorded, 6000, 8000)
+    assert [event["event"] for event in told.take_events() if event["event"].startswith("retun")] == [
+        "retuning_refused"
+    ]
+    for key, value in quiet.newest.models["lssvm_adaptive"].state_dict().items():
+        np.testing.assert_array_equal(value, told.newest.models["lssvm_adaptive"].state_dict()[key])
+
+
+class Told:
+    """Stands in for the background: gives the results it is told, in order."""
+
+    def __init__(self, *results: dict[str, Any]) -> None:
+        self.results = list(results)
+        self.fresh: list[int] = []
+
+    def __call__(self, order: dict[str, Any], arrays: dict[str, Any], timeout_s: float) -> Told:
+        if order["kind"] == "compare":
+            self.fresh.append(arrays["after.targets_V"].size)
+        self.result = self.results.pop(0)
+        return self
+
+    def cancel(self) -> None: ...
+
+
+PROPOSED = {"changed": True, "gamma": 50.0, "widths": [2.0] * 5}
+OPEN = {"better": False, "open": True, "fresh": 0, "before_V": 1.0, "after_V": 0.9, "sigmas": 1.0}
+
+
+@pytest.mark.parametrize("retuner", [{"fresh": 20}], indirect=True)
+def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Told(PROPOSED, OPEN, OPEN, OPEN)
+    monkeypatch.setattr("service.background.retuning.retuner.Job", told)
+    axis = tunable(bundle)
+    axis.retuner = retuner
+    give(axis, recorded, 6000, 8000)
+    retuner.request({})
+    give(axis, recorded, 8000, 13000)
+    first, second, third = told.fresh
+    assert 20 <= first < second < third
+    assert second >= 40
+    assert third >= 80
+    assert retuner.status()["last"]["outcome"] == "worse"
+
+
+@pytest.mark.parametrize("retuner", [{"timeout_s": 0.05}], indirect=True)
+def test_what_takes_too_long_is_ended_and_counted(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
+) -> None:
+    axis = axis_of(bundle, compete=())
+    axis.retuner = retuner
+    give(axis, recorded, 0, 1000)
+    retuner.request({})
+    give(axis, recorded, 1000, 1020)
+    wait_for(retuner)
+    give(axis, recorded, 1020, 1040)
+    status = retuner.status()
+    assert (status["timeouts"], status["state"]) == (1, "idle")
+    assert "timeout_s" in status["last"]["detail"]
+
+
+@pytest.mark.parametrize("retuner", [{"period_s": 1.0}], indirect=True)
+def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
+) -> None:
+    axis = axis_of(bundle, compete=())
+    axis.retuner = retuner
+    u_V, y_um = recorded
+    rest = np.full(3000, u_V[0]), y_um[0] + 0.003 * np.random.default_rng(1).normal(size=3000)
+    give(axis, rest, 0, 3000)
+    assert retuner.status()["started"] == 0
+    give(axis, (np.concatenate([rest[0], u_V]), np.concatenate([rest[1], y_um])), 3000, 6000)
+    assert retuner.status()["started"] == 1
+
+
+def test_a_frozen_learner_is_left_alone(
+    bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
+) -> None:
+    axis = axis_of(bundle, compete=())
+    axis.retuner = retuner
+    give(axis, recorded, 0, 1000)
+    axis.freeze("test")
+    retuner.request({})
+    give(axis, recorded, 1000, 2000)
+    assert retuner.status()["started"] == 0
+    with pytest.raises(FieldError):
+        retuner.request({"hurry": True})
+
+
+def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> None:
+    code = (
+        "import sys\n"
+        "class Blocked:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Blocked())\n"
+        "import service.server.endpoints, service.server.models, service.background.retuning.retuner\n"
+        "from service.background.retuning.worker import _search\n"
+        "assert 'baselines.swarm.evidence' not in sys.modules\n"
+        "print(_search(True)[1])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert "torch is not installed" in run.stdout
+
+
+def test_a_worker_that_dies_says_why() -> None:
+    job = Job({"kind": "nonsense"}, {}, 60.0)
+    until = time.monotonic() + 60.0
+    while job.result is None and time.monotonic() < until:
+        time.sleep(0.02)
+    assert job.result is not None
+    assert "without a result" in job.result["error"]
+
+
+def test_adoptions_are_made_once_in_order_at_their_sample(tmp_path: Path) -> None:
+    class Taker:
+        def __init__(self) -> None:
+            self.taken: list[float] = []
+
+        def adopt(self, hyper: Hyperparameters) -> str:
+            self.taken.append(hyper.gamma)
+            return "worse: no" if hyper.gamma > 2.5 else ""
+
+    adoptions, taker = Adoptions(), Taker()
+    learner: OnlineModel = taker  # type: ignore[assignment]
+    adoptions.add(Retuned(30, 3.0, (1.0,)), Retuned(10, 1.0, (1.0,)))
+    adoptions.add(Retuned(20, 2.0, (1.0,)))
+    made = {seq: [entry.seq for entry, _ in adoptions.apply(seq, learner)] for seq in range(9, 40)}
+    assert {seq: entries for seq, entries in made.items() if entries} == {10: [10], 20: [20], 30: [30]}
+    assert taker.taken == [1.0, 2.0, 3.0]
+    assert (adoptions.adopted, adoptions.refused, bool(adoptions)) == (2, 1, False)
+    for retuned in (Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))):
+        adoption.append(tmp_path, retuned)
+    assert list(adoption.read(tmp_path)) == [Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))]
+    with (tmp_path / adoption.FILE).open("a") as file:
+        file.write('{"seq": 7, "gam')
+    assert len(adoption.read(tmp_path)) == 2
+    (tmp_path / adoption.FILE).write_text('{"seq": 1, "gamma": -1, "widths": [1]}\n')
+    with pytest.raises(InputError, match="gamma"):
+        adoption.read(tmp_path)
+
+
+def test_settings_come_from_the_configuration(tmp_path: Path) -> None:
+    text = (
+        'stage = "demo"\n[[axis]]\nname = "x"\nmodel = "x.npz"\nu_min_V = 0.0\nu_max_V = 1.0\nslew_V_per_s = 1.0\n'
+        'compete = ["mpi"]\n[axis.competition]\nmargin = 1.5\n[axis.retuning]\nperiod_s = 5\n'
+        "[axis.retuning.search]\nstarts = 2\n"
+    )
+    axis = parse_config(text, "serve.toml", tmp_path).axes[0]
+    assert (axis.compete, axis.competition.margin, axis.retuning.period_s) == (("mpi",), 1.5, 5.0)
+    assert axis.retuning.search == RetuneConfig(starts=2)
+    for bad in ("margin = 1.5\n", 'compete = ["mpi"]'):
+        with pytest.raises(InputError):
+            parse_config(text.replace(bad, bad.replace("1.5", "0.5").replace('"mpi"', "3")), "serve.toml", tmp_path)
+    assert competing.champion_of(None) == {}

@@ -1,0 +1,217 @@
+"""``dehyst serve`` as a real process over loopback: comes up, lives on whatever it is sent, goes cleanly."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from adaptive.types import InverseModel
+from service.client.client import Client
+from service.protocol import samples as wire
+from service.protocol.errors import NoReplyError
+from service.protocol.query import encode_query
+from service.runtime.session import open_client
+from service.storage.model_file import BundleMeta, write_bundle
+
+pytestmark = pytest.mark.e2e
+DT_S = 1e-3
+
+
+def dehyst(*args: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "lab.cli", *args], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def samples(first: int, n: int) -> bytes:
+    k = np.arange(first, first + n)
+    y = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * k * DT_S)
+    return wire.encode_samples(k, k * DT_S, (y - 1.0) / (11.0 * 0.95), y)
+
+
+def eventually(condition: Callable[[], Any], within_s: float = 30.0) -> Any:
+    """The first true value of ``condition``; fails the test after ``within_s``."""
+    until = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < until, "did not come true in time"
+        time.sleep(0.02)
+    return value
+
+
+def test_it_serves_learns_publishes_and_goes(serve: Callable[..., Any], tmp_path: Path) -> None:
+    process = serve(extra=f'recorder = "{tmp_path / "rec"}"')
+    assert process.ready["axes"] == {"x": ["linear", "lssvm_adaptive", "auto"]}
+    statuses: list[dict[str, Any]] = []
+    diagnostics: list[dict[str, Any]] = []
+    with Client.connect(process.endpoint, timeout_s=5.0) as client, open_client(process.endpoint) as stage:
+        base = client.keys.base
+        stage.declare_subscriber(f"{base}/status", lambda s: statuses.append(json.loads(s.payload.to_bytes())))
+        stage.declare_subscriber(f"{base}/diagnostics", lambda s: diagnostics.append(json.loads(s.payload.to_bytes())))
+        tokens = [reply.ok.key_expr for reply in stage.liveliness().get(client.keys.alive_any) if reply.ok]
+        assert [str(key) for key in tokens] == [client.keys.alive(process.ready["instance"])]
+        before = client.point(40.0)
+        assert (before.snapshot_seq, before.model, before.tracked_memory) == (-1, "auto", True)
+        for first in range(0, 3000, 20):
+            stage.put(client.keys.sample, samples(first, 20), congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(lambda: client.status()["seq"] == 2999)
+        status = client.status()
+        assert (status["samples"]["received"], status["samples"]["lost"]) == (3000, 0)
+        assert status["samples"]["learnt"] > 500
+        after = client.point(40.0, memory=before.memory)
+        assert after.snapshot_seq == 2980
+        assert client.point(40.0, memory=before.memory, as_of=0).u_V != after.u_V  # it learnt
+        assert client.trajectory([40.0, 41.0], model="linear").u_V.tolist() == pytest.approx([39 / 11, 40 / 11])
+        eventually(lambda: statuses)
+        # Diagnostics begin when the service has noticed that somebody listens.
+        first = 3000
+        while not diagnostics and first < 60_000:
+            stage.put(client.keys.sample, samples(first, 20))
+            first += 20
+            time.sleep(0.01)
+        assert diagnostics[0]["query_us"]["p50"] > 0
+    code, last, err = process.stop(signal.SIGTERM)
+    assert (code, last["stopped"], err) == (0, "SIGTERM", "")
+    recorded = last["axes"]["x"]["recorder"]
+    assert recorded["offered"] == last["axes"]["x"]["samples"]["received"]
+    assert list((tmp_path / "rec").iterdir())
+
+
+BAD_QUERIES = [
+    (None, "payload"),
+    (b"", "payload"),
+    (b"\x01\x04", "payload"),
+    (b"\xff" * 64, "version"),
+    (wire.encode_command(0, 1.0), "payload"),
+    (wire.encode_command(0, [1.0] * 9), "kind"),
+    (encode_query([1.0], [0.0])[:-1], "payload"),
+    (encode_query([1.0, float("nan")], [0.0, 0.0]), "y_um[1]"),
+    (encode_query([1.0, 2.0, 300.0], [0.0, 0.0, 0.0]), "y_um[2]"),
+    (encode_query([1.0], [0.0], model="sorcery"), "model"),
+    (encode_query([1.0], [0.0], memory=[1.0]), "memory"),
+    (encode_query([1.0], [0.0], as_of=10**9), None),
+]
+
+
+def test_bad_input_gets_an_error_reply_and_the_service_lives_on(serve: Callable[..., Any]) -> None:
+    process = serve()
+    with open_client(process.endpoint) as session, Client.connect(process.endpoint, timeout_s=5.0) as client:
+        for payload, field in BAD_QUERIES:
+            (reply,) = list(session.get(client.keys.feedforward, payload=payload, timeout=5.0))
+            if field is None:
+                assert reply.ok is not None
+                continue
+            error = json.loads(reply.err.payload.to_bytes())
+            assert error["error"] == "InputError"
+            assert error["field"] == field
+            assert error["expected"]
+            assert error["got"]
+            assert field in error["message"]
+        (reply,) = list(session.get(f"{client.keys.model}?name=sorcery", timeout=5.0))
+        assert json.loads(reply.err.payload.to_bytes())["field"] == "model"
+        for junk in (b"", b"junk", samples(0, 5)[:-1], wire.encode_command(0, 1.0)):
+            session.put(client.keys.sample, junk)
+        bad = wire.encode_samples([0, 1, 2], [0.0, np.nan, 2e-3], [1.0, np.inf, 1.0], [np.nan, 1.0, np.nan])
+        session.put(client.keys.sample, bad)
+        status = eventually(lambda: (s := client.status())["samples"]["received"] == 3 and s)
+        assert status["samples"]["malformed"] == 4
+        assert status["samples"]["learnt"] == 0
+        assert status["queries"]["errors"] == len(BAD_QUERIES) - 1
+        assert np.isfinite(client.point(40.0).u_V)
+    code, _, err = process.stop(signal.SIGINT)
+    assert (code, err) == (0, "")
+
+
+def test_several_axes_are_served_apart(shared_service: Any) -> None:
+    endpoint = shared_service.endpoint
+    with (
+        Client.connect(endpoint, axis="x", timeout_s=5.0) as x,
+        Client.connect(endpoint, axis="y", timeout_s=5.0) as y,
+    ):
+        y._session.put(y.keys.sample, samples(0, 500))
+        eventually(lambda: y.status()["seq"] == 499)
+        assert x.status()["seq"] == -1
+        assert (x.point(30.0).snapshot_seq, y.point(30.0).snapshot_seq) == (-1, 480)
+        with pytest.raises(NoReplyError, match="dehyst/v1/demo/z"):
+            Client.connect(endpoint, axis="z", timeout_s=2.0)
+
+
+def test_what_cannot_be_served_ends_with_a_message(
+    shared_service: Any, models: dict[str, InverseModel], tmp_path: Path
+) -> None:
+    base = f'stage = "demo"\nlisten = ["{shared_service.endpoint}"]\n[[axis]]\nname = "x"\nmodel = "x.npz"\n'
+    limits = "u_min_V = 0\nu_max_V = 10\nslew_V_per_s = 2000\n"
+    config = tmp_path / "serve.toml"
+    config.write_text(base + limits + "speed = 3\n")
+    np.savez(tmp_path / "x.npz", y=np.zeros(3))
+    unknown = dehyst("serve", "--config", str(config))
+    config.write_text(base + limits)
+    foreign = dehyst("serve", "--config", str(config))
+    config.write_text(base + limits + 'learn = ""\nserved = "linear"\n')
+    write_bundle(tmp_path / "x.npz", {"linear": models["linear"]}, BundleMeta("demo", "x", DT_S))
+    taken = dehyst("serve", "--config", str(config))
+    config.write_text(base.replace("127.0.0.1", "0.0.0.0") + limits)
+    remote = dehyst("serve", "--config", str(config))
+    for ended, words in (
+        (unknown, "speed"),
+        (foreign, "not a model bundle"),
+        (taken, "port is in use"),
+        (remote, "beyond_loopback"),
+        (dehyst("serve"), "--example"),
+    ):
+        assert ended.returncode == 2
+        assert words in ended.stderr
+        assert "Traceback" not in ended.stderr
+
+
+def test_the_example_is_printed_and_help_names_units() -> None:
+    example = dehyst("serve", "--example")
+    assert example.returncode == 0
+    assert "slew_V_per_s" in example.stdout
+    assert "µm" in dehyst("query", "--help").stdout
+
+
+def test_the_serving_process_imports_no_torch_and_no_plots() -> None:
+    code = (
+        "import sys, service.server.process, service.cli.commands.serve, service.storage.recorder;"
+        "import adaptive.online.learner;"
+        "print([m for m in ('torch', 'matplotlib', 'rerun') if m in sys.modules])"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert ended.stdout.strip() == "[]"
+
+
+def test_a_client_is_told_of_a_service_that_is_killed(serve: Callable[..., Any]) -> None:
+    process = serve()
+    with Client.connect(process.endpoint, timeout_s=2.0) as client:
+        client.point(40.0)
+        process.process.kill()
+        process.process.wait(timeout=10)
+        with pytest.raises((NoReplyError, TimeoutError)):
+            eventually(lambda: client.point(40.0) and False)
+
+
+def test_only_loopback_is_listened_at(shared_service: Any) -> None:
+    with open("/proc/net/tcp", encoding="ascii") as table:
+        rows = [line.split() for line in table.readlines()[1:]]
+    with open("/proc/net/tcp6", encoding="ascii") as table:
+        rows += [line.split() for line in table.readlines()[1:]]
+    inodes = _sockets(shared_service.process.pid)
+    listening = [row[1] for row in rows if row[3] == "0A" and row[9] in inodes]
+    port = int(shared_service.endpoint.rpartition(":")[2])
+    assert listening == [f"{socket.inet_aton('127.0.0.1')[::-1].hex().upper()}:{port:04X}"]
+
+
+def _sockets(pid: int) -> set[str]:
+    links = (path.readlink() for path in Path(f"/proc/{pid}/fd").iterdir())
+    return {str(link)[8:-1] for link in links if str(link).startswith("socket:[")}

@@ -1,0 +1,326 @@
+"""The stage as a process: no sample lost, commands honoured in order, twins equal, ticks counted honestly."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from service.cli.commands.stage import parse_change
+from service.protocol import samples as wire
+from service.protocol.keys import Keys
+from service.runtime.delivery import SURELY
+from service.runtime.session import open_client
+from service.stage_node.commands import CommandBuffer
+from service.stage_node.faults import fault_key
+from service.stage_node.node import NodeConfig, status_key
+from service.stage_node.sender import MOST, RING, SampleRing, Sender
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def stage_process(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "lab.cli", "stage", "--listen", endpoint, "--name", "t", *options]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert line.startswith("ready: stage t"), line
+        yield process, endpoint
+    finally:
+        process.kill()
+        process.stdout.close()
+        process.wait(10)
+
+
+def summary_of(process: subprocess.Popen[str]) -> dict[str, object]:
+    assert process.stdout is not None
+    text = process.stdout.readlines()[-1]
+    assert process.wait(10) == 0
+    loaded: dict[str, object] = json.loads(text)
+    return loaded
+
+
+class Collector:
+    """Every sample that arrives under an axis, in the order of arrival."""
+
+    def __init__(self, session: object, axis: str) -> None:
+        self.batches: list[wire.SampleBatch] = []
+        self.subscriber = session.declare_subscriber(  # type: ignore[attr-defined]
+            Keys("t", axis).sample, lambda sample: self.batches.append(wire.decode_samples(sample.payload.to_bytes()))
+        )
+
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        batches = list(self.batches)
+        names = ("seq", "t_s", "u_V", "y_um")
+        return tuple(np.concatenate([getattr(b, name) for b in batches]) for name in names)  # type: ignore[return-value]
+
+
+@pytest.mark.e2e
+def test_no_sample_is_lost_and_commands_are_honoured_in_order() -> None:
+    n, block = 2500, 20
+    t_s = np.arange(n) * 0.001
+    voltages = {"x": 4.0 - 4.0 * np.cos(12.0 * t_s), "a": 4.0 - 4.0 * np.cos(12.0 * t_s), "b": 12.0 * t_s - 3.0}
+    options = ("--twins", "a,b", "--duration", "2.5", "--seed", "5", "--batch", "7")
+    with stage_process(*options) as (process, endpoint):
+        session = open_client(endpoint, wait_s=5.0)
+        try:
+            collectors = {axis: Collector(session, axis) for axis in voltages}
+            started = threading.Event()
+            watch = session.declare_subscriber(Keys("t", "x").sample, lambda _: started.set())
+            time.sleep(0.3)
+            assert not started.is_set(), "the clock starts with the first commands, not before"
+            # The first blocks are ahead by half a second, so that no slow machine can make a command late.
+            sent = 0
+            while sent < n:
+                for axis, values in voltages.items():
+                    session.put(
+                        Keys("t", axis).command,
+                        wire.encode_command(sent, values[sent : sent + block]),
+                        congestion_control=SURELY,
+                    )
+                sent += block
+                if sent >= 500:
+                    assert started.wait(5.0)
+                    time.sleep(0.9 * block * 0.001)
+            summary = summary_of(process)
+            deadline = time.monotonic() + 5.0
+            while any(sum(map(len, c.batches)) < n for c in collectors.values()) and time.monotonic() < deadline:
+                time.sleep(0.02)
+            watch.undeclare()
+            received = {axis: collector.columns() for axis, collector in collectors.items()}
+        finally:
+            session.close()
+    units = summary["units"]
+    assert isinstance(units, dict)
+    for axis, (seq, t, u_V, _) in received.items():
+        np.testing.assert_array_equal(seq, np.arange(n))
+        np.testing.assert_array_equal(t, np.arange(n) * 0.001)
+        counts = units[axis]["commands"]
+        assert units[axis]["published"] == n
+        assert counts["voltages"] == n
+        assert (counts["late"], counts["missing"], counts["refused"]) == (0, 0, 0)
+        np.testing.assert_array_equal(u_V, np.clip(voltages[axis], -2.0, 10.0))
+    # The samples are those of the library, noise included, and twins with equal commands are equal.
+    stage = Stage(preset("rich", seed=5))
+    for axis in voltages:
+        expected, _ = stage.run(stage.initial_state(), np.asarray(voltages[axis], dtype=np.float64))
+        np.testing.assert_array_equal(received[axis][3], expected)
+    assert not np.array_equal(received["x"][3], received["b"][3])
+
+
+@pytest.mark.e2e
+def test_free_run_holds_missing_commands_and_stops_cleanly_on_interrupt() -> None:
+    with stage_process("--free-run", "--batch", "10", "--change", "0.2:gain_drift.gain=-0.06") as (process, endpoint):
+        session = open_client(endpoint, wait_s=5.0)
+        try:
+            collector = Collector(session, "x")
+            states: list[dict[str, object]] = []
+            status = session.declare_subscriber(
+                status_key("t", "x"), lambda sample: states.append(json.loads(sample.payload.to_bytes()))
+            )
+            deadline = time.monotonic() + 10.0
+            while not collector.batches and time.monotonic() < deadline:
+                time.sleep(0.01)
+            now = int(collector.batches[-1].seq[-1])
+            session.put(Keys("t", "x").command, wire.encode_command(0, np.full(10, 9.0)), congestion_control=SURELY)
+            session.put(
+                Keys("t", "x").command, wire.encode_command(now + 400, np.full(5, 3.0)), congestion_control=SURELY
+            )
+            session.put(Keys("t", "x").command, b"nonsense", congestion_control=SURELY)
+            session.put(Keys("t", "x").command, wire.encode_command(now + 10_000_000, [1.0]), congestion_control=SURELY)
+            while not states and time.monotonic() < deadline:
+                time.sleep(0.01)
+            while collector.batches[-1].seq[-1] < now + 600 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            process.send_signal(signal.SIGINT)
+            summary = summary_of(process)
+            status.undeclare()
+            seq, _, u_V, _ = collector.columns()
+        finally:
+            session.close()
+    assert states[0]["state"] == "running"
+    assert np.all(np.diff(seq) == 1)
+    expected = np.where(seq < now + 400, 0.0, 3.0)
+    np.testing.assert_array_equal(u_V, expected)
+    units = summary["units"]
+    assert isinstance(units, dict)
+    counts = units["x"]["commands"]
+    assert (counts["late"], counts["refused"]) == (10, 2)
+    assert counts["missing"] > 100
+    assert "seq" in units["x"]["error"]
+    assert summary["state"] == "stopped"
+
+
+@pytest.mark.e2e
+def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told() -> None:
+    first, n, limit_V = 5_000_000, 1500, 0.02
+    voltages = {"x": np.full(n, 3.0), "y": 1.5 - 1.5 * np.cos(0.012 * np.arange(n))}
+    options = ("--axis2", "y", "--first", str(first), "--slew", str(limit_V / 1e-3), "--inject", "--duration", "1.5")
+    with stage_process(*options, "--seed", "5", "--batch", "5") as (process, endpoint):
+        session = open_client(endpoint, wait_s=5.0)
+        try:
+            collectors = {axis: Collector(session, axis) for axis in voltages}
+            time.sleep(0.3)
+            session.put(fault_key("t", "y"), b'{"fault": "gap", "duration_s": 0.1}', congestion_control=SURELY)
+            session.put(fault_key("t", "y"), b'{"fault": "fire"}', congestion_control=SURELY)
+            time.sleep(0.1)
+            for axis, values in voltages.items():
+                session.put(Keys("t", axis).command, wire.encode_command(first, values), congestion_control=SURELY)
+            summary = summary_of(process)
+            received = {axis: collector.columns() for axis, collector in collectors.items()}
+        finally:
+            session.close()
+    numbers = np.arange(first, first + n)
+    np.testing.assert_array_equal(received["x"][0], numbers)
+    np.testing.assert_array_equal(received["y"][0], numbers[100:])
+    # 3 V are reached in steps of the slew limit; the second axis stays below it.
+    expected = np.minimum(3.0, limit_V * np.arange(1, n + 1))
+    np.testing.assert_allclose(received["x"][2], expected, rtol=1e-6)
+    np.testing.assert_array_equal(received["y"][2], voltages["y"][100:])
+    stage = Stage(preset("rich", seed=5))
+    y_um, y2_um = stage.run(stage.initial_state(), received["x"][2], voltages["y"])
+    np.testing.assert_array_equal(received["x"][3], y_um)
+    np.testing.assert_array_equal(received["y"][3], y2_um[100:])
+    units = summary["units"]
+    assert isinstance(units, dict)
+    assert units["x"]["slew_limited"] == 149
+    assert units["y"]["slew_limited"] == 0
+    assert units["y"]["published"] == n - 100
+    assert (units["y"]["faults"]["gap"], units["y"]["faults"]["refused"]) == (100, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--preset", "poor"), "preset: got 'poor'"),
+        (("--rate", "0"), "--rate: got 0"),
+        (("--batch", "0"), "batch: got 0"),
+        (("--twins", "x"), "units: got x, x"),
+        (("--axis", "X/y"), "axis: got 'X/y'"),
+        (("--change", "soon"), "--change: got 'soon'"),
+        (("--change", "1:gain_drift.nothing=1"), "nothing"),
+        (("--duration", "-1"), "--duration: got -1"),
+        (("--axis2", "x"), "second: got x"),
+        (("--preset", "bouc_wen", "--axis2", "y"), "has one axis"),
+        (("--slew", "0"), "slew_V_per_s: got 0"),
+        (("--first", "-4"), "first: got -4"),
+        (("--endpoint", "tcp/127.0.0.1:1", "--wait", "0"), "nobody listens"),
+    ],
+)
+def test_bad_options_get_a_message_and_status_2(
+    options: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from lab.cli import main
+
+    assert main(["stage", *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_port_in_use_is_said() -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
+        command = [sys.executable, "-m", "lab.cli", "stage", "--listen", endpoint]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "in use" in done.stderr
+
+
+def test_command_buffer_takes_by_number_and_holds_what_is_missing() -> None:
+    buffer = CommandBuffer(size=16)
+    assert buffer.take(0) == 0.0
+    assert buffer.counts["missing"] == 0, "before the first command nothing is missing"
+    buffer.put(wire.Block(3, np.array([3.0, 4.0])))
+    buffer.put(wire.Block(1, np.array([1.0])))
+    assert [buffer.take(k) for k in range(1, 7)] == [1.0, 1.0, 3.0, 4.0, 4.0, 4.0]
+    assert buffer.counts["missing"] == 3
+    buffer.put(wire.Block(5, np.array([5.0, 6.0, 7.0, 8.0])))
+    assert buffer.counts["late"] == 2
+    assert buffer.take(7) == 7.0
+    # A later block for the same number replaces the earlier one; the ring's old entries never come back.
+    buffer.put(wire.Block(8, np.array([80.0])))
+    assert [buffer.take(k) for k in range(8, 40)] == [80.0] * 32
+    with pytest.raises(InputError, match=r"seq: got 56, expected at most 55"):
+        buffer.put(wire.Block(40, np.zeros(17)))
+
+
+def test_change_option() -> None:
+    assert parse_change("30:gain_drift.gain=-0.06,resonance.payload_ratio=1") == (
+        30.0,
+        {"gain_drift.gain": -0.06, "resonance.payload_ratio": 1.0},
+    )
+
+
+def test_bad_node_configuration() -> None:
+    with pytest.raises(InputError, match="ticks: got 0"):
+        NodeConfig(preset("rich"), "t", ("x",), ticks=0)
+
+
+def test_stage_file_and_options_make_the_configuration(tmp_path: Path) -> None:
+    import argparse
+
+    from service.cli.commands.stage import add_arguments, stage_config
+    from sim.stage.file import save_stage
+
+    path = tmp_path / "stage.toml"
+    save_stage(preset("bouc_wen", seed=3), path)
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    config = stage_config(parser.parse_args(["--file", str(path), "--rate", "2000"]))
+    assert (config.name, config.seed, config.dt_s) == ("bouc_wen", 3, 0.0005)
+    changed = stage_config(parser.parse_args(["--seed", "9", "--change", "1:gain_drift.gain=-0.06"]))
+    assert changed == preset("rich", seed=9, changes=((1.0, {"gain_drift.gain": -0.06}),))
+
+
+def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -> None:
+    sent: list[wire.SampleBatch] = []
+    flowing = threading.Event()
+
+    def put(payload: bytes) -> None:
+        flowing.wait(10.0)
+        sent.append(wire.decode_samples(payload))
+
+    ring = SampleRing(0.001, put)
+    sender = Sender([ring], lambda: None)
+    ring.write(0, 0.0, 0.0)
+    sender.wake()
+    start = time.monotonic()
+    n = RING + 5000
+    for k in range(1, n):
+        ring.write(k, float(k), -float(k))
+        sender.wake()
+    assert time.monotonic() - start < 5.0
+    flowing.set()
+    assert sender.close()
+    seq = np.concatenate([batch.seq for batch in sent])
+    u_V = np.concatenate([batch.u_V for batch in sent])
+    np.testing.assert_array_equal(u_V, seq.astype(np.float64))
+    assert np.all(np.diff(seq) >= 1)
+    assert seq[-1] == n - 1
+    assert ring.published == len(seq)
+    assert ring.lost == n - len(seq)
+    assert 5000 <= ring.lost <= 5000 + 2 * MOST
+    assert max(len(batch) for batch in sent) <= MOST

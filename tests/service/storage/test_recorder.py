@@ -1,0 +1,379 @@
+"""The recorder: every sample comes back, a crash loses no segment, a full disk harms nothing but the recording."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError
+from service.intake.intake import Intake
+from service.storage import segments as recorder_files
+from service.storage.journal import Journal, Rows, read_journal
+from service.storage.recorder import ASIDE, Recorder, RecorderConfig
+from service.storage.segments import segments
+from sim.recordings import check, read
+from tests.service.storage.test_checkpoint import make_axis
+from tests.service.storage.test_checkpoint import recording as arriving
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def config(directory: Path, **more: object) -> RecorderConfig:
+    return RecorderConfig(directory, flush_s=0.02, retry_s=0.05, **more)  # type: ignore[arg-type]
+
+
+def block(start: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    seq = np.arange(start, start + n)
+    return seq, seq * 0.001, np.sin(seq * 0.01), 10.0 * np.sin(seq * 0.01 - 0.1)
+
+
+def wait_for(condition: object, timeout_s: float = 10.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.01)
+
+
+def test_what_was_put_is_read_back_to_the_last_bit_across_segments(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path, segment_rows=700)) as recorder:
+        for start in range(0, 2000, 100):
+            assert recorder.put(*block(start, 100), reason="learnt" if start < 1000 else ["redundant"] * 100)
+    counters = recorder.counters()
+    assert (counters["offered"], counters["written"], counters["dropped"], counters["lost"]) == (2000, 2000, 0, 0)
+    assert counters["segments"] == len(segments(tmp_path)) == 3
+    recording = read(tmp_path)
+    seq, t_s, u_V, y_um = block(0, 2000)
+    assert recording.seq is not None
+    assert recording.reason is not None
+    np.testing.assert_array_equal(recording.seq, seq)
+    np.testing.assert_array_equal(recording.t_s, t_s)
+    np.testing.assert_array_equal(recording.u_V, u_V)
+    np.testing.assert_array_equal(recording.y_um, y_um)
+    assert recording.reason.tolist() == ["learnt"] * 1000 + ["redundant"] * 1000
+    assert [f.kind for f in check(recording)] == ["note"]
+
+
+def written_rows(directory: Path) -> int:
+    """Rows in the files of the open segments, as a killed process would leave them."""
+    return sum(len(read_journal(path)[0]) for path in directory.glob("*.journal"))
+
+
+def test_what_was_put_is_in_the_file_at_once_however_long_the_disk_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the pause of the thread that writes nor the disk's own sync may keep samples in memory."""
+    hold, took_s = threading.Event(), []
+    monkeypatch.setattr(os, "fsync", lambda fd: hold.wait(60.0))
+    with Recorder(RecorderConfig(tmp_path, flush_s=60.0, sync_s=1e-3)) as recorder:
+        try:
+            for k in range(100):
+                begin = time.perf_counter()
+                recorder.put(*block(5 * k, 5), reason="learnt")
+                while recorder.counters()["written"] < 5 * (k + 1):
+                    assert time.perf_counter() - begin < 10.0, "left in memory"
+                    time.sleep(1e-4)
+                took_s.append(time.perf_counter() - begin)
+                time.sleep(1e-3)
+            assert written_rows(tmp_path) == 500
+        finally:
+            hold.set()
+    print(f"in the file after {1e3 * np.median(took_s):.2f} ms, at most {1e3 * max(took_s):.1f} ms")
+    assert np.median(took_s) < 0.01
+    assert len(read(tmp_path)) == 500
+
+
+def test_a_disk_that_cannot_sync_is_one_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ill = threading.Event()
+    ill.set()
+
+    def fsync(_: int) -> None:
+        if ill.is_set():
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with Recorder(config(tmp_path, sync_s=0.01)) as recorder:
+        k = 0
+
+        def fed_until(degraded: bool) -> bool:
+            nonlocal k
+            recorder.put(*block(k, 10), reason="learnt")
+            k += 10
+            return bool(recorder.counters()["degraded"]) == degraded
+
+        wait_for(lambda: fed_until(True))
+        assert "Input/output error" in recorder.counters()["error"]
+        ill.clear()
+        wait_for(lambda: fed_until(False))
+    counters = recorder.counters()
+    assert counters["offered"] == counters["written"] + counters["lost"] == k
+    assert len(read(tmp_path)) == counters["written"]
+
+
+def test_refused_samples_are_kept_as_they_came(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path)) as recorder:
+        recorder.put(*block(0, 300), reason="learnt")
+        recorder.put(300, 0.3, 1.0, float("nan"), "not_finite")
+    recording = read(tmp_path)
+    assert recording.reason is not None
+    assert np.isnan(recording.y_um[-1])
+    assert recording.reason[-1] == "not_finite"
+
+
+def test_the_oldest_segments_go_when_the_disks_share_is_used_up(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path, segment_rows=1000)) as recorder:
+        recorder.put(*block(0, 1000), reason="learnt")
+    size = segments(tmp_path)[0].stat().st_size
+    with Recorder(config(tmp_path, segment_rows=1000, max_bytes=int(3.5 * size))) as recorder:
+        for start in range(1000, 10_000, 1000):
+            recorder.put(*block(start, 1000), reason="learnt")
+    kept = segments(tmp_path)
+    assert sum(path.stat().st_size for path in kept) <= 3.5 * size
+    assert [path.stem for path in kept][-1] == "segment-000010"
+    assert recorder.counters()["removed"] == 10 - len(kept)
+    recording = read(tmp_path)
+    assert recording.seq is not None
+    assert recording.seq[-1] == 9999
+    assert np.all(np.diff(recording.seq) == 1)
+
+
+def test_a_full_queue_drops_and_counts_and_never_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold = threading.Event()
+    write = Journal.write
+
+    def slow(self: Journal, rows: Rows, index: np.ndarray) -> None:
+        hold.wait(10.0)
+        write(self, rows, index)
+
+    monkeypatch.setattr(Journal, "write", slow)
+    recorder = Recorder(config(tmp_path, queue_samples=500))
+    try:
+        recorder.put(*block(0, 100), reason="learnt")
+        wait_for(lambda: recorder.counters()["waiting"] == 0)
+        start = time.monotonic()
+        taken = [recorder.put(*block(100 * k, 100), reason="learnt") for k in range(1, 21)]
+        assert time.monotonic() - start < 1.0
+        assert taken == [True] * 5 + [False] * 15
+    finally:
+        hold.set()
+        assert recorder.close()
+    counters = recorder.counters()
+    assert (counters["offered"], counters["written"], counters["dropped"]) == (2100, 600, 1500)
+    assert len(read(tmp_path)) == 600
+    assert not recorder.put(*block(0, 1), reason="late")
+
+
+@pytest.mark.parametrize("where", ["open", "write", "close"])
+def test_a_full_disk_degrades_the_recording_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    full = threading.Event()
+
+    def failing(real: object) -> object:
+        def call(*args: object, **kwargs: object) -> object:
+            if full.is_set():
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(*args, **kwargs)  # type: ignore[operator]
+
+        return call
+
+    if where == "close":
+        monkeypatch.setattr(recorder_files.Closer, "__init__", failing(recorder_files.Closer.__init__))
+    else:
+        name = {"open": "__init__", "write": "write"}[where]
+        monkeypatch.setattr(Journal, name, failing(getattr(Journal, name)))
+    with Recorder(config(tmp_path, segment_rows=200)) as recorder:
+        recorder.put(*block(0, 300), reason="learnt")
+        wait_for(lambda: recorder.counters()["written"] == 300)
+        full.set()
+        recorder.put(*block(300, 250), reason="learnt")
+        wait_for(lambda: recorder.counters()["degraded"])
+        assert "No space left" in recorder.counters()["error"]
+        assert recorder.put(*block(600, 100), reason="learnt")
+        full.clear()
+        time.sleep(0.1)
+        recorder.put(*block(700, 300), reason="learnt")
+        wait_for(lambda: not recorder.counters()["degraded"])
+    counters = recorder.counters()
+    assert counters["errors"] >= 1
+    assert counters["offered"] == counters["written"] + counters["lost"] + counters["dropped"]
+    recording = read(tmp_path)
+    assert recording.seq is not None
+    assert set(range(300)) | set(range(700, 1000)) <= set(recording.seq.tolist())
+    assert len(recording) == counters["written"]
+
+
+def test_a_directory_that_cannot_be_made_is_no_reason_to_fall(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with Recorder(config(tmp_path / "file" / "here")) as recorder:
+        recorder.put(*block(0, 10), reason="learnt")
+        wait_for(lambda: recorder.counters()["lost"] == 10)
+        assert recorder.counters()["degraded"]
+
+
+def test_two_recorders_do_not_share_a_directory(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path)) as first:
+        first.put(*block(0, 300), reason="learnt")
+        wait_for(lambda: first.counters()["written"] == 300)
+        with Recorder(config(tmp_path)) as second:
+            second.put(*block(0, 10), reason="learnt")
+            wait_for(lambda: second.counters()["lost"] == 10)
+            assert "another process records" in second.counters()["error"]
+        # One that had nothing to write leaves the open journal to its owner.
+        Recorder(config(tmp_path)).close()
+        assert segments(tmp_path) == []
+    assert len(read(tmp_path)) == 300
+
+
+@pytest.mark.parametrize("more", [0, 1], ids=["no sample comes", "a sample comes"])
+def test_a_killed_process_leaves_a_stream_that_the_next_run_closes(tmp_path: Path, more: int) -> None:
+    program = (
+        "import sys, time, numpy as np\n"
+        "from pathlib import Path\n"
+        "from service.storage.recorder import Recorder, RecorderConfig\n"
+        "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.02))\n"
+        "for k in range(1000):\n"
+        "    seq = np.arange(10 * k, 10 * k + 10)\n"
+        "    r.put(seq, 1e-3 * seq, np.zeros(10), np.zeros(10), 'learnt')\n"
+        "    time.sleep(0.001)\n"
+        "    if r.counters()['written'] > 500: print(r.counters()['written'], flush=True)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    written = int(process.stdout.readline())
+    os.kill(process.pid, signal.SIGKILL)
+    process.stdout.close()
+    process.wait(10)
+    assert segments(tmp_path) == []
+    (tmp_path / "segment-000099.part").write_bytes(b"half a file")
+    with Recorder(config(tmp_path)) as recorder:
+        if more:
+            recorder.put(20_000, 20.0, 0.0, 0.0, "learnt")
+    assert recorder.counters()["salvaged"] == 1
+    recording = read(tmp_path)
+    assert recording.seq is not None
+    assert bool(recording.seq[-1] == 20_000) is bool(more)
+    assert np.all(np.diff(recording.seq[: len(recording) - more]) == 1)
+    assert len(recording) - more >= written
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_journal_cut_anywhere_keeps_its_whole_rows(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "segment-000001.journal")
+    for k in range(3):
+        seq, t_s, u_V, y_um = block(50 * k, 50)
+        journal.write(Rows(seq, t_s, u_V, y_um, ["learnt", f"word-{k}"] * 25), seq)
+    journal.close()
+    whole = journal.path.read_bytes()
+    for cut in (len(whole), len(whole) - 1, len(whole) - 39, 16 + 40 * 30 + 7, 17, 16, 3, 0):
+        path = tmp_path / f"segment-{100 + cut:06d}.journal"
+        path.write_bytes(whole[:cut] + bytes(400))  # the disk may have been given more than was written
+        rows, index = read_journal(path)
+        assert len(rows) <= max(0, cut - 16) // 40
+        assert len(rows) >= max(0, cut - 16) // 40 - 4  # and those that define words
+        assert index.tolist() == rows.seq.tolist() == list(range(len(rows)))
+        assert rows.reason == [("learnt", f"word-{k // 50}")[k % 2] for k in range(len(rows))]
+        made = recorder_files.convert(path)
+        assert (0 if made is None else len(read(made, None))) == len(rows)
+        assert not path.exists()
+
+
+def test_a_restart_finds_what_came_behind_its_checkpoint_across_segments(tmp_path: Path) -> None:
+    with Recorder(config(tmp_path, segment_rows=500), index=7) as recorder:
+        for start in range(0, 1200, 100):
+            recorder.put(*block(start, 100), reason="learnt")
+            time.sleep(0.03)
+    behind = recorder_files.rows_behind(tmp_path, 7 + 1100)
+    assert behind is not None
+    assert behind.seq.tolist() == list(range(1100, 1200))
+    assert recorder_files.rows_behind(tmp_path, 7 + 1200) is None
+    assert recorder_files.rows_behind(tmp_path, 3) is None
+    # An instance that took over an older state handles some samples again, and what follows is of its count.
+    with Recorder(config(tmp_path), index=1150) as recorder:
+        recorder.put(*block(5000, 50), reason="learnt")
+        wait_for(lambda: recorder.counters()["written"] == 50)
+        again = recorder_files.rows_behind(tmp_path, 1100)
+    assert again is not None
+    assert again.seq.tolist()[-1] == 5049
+
+
+def test_a_file_size_limit_is_a_full_disk(tmp_path: Path) -> None:
+    """A real one, from the operating system, in the middle of a row."""
+    program = (
+        "import resource, sys, time, numpy as np\n"
+        "from pathlib import Path\n"
+        "from service.storage.recorder import Recorder, RecorderConfig\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_001, resource.RLIM_INFINITY))\n"
+        "r = Recorder(RecorderConfig(Path(sys.argv[1]), flush_s=0.005, retry_s=0.05))\n"
+        "k = 0\n"
+        "def feed(until):\n"
+        "    global k\n"
+        "    end = time.monotonic() + 20.0\n"
+        "    while not until(r.counters()) and time.monotonic() < end:\n"
+        "        r.put(np.arange(k, k + 10), 1e-3 * np.arange(k, k + 10), np.ones(10), np.ones(10), 'learnt')\n"
+        "        k += 10\n"
+        "        time.sleep(0.0005)\n"
+        "feed(lambda c: c['lost'] and c['degraded'])\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))\n"
+        "feed(lambda c: not c['degraded'])\n"
+        "r.close()\n"
+        "c = r.counters()\n"
+        "assert c['offered'] == k == c['written'] + c['lost'], c\n"
+        "print(c['written'], c['errors'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    written, errors = map(int, done.stdout.split())
+    assert errors >= 1
+    recording = read(tmp_path)
+    assert recording.seq is not None
+    assert len(recording) == written
+    assert recording.seq[0] == 0
+    assert np.all(np.diff(recording.seq) >= 1)
+
+
+def test_bad_configuration_and_bad_rows(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="segment_rows: got 0"):
+        config(tmp_path, segment_rows=0)
+    with Recorder(config(tmp_path)) as recorder, pytest.raises(InputError, match="y_um: got 1 values, expected 2"):
+        recorder.put([1, 2], [0.0, 0.1], [1.0, 2.0], [1.0], "learnt")
+
+
+def test_what_was_dropped_before_it_was_handled_is_recorded_apart(tmp_path: Path) -> None:
+    axis = make_axis(queue_samples=100)
+    with Recorder(config(tmp_path)) as recorder:
+        intake = Intake(axis, lambda: None, recorder)  # not started yet: nobody takes
+        offered = [intake.offer(arriving(first, 30)) for first in range(0, 150, 30)]
+        assert offered == [True, True, True, False, False]
+        intake.start()
+        intake.close()
+        wait_for(lambda: recorder.counters()["written"] == 90 and recorder.counters()["aside"] == 60)
+        # They count for nothing by which a restart goes on.
+        assert recorder.index == axis.sequence.received == 90
+        behind = recorder_files.rows_behind(tmp_path, 60)
+        assert behind is not None
+        assert behind.seq.tolist() == list(range(60, 90))
+    handled, dropped = read(tmp_path), read(tmp_path / ASIDE)
+    assert handled.seq is not None
+    assert dropped.seq is not None
+    assert dropped.reason is not None
+    assert handled.seq.tolist() == list(range(90))
+    assert dropped.seq.tolist() == list(range(90, 150))
+    assert set(dropped.reason) == {"dropped"}
+    np.testing.assert_array_equal(dropped.y_um, arriving(90, 60).y_um)
+    assert not recorder.put_aside(*block(0, 1), reason="dropped")

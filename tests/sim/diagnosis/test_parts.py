@@ -1,0 +1,202 @@
+"""The parts of the diagnosis against closed forms and against the effects library, which it does not share."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from adaptive.errors import InputError
+from sim.diagnosis.causes.narrow_lines import line_is_there
+from sim.diagnosis.model.chain import Model
+from sim.diagnosis.model.converter import grid_of, repeats
+from sim.diagnosis.model.dynamics import Dynamics, respond
+from sim.diagnosis.model.fit import calibrate
+from sim.diagnosis.model.loops import bouc_wen_loop, bouc_wen_paced
+from sim.diagnosis.model.loops_linear import friction, resample
+from sim.diagnosis.model.measured import Setting
+from sim.diagnosis.model.nominal import BoucWen
+from sim.diagnosis.prepare import prepare
+from sim.diagnosis.search.evidence import split
+from sim.diagnosis.search.noise_floor import noise_floor, repeated_period
+from sim.effects import effect, simulate
+from sim.recordings import Recording
+from tests.sim.diagnosis.plays import plays
+
+DT = 5e-4
+
+
+def test_loop_is_the_chapters_equation() -> None:
+    """h against a fine integration of (2.2) in u, through reversals and through zero."""
+    u = np.array([0.0, 3.0, -1.0, 2.0, 0.5, 4.0])
+    slope, beta, gamma = 5.4, 0.87, 0.99
+    h, expected = 0.0, [0.0]
+    for a, b in pairwise(u):
+        sign = np.sign(b - a)
+        run = solve_ivp(
+            lambda _, h, s=sign: slope * s - beta * h - gamma * s * np.abs(h),
+            (0, abs(b - a)),
+            [h],
+            rtol=1e-9,
+            atol=1e-12,
+        )
+        h = float(run.y[0, -1])
+        expected.append(h)
+    np.testing.assert_allclose(bouc_wen_loop(u, slope, beta, gamma, 0.0), expected, rtol=1e-6)
+    np.testing.assert_allclose(bouc_wen_paced(u, slope, beta, gamma, 0.0, np.ones(u.size), 0.0), expected, rtol=1e-6)
+
+
+@given(st.lists(st.floats(-3.0, 8.0), min_size=3, max_size=40))
+@settings(max_examples=40, deadline=None)
+def test_loop_does_not_depend_on_how_a_monotone_way_is_cut(levels: list[float]) -> None:
+    """Half way stations on every straight way change nothing: the step is exact."""
+    u = np.array(levels)
+    half = np.empty(2 * u.size - 1)
+    half[::2], half[1::2] = u, 0.5 * (u[1:] + u[:-1])
+    coarse = bouc_wen_loop(u, 5.0, 0.9, 0.95, 0.0)
+    np.testing.assert_allclose(bouc_wen_loop(half, 5.0, 0.9, 0.95, 0.0)[::2], coarse, atol=1e-9)
+
+
+def test_lag_with_a_fraction_of_a_sample_of_delay() -> None:
+    w = np.zeros(200)
+    w[50:] = 1.0
+    t = (np.arange(200) - 50) * DT
+    for delay in (0.0, 0.3 * DT, 1.7 * DT):
+        exact = np.where(t - delay > 0.0, 1.0 - np.exp(-np.maximum(t - delay, 0.0) / 2.5e-3), 0.0)
+        got = respond(w, Dynamics((2.5e-3,), (), delay), DT)
+        np.testing.assert_allclose(got, exact, atol=1e-9)
+
+
+def test_mode_rings_as_its_closed_form_and_equal_lags_are_no_trouble() -> None:
+    w = np.zeros(400)
+    w[10:] = 1.0
+    t = np.maximum((np.arange(400) - 10) * DT, 0.0)
+    z, omega = 0.02, 2.0 * np.pi * 350.0
+    damped = omega * np.sqrt(1.0 - z * z)
+    exact = 1.0 - np.exp(-z * omega * t) * (np.cos(damped * t) + z / np.sqrt(1.0 - z * z) * np.sin(damped * t))
+    np.testing.assert_allclose(respond(w, Dynamics((), ((350.0, z),)), DT), exact, atol=1e-8)
+    twice = respond(w, Dynamics((1e-3, 1e-3)), DT)
+    np.testing.assert_allclose(twice, 1.0 - np.exp(-t / 1e-3) * (1.0 + t / 1e-3), atol=1e-4)
+
+
+def test_first_order_hold_is_exact_on_a_ramp() -> None:
+    w = np.arange(300) * DT
+    got = respond(w, Dynamics((2e-3,), hold="first"), DT)
+    t = w
+    np.testing.assert_allclose(got[:-1], (t - 2e-3 * (1.0 - np.exp(-t / 2e-3)))[:-1], atol=1e-9)
+
+
+def test_friction_with_full_share_is_a_play() -> None:
+    u = np.cumsum(np.random.default_rng(0).normal(size=500)) * 0.1
+    play = plays(u - u[0], np.array([0.4]))[0] + u[0]
+    assert np.max(np.abs(friction(u, 0.4, 1.0) - play)) <= 0.4 + 1e-12
+    assert np.all(np.abs(friction(u, 0.4, 0.3) - u) <= 0.4 + 1e-12)
+
+
+def test_resampling_is_exact_for_a_parabola() -> None:
+    k = np.arange(1000.0)
+    got = resample(k * k, 1e-4, 0.25)
+    at = k * (1.0 + 1e-4) + 0.25
+    np.testing.assert_allclose(got[2:-3], (at * at)[2:-3], rtol=1e-9, atol=1e-6)
+
+
+def _steps(n: int = 12_000) -> np.ndarray:
+    u = np.repeat([0.0, 4.0, 8.0, 2.0, 6.0, 0.0], n // 6).astype(np.float64)
+    t = np.arange(n) * DT
+    return np.where(t > 3.0, 4.0 * (1.0 - np.cos(2.0 * np.pi * 4.0 * (t - 3.0))), u)
+
+
+def test_calibration_finds_the_librarys_bouc_wen_stage() -> None:
+    """Parameters of another implementation, from another start, within their physical bounds."""
+    u = _steps()
+    chain = effect("bouc_wen", d_um_per_V=10.2, alpha=0.42, beta_per_V=0.8, gamma_per_V=1.1) + effect(
+        "mechanics", damping_N_s_per_m=8e5
+    )
+    y = 3.0 + simulate(chain, u, DT)
+    fit = calibrate(
+        model := Model(Setting(DT, u, y), BoucWen()),
+        model.nominal.starts(model.setting)[0],
+        np.ones(u.size, bool),
+        40,
+        1e-9,
+    )
+    got = dict(zip([s.name for s in model.slots], fit.p, strict=True))
+    assert np.sqrt(fit.sse_um2 / u.size) < 2e-3
+    assert got["d_um_per_V"] == pytest.approx(10.2, rel=1e-3)
+    assert got["rise_per_V"] == pytest.approx(1.9, rel=1e-2)
+    assert got["tau_s"] == pytest.approx(8e5 / 3.5244e8, rel=1e-2)
+    assert got["offset_um"] == pytest.approx(3.0, abs=0.01)
+
+
+def test_noise_floor_sees_noise_and_not_creep() -> None:
+    rng = np.random.default_rng(1)
+    u = np.repeat([0.0, 5.0, 0.0, 3.0], 4000).astype(np.float64)
+    y = 10.0 * u + 0.2 * np.log10(1.0 + np.arange(u.size) * DT) + 0.005 * rng.standard_normal(u.size)
+    floor = noise_floor(Setting(DT, u, y))
+    assert floor.source == "rests"
+    assert floor.sigma_um == pytest.approx(0.005, rel=0.05)
+
+
+def test_noise_floor_of_repeated_periods() -> None:
+    rng = np.random.default_rng(2)
+    u = np.tile(rng.standard_normal(1500), 4)
+    y = np.convolve(np.tile(u, 2), [0.2, 0.5, 0.3])[u.size : 2 * u.size] + 0.01 * rng.standard_normal(u.size)
+    assert repeated_period(u) == 1500
+    assert noise_floor(Setting(DT, u, y)).sigma_um == pytest.approx(0.01, rel=0.05)
+    assert repeated_period(np.sin(np.arange(3000.0) ** 1.3 * 0.01)) == 0
+
+
+def test_grid_and_repeats() -> None:
+    rng = np.random.default_rng(3)
+    y = 5.0 * np.sin(np.arange(20_000) * 0.01) + 0.02 * rng.standard_normal(20_000)
+    assert grid_of(np.round(y / 0.05) * 0.05).step_um == pytest.approx(0.05, rel=1e-3)
+    assert grid_of(y).step_um == 0.0
+    fast = 40.0 * np.sin(np.arange(20_000) * 0.03) + 0.005 * rng.standard_normal(20_000)
+    assert repeats(fast, 0.005, 0.0).count == 0
+    doubled = fast.copy()
+    doubled[500::997] = doubled[499::997][: doubled[500::997].size]
+    assert repeats(doubled, 0.005, 0.0).count >= 15
+
+
+def test_a_line_is_told_from_ringing() -> None:
+    n = 40_000
+    u = np.zeros(n)
+    u[::4000] = 1.0
+    t = np.arange(n) * DT
+    setting = Setting(DT, u, np.zeros(n))
+    rng = np.random.default_rng(4)
+    noise = 0.005 * rng.standard_normal(n)
+    assert line_is_there(noise + 0.002 * np.sin(2 * np.pi * 50.0 * t), setting, 50.0)
+    assert not line_is_there(noise, setting, 50.0)
+    since = np.mod(np.arange(n), 4000) * DT
+    assert not line_is_there(noise + 0.2 * np.exp(-since / 0.02) * np.sin(2 * np.pi * 53.0 * since), setting, 50.0)
+
+
+def test_folds_leave_out_whole_stretches() -> None:
+    u = _steps()
+    parts = split(Setting(DT, u, u))
+    assert parts.edges[0] == 0
+    assert parts.edges[-1] == u.size
+    assert sum(int(parts.samples(f).sum()) for f in range(parts.n_folds)) == u.size
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda u, y: (u[:100], y[:100]), "100 samples"),
+        (lambda u, y: (u, np.zeros_like(y)), "every sample is zero"),
+        (lambda u, y: (u, np.where(np.arange(y.size) % 10 == 0, np.nan, y)), "no finite numbers"),
+        (lambda u, y: (y, u), "swapped"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_refused(make: object, said: str) -> None:
+    t = np.arange(8000) * DT
+    u = 4.0 * (1.0 - np.cos(2.0 * np.pi * 5.0 * t))
+    chain = effect("bouc_wen") + effect("mechanics") + effect("sensor_noise", rms_um=0.02)
+    u, y = make(u, simulate(chain, u, DT))  # type: ignore[operator]
+    with pytest.raises(InputError, match=said):
+        prepare(Recording(t_s=np.arange(u.size) * DT, u_V=u, y_um=y, dt_s=DT))

@@ -1,0 +1,209 @@
+"""What is wrong with a recording is found, placed and counted; a healthy one is left in peace; repairs are exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError
+from sim.recordings import Recording, check, repaired, require_usable
+
+DT = 0.001
+
+
+def healthy(n: int = 4000, seed: int = 3) -> Recording:
+    """A lagging, noisy stage under a sine with a hold in its middle."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(n) * DT
+    phase = 2 * np.pi * 3.0 * t_s
+    u_V = 4.0 - 3.5 * np.cos(phase)
+    y_um = 40.0 - 36.0 * np.cos(phase - 0.15) + 0.01 * rng.standard_normal(n)
+    hold = slice(2 * n // 5, n // 2)
+    u_V[hold], y_um[hold] = u_V[hold.start], y_um[hold.start] + 0.01 * rng.standard_normal(n // 2 - 2 * n // 5)
+    return Recording(t_s=t_s, u_V=u_V, y_um=y_um, dt_s=DT, source="made")
+
+
+def kinds(recording: Recording) -> dict[str, str]:
+    return {finding.kind: finding.severity for finding in check(recording)}
+
+
+def without(recording: Recording, gone: np.ndarray) -> Recording:
+    keep = np.ones(len(recording), dtype=bool)
+    keep[gone] = False
+    return replace(recording, t_s=recording.t_s[keep], u_V=recording.u_V[keep], y_um=recording.y_um[keep])
+
+
+def changed(recording: Recording, **columns: tuple[object, object]) -> Recording:
+    copies = {}
+    for name, (where, value) in columns.items():
+        copies[name] = getattr(recording, name).copy()
+        copies[name][where] = value
+    return replace(recording, **copies)
+
+
+def test_a_healthy_recording_has_no_findings() -> None:
+    for seed in range(5):
+        assert check(healthy(seed=seed)) == []
+    whole = repaired(healthy())
+    assert whole.done == ()
+    assert whole.valid.all()
+    np.testing.assert_array_equal(whole.recording.y_um, healthy().y_um)
+
+
+def test_gaps() -> None:
+    recording = without(healthy(), np.r_[500:510, 900])
+    (finding,) = check(recording)
+    assert (finding.kind, finding.count, finding.severity) == ("gap", 2, "warning")
+    assert finding.at_s == pytest.approx((0.499, 0.899))
+    assert "11 samples missing" in finding.message
+    whole = repaired(recording)
+    assert np.flatnonzero(~whole.valid).tolist() == [*range(500, 510), 900]
+    np.testing.assert_allclose(whole.recording.t_s, healthy().t_s, atol=1e-12)
+    np.testing.assert_array_equal(whole.recording.y_um[whole.valid], recording.y_um)
+
+
+def test_a_long_gap_or_a_step_back_splits_and_the_longest_part_is_taken() -> None:
+    whole = repaired(without(healthy(), np.r_[1000:1100]))
+    assert len(whole.recording) == 2900
+    assert whole.recording.t_s[0] == pytest.approx(1.1)
+    twice = healthy(1500), healthy(2500)
+    joined = replace(
+        twice[0],
+        **{name: np.concatenate([getattr(r, name) for r in twice]) for name in ("t_s", "u_V", "y_um")},
+    )
+    assert kinds(joined)["backwards"] == "warning"
+    assert len(repaired(joined).recording) == 2500
+
+
+@pytest.mark.parametrize(("since", "first_s"), [(0, 1.1), (900, 1.1), (3600, 1.1), (3650, 3.9), (3700, 3.9)])
+def test_of_several_parts_the_one_with_most_of_what_is_asked_for(since: int, first_s: float) -> None:
+    # Rows 0 to 999, 1000 to 3699 and 3700 to 3799: two hundred samples are missing.
+    whole = repaired(without(healthy(), np.r_[1000:1100, 3800:3900]), since)
+    assert whole.recording.t_s[0] == pytest.approx(first_s)
+
+
+def test_doubled_samples_by_time_and_by_value() -> None:
+    base = healthy()
+    again = np.sort(np.r_[np.arange(4000), 700, 1300])
+    by_time = replace(base, t_s=base.t_s[again], u_V=base.u_V[again], y_um=base.y_um[again])
+    assert kinds(by_time) == {"doubled": "warning"}
+    np.testing.assert_array_equal(repaired(by_time).recording.y_um, base.y_um)
+    by_value = changed(base, u_V=(700, base.u_V[699]), y_um=(700, base.y_um[699]))
+    assert [(f.kind, f.count, f.at_s) for f in check(by_value)] == [("doubled", 1, (pytest.approx(0.7),))]
+    whole = repaired(by_value)
+    assert np.flatnonzero(~whole.valid).tolist() == [700]
+    assert whole.recording.u_V[700] == pytest.approx(base.u_V[700], abs=1e-3)
+
+
+def test_dropouts_to_zero() -> None:
+    base = healthy()
+    broken = changed(base, y_um=(np.r_[800:803, 2500], 0.0))
+    (finding,) = check(broken)
+    assert (finding.kind, finding.column, finding.count) == ("dropout", "y_um", 4)
+    whole = repaired(broken)
+    np.testing.assert_allclose(whole.recording.y_um[[800, 801, 802, 2500]], base.y_um[[800, 801, 802, 2500]], atol=0.3)
+    # A sensor that merely passes through zero is no dropout.
+    through = replace(base, y_um=np.round(base.y_um - 40.0, 1))
+    assert np.count_nonzero(through.y_um == 0.0) > 0
+    assert "dropout" not in kinds(through)
+
+
+def test_flat_tops() -> None:
+    base = healthy()
+    clipped = replace(base, y_um=np.minimum(base.y_um, 70.0))
+    assert kinds(clipped) == {"clipped": "warning"}
+    limited = replace(base, u_V=np.minimum(base.u_V, 7.0))
+    assert kinds(limited) == {"clipped": "note"}
+
+
+def test_not_finite() -> None:
+    few = changed(healthy(), y_um=(np.r_[100:110], np.nan), u_V=(5, np.inf))
+    found = {finding.column: finding.count for finding in check(few)}
+    assert found == {"y_um": 10, "u_V": 1}
+    whole = repaired(few)
+    assert np.isfinite(whole.recording.y_um).all()
+    assert (~whole.valid).sum() == 11
+    ridden = changed(healthy(), y_um=(np.random.default_rng(1).permutation(4000)[:1500], np.nan))
+    with pytest.raises(InputError, match=r"made: y_um: 1500 of 4000 samples"):
+        require_usable(ridden, check(ridden))
+
+
+@pytest.mark.parametrize("column", ["u_V", "y_um"])
+@pytest.mark.parametrize("level", [0.0, 2.5])
+def test_all_zero_and_constant_are_refused(column: str, level: float) -> None:
+    dead = changed(healthy(), **{column: (slice(None), level)})
+    with pytest.raises(InputError, match=f"{column}: every sample is"):
+        require_usable(dead, check(dead))
+
+
+def test_too_short() -> None:
+    short = healthy().part(0, 100)
+    with pytest.raises(InputError, match="100 samples: too few"):
+        require_usable(short, check(short))
+    assert kinds(healthy().part(0, 500)) == {"too_short": "warning"}
+
+
+def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
+    base = healthy()
+    exchanged = replace(base, u_V=base.y_um, y_um=base.u_V)
+    with pytest.raises(InputError, match="look swapped"):
+        require_usable(exchanged, check(exchanged))
+    negative = replace(base, y_um=-base.y_um)
+    assert "swapped" not in kinds(negative)
+
+
+def test_jitter_and_wrong_units() -> None:
+    rng = np.random.default_rng(0)
+    base = healthy()
+    assert kinds(replace(base, t_s=base.t_s + 1e-4 * rng.standard_normal(4000))) == {"jitter": "warning"}
+    assert kinds(replace(base, y_um=base.y_um * 1e3)) == {"unit": "warning"}
+    assert kinds(replace(base, u_V=base.u_V * 1e-3)) == {"unit": "warning"}
+
+
+def test_columns_of_another_length_are_refused() -> None:
+    with pytest.raises(InputError, match=r"y_um: got shape \(3,\), expected \(2,\)"):
+        Recording(t_s=np.zeros(2), u_V=np.zeros(2), y_um=np.zeros(3), dt_s=1.0)
+
+
+def test_between() -> None:
+    part = healthy().between(1.0, 1.5)
+    assert (len(part), part.t_s[0]) == (500, 1.0)
+    with pytest.raises(InputError, match=r"range: got 9:10 s.*0 to 3\.999 s"):
+        healthy().between(9.0, 10.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    gone=st.sets(st.integers(1, 2998), max_size=40),
+    nans=st.sets(st.integers(0, 2999), max_size=20),
+    doubled=st.sets(st.integers(0, 2999), max_size=20),
+)
+def test_repair_puts_every_good_sample_where_it_was(gone: set[int], nans: set[int], doubled: set[int]) -> None:
+    base = healthy(3000)
+    broken = changed(base, y_um=(sorted(nans), np.nan)) if nans else base
+    order = np.sort([k for k in range(3000) if k not in gone] + [k for k in doubled if k not in gone])
+    broken = replace(broken, t_s=broken.t_s[order], u_V=broken.u_V[order], y_um=broken.y_um[order])
+    whole = repaired(broken)
+    assert len(whole.recording) == 3000
+    invalid = set(np.flatnonzero(~whole.valid).tolist())
+    assert invalid == gone | nans
+    np.testing.assert_allclose(whole.recording.t_s, base.t_s, atol=1e-12)
+    np.testing.assert_array_equal(whole.recording.u_V[whole.valid], base.u_V[whole.valid])
+    np.testing.assert_array_equal(whole.recording.y_um[whole.valid], base.y_um[whole.valid])
+
+
+@pytest.mark.parametrize("name", ["rich", "bouc_wen"])
+def test_simulated_stages_are_healthy_and_swapped_ones_are_seen(name: str) -> None:
+    from sim.signals.signals import training_input
+    from sim.stage.presets import preset
+    from sim.stage.stage import Stage
+
+    t_s, u_V = training_input(DT, 10.0)[:2]
+    stage = Stage(preset(name, dt_s=DT))
+    y_um, _ = stage.run(stage.initial_state(), u_V)
+    assert check(Recording(t_s=t_s, u_V=u_V, y_um=y_um, dt_s=DT)) == []
+    assert kinds(Recording(t_s=t_s, u_V=y_um, y_um=u_V, dt_s=DT)) == {"swapped": "refusal"}

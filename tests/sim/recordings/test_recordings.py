@@ -1,0 +1,291 @@
+"""Readers: every format gives the same recording; every bad file gets a message that mends it."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyarrow import parquet
+from scipy.io import savemat
+
+from adaptive.errors import InputError
+from sim.recordings import ColumnMap, Recording, load_map, read
+
+N = 300
+T = np.arange(N) * 0.002
+U = np.round(4.0 - 4.0 * np.cos(2 * np.pi * 2.0 * T), 6)
+Y = np.round(10.0 * U - 3.0 + 0.4 * np.sin(2 * np.pi * 2.0 * T), 6)
+
+
+def write_csv(path: Path, header: str, *columns: np.ndarray, delimiter: str = ",") -> Path:
+    rows = [delimiter.join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def same(recording: Recording) -> None:
+    np.testing.assert_allclose(recording.t_s, T, atol=1e-9)
+    np.testing.assert_allclose(recording.u_V, U, atol=1e-6)
+    np.testing.assert_allclose(recording.y_um, Y, atol=1e-6)
+    assert recording.dt_s == 0.002
+
+
+def write_gcs(path: Path, *, dim: int = 2, ndata: int = N, sample_time: str = "0.002000", end: bool = True) -> Path:
+    head = ["VERSION = 1", "TYPE = 1", "SEPARATOR = 32", f"DIM = {dim}", f"SAMPLE_TIME = {sample_time}"]
+    head += [f"NDATA = {ndata}", "NAME0 = Control Voltage of Piezo  1", "NAME1 = Current Position of Axis  1"]
+    lines = ["# ", *[f"# {line}" for line in head], "# "] + (["# END_HEADER"] if end else [])
+    path.write_text("\n".join([*lines, *[f"{u:.6f} {y:.6f} " for u, y in zip(U, Y, strict=True)]]) + "\n")
+    return path
+
+
+GCS_MAP = ColumnMap(
+    columns={"u": "Control Voltage of Piezo  1", "y": "Current Position of Axis  1"}, units={"u": "V", "y": "um"}
+)
+
+
+def test_canonical_csv(tmp_path: Path) -> None:
+    recording = read(write_csv(tmp_path / "a.csv", "t_s,u_V,y_um,temperature_C", T, U, Y, 20 + T))
+    same(recording)
+    assert recording.temperature_C is not None
+    assert recording.u2_V is None
+    assert len(recording.sha256) == 64
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+def test_text_by_its_delimiter_with_comments_before_the_header(tmp_path: Path, delimiter: str) -> None:
+    path = write_csv(tmp_path / "a.txt", delimiter.join(["t_s", "u_V", "y_um"]), T, U, Y, delimiter=delimiter)
+    path.write_text("# rig 7\n% made by hand\n\n" + path.read_text())
+    same(read(path))
+
+
+def test_decimal_commas_windows_line_ends_and_a_byte_order_mark(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", "t_s;u_V;y_um", T, U, Y, delimiter=";")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_text().replace(".", ",").replace("\n", "\r\n").encode())
+    same(read(path, ColumnMap(decimal=",")))
+
+
+def test_other_names_and_units_by_options(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", "time,drive,sensor", T * 1e3, U * 1e3, Y * 1e3)
+    mapping = ColumnMap(columns={"t": "time", "u": "drive", "y": "sensor"}, units={"t": "ms", "u": "mV", "y": "nm"})
+    same(read(path, mapping))
+
+
+def test_a_unit_in_the_name_is_believed(tmp_path: Path) -> None:
+    same(read(write_csv(tmp_path / "a.csv", "t_ms,u_mV,y_nm", T * 1e3, U * 1e3, Y * 1e3)))
+    mapping = ColumnMap(columns={"t": "time [ms]", "u": "drive (mV)", "y": "pos_nm"})
+    same(read(write_csv(tmp_path / "b.csv", "time [ms],drive (mV),pos_nm", T * 1e3, U * 1e3, Y * 1e3), mapping))
+
+
+def test_scale_in_place_of_a_unit_and_kelvin(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", "t_s,u_V,sensor_V,temperature_K", T, U, Y / 10.0, np.full(N, 293.15))
+    recording = read(path, ColumnMap(columns={"y": "sensor_V"}, scale={"y": 10.0}))
+    same(recording)
+    assert recording.temperature_C is not None
+    np.testing.assert_allclose(recording.temperature_C, 20.0)
+
+
+def test_sample_time_by_option_where_there_is_no_time_column(tmp_path: Path) -> None:
+    path = write_csv(tmp_path / "a.csv", "u_V,y_um", U, Y)
+    same(read(path, ColumnMap(dt_s=0.002)))
+    with pytest.raises(InputError, match=r"no time.*--dt-s"):
+        read(path)
+
+
+def test_parquet_with_timestamps(tmp_path: Path) -> None:
+    stamps = pa.array((np.round(T * 1e9)).astype("datetime64[ns]"))
+    parquet.write_table(pa.table({"t_s": stamps, "u_V": U, "y_um": Y}), tmp_path / "a.parquet")
+    same(read(tmp_path / "a.parquet"))
+
+
+def test_a_folder_of_segments_is_one_recording(tmp_path: Path) -> None:
+    for k, part in enumerate((slice(0, 100), slice(100, N))):
+        table = pa.table({"t_s": T[part], "u_V": U[part], "y_um": Y[part], "reason": ["learnt"] * len(T[part])})
+        parquet.write_table(table, tmp_path / f"segment-{k:03d}.parquet")
+    recording = read(tmp_path)
+    same(recording)
+    assert recording.reason is not None
+    assert recording.notes == ("2 segments",)
+
+
+def test_mat_with_structures_and_columns(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t_s": T.reshape(-1, 1), "rec": {"u": U.reshape(-1, 1), "y": Y * 1e3}, "name": "rig"})
+    mapping = ColumnMap(columns={"u": "rec.u", "y": "rec.y"}, units={"u": "V", "y": "nm"})
+    same(read(tmp_path / "a.mat", mapping))
+
+
+def test_mat_7_3_says_how_to_convert(tmp_path: Path) -> None:
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Mon".ljust(116)
+    (tmp_path / "a.mat").write_bytes(head + bytes(8) + b"\x00\x02IM" + bytes(400))
+    with pytest.raises(InputError, match=r"7\.3.*'-v7'"):
+        read(tmp_path / "a.mat")
+
+
+def test_npz_with_several_dimensions_and_a_rate(tmp_path: Path) -> None:
+    y = np.zeros((N, 3, 2))
+    y[:, 2, 1] = Y * 1e-6
+    np.savez(tmp_path / "a.npz", u_N=U, y_m=y, fs_hz=500.0)
+    columns = {"u": "u_N", "y": "y_m", "rate": "fs_hz"}
+    same(read(tmp_path / "a.npz", ColumnMap(columns=columns, scale={"u": 1.0}, index={"y": ":,2,1"})))
+    with pytest.raises(InputError, match=r"shape \(300, 3, 2\).*--index y=:,0,0"):
+        read(tmp_path / "a.npz", ColumnMap(columns=columns, scale={"u": 1.0}))
+    for bad in (":,3,1", ":,0", "0,0,0", ":,:,0", ":,x,0", ":,-1,0"):
+        with pytest.raises(InputError, match="index of y"):
+            read(tmp_path / "a.npz", ColumnMap(columns=columns, scale={"u": 1.0}, index={"y": bad}))
+
+
+def test_npz_without_a_unit_for_the_input(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", u_N=U, y_um=Y, fs_hz=500.0)
+    with pytest.raises(InputError, match=r"'u_N' for u has no unit.*V, mV.*--unit u=V.*--scale"):
+        read(tmp_path / "a.npz", ColumnMap(columns={"u": "u_N", "rate": "fs_hz"}))
+
+
+def test_controllers_array_file(tmp_path: Path) -> None:
+    recording = read(write_gcs(tmp_path / "a.dat"), GCS_MAP)
+    same(recording)
+    assert any("SAMPLE_TIME" in note for note in recording.notes)
+    recording = read(write_gcs(tmp_path / "b.dat", ndata=N + 5), GCS_MAP)
+    assert any("NDATA = 305" in note for note in recording.notes)
+
+
+def test_controllers_array_file_without_stated_units_is_refused(tmp_path: Path) -> None:
+    path = write_gcs(tmp_path / "a.dat")
+    with pytest.raises(InputError, match=r"no unit.*--unit u=V"):
+        read(path, ColumnMap(columns=GCS_MAP.columns))
+    with pytest.raises(InputError, match=r"Control Voltage of Piezo  1, Current Position of Axis  1.*--column u="):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dim": 3}, "data row 1: got .* expected DIM = 3 numbers"),
+        ({"sample_time": "fast"}, "SAMPLE_TIME: got 'fast'.*--dt-s"),
+        ({"end": False}, "END_HEADER"),
+    ],
+)
+def test_damaged_array_files(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(write_gcs(tmp_path / "a.dat", **options), GCS_MAP)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty file"),
+        ("\n\n", "no data"),
+        ("0,1,2\n0.1,1,2\n", "numbers in its first line.*header"),
+        ("t_s,u_V,u_V\n0,1,2\n", "'u_V' twice"),
+        ("t_s,u_V,y_um\n", "no samples|not a table"),
+        ("t_s,u_V,y_um\n0,1,2\n1,2\n", "not a table of 3 columns"),
+        ("t_s,u_V,y_um\n0,1,2\n1,2,off\n", "'off' in data row 2"),
+        ("t_s,u_V,y\n0,1,2\n1,2,3\n", r"'y' for y has no unit.*um, .*nm.*--unit y=um"),
+        ("t_s,u_V,sensor\n0,1,2\n", r"t_s, u_V, sensor, expected y_um: add --column y=NAME"),
+        ("t_s,u_V,y_nm,y_mm\n0,1,2,3\n", "y_nm, y_mm, expected one"),
+        ("t_s,u_V,y_um\n0,1,2\n0,2,3\n", "never advances"),
+    ],
+)
+def test_bad_text_gets_a_message(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read(path)
+    assert "bad.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a.mat", "a.npz", "a.parquet", "a.csv"])
+def test_noise_and_cut_files_are_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(np.random.default_rng(1).bytes(4000))
+    with pytest.raises(InputError, match=name):
+        read(path)
+
+
+def test_missing_file_and_empty_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.csv: cannot be read"):
+        read(tmp_path / "none.csv")
+    with pytest.raises(InputError, match=r"without \.parquet files"):
+        read(tmp_path)
+
+
+def test_map_file(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(
+        'sensor_late = 1\n[columns]\nt = "time"\nu = "drive"\ny = "pos"\n[units]\nt = "s"\nu = "V"\n[scale]\ny = 2\n'
+    )
+    mapping = load_map(tmp_path / "map.toml")
+    recording = read(write_csv(tmp_path / "a.csv", "time,drive,pos", T, U, Y), mapping)
+    assert len(recording) == N - 1
+    np.testing.assert_allclose(recording.y_um, 2.0 * Y[1:], atol=1e-6)
+    np.testing.assert_allclose(recording.u_V, U[:-1], atol=1e-6)
+    np.testing.assert_allclose(recording.t_s, T[:-1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("column = 1", "unknown key 'column'"),
+        ("[columns]\nz = 'a'", "quantity 'z'"),
+        ("[units]\ny = 'inch'", "unit of y: got 'inch', expected one of um"),
+        ("[units]\ny = 3", "units.y: got 3, expected str"),
+        ("[scale]\ny = 0.0", "scale of y"),
+        ("[scale]\ny = 1.0\n[units]\ny = 'um'", "both a unit and a scale"),
+        ("sensor_late = -1", "sensor_late: got -1"),
+        ("dt_s = 0", "dt_s"),
+        ("not toml", "is not TOML"),
+    ],
+)
+def test_bad_maps(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_map(tmp_path / "map.toml")
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_any_column_order_and_unit_gives_the_same_recording(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    units = {"t": {"s": 1.0, "ms": 1e-3, "us": 1e-6}, "u": {"V": 1.0, "mV": 1e-3}, "y": {"um": 1.0, "nm": 1e-3}}
+    columns = {"t": T, "u": U, "y": Y}
+    order = data.draw(st.permutations(sorted(columns)))
+    chosen = {q: data.draw(st.sampled_from(sorted(units[q]))) for q in order}
+    path = tmp_path_factory.mktemp("order") / "a.csv"
+    write_csv(path, ",".join(order), *[columns[q] / units[q][chosen[q]] for q in order])
+    same(read(path, ColumnMap(units=chosen)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(content=st.binary(min_size=1, max_size=300), name=st.sampled_from(["a.csv", "a.mat", "a.npz", "a.parquet"]))
+def test_whatever_the_bytes_only_input_errors_leave(
+    content: bytes, name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("bytes") / name
+    path.write_bytes(content)
+    with pytest.raises(InputError):
+        read(path)
+
+
+def test_measured_files_of_every_folder() -> None:
+    data_dir = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data"))
+    if not data_dir.is_dir():
+        pytest.skip(f"no measured data at {data_dir} (DEHYST_DATA)")
+    recording = read(data_dir / "picma_stack" / "model_sine_1hz.csv")
+    assert (len(recording), recording.dt_s) == (8027, 0.005)
+    mirror = ColumnMap(columns={"u": "u", "rate": "fs_hz"}, units={"u": "V"}, index={"u": ":,2,1,0", "y": ":,0,1,0"})
+    recording = read(data_dir / "fine_steering_mirror" / "fsm_100mV_test.npz", mirror)
+    assert (len(recording), recording.dt_s) == (8192, 1.0 / 6400)
+    benchmark = ColumnMap(columns={"u": "u_N", "y": "y_m", "rate": "fs_hz"}, scale={"u": 1.0})
+    recording = read(data_dir / "boucwen_benchmark" / "test_multisine.npz", benchmark)
+    assert float(np.sqrt(np.mean(recording.y_um**2))) == pytest.approx(667.0, rel=0.01)
+
+
+def test_findings_are_json(tmp_path: Path) -> None:
+    from sim.recordings import check
+
+    findings = check(read(write_gcs(tmp_path / "b.dat", ndata=N + 5), GCS_MAP))
+    assert json.loads(json.dumps([finding.as_dict() for finding in findings]))
