@@ -28,8 +28,8 @@ from typing import Any
 #: cannot compile what the fuzzer has put into them.
 INSTRUMENTED = [
     "service.protocol.samples", "service.protocol.reply", "service.protocol.query", "service.protocol.model",
-    "service.storage.model_file", "service.operating.request", "service.protocol.errors", "service.storage.checkpoint",
-    "service.stage_node.faults", "service.failover.state_transfer",
+    "service.protocol.container", "service.storage.model_file", "service.operating.request", "service.protocol.errors",
+    "service.storage.checkpoint", "service.stage_node.faults", "service.failover.state_transfer",
 ]  # fmt: skip
 _MAX_BYTES = 4096
 _SLOW_S = 5

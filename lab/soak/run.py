@@ -15,14 +15,14 @@ from lab.soak.processes.setup import identify, stage_of
 from lab.soak.verdict.interim import Interim
 from lab.soak.verdict.judge import TRACKING_PCT, judge, recorded
 from lab.soak.verdict.ledger import FAST, REAL_TIME, Ledger
-from lab.soak.verdict.outcome import PART, SECONDS, summary, write_found, write_seconds
+from lab.soak.verdict.outcome import SECONDS, summary, write_found, write_seconds
 from lab.soak.verdict.report import report
 from lab.soak.verdict.settling import settle
 from lab.soak.verdict.track import OTHER_LIFE, Intervals
 from service.storage.output_folder import clear_output
 
 #: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
-OURS = ("soak.json", f"soak.json{PART}", "report.md", "plan.json", SECONDS, "error.png", "latency.png", "memory.png",
+OURS = ("soak.json", "report.md", "plan.json", SECONDS, "error.png", "latency.png", "memory.png",
         "soak.rrd", "model.npz", "a", "b", "logs")  # fmt: skip
 #: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
 OWN_STAGE_RATIO = 2.0

@@ -12,11 +12,12 @@ import numpy as np
 
 from adaptive.finite import all_finite
 from adaptive.types import FloatArray, InverseModel
-from service.answers.fallback import Rules, StandIn, answer_safely
+from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, check_voltages
 from service.config.config import AxisConfig
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
+from service.protocol.model import StandIn
 from service.protocol.query import NEWEST, FeedforwardQuery, Pending
 from service.protocol.reply import FeedforwardReply
 

@@ -22,18 +22,11 @@ from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
+from service.protocol.model import StandIn
 from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
 
 #: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
 FADE_S, FADE_SAMPLES = 0.006, 6.0
-
-
-class StandIn(NamedTuple):
-    """The model that stands in, and (m,) the memory from which it begins: tracked from the samples to the snapshot."""
-
-    name: str
-    model: InverseModel
-    memory: FloatArray
 
 
 class Rules(NamedTuple):

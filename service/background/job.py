@@ -20,6 +20,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from service.background.priority import step_back
+from service.storage.atomic_write import atomic_write
 
 _ORDER: Final = "order.json"
 _DATA: Final = "data.npz"
@@ -128,7 +129,6 @@ def work(folder: Path, do: Callable[[dict[str, Any], dict[str, FloatArray]], dic
     order = json.loads((folder / _ORDER).read_text(encoding="utf-8"))
     with np.load(folder / _DATA, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    part = folder / "result.part"
-    part.write_text(json.dumps(do(order, arrays)), encoding="utf-8")
-    os.replace(part, folder / _RESULT)
+    with atomic_write(folder / _RESULT) as file:
+        file.write(json.dumps(do(order, arrays)).encode())
     return 0

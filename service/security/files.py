@@ -16,7 +16,6 @@ from __future__ import annotations
 import base64
 import ipaddress
 import json
-import os
 import secrets
 import shutil
 import subprocess
@@ -29,6 +28,7 @@ from typing import Any, Final
 from service.protocol.errors import FieldError, ServiceError
 from service.protocol.keys import check_name
 from service.security.rules import ROLES, ROUTER, SERVICE, STAGE, access_control
+from service.storage.atomic_write import atomic_write
 
 MANIFEST: Final = "access.json"
 USERS: Final = "users.txt"
@@ -218,10 +218,6 @@ def _json(data: Any) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Whole or not at all, and for its owner's eyes only from the first byte on."""
-    scratch = path.with_name(path.name + ".new")
-    with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    scratch.replace(path)
+    """Write atomically; only the owner can read the file, from the first byte on."""
+    with atomic_write(path, mode=0o600) as file:
+        file.write(text.encode())

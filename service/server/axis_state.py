@@ -21,9 +21,9 @@ from service.answers.answering import Served
 from service.background.retuning.adoption import Retuned
 from service.intake.clock import SampleClock
 from service.protocol.errors import FieldError
+from service.protocol.model_classes import build_model, stored_kind
 from service.server.competing import champion_of
 from service.server.model_watch import POISON
-from service.storage.model_file import build, kind_of
 
 if TYPE_CHECKING:
     from service.server.axis import Axis
@@ -59,7 +59,7 @@ def axis_state(axis: Axis) -> StateDict:
     state |= prefixed("memory.", served.memories)
     state |= prefixed("watch.", axis.watch.state_dict())
     for role, model in axis.watch.models().items():
-        state |= {f"model.{role}.kind": kind_of(model)}
+        state |= {f"model.{role}.kind": stored_kind(model)}
         state |= prefixed(f"model.{role}.", model.state_dict())
     if served.trouble in POISON:
         # What the learner goes back to when the samples are good again.
@@ -140,7 +140,7 @@ def _roles(state: StateDict) -> list[str]:
 
 def _model(state: StateDict, role: str) -> InverseModel:
     kind = str(state["kind"])
-    return build(kind, state, f"the {role} model")
+    return build_model(kind, state, f"the {role} model")
 
 
 def _served(axis: Axis, state: StateDict, learner: OnlineModel | None, watched: dict[str, InverseModel]) -> Served:

@@ -7,11 +7,11 @@ from typing import Any, Final
 from service.answers.latency import LatencyMeter
 from service.intake.intake import Intake
 from service.protocol.keys import Keys
+from service.protocol.model_classes import stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.security.refusals import refusal_counters
 from service.server.axis import Axis
-from service.storage.model_file import kind_of
 
 SCHEMA: Final = 1
 #: What of the learner's diagnostics a status repeats, once a second.
@@ -36,7 +36,8 @@ def axis_status(
         "served": axis.served,
         "learning": axis.config.learn if axis.learning else None,
         "models": {
-            name: {"kind": kind_of(model), "memory_size": model.memory_size} for name, model in served.models.items()
+            name: {"kind": stored_kind(model), "memory_size": model.memory_size}
+            for name, model in served.models.items()
         },
         "limits": axis.limits.to_json(),
         "seq": tally.seq,

@@ -1,45 +1,41 @@
-"""A checkpoint: all that an axis has learnt, in one file that is whole or refused, with what it belongs to.
+"""Checkpoints: the complete state of an axis in one file, and the folder that keeps them.
 
-Layout: 8 bytes ``DHCKPT01``, u64 length of the JSON text, 16 bytes BLAKE2b of everything after them, JSON text, arrays
-each at a multiple of 8 bytes from the end of the text. The same bytes travel from a serving instance to its standby.
+Layout: 8 bytes ``DHCKPT01``, u64 length of the JSON header, 16 bytes BLAKE2b of everything behind them, then the body
+of `service.protocol.container`. A serving instance sends the same bytes to its standby. A file with a wrong digest is
+refused.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
-import math
-import os
 import struct
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from adaptive.errors import ModelFileError
 from adaptive.state_codec import under
 from adaptive.types import OnlineModel, StateDict
+from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_body, decode_header, encode_body, split_state
 from service.protocol.errors import FieldError
 from service.server.axis_state import STATE_SCHEMA, restored_learner
-from service.storage.model_file import UNITS, split_state
+from service.storage.atomic_write import atomic_write
 
 MAGIC: Final = b"DHCKPT01"
 _HEAD: Final = struct.Struct("<8sQ16s")
-SUFFIX, PART = ".ckpt", ".ckpt-part"
-_DTYPES: Final = {"<f8", "<f4", "<i8", "<i4", "|u1", "|b1"}
+SUFFIX: Final = ".ckpt"
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointMeta:
-    """What a checkpoint belongs to, and when it was made.
+    """The axis and the sample that a checkpoint belongs to.
 
     Attributes
     ----------
     stage, axis : names on the wire. dt_s : sample time, s. units : those of the model file.
-    schema : of the state. seq : last sample handled. samples : handled in all until then.
-    time_unix_s : for people only; nothing is decided by it. instance : that made it.
+    schema : version of the state. seq : number of the last sample handled. samples : count of all samples handled.
+    time_unix_s : time of writing, s; for display only. instance : the instance that wrote it.
     """
 
     stage: str
@@ -53,7 +49,7 @@ class CheckpointMeta:
     units: dict[str, str] | None = None
 
     def refuse_unless(self, stage: str, axis: str, dt_s: float) -> None:
-        """ModelFileError with the reason, unless it belongs to this axis and can be read by this program."""
+        """Raise ModelFileError with the reason if the checkpoint is of another axis or of another version."""
         for name, got, wanted in (
             ("schema", self.schema, STATE_SCHEMA),
             ("stage", self.stage, stage),
@@ -66,54 +62,36 @@ class CheckpointMeta:
 
 
 def encode_checkpoint(meta: CheckpointMeta, state: StateDict) -> list[Any]:
-    """The bytes of a checkpoint as buffers in their order; nothing of the arrays is copied."""
+    """The bytes of a checkpoint as buffers in order; arrays are not copied."""
     values, arrays = split_state(state)
-    listed: list[list[Any]] = []
-    buffers: list[Any] = []
-    for name, array in arrays.items():
-        little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-        listed.append([name, little.dtype.str, list(array.shape)])
-        buffers += [little.reshape(-1).view(np.uint8).data, bytes(-little.nbytes % 8)]
-    header = {"meta": {**asdict(meta), "units": UNITS}, "values": values, "arrays": listed}
-    text = json.dumps(header, allow_nan=False).encode()
-    text += b" " * (-len(text) % 8)
-    sha = hashlib.blake2b(digest_size=16)
-    for buffer in (text, *buffers):
-        sha.update(buffer)
-    return [_HEAD.pack(MAGIC, len(text), sha.digest()), text, *buffers]
+    body = encode_body({"meta": {**asdict(meta), "units": UNITS}, "values": values}, arrays)
+    digest = hashlib.blake2b(digest_size=16)
+    for buffer in body:
+        digest.update(buffer)
+    return [_HEAD.pack(MAGIC, len(body[0]), digest.digest()), *body]
 
 
 def decode_checkpoint(data: bytes) -> tuple[CheckpointMeta, StateDict]:
-    """(meta, state). Raises ModelFileError saying what is wrong with the bytes."""
+    """(meta, state). Raises ModelFileError if the bytes are cut off, damaged or foreign."""
     if len(data) < _HEAD.size:
         raise ModelFileError("cut off in its header")
     magic, length, digest = _HEAD.unpack_from(data)
     if magic != MAGIC:
         raise ModelFileError("not a checkpoint of this program")
-    view = memoryview(data)[_HEAD.size :]
-    if length > len(view) or hashlib.blake2b(view, digest_size=16).digest() != digest:
+    body = memoryview(data)[_HEAD.size :]
+    if length > len(body) or hashlib.blake2b(body, digest_size=16).digest() != digest:
         raise ModelFileError("damaged or cut off: its digest does not match")
     try:
-        header = json.loads(bytes(view[:length]))
-        meta = CheckpointMeta(**header["meta"])
-        state: StateDict = dict(header["values"])
-        offset = length
-        for name, dtype, shape in header["arrays"]:
-            if dtype not in _DTYPES:
-                raise ValueError(f"{name}: type {dtype}")
-            count = math.prod(shape)
-            array = np.frombuffer(view, dtype=dtype, count=count, offset=offset).reshape(shape)
-            state[str(name)] = array.copy()
-            offset += array.nbytes + (-array.nbytes % 8)
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise ModelFileError(f"its header does not fit: {error!r}") from error
-    return meta, state
+        header, arrays = decode_body(body, length, len(body))
+        return CheckpointMeta(**header["meta"]), dict(header["values"]) | arrays
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelFileError(f"its header is not valid: {error!r}") from error
 
 
 class CheckpointFolder:
-    """The checkpoints of one axis: the newest, and older ones further and further apart.
+    """The checkpoints of one axis: all of the newest, and older ones at growing distances (see `is_kept`).
 
-    One process writes; anybody may read.
+    One process writes; any number may read.
     """
 
     def __init__(self, directory: Path, stage: str, axis: str, dt_s: float, kept: int) -> None:
@@ -122,27 +100,18 @@ class CheckpointFolder:
         self._belongs = (stage, axis, dt_s)
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
-        """Write one under the next number: whole or not at all, and on the disk itself. Raises OSError."""
+        """Write a checkpoint under the next number, atomically and synced. Raises OSError."""
         self.directory.mkdir(parents=True, exist_ok=True)
         number = max((number_of(path) for path in self._paths()), default=0) + 1
         path = self.directory / f"checkpoint-{number:09d}{SUFFIX}"
-        part = path.with_suffix(PART)
-        try:
-            with open(part, "wb") as file:
-                for buffer in encode_checkpoint(meta, state):
-                    file.write(buffer)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
-            raise
+        with atomic_write(path) as file:
+            for buffer in encode_checkpoint(meta, state):
+                file.write(buffer)
         self._remove_surplus(number)
         return path
 
     def entries(self) -> list[dict[str, Any]]:
-        """checkpoint (number), seq, samples, time_unix_s, bytes of each, newest first; damaged ones are left out."""
+        """checkpoint (number), seq, samples, time_unix_s and bytes of each, newest first, without unreadable ones."""
         found = []
         for path in reversed(self._paths()):
             with contextlib.suppress(OSError, ModelFileError):
@@ -159,7 +128,7 @@ class CheckpointFolder:
         return found
 
     def read(self, number: int) -> tuple[CheckpointMeta, StateDict]:
-        """(meta, state) of one. Raises ModelFileError with the reason why it is refused."""
+        """(meta, state) of one checkpoint. Raises ModelFileError if it is damaged or of another axis."""
         path = self.directory / f"checkpoint-{number:09d}{SUFFIX}"
         try:
             meta, state = decode_checkpoint(path.read_bytes())
@@ -169,11 +138,11 @@ class CheckpointFolder:
         return meta, state
 
     def numbers(self) -> list[int]:
-        """Numbers of all there are, newest first."""
+        """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
 
     def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint. Raises FieldError where there is none such, or it does not match ``like``."""
+        """The learner of a checkpoint. Raises InputError if it does not exist or does not match ``like``."""
         if number not in self.numbers():
             known = ", ".join(map(str, self.numbers()[:8])) or "none"
             raise FieldError("checkpoint", number, f"one of those there are ({known} ...)", "see 'checkpoints'")
@@ -190,20 +159,20 @@ class CheckpointFolder:
         for path in self._paths():
             if number_of(path) not in keep:
                 path.unlink(missing_ok=True)
-        for part in self.directory.glob(f"*{PART}"):
+        for part in self.directory.glob("*checkpoint-*part"):  # of a process that was killed while it wrote
             part.unlink(missing_ok=True)
 
 
 def is_kept(number: int, age: int) -> bool:
-    """Whether the checkpoint with this number is kept at this age, counted in checkpoints.
+    """Whether the checkpoint with this number is kept at ``age``, counted in checkpoints.
 
-    The newest four, then two of every four, two of every eight and so on: a few dozen reach back for months.
+    The newest four are kept, then two of every four, two of every eight and so on: a few dozen cover months.
     """
     return age < 4 or number % (1 << (age.bit_length() - 2)) == 0
 
 
 def number_of(path: Path) -> int:
-    """The running number in a checkpoint's name, -1 where it is none of ours."""
+    """The number in a checkpoint's file name; -1 if the file is not a checkpoint."""
     text = path.stem.removeprefix("checkpoint-")
     return int(text) if text.isdigit() else -1
 
@@ -214,9 +183,9 @@ def _read_meta(path: Path) -> CheckpointMeta:
         if len(head) < _HEAD.size or head[: len(MAGIC)] != MAGIC:
             raise ModelFileError("not a checkpoint")
         length = _HEAD.unpack(head)[1]
-        if length > 2**24:
+        if length > MAX_HEADER_BYTES:
             raise ModelFileError("not a checkpoint")
         try:
-            return CheckpointMeta(**json.loads(file.read(length))["meta"])
+            return CheckpointMeta(**decode_header(file.read(length))["meta"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ModelFileError(f"its header does not fit: {error!r}") from error
+            raise ModelFileError(f"its header is not valid: {error!r}") from error

@@ -20,9 +20,10 @@ from typing import IO, Any, Final
 import numpy as np
 
 from service.background.priority import step_back
+from service.storage.atomic_write import PART, atomic_write
 from service.storage.journal import INDEX_MODULUS, Rows, read_journal
 
-OPEN, CLOSED, PART = ".journal", ".parquet", ".part"
+OPEN, CLOSED = ".journal", ".parquet"
 #: The name of the journal of a segment that is Parquet already.
 DONE: Final = ".done"
 #: Journals' names begin so: what reads the folder as one data set, as pyarrow does, passes over such files.
@@ -54,20 +55,10 @@ def convert(journal: Path) -> Path | None:
     from pyarrow import parquet
 
     target = journal.with_name(journal.name.removeprefix(HIDDEN)).with_suffix(CLOSED)
-    part = journal.with_suffix(PART)
     columns = [pa.array(column) for column in (rows.seq, rows.t_s, rows.u_V, rows.y_um)]
     table = pa.table([*columns, pa.array(rows.reason, pa.string())], schema=schema())
-    try:
-        with open(part, "wb") as out:
-            parquet.write_table(table, out, compression="zstd", use_dictionary=["reason"])
-            out.flush()
-            os.fsync(out.fileno())
-        os.replace(part, target)
-        _sync_directory(journal.parent)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise
+    with atomic_write(target) as file:
+        parquet.write_table(table, file, compression="zstd", use_dictionary=["reason"])
     os.replace(journal, journal.with_suffix(DONE))
     return target
 
@@ -213,14 +204,6 @@ def make_room(directory: Path, max_bytes: int) -> int:
 
 def _sorted(directory: Path, suffix: str) -> list[Path]:
     return sorted((p for p in directory.glob(f"*segment-*{suffix}") if number_of(p) >= 0), key=number_of)
-
-
-def _sync_directory(directory: Path) -> None:
-    fd = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def main() -> int:

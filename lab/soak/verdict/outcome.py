@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
@@ -19,12 +18,11 @@ from lab.soak.verdict.invariant import Invariant
 from lab.soak.verdict.ledger import Happened, Ledger, Probe
 from lab.soak.verdict.memory import memory_slopes
 from lab.soak.verdict.track import Second
+from service.storage.atomic_write import atomic_write
 
 #: Verdicts of a run that is over, and of one that goes on.
 HELD, BROKEN = "held", "broken"
 RUNNING, BROKEN_SO_FAR = "running", "broken so far"
-#: Appended to the name of a file that is not whole yet.
-PART: Final = ".part"
 
 
 def summary(
@@ -86,10 +84,10 @@ def verdict_line(found: Mapping[str, Any]) -> str:
 
 
 def write_found(path: Path, found: Mapping[str, Any]) -> None:
-    """Write ``soak.json`` whole or not at all: whoever reads it never sees half of it."""
-    part = path.with_name(path.name + PART)
-    part.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    """Write ``soak.json`` atomically."""
+    text = json.dumps(found, indent=1, allow_nan=False) + "\n"
+    with atomic_write(path) as file:
+        file.write(text.encode())
 
 
 # --- ``seconds.csv`` of a soak: what was seen in each second, to look up what a verdict or a picture only hints at.

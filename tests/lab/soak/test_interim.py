@@ -14,6 +14,7 @@ from lab.soak.verdict import outcome
 from lab.soak.verdict.interim import EVERY_S, Interim
 from lab.soak.verdict.judge import TRACKING_PCT
 from lab.soak.verdict.ledger import Happened, Ledger
+from service.storage import atomic_write
 from tests.lab.soak.soaked import healthy, verdict
 
 
@@ -211,7 +212,7 @@ def test_a_file_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(outcome.os, "replace", fail)
+    monkeypatch.setattr(atomic_write.os, "replace", fail)
     with pytest.raises(OSError, match="no space"):
         outcome.write_found(path, {"verdict": "held"})
     assert json.loads(path.read_text()) == {"verdict": "running"}

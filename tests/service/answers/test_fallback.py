@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answers.answering import trust_by_age
-from service.answers.fallback import Answer, Rules, StandIn, answer_safely, domain_weight
+from service.answers.fallback import Answer, Rules, answer_safely, domain_weight
 from service.answers.guard import Limits
 from service.config.config import AxisConfig
-from service.protocol.model import decode_model, encode_model
+from service.protocol.model import StandIn, decode_model, encode_model
 from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import (
     BLENDED,

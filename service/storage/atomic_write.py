@@ -1,0 +1,50 @@
+"""Atomic file writing: a reader sees the old file or the new one, never a part."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final
+
+#: Suffix of a file that is not complete. Its name begins with a dot, so that readers of a whole folder skip it.
+PART: Final = ".part"
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """Open a binary file that replaces ``path`` when the block ends without an exception.
+
+    When the block ends, the content and the name of the file are on the disk: both the file and its folder are synced.
+    After an exception ``path`` is unchanged and the partial file is removed. Only a killed process leaves the partial
+    file ``.NAME.XXXXXXXX.part`` behind.
+
+    Parameters
+    ----------
+    path : file to write or to replace. Its folder must exist.
+    mode : permissions of the new file, before the umask.
+
+    Raises OSError as the disk does.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
+    try:
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
