@@ -3,7 +3,7 @@
 One stated deviation is to hold 68 % of the errors and 1.96 of them 95 %. Errors of a model last longer than a sample,
 so that some ten thousand samples are a few hundred independent ones, and a share of them scatters by some percent. The
 limits are what was measured with three seeds and that scatter, and so they tell where 68 % is not met: see
-docs/scenarios.md, "Stated intervals".
+docs/measurements/scenarios.md, "Stated intervals".
 """
 
 from __future__ import annotations
