@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service.config.config import EXAMPLE, ServeConfig, read_config
+from service.config.config import ServeConfig, read_config
 from service.protocol.errors import FieldError
 from service.runtime.memory import starting
 from service.runtime.session import check_endpoint, is_loopback
@@ -40,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted. Returns 0; errors of configuration, model file or port are raised."""
     if args.example:
-        print(EXAMPLE, end="")
+        from service.config.reference import example
+
+        print(example(), end="")
         return 0
     if args.config is None:
         raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints one to begin with")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from adaptive.errors import InputError
-from service.config.config import EXAMPLE, parse_config, read_config
+from service.config.config import parse_config, read_config
+from service.config.reference import example, page
 from service.runtime.session import check_endpoint, is_loopback
 
 GOOD = """
@@ -35,24 +37,39 @@ def test_a_short_configuration_has_safe_defaults(tmp_path: Path) -> None:
     assert (axis.served, axis.learn, axis.recorder) == ("auto", "lssvm_adaptive", None)
 
 
-def test_the_example_is_a_good_configuration_with_every_key(tmp_path: Path) -> None:
-    assert parse_config(EXAMPLE, "example", tmp_path).stage == "demo"
-    # Uncommented as well: what the comments offer exists.
-    lines = [line.removeprefix("# ") for line in EXAMPLE.splitlines() if not line.startswith("# Configuration")]
+def test_the_example_has_every_key_and_every_default(tmp_path: Path) -> None:
+    shown = parse_config(example(), "example", tmp_path)
+    assert shown.stage == "demo"
+    # Uncommented as well: each key exists, and each default is the one that holds without the key.
+    lines = [line.removeprefix("# ") for line in example().splitlines() if not line.startswith("# Configuration")]
     full = parse_config("\n".join(lines), "example", tmp_path)
-    assert full.axes[0].recorder == tmp_path / "recordings/x"
+    given = {"recorder": tmp_path / "recordings/x", "checkpoints": tmp_path / "checkpoints/x", "stand_in": "mpi"}
+    limits = replace(shown.axes[0].limits, y_min_um=-5.0, y_max_um=95.0)
+    assert full.axes == (replace(shown.axes[0], limits=limits, **given),)  # type: ignore[arg-type]
+    assert replace(full, axes=(), zenoh_config=None) == replace(shown, axes=())
+
+
+def test_the_page_of_the_configuration_is_the_schema() -> None:
+    """Keys, defaults and values; the meanings of nested tables come from docstrings and may be newer."""
+    committed = (Path(__file__).resolve().parents[3] / "docs" / "configuration.md").read_text(encoding="utf-8")
+
+    def cells(text: str) -> list[list[str]]:
+        return [line.split(" | ")[:3] for line in text.splitlines() if line.startswith("| `")]
+
+    assert len(cells(committed)) > 90
+    assert cells(committed) == cells(page()), "run: python -m service.config.reference > docs/configuration.md"
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ('stage = "demo"', 'stage = "demo"\nspeed = 3', ["speed", "3", "known keys", "listen"]),
-        ("u_max_V = 10", "u_max_V = 10\numax = 3", ["axis[0]: umax", "known keys", "u_max_V"]),
-        ("u_max_V = 10", "", ["axis[0]: u_max_V", "nothing", "must be given"]),
+        ("u_max_V = 10", "u_max_V = 10\numax = 3", ["axis[0].umax", "known keys", "u_max_V"]),
+        ("u_max_V = 10", "", ["axis[0].u_max_V", "nothing", "no default"]),
         ("u_max_V = 10", 'u_max_V = "10"', ["u_max_V", "'10'", "a number"]),
         ("u_max_V = 10", "u_max_V = -1", ["axis[0].u_max_V", "u_min_V < u_max_V"]),
         ("u_max_V = 10", "u_max_V = nan", ["u_max_V", "nan"]),
-        ("u_max_V = 10", "u_max_V = 10\nsnapshot_every = 0", ["snapshot_every", "from 1"]),
+        ("u_max_V = 10", "u_max_V = 10\nsnapshot_every = 0", ["snapshot_every", "1 to 100000"]),
         ("u_max_V = 10", "u_max_V = 10\nsnapshot_every = true", ["snapshot_every", "True"]),
         ('name = "x"', 'name = "X/1"', ["axis[0].name", "'X/1'", "a-z"]),
         ('model = "x.npz"', "", ["axis[0].model", "dehyst identify"]),
@@ -65,7 +82,7 @@ def test_the_example_is_a_good_configuration_with_every_key(tmp_path: Path) -> N
         ),
         ('stage = "demo"', 'stage = "demo"\nlisten = []', ["listen", "nothing"]),
         ('stage = "demo"', "stage = ", ["f", "TOML", "line 2"]),
-        ("[[axis]]", "[axis]", ["axis", "a list"]),
+        ("[[axis]]", "[axis]", ["axis", "a list of tables"]),
     ],
 )
 def test_what_is_wrong_is_named(old: str, new: str, words: list[str], tmp_path: Path) -> None:

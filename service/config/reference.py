@@ -1,0 +1,153 @@
+"""What the schema of the configuration says, for people: the example file and the reference page.
+
+``python -m service.config.reference`` prints the page, which is ``docs/configuration.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from dataclasses import MISSING, is_dataclass
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin
+
+from baselines.competition.config import CompetitionConfig
+from service.background.diagnosing.settings import WatchConfig
+from service.background.retuning.settings import RetuningConfig
+from service.config.config import AxisConfig, ServeConfig
+from service.config.schema import Key, inline_keys, keys_of
+
+_HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
+_WIDTH = 36
+#: Nested dataclasses that have a table of their own on the page.
+_OWN_TABLES = (CompetitionConfig, RetuningConfig, WatchConfig)
+_TITLE = """\
+# Configuration of `dehyst serve`
+
+One TOML file. `dehyst serve --example` prints one with every key of the first two tables. A key that is not listed here
+is an error. Relative paths are relative to the folder of the file. This page is generated from the schema:
+`python -m service.config.reference > docs/configuration.md`.
+"""
+
+
+def example() -> str:
+    """An example file: the keys without a default, and every other key with its default in a comment."""
+    lines = [_HEAD, *_example_of(ServeConfig), "", "[[axis]]", *_example_of(AxisConfig), ""]
+    for key in _flat(AxisConfig):
+        if _is_table(key):
+            lines.append(f"{f'# [axis.{key.name}]':<{_WIDTH}}# {key.setting.help}")
+    return "\n".join(lines) + "\n"
+
+
+def tables() -> tuple[tuple[str, type], ...]:
+    """The tables of the file: title on the page, and schema."""
+    from adaptive.online.config import LearnerConfig  # imports scipy, which the example does not need
+
+    return (
+        ("The file", ServeConfig),
+        ("`[[axis]]`: one table for each axis", AxisConfig),
+        ("`[axis.learner]`: the model that learns", LearnerConfig),
+        ("`[axis.competition]`: comparison and exchange of models", CompetitionConfig),
+        ("`[axis.retuning]`: background tuning of hyper-parameters", RetuningConfig),
+        ("`[axis.diagnosis]`: background diagnosis", WatchConfig),
+    )
+
+
+def page() -> str:
+    """The reference page: a table of keys for each table of the file, in Markdown."""
+    parts = [_TITLE]
+    for title, kind in tables():
+        parts += [f"## {title}\n", *_rows(kind, "")]
+    return "\n".join(parts)
+
+
+def _example_of(kind: type) -> list[str]:
+    lines = []
+    for key in _flat(kind):
+        if _is_table(key) or key.name == "axis":
+            continue
+        shown = key.required or key.setting.shown
+        left = f"{'' if shown else '# '}{key.name} = {_toml(key)}"
+        unit = f", {key.setting.unit}" if key.setting.unit else ""
+        lines.append(f"{left:<{_WIDTH - 1}} # {key.setting.help}{unit}")
+    return lines
+
+
+def _rows(kind: type, prefix: str) -> list[str]:
+    """The rows of one table; nested tables follow with dotted names."""
+    described = _described(kind)
+    head = ["| key | default | values | meaning |", "|---|---|---|---|"] if not prefix else []
+    rows, nested = [], []
+    for key in _flat(kind):
+        if isinstance(key.type, type) and is_dataclass(key.type) and key.type not in _OWN_TABLES:
+            nested += _rows(key.type, f"{prefix}{key.name}.")
+        else:
+            meaning = key.setting.help or described.get(key.name, "")
+            cells = (f"`{prefix}{key.name}`", _default(key), _values(key), meaning)
+            rows.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    return [*head, *rows, *nested, *([] if prefix else [""])]
+
+
+def _flat(kind: type) -> list[Key]:
+    return [inner for key in keys_of(kind) for inner in inline_keys(key)]
+
+
+def _is_table(key: Key) -> bool:
+    return is_dataclass(key.type) or get_origin(key.type) is dict
+
+
+def _plain(value: Any) -> bool:
+    """Whether a default can be written down: neither empty nor infinite."""
+    return value not in (MISSING, None, "") and not (isinstance(value, float) and math.isinf(value))
+
+
+def _toml(key: Key) -> str:
+    value = key.default if _plain(key.default) else key.setting.example
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+
+
+def _default(key: Key) -> str:
+    if key.required:
+        return "none: must be given"
+    if get_origin(key.type) is dict or is_dataclass(key.type):
+        return "see below"
+    return f"`{_toml(key)}`" if _plain(key.default) else ""
+
+
+def _values(key: Key) -> str:
+    bounds = key.setting.range()
+    if bounds:
+        return bounds
+    kinds = (
+        [one for one in get_args(key.type) if one is not type(None)] if isinstance(key.type, UnionType) else [key.type]
+    )
+    kind = kinds[0]
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{json.dumps(choice)}`" for choice in get_args(kind))
+    if get_origin(kind) is tuple:
+        return "tables" if is_dataclass(get_args(kind)[0]) else "list"
+    if get_origin(kind) is dict or is_dataclass(kind):
+        return "table"
+    names = {str: "text", Path: "path", float: "number", int: "integer", bool: "`true`, `false`"}
+    return f"{names[kind]}{', ' + key.setting.unit if key.setting.unit else ''}"
+
+
+def _described(kind: type) -> dict[str, str]:
+    """What the docstring of a dataclass says of its fields, as ``name : text`` or ``name, name : text``."""
+    names = [key.name for key in keys_of(kind)]
+    text = " ".join((kind.__doc__ or "").split())
+    one = "|".join(map(re.escape, names))
+    marks = list(re.finditer(rf"(?<!\S)((?:{one})(?:, (?:{one}))*) : ", text))
+    found: dict[str, str] = {}
+    ends = [mark.start() for mark in marks[1:]] + [len(text)]
+    for mark, end in zip(marks, ends, strict=False):
+        meaning = text[mark.end() : end].strip().rstrip(".")
+        found |= dict.fromkeys(mark[1].split(", "), meaning)
+    return found
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
