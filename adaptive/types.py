@@ -87,31 +87,41 @@ class Sample:
     y_um: float
 
 
-@runtime_checkable
-class SelfWatching(Protocol):
-    """An online model that knows when its samples are not fit to learn from, and says so."""
+@dataclass(frozen=True, slots=True)
+class Hyperparameters:
+    """gamma : regularisation, positive. widths : (d,) kernel widths, one an input, dimensionless, positive."""
 
-    @property
-    def trouble(self) -> str:
-        """Name of what is wrong, "" while nothing is."""
-        ...
+    gamma: float
+    widths: tuple[float, ...]
 
-    @property
-    def why(self) -> str:
-        """The reason in words."""
-        ...
 
-    @property
-    def distrusts(self) -> bool:
-        """Whether the readings are on trial: what it serves is from before them, and goes on without them."""
-        ...
+@dataclass(frozen=True)
+class WindowData:
+    """A copy of the learner's window, to tune its hyper-parameters in another process.
+
+    Attributes
+    ----------
+    kernel : (n, d) kernel inputs, dimensionless. targets_V : (n,) voltage less the linear part, V.
+    weights : (n,) noise weights. age : (n,) steps of the window since each sample was taken, 0 for the newest.
+    hyper : the hyper-parameters that the window works with.
+    """
+
+    kernel: FloatArray
+    targets_V: FloatArray
+    weights: FloatArray
+    age: FloatArray
+    hyper: Hyperparameters
 
 
 class OnlineModel(Protocol):
-    """A model that learns sample by sample; the learner and all adaptive baselines are of this kind.
+    """A model that learns sample by sample: the learner, every adaptive baseline, and a competition between them.
 
-    Deterministic: the same samples in the same order give the same snapshots to the last bit.
+    Deterministic: the same samples in the same order give the same snapshots to the last bit. Not for several threads
+    at once. All that a service needs of a learner is declared here, so that a type checker sees each use. A model that
+    lacks an ability implements it trivially and says so; see ``baselines.online.OnlineBaseline``.
     """
+
+    # ---- samples in
 
     @property
     def seq(self) -> int:
@@ -122,12 +132,91 @@ class OnlineModel(Protocol):
         """Take one sample. Returns ``"learnt"`` or the name of the gate that refused it; never raises on data."""
         ...
 
+    def resync(self) -> None:
+        """Forget the sequence: take the next sample whatever its number and time, as after a restart of the stage."""
+        ...
+
+    def take_place_of(self, other: OnlineModel) -> None:
+        """Continue at the position of ``other`` with the parameters learnt here; ``resync`` where the types differ."""
+        ...
+
+    # ---- learning on and off
+
+    def freeze(self) -> None:
+        """Stop learning. Samples still advance memory and error statistics."""
+        ...
+
+    def thaw(self) -> None:
+        """Resume learning."""
+        ...
+
+    # ---- models out
+
+    @property
+    def base(self) -> InverseModel:
+        """The identified model that learning started from."""
+        ...
+
     def snapshot(self) -> InverseModel:
-        """The model as it stands, immutable, cheap (at most some tens of µs)."""
+        """The current model, immutable; costs at most some tens of µs."""
+        ...
+
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
+        """(m,) hysteresis memory with which ``model``, a snapshot of this one, continues after the last sample.
+
+        ``smoothed`` : the memory at the smoother's instant instead. None where this model tracks no memory of its own.
+        """
+        ...
+
+    # ---- hyper-parameters tuned elsewhere
+
+    def window_data(self) -> WindowData | None:
+        """A copy of the samples to tune hyper-parameters on; None where there are none to tune."""
+        ...
+
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Continue with other hyper-parameters from the present sample on. Returns "", or why they are refused."""
+        ...
+
+    # ---- reports
+
+    @property
+    def trouble(self) -> str:
+        """Name of what makes the samples or the model unfit to learn from, "" while nothing does."""
+        ...
+
+    @property
+    def why(self) -> str:
+        """The reason for ``trouble`` in words."""
+        ...
+
+    @property
+    def distrusts(self) -> bool:
+        """Whether the sensor is on trial: the snapshot is then from before its readings became doubtful."""
         ...
 
     def counters(self) -> dict[str, int]:
-        """How many samples were learnt, and refused by reason; numerical events too."""
+        """Samples by outcome (learnt, or refused by which gate), and numerical events."""
         ...
 
-    def state_dict(self) -> StateDict: ...
+    def diagnostics(self) -> dict[str, Any]:
+        """Errors, gain and other figures for a viewer; empty where there are none."""
+        ...
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """(event, detail) since the last call, oldest first."""
+        ...
+
+    # ---- keeping
+
+    def warm(self) -> None:
+        """Load every compiled step, so that no sample waits for the compiler."""
+        ...
+
+    def state_dict(self) -> StateDict:
+        """The whole state, flat; ``restored`` continues from it to the same last bit."""
+        ...
+
+    def restored(self, state: StateDict) -> OnlineModel:
+        """A model like this one with ``state``. Raises ModelFileError where entries are missing or do not fit."""
+        ...

@@ -23,7 +23,7 @@ from adaptive.online.gates import (
     UNEXCITED,
 )
 from adaptive.state_codec import prefixed
-from adaptive.types import Sample, StateDict
+from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
 #: Relative error of a time step beyond which a sample's clock is not believed.
@@ -35,7 +35,8 @@ _ABSURD = 1e9
 class OnlineBaseline:
     """Gates and bookkeeping of one axis; the models derive from it and implement ``_advance``.
 
-    Deterministic, bounded in time and memory. Not for several threads at once.
+    Deterministic, bounded in time and memory. Not for several threads at once. The abilities of
+    :class:`adaptive.types.OnlineModel` that a baseline lacks are implemented here, trivially.
     """
 
     def __init__(self, dt_s: float, settle: int) -> None:
@@ -51,6 +52,58 @@ class OnlineBaseline:
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self._seq
+
+    # ---- abilities that only a learner has
+
+    def resync(self) -> None:
+        """Nothing: ``handle`` restarts by itself after a gap in time or numbers."""
+
+    def take_place_of(self, other: OnlineModel) -> None:
+        """Nothing, as in ``resync``: the position of a baseline is its last sample."""
+
+    def freeze(self) -> None:
+        """Nothing: a competition gives a frozen baseline no samples."""
+
+    def thaw(self) -> None:
+        """Nothing; see ``freeze``."""
+
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
+        """None: a baseline tracks no memory of its own."""
+        return None
+
+    def window_data(self) -> WindowData | None:
+        """None: there are no hyper-parameters to tune."""
+        return None
+
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Refused."""
+        return "it has no hyper-parameters"
+
+    @property
+    def trouble(self) -> str:
+        """Always "": a baseline does not judge the sensor."""
+        return ""
+
+    @property
+    def why(self) -> str:
+        return ""
+
+    @property
+    def distrusts(self) -> bool:
+        return False
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Empty."""
+        return {}
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """Empty."""
+        return []
+
+    def warm(self) -> None:
+        """Nothing: the first samples load every step."""
+
+    # ---- samples, counters and the shared state
 
     def counters(self) -> dict[str, int]:
         """Samples by outcome; every outcome there is appears."""
@@ -94,6 +147,15 @@ class OnlineBaseline:
     def _advance(self, u_V: float, y_um: float, settled: bool) -> str:
         """Take a good sample; returns the outcome. ``settled``: enough samples since start or gap."""
         raise NotImplementedError
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> OnlineModel:
+        """Inverse of ``state_dict`` of the same class."""
+        raise NotImplementedError
+
+    def restored(self, state: StateDict) -> OnlineModel:
+        """A baseline of this class with ``state``. Raises InputError where a field is missing."""
+        return self.from_state(state)
 
     def _common_state(self) -> StateDict:
         counted = prefixed("count_", self._counters)

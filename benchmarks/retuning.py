@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from adaptive.tuning.config import RetuneConfig
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, Hyperparameters, WindowData
 from benchmarks.latency_processes import AXIS, STAGE
 from benchmarks.latency_world import WINDOW, World, world
 from benchmarks.measuring import DIMENSION, stream

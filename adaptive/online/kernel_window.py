@@ -12,8 +12,7 @@ from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.state_codec import prefixed, under
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, Hyperparameters, StateDict, WindowData
 from adaptive.window import arrays as ws
 from adaptive.window.arrays import IntArray, Status
 from adaptive.window.config import SolverConfig, WindowConfig

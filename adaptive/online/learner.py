@@ -21,8 +21,7 @@ from adaptive.online.learner_parts import RAIL_S, RAIL_SHARE, Parts, model_of, r
 from adaptive.online.track import Pair
 from adaptive.state_codec import prefixed
 from adaptive.tuning.adoption import adopt
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import FloatArray, Sample, StateDict
+from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 
 # --- What a learner tells of itself: counters, and what a viewer draws.
 
@@ -127,11 +126,14 @@ class Learner:
         """Forget the sequence: the next sample is taken whatever its number, after the stage itself began anew."""
         self.parts.front.resync()
 
-    def take_place_of(self, other: Learner) -> None:
+    def take_place_of(self, other: OnlineModel) -> None:
         """Go on where ``other`` is, with what this one knows: after samples that ``other`` should not have believed.
 
         Where the stage is and has been ``other`` knows still, and in what frame its readings are.
         """
+        if not isinstance(other, Learner):
+            self.resync()
+            return
         mine, its = self.parts.front, other.parts.front
         if its.track is None:
             self.resync()
@@ -276,7 +278,7 @@ class Learner:
         track = self.parts.front.track
         return self.base.rest_memory(self.base.features.y_rest_um) if track is None else track.memory.copy()
 
-    def memory_for(self, model: LssvmInverse, smoothed: bool = False) -> FloatArray | None:
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """(m,) hysteresis memory with which ``model``, a snapshot of this learner, goes on from the last sample.
 
         What was learnt was learnt with it: one that is tracked otherwise, over readings that were not believed, would
@@ -285,9 +287,9 @@ class Learner:
         """
         front = self.parts.front
         # Of two memories in one frame, that of the learner has seen no reading that was not believed.
-        frozen = model.features != front.served and model.features == self.base.features
-        if front.track is None or (smoothed and front.holds):
+        if front.track is None or (smoothed and front.holds) or not isinstance(model, LssvmInverse):
             return None
+        frozen = model.features != front.served and model.features == self.base.features
         if smoothed:
             return (front.track.frozen_memory if frozen else front.track.memory).copy()
         return front.memory_now(frozen)
@@ -353,9 +355,17 @@ class Learner:
         """For a viewer; see ``adaptive.online.learner``."""
         return diagnostics(self)
 
+    def take_events(self) -> list[tuple[str, str]]:
+        """None: what happens to a learner shows in ``counters`` and ``trouble``."""
+        return []
+
     def state_dict(self) -> StateDict:
         """All of the state; ``from_state`` goes on from it with the same result to the last bit."""
         return state_of(self.base, self.config, self.parts, self._frozen)
+
+    def restored(self, state: StateDict) -> Learner:
+        """A learner with ``state``. Raises ModelFileError where entries are missing or do not fit together."""
+        return self.from_state(state)
 
     @classmethod
     def from_state(cls, state: StateDict) -> Learner:

@@ -11,7 +11,7 @@ from adaptive.errors import DehystError
 
 if TYPE_CHECKING:
     from adaptive.online.learner_parts import Parts
-    from adaptive.tuning.samples import Hyperparameters
+    from adaptive.types import Hyperparameters
 
 #: Samples on which the old and the new are compared: the newest that the window holds.
 NEWEST = 100

@@ -18,9 +18,8 @@ from scipy.optimize import minimize
 from adaptive.errors import InputError, NumericsError
 from adaptive.tuning.config import RetuneConfig
 from adaptive.tuning.evidence import Problem, evaluate, problem
-from adaptive.tuning.samples import Hyperparameters, WindowData
 from adaptive.tuning.trial import Trial, compare, fresh_rows
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, Hyperparameters, WindowData
 
 __all__ = ["Proposal", "RetuneConfig", "Trial", "compare", "fresh_rows", "propose"]
 

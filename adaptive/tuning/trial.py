@@ -14,8 +14,7 @@ from adaptive import kernels
 from adaptive.errors import InputError, NumericsError
 from adaptive.online.kernel_window import SAME
 from adaptive.tuning.config import RetuneConfig
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import BoolArray, FloatArray
+from adaptive.types import BoolArray, FloatArray, Hyperparameters, WindowData
 from adaptive.window.arrays import Status
 from adaptive.window.config import WindowConfig
 from adaptive.window.window import Window

@@ -21,11 +21,10 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.state_codec import prefixed, under
-from adaptive.tuning.samples import Hyperparameters
-from adaptive.types import InverseModel, OnlineModel, Sample, SelfWatching, StateDict
+from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.config import CompetitionConfig
-from baselines.competition.contestants import ONLINE_KINDS, Revive, challenger, fingerprint, stating, take_place
+from baselines.competition.contestants import ONLINE_KINDS, Revive, challenger, fingerprint, stating
 from baselines.competition.scoring import NOT_SCORED, Judging, Motion
 from baselines.competition.succession import Succession
 
@@ -60,7 +59,7 @@ def counters(c: Competition) -> dict[str, int]:
 
 def diagnostics(c: Competition) -> dict[str, Any]:
     """The favourite's, with ``competition_NAME_rms_pct`` of each contestant and the champion's index."""
-    told: dict[str, Any] = getattr(c.favourite, "diagnostics", dict)()
+    told = c.favourite.diagnostics()
     percent = 100.0 / c._span_V
     own = {f"competition_{name}_rms_pct": c._judging.rms_V(i) * percent for i, name in enumerate(c.names)}
     return {**told, **own, "competition_champion": float(c._succession.champion)}
@@ -71,7 +70,7 @@ def diagnostics(c: Competition) -> dict[str, Any]:
 
 def to_state(c: Competition) -> StateDict:
     """All of ``c``; copies. Raises InputError where a contestant is of no kind that can be read back."""
-    kinds = {known: kind for kind, known in ONLINE_KINDS.items()}
+    kinds: dict[type, str] = {known: kind for kind, known in ONLINE_KINDS.items()}
     if any(type(model) not in kinds for model in c._models):
         raise InputError(f"contestants: expected models of the kinds {', '.join(ONLINE_KINDS)} to be stored")
     state: StateDict = {
@@ -98,7 +97,7 @@ def to_state(c: Competition) -> StateDict:
     state["champion"] = c._succession.champion
     for name, model, score in zip(c.names, c._models, c._judging.scores, strict=True):
         # What it began from, so that the state of another identification can be told.
-        state[f"base.{name}"] = fingerprint(getattr(model, "base", None))
+        state[f"base.{name}"] = fingerprint(model.base)
         state |= {f"score.{name}.memory": score.memory.copy(), f"score.{name}.square_V2": score.square_V2}
         state[f"score.{name}.weight"] = score.weight
         state |= prefixed(f"model.{name}.", model.state_dict())
@@ -186,12 +185,6 @@ class Competition:
         self._revive, self._failed_seq = revive, -1
         self._events: deque[tuple[str, str]] = deque(maxlen=64)
 
-    def __getattr__(self, name: str) -> Any:
-        # Only what is not found here comes here; names of our own that are missing are missing.
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self.favourite, name)
-
     @property
     def favourite(self) -> OnlineModel:
         """The first contestant."""
@@ -205,25 +198,27 @@ class Competition:
     @property
     def trouble(self) -> str:
         """What the favourite says is wrong with the samples, "" while nothing is."""
-        favourite = self.favourite
-        return favourite.trouble if isinstance(favourite, SelfWatching) else ""
+        return self.favourite.trouble
 
     @property
     def why(self) -> str:
         """The reason for ``trouble`` in words."""
-        favourite = self.favourite
-        return favourite.why if isinstance(favourite, SelfWatching) else ""
+        return self.favourite.why
 
     @property
     def distrusts(self) -> bool:
         """Whether the favourite has the readings on trial."""
-        favourite = self.favourite
-        return isinstance(favourite, SelfWatching) and favourite.distrusts
+        return self.favourite.distrusts
 
     @property
     def seq(self) -> int:
         """Sequence number of the last sample handled, -1 before any."""
         return self._seq
+
+    @property
+    def base(self) -> InverseModel:
+        """The identified model that the favourite started from."""
+        return self.favourite.base
 
     # ---- samples in
 
@@ -252,20 +247,24 @@ class Competition:
             self._judge()
         return verdict
 
+    def window_data(self) -> WindowData | None:
+        """The favourite's samples, to tune its hyper-parameters on."""
+        return self.favourite.window_data()
+
     def adopt(self, hyper: Hyperparameters) -> str:
         """Let the favourite go on with other hyper-parameters: "" if it does, else why not."""
         self._changed = True
-        return str(getattr(self.favourite, "adopt", lambda _: "it has no hyper-parameters")(hyper))
+        return self.favourite.adopt(hyper)
 
     def freeze(self) -> None:
         """Stop learning and keep the champion; samples go on being judged."""
         self._frozen = self._changed = True
-        getattr(self.favourite, "freeze", lambda: None)()
+        self.favourite.freeze()
 
     def thaw(self) -> None:
         """Learn again, and let the better one be champion."""
         self._frozen, self._changed = False, True
-        getattr(self.favourite, "thaw", lambda: None)()
+        self.favourite.thaw()
 
     @property
     def frozen(self) -> bool:
@@ -275,13 +274,16 @@ class Competition:
     def resync(self) -> None:
         """Forget the sequence: the stage's count has begun anew."""
         for model in self._models:
-            getattr(model, "resync", lambda: None)()
+            model.resync()
 
-    def take_place_of(self, other: Competition) -> None:
+    def take_place_of(self, other: OnlineModel) -> None:
         """Go on where ``other`` is, with what this one knows; see
         :meth:`adaptive.online.learner.Learner.take_place_of`."""
+        if not isinstance(other, Competition):
+            self.resync()
+            return
         for mine, its, out in zip(self._models, other._models, other._out, strict=True):
-            take_place(mine, None if out else its)
+            mine.resync() if out else mine.take_place_of(its)
 
     def _exclude(self, i: int, error: Exception) -> None:
         self._out[i] = True
@@ -349,6 +351,14 @@ class Competition:
             self._serving = self._served()
         return self._serving
 
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
+        """(m,) the favourite's own memory for ``model``, a snapshot of the favourite."""
+        return self.favourite.memory_for(model, smoothed)
+
+    def warm(self) -> None:
+        """Load every compiled step of the favourite; the others load theirs with their first samples."""
+        self.favourite.warm()
+
     def _served(self) -> ChampionInverse:
         """The newest snapshots as they are served; the champion states what it has been wrong by."""
         champion, models = self._succession.champion, list(self._newest)
@@ -378,6 +388,10 @@ class Competition:
     def state_dict(self) -> StateDict:
         """Everything; ``from_state`` continues to the same last bit. Raises InputError on foreign contestants."""
         return to_state(self)
+
+    def restored(self, state: StateDict) -> Competition:
+        """A competition with ``state`` that begins a failed favourite anew as this one does. Raises ModelFileError."""
+        return self.from_state(state, self._revive)
 
     @classmethod
     def from_state(cls, state: StateDict, revive: Revive | None = None) -> Competition:

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,13 +17,14 @@ from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
 from baselines.linear import LinearInverse
 from baselines.linear_online import LinearOnline
+from baselines.online import OnlineBaseline
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.online import MpiOnline
 
 #: Makes a model that has failed anew, from its last snapshot.
 Revive = Callable[[InverseModel], OnlineModel]
 #: Kinds of contestants that a state can be read back into.
-ONLINE_KINDS: Final[dict[str, Any]] = {
+ONLINE_KINDS: Final[dict[str, type[Learner] | type[OnlineBaseline]]] = {
     "learner": Learner,
     "linear": LinearOnline,
     "mpi": MpiOnline,
@@ -42,14 +43,6 @@ def challenger(model: InverseModel) -> OnlineModel | None:
     return None
 
 
-def take_place(mine: OnlineModel, its: OnlineModel | None) -> None:
-    """Let ``mine`` go on where ``its`` is, with what it knows itself; where it cannot, it takes whatever comes next."""
-    if isinstance(mine, Learner) and isinstance(its, Learner):
-        mine.take_place_of(its)
-    else:
-        getattr(mine, "resync", lambda: None)()
-
-
 def stating(model: InverseModel, rms_V: float) -> InverseModel:
     """``model`` with a deviation of at least ``rms_V``, V, what its answers were judged to be wrong by.
 
@@ -62,10 +55,8 @@ def stating(model: InverseModel, rms_V: float) -> InverseModel:
     return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
 
 
-def fingerprint(model: InverseModel | None) -> str:
-    """A short digest of a model's numbers; empty for none."""
-    if model is None:
-        return ""
+def fingerprint(model: InverseModel) -> str:
+    """A short digest of a model's numbers."""
     sha = hashlib.blake2b(digest_size=8)
     for name, value in sorted(model.state_dict().items()):
         array = isinstance(value, np.ndarray)

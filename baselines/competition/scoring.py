@@ -200,7 +200,7 @@ class Judging:
     def correct(self, models: Sequence[OnlineModel], newest: Models) -> None:
         """Go on from a contestant's own memory where it knows one: over lost readings ours is a guess."""
         for model, snapshot, score in zip(models, newest, self.scores, strict=True):
-            own = getattr(model, "memory_for", lambda *_: None)(snapshot, True)
+            own = model.memory_for(snapshot, True)
             if own is not None:
                 score.memory = own
 

@@ -45,7 +45,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
             verdicts = axis.handle(batch)
             recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
             if done % (5 * size) == 0 and axis.learner is not None:
-                told = axis.learner.diagnostics() if hasattr(axis.learner, "diagnostics") else {}
+                told = axis.learner.diagnostics()
                 if done % 1000:
                     told = {
                         key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key

@@ -19,6 +19,7 @@ from service.intake.sinks import SampleSink, SampleWatcher
 from service.protocol.errors import ServiceError
 from service.protocol.samples import SampleBatch, joined
 from service.server.axis import Axis
+from service.server.competing import standing_of
 
 T = TypeVar("T")
 
@@ -212,13 +213,14 @@ class Intake:
             return
         self._next_diagnostics_s = t_s + DIAGNOSTICS_S
         self.counters = dict(learner.counters())
-        self.standing = getattr(learner, "standing", lambda: None)()
-        diagnose = getattr(learner, "diagnostics", None)
+        self.standing = standing_of(learner)
         ticks, self._ticks = self._ticks, self._ticks + 1
         # Once a second for the status, even where nobody follows.
-        if diagnose is None or (not self.want_diagnostics and ticks % _WINDOW_EVERY):
+        if not self.want_diagnostics and ticks % _WINDOW_EVERY:
             return
-        told = dict(diagnose())
+        told = learner.diagnostics()
+        if not told:
+            return
         if ticks % _WINDOW_EVERY:
             for name in _WINDOW_FIELDS:
                 told.pop(name, None)

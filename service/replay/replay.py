@@ -123,7 +123,7 @@ def replay(
     gate = np.zeros(len(recording), dtype=np.int16)
     note_t_s: list[float] = []
     notes: list[dict[str, float]] = []
-    row, told = 0, getattr(axis.learner, "diagnostics", dict)
+    row, told = 0, axis.learner.diagnostics
     for block, stop_row in enumerate(ends):
         part = slice(block * size, min(n, (block + 1) * size))
         while len(ring) > 1 and ring[1][0] <= part.start - age:

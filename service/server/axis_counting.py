@@ -7,7 +7,7 @@ is for the thread that handles samples.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
 from adaptive.types import Sample
@@ -15,15 +15,6 @@ from service.answers.memory_tracking import MemoryTracker
 from service.intake.clock import SampleClock
 from service.intake.sequence import AHEAD, RESTARTED, Seldom
 from service.server.axis_learning import AxisLearning
-
-
-@runtime_checkable
-class Resyncing(Protocol):
-    """A learner with a count and a time of its own."""
-
-    def resync(self) -> None:
-        """Forget both: the next sample is taken whatever they are."""
-        ...
 
 
 class AxisCounting(AxisLearning):
@@ -57,7 +48,7 @@ class AxisCounting(AxisLearning):
         if self.clock.in_doubt and self.learning:
             return TIMING
         verdict = self._learn(sample)
-        if self.clock.unheard(verdict) and isinstance(self.learner, Resyncing):
+        if self.clock.unheard(verdict) and self.learner is not None:
             detail = f"it refused samples in order as {verdict}: its own count and time begin anew"
             self._note_seldom("learner_resynced", detail)
             self.learner.resync()

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import DehystError
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, SelfWatching, StateDict
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import Served
 from service.intake.sequence import SequenceTracker
@@ -62,7 +62,7 @@ class AxisLearning(AxisOperations):
                 self._failed(f"snapshot: {error}")
         before = self.watch.trouble
         told, distrusts = "", False
-        if isinstance(self.learner, SelfWatching) and not self._learner_dead:
+        if not self._learner_dead:
             told, distrusts = self.learner.trouble, self.learner.distrusts
         good = self.watch.judge(candidate, last.models.get(last.stand_in), told, distrusts)
         now = self.watch.trouble
@@ -72,12 +72,12 @@ class AxisLearning(AxisOperations):
             if before in POISON and not now:
                 self._go_back()
             self.set_teaching()
-            why = f" ({self.learner.why})" if told and isinstance(self.learner, SelfWatching) else ""
+            why = f" ({self.learner.why})" if told else ""
             served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
             detail = f"{now}{why}: {served} is served, then {last.stand_in or 'nothing else'}" if now else before
             if now != LEARNER_FAILED:  # which has told of itself
                 self.note("trouble" if now else "recovered", detail)
-        for event in getattr(self.learner, "take_events", list)():
+        for event in self.learner.take_events():
             self.note(*event)
         if good is None:
             return {}
@@ -96,10 +96,10 @@ class AxisLearning(AxisOperations):
 
     def _own_memory(self, models: dict[str, InverseModel], tracked: dict[str, FloatArray]) -> dict[str, FloatArray]:
         """``tracked`` memories, with the learner's own for its model, alone and as the champion's contestant."""
-        name, memory_for = self.config.learn, getattr(self.learner, "memory_for", None)
-        if memory_for is None or self._learner_dead:
+        if self.learner is None or self._learner_dead:
             return tracked
-        own = memory_for(models[name])
+        name = self.config.learn
+        own = self.learner.memory_for(models[name])
         if own is None or own.shape != tracked[name].shape or not np.isfinite(own).all():
             return tracked
         champion = models.get(AUTO)
@@ -125,18 +125,17 @@ class AxisLearning(AxisOperations):
         sensor shows when it comes to itself is no jump of the stage.
         """
         assert self.learner is not None
-        before, place = self.learner, None
+        before = self.learner
         if self._marks[0]:
             try:
                 self.learner = restored_learner(self._marks[0], before)
-                self.note("learner_went_back", "to before the samples went wrong")
-                place = getattr(self.learner, "take_place_of", None)
             except DehystError as error:
                 self.note("internal_error", f"going back: {error}")
-        if place is None:
-            getattr(self.learner, "resync", lambda: None)()
-        else:
-            place(before)
+        if self.learner is before:
+            self.learner.resync()
+            return
+        self.note("learner_went_back", "to before the samples went wrong")
+        self.learner.take_place_of(before)
 
     def _begin_anew(self, model: InverseModel) -> None:
         assert self._revive is not None

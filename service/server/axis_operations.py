@@ -91,7 +91,7 @@ class AxisOperations:
             raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
         learner = self.archive.learner_of(checkpoint, self.learner)
         # Its count and its time are of then.
-        getattr(learner, "resync", lambda: None)()
+        learner.resync()
         self.learner, self._learner_dead = learner, False
         self.set_teaching()
         model = learner.snapshot()
@@ -136,7 +136,7 @@ class AxisOperations:
         """Freeze or thaw the learner as operator and watch want it."""
         stop = self.frozen or not self.watch.teachable
         if self.learner is not None:
-            getattr(self.learner, "freeze" if stop else "thaw", lambda: None)()
+            self.learner.freeze() if stop else self.learner.thaw()
 
     def state_dict(self) -> StateDict:
         """All that changes with the samples, as :mod:`service.server.axis_state` puts it together. Copies."""

@@ -113,12 +113,7 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
             raise ModelFileError(
                 f"it belongs to another {what}: {name} is {_short(state.get(name))}, now {_short(value)}"
             )
-    # What needs more than a class to be made again offers a method of its own.
-    restored = getattr(like, "restored", None) or getattr(type(like), "from_state", None)
-    if restored is None:
-        raise ModelFileError(f"a {type(like).__name__} cannot be restored")
-    learner: OnlineModel = restored(state)
-    return learner
+    return like.restored(state)
 
 
 def fingerprint(model: InverseModel) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from adaptive.inverse_model import LssvmInverse
-from adaptive.types import InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition, of_models
 from baselines.competition.config import CompetitionConfig
@@ -18,71 +18,98 @@ from service.protocol.keys import AUTO
 
 
 class Competing:
-    """A competition whose snapshot is the favourite's. Implements ``adaptive.types.OnlineModel``.
+    """A competition that serves the favourite's model as its snapshot. Implements ``adaptive.types.OnlineModel``."""
 
-    What is not here (freezing, adopting, looking in) is the competition's, and what that has not, the favourite's.
-    """
-
-    def __init__(self, competition: Competition, make: Callable[[InverseModel], OnlineModel] | None = None) -> None:
+    def __init__(self, competition: Competition) -> None:
         self.competition = competition
-        self._make = make
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name == "competition":
-            raise AttributeError(name)
-        return getattr(self.competition, name)
-
-    @property
-    def trouble(self) -> str:
-        """What the learner says is wrong with the samples, "" while nothing is."""
-        return self.competition.trouble
-
-    @property
-    def why(self) -> str:
-        """The reason for ``trouble`` in words."""
-        return self.competition.why
-
-    @property
-    def distrusts(self) -> bool:
-        """Whether the learner has the readings on trial."""
-        return self.competition.distrusts
-
-    @property
-    def seq(self) -> int:
-        """Sequence number of the last sample handled, -1 before any."""
-        return self.competition.seq
-
-    def handle(self, sample: Sample) -> str:
-        """Give a sample to all contestants; the favourite's verdict."""
-        return self.competition.handle(sample)
 
     def snapshot(self) -> InverseModel:
         """The favourite's model."""
         return self.competition.snapshot().models[0]
 
     def champion_model(self) -> ChampionInverse:
-        """What answers as ``auto``."""
+        """The model that answers as ``auto``."""
         return self.competition.snapshot()
 
-    def take_place_of(self, other: Competing) -> None:
-        """Go on where ``other`` is, with what this one has learnt."""
-        self.competition.take_place_of(other.competition)
+    def standing(self) -> dict[str, Any]:
+        """Champion, changes, and the rms error of each contestant."""
+        return self.competition.standing()
+
+    def take_place_of(self, other: OnlineModel) -> None:
+        """Continue at the position of ``other`` with what the contestants here have learnt."""
+        self.competition.take_place_of(other.competition if isinstance(other, Competing) else other)
+
+    def restored(self, state: StateDict) -> Competing:
+        """A competition like this one with ``state``. Raises ModelFileError where it does not fit."""
+        return Competing(self.competition.restored(state))
+
+    # ---- the same as the competition's
+
+    @property
+    def seq(self) -> int:
+        return self.competition.seq
+
+    @property
+    def base(self) -> InverseModel:
+        return self.competition.base
+
+    @property
+    def trouble(self) -> str:
+        return self.competition.trouble
+
+    @property
+    def why(self) -> str:
+        return self.competition.why
+
+    @property
+    def distrusts(self) -> bool:
+        return self.competition.distrusts
+
+    def handle(self, sample: Sample) -> str:
+        return self.competition.handle(sample)
+
+    def resync(self) -> None:
+        self.competition.resync()
+
+    def freeze(self) -> None:
+        self.competition.freeze()
+
+    def thaw(self) -> None:
+        self.competition.thaw()
+
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
+        return self.competition.memory_for(model, smoothed)
+
+    def window_data(self) -> WindowData | None:
+        return self.competition.window_data()
+
+    def adopt(self, hyper: Hyperparameters) -> str:
+        return self.competition.adopt(hyper)
 
     def counters(self) -> dict[str, int]:
         return self.competition.counters()
 
+    def diagnostics(self) -> dict[str, Any]:
+        return self.competition.diagnostics()
+
+    def take_events(self) -> list[tuple[str, str]]:
+        return self.competition.take_events()
+
+    def warm(self) -> None:
+        self.competition.warm()
+
     def state_dict(self) -> StateDict:
         return self.competition.state_dict()
 
-    def restored(self, state: StateDict) -> Competing:
-        """One like this, going on from a state. Raises ModelFileError where it does not fit."""
-        return Competing(Competition.from_state(state, self._make), self._make)
-
 
 def champion_of(learner: OnlineModel | None) -> dict[str, InverseModel]:
-    """The champion under its name; nothing where what learns is alone."""
-    made = getattr(learner, "champion_model", None)
-    return {} if made is None else {AUTO: made()}
+    """The champion under its name; empty without a competition."""
+    return {AUTO: learner.champion_model()} if isinstance(learner, Competing) else {}
+
+
+def standing_of(learner: OnlineModel | None) -> dict[str, Any] | None:
+    """Champion, changes, and the rms error of each contestant; None without a competition."""
+    return learner.standing() if isinstance(learner, Competing) else None
 
 
 def compete(
@@ -100,4 +127,4 @@ def compete(
     if not others or not isinstance(model, LssvmInverse):
         return learner
     made = of_models(name, learner, model, dict(others), config, make)
-    return Competing(made, make) if len(made.names) > 1 else learner
+    return Competing(made) if len(made.names) > 1 else learner

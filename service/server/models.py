@@ -99,7 +99,7 @@ def _warm_learner(learner: OnlineModel, limits: Limits) -> None:
         phase = math.sin(0.1 * seq)
         y_um = 0.5 * (low + high) + 0.4 * (high - low) * phase
         learner.handle(Sample(seq, seq * dt_s, middle + half * phase, y_um))
-    getattr(learner, "warm", lambda: None)()
+    learner.warm()
     learner.snapshot()
 
 

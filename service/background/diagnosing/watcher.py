@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
 from service.background.diagnosing.alarm import Alarm, Levels
 from service.background.diagnosing.buffer import SampleBuffer
@@ -133,8 +133,8 @@ class Watcher:
         return max(1, round(seconds / self._dt_s))
 
     def _levels(self) -> Levels | None:
-        tell: Callable[[], dict[str, Any]] | None = getattr(self._axis.learner, "diagnostics", None)
-        return Levels.of(tell()) if tell is not None and self._axis.learning else None
+        learner = self._axis.learner
+        return Levels.of(learner.diagnostics()) if learner is not None and self._axis.learning else None
 
     def _look(self, t_s: float) -> None:
         wanted = self._samples(self.config.reference_s)
@@ -223,5 +223,5 @@ class Watcher:
 
 
 def _span_V(axis: Axis) -> float:
-    base = getattr(axis.learner, "base", None)
-    return float(getattr(base, "span_V", axis.limits.u_max_V - axis.limits.u_min_V))
+    base = None if axis.learner is None else axis.learner.base
+    return base.span_V if isinstance(base, LssvmInverse) else axis.limits.u_max_V - axis.limits.u_min_V

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from adaptive.tuning.samples import Hyperparameters
-from adaptive.types import OnlineModel
+from adaptive.types import Hyperparameters, OnlineModel
 from service.protocol.errors import FieldError
 
 FILE: Final = "retuned.jsonl"
@@ -95,8 +94,7 @@ class Adoptions:
             self._pending = self._pending[len(due) :]
         done = []
         for entry in due:
-            adopt = getattr(learner, "adopt", None)
-            refused = "it has no hyper-parameters" if adopt is None else str(adopt(entry.hyper))
+            refused = learner.adopt(entry.hyper)
             self.adopted += not refused
             self.refused += bool(refused)
             done.append((entry, refused))

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, Hyperparameters, WindowData
 from service.background.job import BackgroundJob
 
 

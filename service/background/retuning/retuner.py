@@ -16,8 +16,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import OnlineModel
+from adaptive.types import Hyperparameters, OnlineModel, WindowData
 from service.background.retuning.adoption import Retuned, append
 from service.background.retuning.job import Job, pack
 from service.background.retuning.settings import RetuningConfig
@@ -95,7 +94,7 @@ class Retuner:
     def step(self, axis: TunedAxis) -> None:
         """Go on with what is under way, and begin what is due. Never blocks; after each message of samples."""
         learner = axis.learner
-        if learner is None or not axis.learning or learner.seq < 0 or not hasattr(learner, "window_data"):
+        if learner is None or not axis.learning or learner.seq < 0:
             return
         now_s = learner.seq * axis.dt_s
         if self._state == IDLE:
@@ -128,7 +127,7 @@ class Retuner:
 
     # ---- step by step
 
-    def _begin(self, axis: TunedAxis, learner: Any, now_s: float) -> None:
+    def _begin(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
         due = self.config.period_s > 0.0 and now_s - self._since_s >= self.config.period_s
         if math.isnan(self._since_s) or now_s < self._since_s:
             self._since_s, self._taught = now_s, _taught(learner)
@@ -139,6 +138,8 @@ class Retuner:
         if not self._asked and _taught(learner) - self._taught < self.config.fresh:
             return
         data = learner.window_data()
+        if data is None:
+            return
         with self._lock:
             self._asked, self._state = False, PROPOSING
             self._number += 1
@@ -157,13 +158,15 @@ class Retuner:
         else:
             self._end(now_s, "unchanged", "nothing better was found")
 
-    def _try(self, axis: TunedAxis, learner: Any, now_s: float) -> None:
+    def _try(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
         if 0.0 <= now_s - self._look_s < _LOOK_S:
             return
         self._look_s = now_s
         before = self._before
         assert before is not None
-        self._collect(learner.window_data())
+        data = learner.window_data()
+        assert data is not None, "it was not None when the proposal was asked for"
+        self._collect(data)
         if len(self._fresh) < self.config.fresh << self._looks:
             if now_s - self._since_s > self.config.wait_s:
                 self._end(now_s, "dropped", "too few fresh samples came to try it on")

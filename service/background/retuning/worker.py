@@ -24,7 +24,7 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
     from adaptive.errors import DehystError
     from adaptive.tuning.proposal import RetuneConfig, compare, propose
-    from adaptive.tuning.samples import Hyperparameters
+    from adaptive.types import Hyperparameters
     from service.background.retuning.job import unpack
 
     data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}

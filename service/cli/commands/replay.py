@@ -60,9 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
+    from adaptive.inverse_model import LssvmInverse
     from service.background.retuning.adoption import read as read_adoptions
     from service.config.learner import read_learner_settings
     from service.replay.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
+    from service.server.competing import standing_of
     from service.server.models import load_axis
     from service.storage.model_file import read_bundle, write_bundle
 
@@ -103,7 +105,8 @@ def run(args: argparse.Namespace) -> int:
 
     done: Replayed = replay(recording, axis, AGE_S if args.age is None else args.age, progress)
     seconds = time.perf_counter() - start
-    span_V = float(getattr(bundle.models[config.learn], "span_V", 1.0))
+    learnt = bundle.models[config.learn]
+    span_V = learnt.span_V if isinstance(learnt, LssvmInverse) else 1.0
     numbers: dict[str, Any] = {
         "recording": args.data.name,
         "sha256": recording.sha256,
@@ -112,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         "settings": found.settings,
         "duration_s": recording.duration_s,
         "seconds": round(seconds, 3),
-        "competition": getattr(axis.learner, "standing", lambda: None)(),
+        "competition": standing_of(axis.learner),
         **summary(done, span_V),
     }
     (args.out / "replay.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")

@@ -11,8 +11,7 @@ import pytest
 
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
-from adaptive.tuning.samples import Hyperparameters
-from adaptive.types import Sample
+from adaptive.types import Hyperparameters, Sample
 
 DT = 1e-3
 Recording = tuple[np.ndarray, np.ndarray]
@@ -119,7 +118,7 @@ import sys
 import numpy as np
 from adaptive.features import FeatureMap
 from adaptive.online.learner import Learner
-from adaptive.tuning.samples import Hyperparameters
+from adaptive.types import Hyperparameters
 from adaptive.online.config import LearnerConfig
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Sample

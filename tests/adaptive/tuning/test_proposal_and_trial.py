@@ -10,9 +10,8 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.tuning.evidence import evaluate, problem
 from adaptive.tuning.proposal import Proposal, RetuneConfig, bounds_of, compare, fresh_rows, pattern, propose
-from adaptive.tuning.samples import Hyperparameters, WindowData
 from adaptive.tuning.trial import significance
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, Hyperparameters, WindowData
 
 NARROW = Hyperparameters(1e5, (0.12, 0.12))
 GOOD = Hyperparameters(2e3, (1.0, 0.8))

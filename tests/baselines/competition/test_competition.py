@@ -12,7 +12,7 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, InverseModel, Sample, StateDict
+from adaptive.types import FloatArray, InverseModel, Sample
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.competition.champion import ChampionInverse
@@ -25,6 +25,7 @@ from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from baselines.validation import Domain
+from tests.online_models import PlainModel
 
 DT, GAIN, SPAN_V, RANGE_UM = 1e-3, 11.0, 7.0, 77.0
 SEEN = Domain(0.0, 80.0, 2000.0)
@@ -44,14 +45,13 @@ def line(gain: float = GAIN, offset_um: float = 0.0) -> LinearInverse:
     return LinearInverse(LinearParameters(gain, offset_um), DT, SEEN, 0.1)
 
 
-class Fixed:
+class Fixed(PlainModel):
     """An online model that learns nothing; its gain is set from outside, and it may be told to fail."""
 
     def __init__(self, gain: float) -> None:
+        super().__init__(line())
         self.gain = gain
-        self.seq = -1
         self.fails = False
-        self.base = line()
 
     def handle(self, sample: Sample) -> str:
         if self.fails:
@@ -66,9 +66,6 @@ class Fixed:
 
     def counters(self) -> dict[str, int]:
         return {"learnt": self.seq + 1}
-
-    def state_dict(self) -> StateDict:
-        return {}
 
 
 class Broken:

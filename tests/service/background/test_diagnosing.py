@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from adaptive.types import Sample
+from adaptive.types import InverseModel
 from service.answers.guard import Limits
 from service.background.diagnosing.job import Job
 from service.background.diagnosing.settings import WatchConfig
@@ -35,6 +35,7 @@ from sim.signals.signals import training_input
 from sim.signals.unseen_reference import demo_reference
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
+from tests.online_models import PlainModel
 from tests.service.background.test_diagnosing_parts import DT_S, batch
 
 QUICK = WatchConfig(history_s=8.0, reference_s=4.0, recent_s=3.0, collect_s=2.0, cooldown_s=5.0, timeout_s=60.0)
@@ -150,27 +151,15 @@ def test_a_cancelled_job_tells_nothing_and_leaves_no_process(model_file: Path) -
     assert told == []
 
 
-class StandIn:
+class StandIn(PlainModel):
     """A learner that tells a gain; nothing is learnt."""
 
-    def __init__(self, model: Any) -> None:
-        self.model, self.gain, self.seq = model, 1.0, -1
-
-    def handle(self, sample: Sample) -> str:
-        self.seq = sample.seq
-        return "learnt"
-
-    def snapshot(self) -> Any:
-        return self.model
-
-    def counters(self) -> dict[str, int]:
-        return {}
+    def __init__(self, model: InverseModel) -> None:
+        super().__init__(model)
+        self.gain = 1.0
 
     def diagnostics(self) -> dict[str, Any]:
         return {"gain": self.gain, "offset_V": 0.0, "recent_rms_error_pct": 0.05, "valid": 1.0}
-
-    def state_dict(self) -> dict[str, Any]:
-        return {}
 
 
 def watched(model_file: Path, config: WatchConfig = QUICK) -> tuple[Watcher, Axis, StandIn]:

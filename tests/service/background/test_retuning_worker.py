@@ -18,8 +18,7 @@ import pytest
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.tuning import proposal as retune
 from adaptive.tuning.config import RetuneConfig
-from adaptive.tuning.samples import Hyperparameters, WindowData
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, Hyperparameters, WindowData
 from service.answers.guard import Limits
 from service.background.retuning.job import Job, pack
 from service.background.retuning.retuner import Retuner

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from adaptive.types import Feedforward, FloatArray, InverseModel, OnlineModel, Sample
+from adaptive.types import Feedforward, FloatArray, InverseModel, Sample
 from service.answers.guard import Limits
 from service.config.config import AxisConfig
 from service.intake.intake import Intake
@@ -24,6 +24,7 @@ from service.protocol.samples import SampleBatch, decode_samples, encode_samples
 from service.server.axis import Axis
 from service.server.models import load_axis, make_learner
 from service.storage.model_file import Bundle, BundleMeta
+from tests.online_models import PlainLearner
 
 DT_S = 1e-3
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
@@ -265,26 +266,13 @@ def test_a_model_gone_bad_still_gives_safe_voltages(models: dict[str, InverseMod
     assert np.isfinite(alone_reply.u_V).all()
 
 
-class Failing:
+class Failing(PlainLearner):
     """A learner that raises after a while, which none may."""
-
-    def __init__(self, inner: OnlineModel) -> None:
-        self.inner = inner
-
-    @property
-    def seq(self) -> int:
-        return self.inner.seq
 
     def handle(self, sample: Sample) -> str:
         if sample.seq > 450:
             raise ZeroDivisionError("no")
-        return self.inner.handle(sample)
-
-    def snapshot(self) -> InverseModel:
-        return self.inner.snapshot()
-
-    def counters(self) -> dict[str, int]:
-        return self.inner.counters()
+        return super().handle(sample)
 
     def state_dict(self) -> dict[str, Any]:
         return {}

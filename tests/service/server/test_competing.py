@@ -16,8 +16,7 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.tuning.proposal import RetuneConfig
-from adaptive.tuning.samples import Hyperparameters
-from adaptive.types import FloatArray, InverseModel, OnlineModel
+from adaptive.types import FloatArray, Hyperparameters, InverseModel
 from baselines.fit import fit_linear, fit_mpi
 from service.answers.guard import Limits
 from service.background.retuning import adoption
@@ -36,6 +35,7 @@ from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.signals import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
+from tests.online_models import PlainModel
 
 DT_S = 1e-3
 LIMITS = Limits(-2.0, 10.0, 4000.0)
@@ -89,7 +89,7 @@ def ask(axis: Axis, name: str = "") -> Any:
 def degrade(axis: Axis, by_V: float) -> None:
     """Poison the learner: what its linear part gives is off by ``by_V``, whatever it learns."""
     learner: Any = axis.learner
-    favourite = learner.favourite
+    favourite = learner.competition.favourite
     inner = favourite.snapshot
 
     def snapshot() -> InverseModel:
@@ -125,16 +125,16 @@ def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
     axis = axis_of(bundle)
     give(axis, recorded, 0, 3000)
     learner: Any = axis.learner
-    inner = learner.favourite.snapshot
+    inner = learner.competition.favourite.snapshot
     degrade(axis, 0.6)
     give(axis, recorded, 3000, 5000)
-    assert learner.champion == "mpi"
+    assert learner.competition.champion == "mpi"
     assert [event["event"] for event in axis.take_events()].count("champion_changed") == 1
     bad, served, baseline = (ask(axis, name).u_V[-1] for name in ("lssvm_adaptive", "", "mpi"))
     assert abs(served - baseline) < 0.15 < 0.4 < abs(bad - served)
-    learner.favourite.snapshot = inner
+    learner.competition.favourite.snapshot = inner
     give(axis, recorded, 5000, 9000)
-    assert learner.champion == "lssvm_adaptive"
+    assert learner.competition.champion == "lssvm_adaptive"
     np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
 
 
@@ -151,7 +151,7 @@ def test_a_state_goes_on_to_the_last_bit_with_adoptions_to_come(
 ) -> None:
     one = axis_of(bundle)
     give(one, recorded, 0, 2500)
-    hyper = Hyperparameters(500.0, tuple(1.3 * w for w in one.learner.hyper.widths))  # type: ignore[union-attr]
+    hyper = Hyperparameters(500.0, tuple(1.3 * w for w in hyper_of(one).widths))
     one.adopt_at(Retuned(2800, hyper.gamma, hyper.widths))
     state = one.state_dict()
     two = axis_of(bundle)
@@ -199,9 +199,10 @@ def tunable(bundle: Bundle) -> Axis:
 
 
 def hyper_of(axis: Axis) -> Hyperparameters:
-    learner: Any = axis.learner
-    hyper: Hyperparameters = learner.hyper
-    return hyper
+    assert axis.learner is not None
+    data = axis.learner.window_data()
+    assert data is not None
+    return data.hyper
 
 
 def retuned_from_7500(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner) -> list[dict[str, Any]]:
@@ -405,22 +406,22 @@ def test_a_worker_that_dies_says_why() -> None:
     assert "without a result" in job.result["error"]
 
 
-def test_adoptions_are_made_once_in_order_at_their_sample(tmp_path: Path) -> None:
-    class Taker:
+def test_adoptions_are_made_once_in_order_at_their_sample(bundle: Bundle, tmp_path: Path) -> None:
+    class Taker(PlainModel):
         def __init__(self) -> None:
+            super().__init__(bundle.models["linear"])
             self.taken: list[float] = []
 
         def adopt(self, hyper: Hyperparameters) -> str:
             self.taken.append(hyper.gamma)
             return "worse: no" if hyper.gamma > 2.5 else ""
 
-    adoptions, taker = Adoptions(), Taker()
-    learner: OnlineModel = taker  # type: ignore[assignment]
+    adoptions, learner = Adoptions(), Taker()
     adoptions.add(Retuned(30, 3.0, (1.0,)), Retuned(10, 1.0, (1.0,)))
     adoptions.add(Retuned(20, 2.0, (1.0,)))
     made = {seq: [entry.seq for entry, _ in adoptions.apply(seq, learner)] for seq in range(9, 40)}
     assert {seq: entries for seq, entries in made.items() if entries} == {10: [10], 20: [20], 30: [30]}
-    assert taker.taken == [1.0, 2.0, 3.0]
+    assert learner.taken == [1.0, 2.0, 3.0]
     assert (adoptions.adopted, adoptions.refused, bool(adoptions)) == (2, 1, False)
     for retuned in (Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))):
         adoption.append(tmp_path, retuned)

@@ -22,6 +22,7 @@ from service.server.axis import Axis
 from service.server.axis_state import axis_state, fingerprint, restore_axis
 from service.server.models import load_axis, make_learner
 from service.storage.model_file import Bundle, BundleMeta
+from tests.online_models import PlainLearner
 from tests.service.conftest import DT_S, make_models
 
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
@@ -162,21 +163,18 @@ def test_a_stage_at_rest_is_no_frozen_sensor() -> None:
     assert bench.events == []
 
 
-class Sick:
+class Sick(PlainLearner):
     """A learner whose snapshots are mad for a while, or which raises."""
 
     def __init__(self, inner: OnlineModel, ill: range, raises: bool, alive: list[int]) -> None:
-        self.inner, self.ill, self.raises = inner, ill, raises
+        super().__init__(inner)
+        self.ill, self.raises = ill, raises
         alive.append(1)
-
-    @property
-    def seq(self) -> int:
-        return self.inner.seq
 
     def handle(self, sample: Sample) -> str:
         if self.raises and sample.seq in self.ill:
             raise ZeroDivisionError("no")
-        return self.inner.handle(sample)
+        return super().handle(sample)
 
     def snapshot(self) -> InverseModel:
         model = self.inner.snapshot()
@@ -184,12 +182,6 @@ class Sick:
         if not self.raises and self.seq in self.ill:
             return replace(model, beta=model.beta * 40.0)
         return model
-
-    def counters(self) -> dict[str, int]:
-        return self.inner.counters()
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.inner.state_dict()
 
 
 def test_a_mad_model_is_never_served() -> None:

@@ -55,7 +55,7 @@ def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseMo
     intake = Intake(axis, lambda: None)
     give(intake, 0, 1000)
     learner: Any = axis.learner
-    window = learner.parts.window
+    window = (learner.competition.favourite if compete else learner).parts.window
     first = told(axis, intake)
     assert first.keys() >= {f"window_{name}" for name in WINDOW}
     assert {f"window_{name}": count for name, count in window.counters().items()} == {
