@@ -8,9 +8,9 @@ so it is found within tens of milliseconds, while what the plays know of the loo
 The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form). ``algebra="filterpy"`` has the library do it;
 ``"compiled"``, the default, is the same by ``adaptive.online.drift``, held to the library by tests. The library's calls
 and copies cost 70 µs an update of 63 coefficients, as much as all the rest of the learner, and a query that meets them
-waits: the promise of the service's latency cannot be kept with them (docs/measurements/latency.md). The measurement
-is the voltage minus the kernel part of the model, so that filter and window learn one
-model together and neither undoes the other.
+waits: the promise of the service's latency cannot be kept with them (docs/measurements/latency.md). The measurement is
+the voltage minus the kernel part of the model, so that filter and window learn one model together and neither undoes
+the other.
 """
 
 from __future__ import annotations
