@@ -151,7 +151,7 @@ def seeds(target: str) -> list[bytes]:
         framed.append(size.to_bytes(2, "little") + payload[24:])
     meta = checkpoint.CheckpointMeta("demo", "x", 1e-3, 41, 40)
     kept = b"".join(checkpoint.encode_checkpoint(meta, {"a": np.arange(3.0), "name": "x", "n": 2, "b": np.eye(2)}))
-    reply = wire_reply.FeedforwardReply(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
+    reply = wire_reply.Answer(y, v, np.zeros(4, np.uint8), np.ones(2), 41, "mpi", True, True, True)
     return {
         "samples": [wire.encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, np.nan, 2.0], [3.0, 4.0, np.inf])],
         "command": [wire.encode_command(9, y)],

@@ -20,7 +20,7 @@ from benchmarks.latency_processes import AXIS, ECHO_KEY, STAGE
 from benchmarks.latency_world import READY_S, WINDOW, World, world
 from service.client.client import Client
 from service.protocol.query import encode_query
-from service.protocol.reply import FeedforwardReply, encode_reply
+from service.protocol.reply import Answer, Trajectory, encode_reply
 from service.runtime.session import open_client
 
 TRAJECTORY = 100
@@ -125,9 +125,9 @@ def _samples(around: World, client: Client, seconds: float) -> dict[str, Any]:
     }
 
 
-def _reply(n: int, m: int, name: str) -> FeedforwardReply:
+def _reply(n: int, m: int, name: str) -> Trajectory:
     zeros = np.zeros(n)
-    return FeedforwardReply(zeros, zeros, np.zeros(n, dtype=np.uint8), np.zeros(m), 0, name)
+    return Answer(zeros, zeros, np.zeros(n, dtype=np.uint8), np.zeros(m), 0, name)
 
 
 def _in_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, FloatArray]:

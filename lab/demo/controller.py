@@ -20,11 +20,12 @@ from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from lab.demo.result import empty
-from service.client.client import Client, Trajectory
+from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
 from service.protocol.keys import Keys
 from service.protocol.query import NEWEST
+from service.protocol.reply import Trajectory
 from service.runtime.delivery import SURELY, wait_followed
 from service.runtime.session import open_client
 

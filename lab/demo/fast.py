@@ -10,7 +10,7 @@ import numpy as np
 from adaptive.types import FloatArray
 from lab.demo.plan import MODELS, TEACHER, Plan
 from lab.demo.result import Run, empty
-from service.client.answers import Commanded
+from service.client.pending import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -30,7 +30,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
     states = {name: stage.initial_state() for name in MODELS}
     u_V, y_um, std_V = empty(plan), empty(plan), empty(plan)
     memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
-    commanded = Commanded()
+    commanded = PendingCommands()
     last_V = {name: float("nan") for name in MODELS}
     durations, notes = [], []
     for block in range(n // size + ahead + 1):

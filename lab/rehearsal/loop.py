@@ -22,7 +22,7 @@ from adaptive.types import FloatArray, InverseModel
 from lab.rehearsal.disturbance import Line, Message, Sensor, Stand
 from lab.rehearsal.reference import Motion
 from service.answers.guard import Limits, guard
-from service.client.answers import Commanded
+from service.client.pending import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.server.axis import Axis
 
@@ -109,7 +109,7 @@ def run_adaptive(
     verdict, trouble = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int16)
     verdicts, troubles = _Names(NEVER_CAME), _Names("")
     events: list[tuple[float, str, str]] = []
-    commanded, count = Commanded(), _Count(first_number)
+    commanded, count = PendingCommands(), _Count(first_number)
     before_V, newest = u_before_V, -1  # the last sample of the rest
     for first in range(0, n + block, block):
         part, held = slice(first, first + block), slice(first - block, first)

@@ -19,7 +19,7 @@ from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
 from service.answers.guard import Limits
-from service.client.answers import Commanded
+from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
@@ -102,7 +102,7 @@ def run_scenario(
     n = wanted.y_um.size // BLOCK * BLOCK
     u_V = {name: np.zeros(n) for name in MODELS}
     y_um = {name: np.zeros(n) for name in MODELS}
-    commanded = Commanded()
+    commanded = PendingCommands()
     memory: FloatArray | None = None
     last_V = dict.fromkeys(MODELS, float("nan"))
     names: dict[str, int] = {}

@@ -19,7 +19,7 @@ from lab.soak.verdict.interim import Interim
 from lab.soak.verdict.ledger import Happened, Ledger, Row, flat
 from lab.soak.verdict.track import Track
 from service.answers.guard import Limits
-from service.client.answers import Commanded
+from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
@@ -97,7 +97,7 @@ class _Turns:
         self._reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
         self._commands: dict[int, FloatArray] = {}
         self._asked = 0
-        self._commanded = Commanded()
+        self._commanded = PendingCommands()
         self._last_V = math.nan
         self._told = 0
 

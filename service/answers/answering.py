@@ -19,7 +19,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import StandIn
 from service.protocol.query import NEWEST, FeedforwardQuery, Pending
-from service.protocol.reply import FeedforwardReply
+from service.protocol.reply import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[floa
 
 def answer(
     query: FeedforwardQuery, ring: tuple[Served, ...], handled: int, config: AxisConfig, limits: Limits, age_s: float
-) -> FeedforwardReply:
+) -> Trajectory:
     """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
 
     ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
@@ -111,10 +111,7 @@ def answer(
         blends(name, default, config),
         resumes_V,
     )
-    return FeedforwardReply(
-        got.u_V, got.std_V, got.flags, got.memory, served.seq, name, behind, query.memory is None, got.fallback,
-        got.stand_in,
-    )  # fmt: skip
+    return got._replace(snapshot_seq=served.seq, model=name, behind=behind, tracked_memory=query.memory is None)
 
 
 def under_way(

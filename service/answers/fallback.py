@@ -23,7 +23,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
 from service.protocol.model import StandIn
-from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN
+from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
 
 #: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
 FADE_S, FADE_SAMPLES = 0.006, 6.0
@@ -44,17 +44,6 @@ class Rules(NamedTuple):
     stale: bool = False
 
 
-class Answer(NamedTuple):
-    """What may leave: (n,) voltages, V, their deviations, V, and flags; (m,) memory; whether anything went wrong."""
-
-    u_V: FloatArray
-    std_V: FloatArray
-    flags: NDArray[np.uint8]
-    memory: FloatArray
-    fallback: bool
-    stand_in: str
-
-
 def answer_safely(
     model: InverseModel,
     memory: FloatArray,
@@ -64,7 +53,7 @@ def answer_safely(
     stand_in: StandIn | None,
     blends: bool = True,
     resumes_V: float = math.nan,
-) -> Answer:
+) -> Trajectory:
     """Voltages for (n,) points (y µm, v µm/s, a µm/s²) from ``memory`` (m,) on; never raises.
 
     ``blends``: whether ``model`` is one that gives way to ``stand_in`` outside its domain and by its trust; where not,
@@ -83,7 +72,7 @@ def answer_safely(
         # Almost every answer: nothing speaks against what the model says.
         safe, flags, found = guarded(u, forward.inside, model.dt_s, rules.limits, u_before_V)
         if not found & (NOT_FINITE_REPLACED | (OUTSIDE_DOMAIN if blends else 0)):
-            return Answer(safe, std, flags, forward.memory, False, "")
+            return Answer(safe, std, flags, forward.memory)
     finite = np.isfinite(u)
     ok = bool(finite.all())
     marks: NDArray[np.uint8] | None = None
@@ -104,7 +93,7 @@ def answer_safely(
     if rules.stale:
         flags |= STALE
     fallback = not ok or not after_ok or not trusted
-    return Answer(safe, std, flags, forward.memory if after_ok else memory, fallback, name)
+    return Answer(safe, std, flags, forward.memory if after_ok else memory, fallback=fallback, stand_in=name)
 
 
 def _resumed(
@@ -116,7 +105,7 @@ def _resumed(
     stand_in: StandIn | None,
     blends: bool,
     resumes_V: float,
-) -> Answer:
+) -> Trajectory:
     free = rules._replace(limits=replace(rules.limits, slew_V_per_s=math.inf))
     got = answer_safely(model, memory, points, math.nan, free, stand_in, blends)
     n = got.u_V.size - 1

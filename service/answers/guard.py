@@ -89,6 +89,36 @@ def check_voltages(u_V: FloatArray, limits: Limits, field: str) -> None:
         )
 
 
+def limit_voltage(u_V: float, previous_V: float, u_min_V: float, u_max_V: float, step_V: float) -> tuple[float, int]:
+    """(safe voltage, V; flags) of one point; the service compiles it, the follower calls it in Python.
+
+    In order: a voltage that is not finite becomes ``previous_V`` (mid-range if there is none); the voltage limits; at
+    most ``step_V`` away from ``previous_V``, if that is finite.
+    """
+    flags = 0
+    known = math.isfinite(previous_V)
+    if not math.isfinite(u_V):
+        u_V = previous_V if known else 0.5 * (u_min_V + u_max_V)
+        flags |= NOT_FINITE_REPLACED
+    if u_V < u_min_V:
+        u_V = u_min_V
+        flags |= LIMITED_VOLTAGE
+    elif u_V > u_max_V:
+        u_V = u_max_V
+        flags |= LIMITED_VOLTAGE
+    if known:
+        if u_V > previous_V + step_V:
+            u_V = previous_V + step_V
+            flags |= LIMITED_SLEW
+        elif u_V < previous_V - step_V:
+            u_V = previous_V - step_V
+            flags |= LIMITED_SLEW
+    return u_V, flags
+
+
+_limit_voltage = compiled(limit_voltage)
+
+
 @compiled
 def limit(
     u_V: FloatArray,
@@ -99,40 +129,22 @@ def limit(
     step_V: float,
     flags: NDArray[np.uint8],
 ) -> int:
-    """Make ``u_V`` (n,) safe in place and say in ``flags`` (n,) what was done; returns all of their bits in one.
+    """Apply `limit_voltage` to (n,) ``u_V`` in place, add to (n,) ``flags``; returns the bits of all points in one.
 
-    In order: what is not finite becomes the voltage before it (mid-range where there is none), then the voltage limits,
-    then at most ``step_V`` from one point to the next, beginning from ``u_before_V`` where that is finite.
+    ``u_before_V`` is the voltage before the first point, V; NaN if there is none.
     """
     found = 0
     previous = u_before_V
     if math.isfinite(previous):
         previous = min(max(previous, u_min_V), u_max_V)
     for i in range(u_V.size):
-        bits = flags[i]
-        u = u_V[i]
+        previous, bits = _limit_voltage(u_V[i], previous, u_min_V, u_max_V, step_V)
         if not inside[i]:
             bits |= OUTSIDE_DOMAIN
-        if not math.isfinite(u):
-            u = previous if math.isfinite(previous) else 0.5 * (u_min_V + u_max_V)
-            bits |= NOT_FINITE_REPLACED
-        if u < u_min_V:
-            u = u_min_V
-            bits |= LIMITED_VOLTAGE
-        elif u > u_max_V:
-            u = u_max_V
-            bits |= LIMITED_VOLTAGE
-        if math.isfinite(previous):
-            if u > previous + step_V:
-                u = previous + step_V
-                bits |= LIMITED_SLEW
-            elif u < previous - step_V:
-                u = previous - step_V
-                bits |= LIMITED_SLEW
-        u_V[i] = u
+        bits |= flags[i]
+        u_V[i] = previous
         flags[i] = bits
         found |= bits
-        previous = u
     return found
 
 

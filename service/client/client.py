@@ -1,12 +1,12 @@
-"""The client: voltages from a running service by one call, or by a model that is followed into this process.
+"""Client of one axis: voltages by a query, or by a model that is followed into this process.
 
     with Client.connect("tcp/127.0.0.1:7447", stage="demo", axis="x") as client:
         u_V = client.point(y_um=40.0).u_V
         answer = client.trajectory(y_um)          # (n,) points, one sample time apart
         more = client.trajectory(next_y_um, after=answer)
 
-Queries change nothing in the service: after an error any of them may be repeated, and what gets no answer is, for a
-while, by the client itself. Given the endpoints of a service and of its standby it goes on with the one that is left.
+Queries change nothing in the service: any of them can be repeated. The client repeats an unanswered query itself for
+``retry_s``. With the endpoints of a service and of its standby it continues with the one that is alive.
 """
 
 from __future__ import annotations
@@ -24,28 +24,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.answers.guard import Limits, guard
 from service.answers.motion import derivatives
-from service.client.answers import Point, Trajectory, as_point, as_trajectory, continued, extended
-from service.client.asking import RETRY_S, Asking
 from service.client.follower import Follower
+from service.client.pending import continued, with_pending
+from service.client.retry import RETRY_S, RetryingQueries
 from service.protocol.errors import NoReplyError
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import NEWEST, encode_query
+from service.protocol.reply import Answer, Point, Trajectory
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference
 from service.runtime.delivery import SURELY
 from service.runtime.session import DEFAULT_ENDPOINT, open_client
 
-#: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
+#: Longest time until an open session knows what is declared at its other end, s; until then queries get no reply.
 _SETTLE_S: Final = 0.5
-
-
-__all__ = ["Client", "Point", "Trajectory"]
+_SETTLE_PAUSE_S: Final = 0.05
 
 
 class Client:
     """A connection to one axis of a service; use as a context manager, or call :meth:`close`.
 
-    All methods raise NoReplyError (nobody there), ReplyTimeoutError, RefusedError (the service's own words) and
-    InputError (not even sent). Not for use from several threads at once.
+    All methods raise NoReplyError (no service), ReplyTimeoutError, RefusedError (refused by the service, with its
+    message) and InputError (refused before sending). Use one client from one thread.
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class Client:
         self._session = session
         self._owns = owns_session
         self._followers: list[Follower] = []
-        self._asking = Asking(session, keys, timeout_s, retry_s)
+        self._queries = RetryingQueries(session, keys, timeout_s, retry_s)
         self._status: dict[str, Any] | None = None
 
     @classmethod
@@ -75,11 +74,15 @@ class Client:
         zenoh_config: Path | None = None,
         retry_s: float = RETRY_S,
     ) -> Client:
-        """Connect to the service at ``endpoint``, or to one of several, and make sure that it serves this axis.
+        """Connect to the service at ``endpoint``, or to one of several, and check that it serves this axis.
 
-        ``timeout_s`` is for each query; ``retry_s`` is how long one that gets no answer is repeated; ``wait_s`` is how
-        long to wait for the service to come up. ``zenoh_config`` is a file of zenoh's own for TLS and passwords. Raises
-        SessionError where nobody listens, NoReplyError where the axis is not served there.
+        Parameters
+        ----------
+        timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
+        wait_s : time to wait for the service to start, s.
+        zenoh_config : configuration file of zenoh with TLS and passwords (docs/access.md); None without.
+
+        Raises SessionError if nobody listens at the endpoint, NoReplyError if the axis is not served there.
         """
         keys = Keys(stage, axis)
         until = time.monotonic() + max(wait_s, _SETTLE_S)
@@ -88,12 +91,12 @@ class Client:
             client = cls(session, keys, timeout_s, owns_session=True, retry_s=retry_s)
             while True:
                 try:
-                    client._status = client._asking.status(once=True)
+                    client._status = client._queries.status(once=True)
                     return client
                 except NoReplyError:
                     if time.monotonic() >= until:
                         raise
-                    time.sleep(0.05)
+                    time.sleep(_SETTLE_PAUSE_S)
         except BaseException:
             session.close()  # type: ignore[no-untyped-call]
             raise
@@ -107,22 +110,22 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Undeclare, and close the session if this client opened it."""
+        """Close followers and queries, and the session if this client opened it."""
         for follower in self._followers:
             follower.close()
         self._followers = []
-        self._asking.close()
+        self._queries.close()
         if self._owns:
             self._session.close()  # type: ignore[no-untyped-call]
 
     @property
     def retries(self) -> int:
-        """Queries that were repeated because there was no answer."""
-        return self._asking.retries
+        """Count of queries that were repeated because there was no answer."""
+        return self._queries.retries
 
     @property
     def dt_s(self) -> float:
-        """Sample time of the axis, s: the distance of a trajectory's points."""
+        """Sample time of the axis, s: the distance of the points of a trajectory."""
         return float(self._known()["dt_s"])
 
     @property
@@ -131,8 +134,8 @@ class Client:
         return Limits.from_json(self._known()["limits"])
 
     def status(self) -> dict[str, Any]:
-        """The status of the axis as the service tells it now (docs/protocol.md)."""
-        self._status = self._asking.status()
+        """The present status of the axis (docs/protocol.md)."""
+        self._status = self._queries.status()
         return self._status
 
     def point(
@@ -151,10 +154,10 @@ class Client:
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
         query = continued(memory, model, u_before_V, after, begin)
-        reply = self._asking.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
-        if begin is None:
-            return as_point(reply)
-        return as_point(reply, extended(query["pending"], begin, np.array([y_um]), reply.u_V))
+        answer = self._queries.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
+        if begin is not None:
+            answer = with_pending(answer, query["pending"], begin, np.array([y_um]))
+        return Answer(answer.u_V.item(0), answer.std_V.item(0), answer.flags.item(0), *answer[3:])
 
     def trajectory(
         self,
@@ -172,42 +175,39 @@ class Client:
     ) -> Trajectory:
         """Voltages for n desired points, ``dt_s`` apart.
 
-        Main arguments
-        --------------
+        Parameters
+        ----------
         y_um : (n,) desired displacement, µm.
-        v_um_per_s, a_um_per_s2 : (n,) its velocity and acceleration at the same instants. What is not given is taken
-            by central differences, which costs accuracy at the ends of a block: give what the planner knows.
-
-        Other arguments
-        ---------------
-        after : the answer before this one; brings back its memory and its last voltage.
-        begin : the stage's number of the sample at which the first point is due, for whoever commands the answers. The
-            hysteresis memory is then what the service tracks from the samples, carried along what ``after`` left under
-            way: where the stage has not gone where it was sent, the next answer knows. An answer may begin before the
-            end of the one before, which it then replaces from there on.
-        memory, u_before_V : the same by hand. Without any, the service begins with what it tracks from the samples.
-        model : name of the model to ask, "" for the service's default.
+        v_um_per_s, a_um_per_s2 : (n,) its velocity and acceleration at the same instants. Central differences replace
+            what is not given; they are less accurate at the ends of a block, so give what the planner knows.
+        after : the previous answer; gives its memory, its model and its last voltage to this query.
+        begin : sample number of the stage at which the first point is due, for a controller that commands the answers.
+            The service then takes the hysteresis memory that it tracks from the samples and advances it by what
+            ``after`` left under way, so that it knows where the stage really is. An answer may begin before the end of
+            the previous one and replaces it from there on.
+        memory, u_before_V : (m,) memory and voltage, V, before the first point, instead of ``after``. Without any, the
+            service takes the memory that it tracks from the samples.
+        model : name of the model to ask; "" for the default of the service.
         as_of : answer from the newest snapshot that has seen no sample after this number.
-        wait_s : with ``as_of``, how long to wait until the service has learnt that far, s; BehindError after that.
+        wait_s : with ``as_of``, longest time to wait until the service has learnt that far, s; then BehindError.
         """
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
-        reply = self._asking.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s)
-        return as_trajectory(reply, None if begin is None else extended(query["pending"], begin, y, reply.u_V))
+        answer = self._queries.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s)
+        return answer if begin is None else with_pending(answer, query["pending"], begin, y)
 
     def follow(self, model: str = "", memory: ArrayLike | None = None) -> Follower:
-        """Follow the model into this process; see :class:`service.client.follower.Follower`. Closed with this client.
+        """Follow a model into this process; see :class:`service.client.follower.Follower`. Closed with this client.
 
-        Only the model that learns and "auto" are published as they change; any other is fetched once, which is all
-        there is to it. "auto" carries every model that competes; the one that learns is quicker to evaluate alone.
+        The learning model and "auto" are published when they change; any other model is constant and fetched once.
+        "auto" holds all competing models: the learning model alone is faster to evaluate.
         """
         status = self._known()
         name = model or str(status["served"])
 
         def fetch() -> bytes:
-            # The selector's own syntax keeps the name from being taken for something else: names are plain chunks.
-            return self._asking.get(f"{self.keys.model}?name={name}")
+            return self._queries.get(f"{self.keys.model}?name={name}")
 
         key = {str(status.get("learning")): self.keys.model, AUTO: self.keys.champion}.get(name)
         follower = Follower(self._session, key, name, fetch, self.limits, memory)
@@ -215,19 +215,19 @@ class Client:
         return follower
 
     def command(self, seq: int, u_V: ArrayLike) -> NDArray[np.uint8]:
-        """Publish voltages, (n,) V, for the stage's samples ``seq``, ``seq + 1``, …; returns (n,) flags.
+        """Publish voltages, (n,) V, for the samples ``seq``, ``seq + 1``, … of the stage; returns (n,) flags.
 
-        What leaves is within the limits of the axis and, from the command before on, within its slew limit; flags say
-        where that changed a voltage. Raises InputError on what is not finite.
+        The published voltages keep the limits of the axis, and its slew limit from the previous command on; the flags
+        mark changed voltages. Raises InputError if a voltage is not finite.
         """
         wanted = column("u_V", u_V)
         check_finite("u_V", wanted)
         following, before = self._commanded
         limits, gap = self.limits, check_seq("seq", seq) - following
         if following < 0 or gap < 0:
-            before = math.nan  # the first, or one that is to replace others
+            before = math.nan  # the first command, or one that replaces others
         elif gap:
-            # Over samples for which nothing was commanded the stage has held the last one; it had as long to move.
+            # In a gap the stage holds the last voltage: the slew limit allows a larger step after it.
             reach = gap * limits.slew_V_per_s * self.dt_s
             before = min(max(float(wanted[0]), before - reach), before + reach)
         safe, flags = guard(wanted, np.ones(wanted.size, dtype=np.bool_), self.dt_s, limits, before)
@@ -236,7 +236,7 @@ class Client:
         return flags
 
     def reference(self, seq: int, y_um: ArrayLike) -> None:
-        """Publish what is wanted, (n,) µm, at the stage's samples ``seq``, ``seq + 1``, …; for diagnostics only."""
+        """Publish the desired motion, (n,) µm, at the samples ``seq``, ``seq + 1``, …; for diagnostics only."""
         payload = encode_reference(check_seq("seq", seq), y_um)
         self._session.put(self.keys.reference, payload, congestion_control=SURELY)
 

@@ -1,4 +1,4 @@
-"""The model followed into the caller's process: fast, and with no wire between the question and the answer."""
+"""A follower: holds the newest snapshot of a model in the caller's process and answers there, without the wire."""
 
 from __future__ import annotations
 
@@ -17,35 +17,34 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import trust_by_age
-from service.answers.fallback import Answer, Rules, answer_safely
-from service.answers.guard import Limits, check_domain
+from service.answers.fallback import Rules, answer_safely
+from service.answers.guard import Limits, check_domain, limit_voltage
 from service.answers.motion import derivatives
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
 from service.protocol.reply import (
     BLENDED,
-    LIMITED_SLEW,
-    LIMITED_VOLTAGE,
     NOT_FINITE_REPLACED,
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
+    Trajectory,
 )
 
 
 class Follower:
-    """Holds the newest snapshot of one model and the caller's hysteresis memory, and evaluates here.
+    """Evaluates the newest snapshot of one model, with the hysteresis memory and the limits of the caller's axis.
 
-    Every answer advances :attr:`memory`, so that points asked one after the other are one trajectory. The limits of
-    the service are enforced here as there. One thread asks; snapshots arrive in another.
+    Every answer advances :attr:`memory`: consecutive points are one trajectory. The answers equal those of the service.
+    One thread asks; zenoh's thread delivers snapshots.
 
     Attributes
     ----------
-    memory : (m,) hysteresis memory after the last point answered.
-    received, refused : snapshots taken over, and those that could not be used.
-    last_flags : what was done to the last voltage answered, bits as in a reply (``service.protocol.reply.flag_names``).
-    last_std_V : one standard deviation of it, V; NaN where the model has no notion of it, and before any answer.
-    last_trajectory : all that :meth:`trajectory` last answered, deviations and stand-in among it; None before any.
+    memory : (m,) hysteresis memory after the last answered point.
+    received, refused : counts of accepted and of unusable snapshots. last_error : why the last one was refused.
+    last_flags : flags of the last voltage (see :func:`service.protocol.reply.flag_names`).
+    last_std_V : one standard deviation of the last voltage, V; NaN if the model does not state it or before any answer.
+    last_trajectory : the last answer of :meth:`trajectory`, with deviations and stand-in; None before any.
     """
 
     def __init__(
@@ -66,7 +65,7 @@ class Follower:
         self._subscriber: Any = None
         self._newest: tuple[ModelMessage, float]
         if key is not None:
-            # Subscribed before the first fetch, so that no snapshot falls between the two.
+            # Subscribe before the first fetch: no snapshot is missed between the two.
             self._subscriber = session.declare_subscriber(key, self._on_model)
         try:
             self._take(decode_model(fetch()))
@@ -79,8 +78,8 @@ class Follower:
         self._u_before_V = math.nan
         self.last_flags = 0
         self.last_std_V = math.nan
-        self.last_trajectory: Answer | None = None
-        #: Who gave the last answer: the model itself, and the name of what stood in for it where the flags say so.
+        self.last_trajectory: Trajectory | None = None
+        #: The model that gave the last answer, and the name of its stand-in if the flags mark one.
         self._answered: InverseModel | None = None
         self._stand_in = ""
         self._one = np.empty(1), np.empty(1)
@@ -92,7 +91,7 @@ class Follower:
 
     @property
     def snapshot_seq(self) -> int:
-        """The last sample that the newest snapshot had seen."""
+        """Number of the last sample that the newest snapshot has seen."""
         return self._newest[0].snapshot_seq
 
     @property
@@ -101,7 +100,7 @@ class Follower:
         return time.monotonic() - self._newest[1]
 
     def point(self, y_um: float, v_um_per_s: float = 0.0, a_um_per_s2: float = 0.0) -> float:
-        """The voltage, V, for the next point. Raises InputError beyond the domain or on what is not finite."""
+        """The voltage, V, for the next point. Raises InputError if it is outside the domain or not finite."""
         limits = self.limits
         if not (limits.y_min_um <= y_um <= limits.y_max_um and math.isfinite(v_um_per_s + a_um_per_s2 + y_um)):
             raise FieldError(
@@ -111,7 +110,7 @@ class Follower:
             )
         message = self._newest[0]
         model, after = message.model, self.memory.copy()
-        # Compiled for floats: another kind of number would be compiled for, which takes seconds.
+        # The compiled functions exist for floats; another number type would be compiled anew, which takes seconds.
         motion = float(y_um), float(v_um_per_s), float(a_um_per_s2)
         if type(model) is ChampionInverse:
             answer = model.evaluate_point(*motion, after, self._one)
@@ -126,24 +125,10 @@ class Follower:
         trust, stale = self._standing()
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely(_arrays(motion)).u_V[0])
-        # The guard of one point without its arrays: the same order, the same numbers, the same flags.
         self.memory = after
-        flags = (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
-        if u < limits.u_min_V:
-            u = limits.u_min_V
-            flags |= LIMITED_VOLTAGE
-        elif u > limits.u_max_V:
-            u = limits.u_max_V
-            flags |= LIMITED_VOLTAGE
-        before = self._u_before_V
-        if math.isfinite(before):
-            step = limits.slew_V_per_s * model.dt_s
-            if u > before + step:
-                u = before + step
-                flags |= LIMITED_SLEW
-            elif u < before - step:
-                u = before - step
-                flags |= LIMITED_SLEW
+        step_V = limits.slew_V_per_s * model.dt_s
+        u, flags = limit_voltage(u, self._u_before_V, limits.u_min_V, limits.u_max_V, step_V)
+        flags |= (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
         self._u_before_V, self._answered, self._stand_in = u, model, ""
         self.last_flags, self.last_std_V = flags, std
         return u
@@ -164,9 +149,9 @@ class Follower:
 
     @property
     def source(self) -> str:
-        """Which model gave the last voltage: a competition's champion, "A+B" where B was blended in, a stand-in alone.
+        """Name of the model that gave the last voltage: "A+B" if B was blended in; for "auto" the champion's name.
 
-        Empty before any, and where nobody could say anything and the voltage before was held.
+        Empty before any answer, and if no model was usable and the voltage was held.
         """
         if self.last_flags & STAND_IN:
             return self._stand_in
@@ -178,24 +163,24 @@ class Follower:
 
     @property
     def stale(self) -> bool:
-        """Whether snapshots have stopped coming."""
+        """Whether snapshots are expected and no longer arrive."""
         return self._standing()[1]
 
     @property
     def _expected(self) -> bool:
-        """Whether snapshots come: some did, after the first one was fetched."""
+        """Whether snapshots are expected: at least one arrived after the fetched one."""
         return self._subscriber is not None and self.received > 1
 
     def _standing(self) -> tuple[float, bool]:
-        """(weight of the model inside its domain, whether snapshots have stopped coming)."""
+        """(weight of the model inside its domain, `stale`)."""
         safety = self._newest[0].safety
         if not self._expected:
             return safety.trust, False
         weight, stale = trust_by_age(self.age_s, safety.stale_s, safety.last_good_s)
         return safety.trust * weight, stale
 
-    def _safely(self, points: tuple[FloatArray, FloatArray, FloatArray]) -> Answer:
-        """What the service would answer; advances memory and the voltage from which the slew limit counts."""
+    def _safely(self, points: tuple[FloatArray, FloatArray, FloatArray]) -> Trajectory:
+        """The answer that the service would give; advances the memory and the voltage before the next point."""
         message = self._newest[0]
         safety = message.safety
         rules = Rules(self.limits, safety.blend_share, *self._standing())
@@ -206,7 +191,7 @@ class Follower:
         return got
 
     def close(self) -> None:
-        """Stop to follow; what was received last can still be evaluated."""
+        """Stop following; the last snapshot can still be evaluated."""
         if self._subscriber is not None:
             self._subscriber.undeclare()
             self._subscriber = None
@@ -215,7 +200,6 @@ class Follower:
         try:
             self._take(decode_model(sample.payload.to_bytes()))
         except DehystError as error:
-            # The last good snapshot stays; the count and the words are there for whoever looks.
             self.refused += 1
             self.last_error = str(error)
 

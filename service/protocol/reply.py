@@ -1,15 +1,16 @@
-"""Binary payload of the reply to a feedforward query; docs/protocol.md is the page about it."""
+"""The answer to a feedforward query, and its binary payload (docs/protocol.md)."""
 
 from __future__ import annotations
 
 import struct
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
+from service.protocol.query import Pending
 from service.protocol.samples import (
     FEEDFORWARD_REPLY,
     VERSION,
@@ -21,51 +22,79 @@ from service.protocol.samples import (
     doubles,
 )
 
-#: Reply options: the learner has not yet handled all that ``as_of`` needs, so this answer may differ from a repeated
-#: one; the query brought no memory, so the service's own was used; another model than the one asked for answered in
-#: part or whole because something went wrong; the name of the model that stood in follows that of the one asked.
+#: What was done to a voltage, one bit each (docs/protocol.md).
+LIMITED_VOLTAGE: Final = 1
+LIMITED_SLEW: Final = 2
+OUTSIDE_DOMAIN: Final = 4
+NOT_FINITE_REPLACED: Final = 8
+BLENDED: Final = 16
+STAND_IN: Final = 32
+STALE: Final = 64
+FLAG_NAMES: Final = {
+    LIMITED_VOLTAGE: "limited_voltage",
+    LIMITED_SLEW: "limited_slew",
+    OUTSIDE_DOMAIN: "outside_domain",
+    NOT_FINITE_REPLACED: "not_finite_replaced",
+    BLENDED: "blended",
+    STAND_IN: "stand_in",
+    STALE: "stale",
+}
+
+#: Options of a reply: the learner has not yet handled all samples that ``as_of`` covers, so that the same query may get
+#: another answer later; the query had no memory and the service used its own; another model than the asked one answered
+#: in part or completely because something went wrong; the name of the stand-in follows the name of the asked model.
 BEHIND: Final = 1
 TRACKED_MEMORY: Final = 2
 FALLBACK: Final = 4
 HAS_STAND_IN: Final = 8
 
-#: Snapshots from before the first sample have this number.
+#: ``snapshot_seq`` of a snapshot from before the first sample.
 _LEAST_SEQ: Final = -1
 
 # version, kind, options, n, snapshot_seq, m, bytes of the name
 _REPLY: Final = struct.Struct("<BBHIqII")
 
 
-class FeedforwardReply(NamedTuple):
-    """Voltages for n desired points.
+Voltage = TypeVar("Voltage")
+Flag = TypeVar("Flag")
+
+
+class Answer(NamedTuple, Generic[Voltage, Flag]):
+    """Voltages for desired points, from the model to the client: `Trajectory` for (n,) points, `Point` for one.
 
     Attributes
     ----------
-    u_V : (n,) finite and within the limits, V.
-    std_V : (n,) one standard deviation, V; NaN where the model has no notion of it.
-    flags : (n,) bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE.
-    memory : (m,) after the last point, for the next query.
-    snapshot_seq : the last sample that the answering snapshot had seen, -1 before any.
+    u_V : voltage, V; finite and within the limits.
+    std_V : one standard deviation, V; NaN if the model does not state it.
+    flags : bits LIMITED_VOLTAGE, LIMITED_SLEW, OUTSIDE_DOMAIN, NOT_FINITE_REPLACED, BLENDED, STAND_IN, STALE.
+    memory : (m,) hysteresis memory after the last point, for the next query.
+    snapshot_seq : number of the last sample that the answering snapshot has seen; -1 before any.
     model : name of the model that was asked.
-    stand_in : name of the model that answered where the flags say NOT_FINITE_REPLACED or STAND_IN, and with a share
-    where they say BLENDED; empty where no point is of it.
-    behind, tracked_memory, fallback : the reply's options, see the module's constants.
+    behind, tracked_memory, fallback : the options of the reply, see the constants of this module.
+    stand_in : name of the stand-in. It answered the points with the flag STAND_IN or NOT_FINITE_REPLACED, and with a
+        share the points with the flag BLENDED. Empty if there are none.
+    pending : what is under way once the answer has been commanded; set by a client that was given ``begin``.
     """
 
-    u_V: FloatArray
-    std_V: FloatArray
-    flags: NDArray[np.uint8]
+    u_V: Voltage
+    std_V: Voltage
+    flags: Flag
     memory: FloatArray
-    snapshot_seq: int
-    model: str
+    snapshot_seq: int = -1
+    model: str = ""
     behind: bool = False
     tracked_memory: bool = False
     fallback: bool = False
     stand_in: str = ""
+    pending: Pending | None = None
 
 
-def encode_reply(reply: FeedforwardReply) -> bytes:
-    """Payload of a reply."""
+Trajectory = Answer[FloatArray, NDArray[np.uint8]]
+Point = Answer[float, int]
+
+
+def encode_reply(reply: Trajectory) -> bytes:
+    """Payload of a reply; ``pending`` is not part of it."""
     options = BEHIND * reply.behind | TRACKED_MEMORY * reply.tracked_memory | FALLBACK * reply.fallback
     name = reply.model.encode()
     if reply.stand_in:
@@ -84,8 +113,8 @@ def encode_reply(reply: FeedforwardReply) -> bytes:
     )
 
 
-def decode_reply(data: bytes) -> FeedforwardReply:
-    """The reply in a payload. Raises InputError where it is malformed or a voltage is not finite."""
+def decode_reply(data: bytes) -> Trajectory:
+    """The reply in a payload. Raises InputError if it is malformed or a voltage is not finite."""
     options, n = check_header(data, FEEDFORWARD_REPLY, _REPLY.size, BEHIND | TRACKED_MEMORY | FALLBACK | HAS_STAND_IN)
     *_, snapshot_seq, m, name_bytes = _REPLY.unpack_from(data)
     check_sizes(m, name_bytes // 2)
@@ -101,7 +130,7 @@ def decode_reply(data: bytes) -> FeedforwardReply:
     name, stand_in = check_name(data[end + n :]), ""
     if options & HAS_STAND_IN:
         name, _, stand_in = name.partition("/")
-    return FeedforwardReply(
+    return Answer(
         u,
         std,
         flags,
@@ -113,28 +142,6 @@ def decode_reply(data: bytes) -> FeedforwardReply:
         bool(options & FALLBACK),
         stand_in,
     )
-
-
-# --- What was done to a voltage, told with it: a byte of flags for each point of a reply.
-
-
-#: What was done to a voltage, one bit each, as documented in docs/protocol.md.
-LIMITED_VOLTAGE: Final = 1
-LIMITED_SLEW: Final = 2
-OUTSIDE_DOMAIN: Final = 4
-NOT_FINITE_REPLACED: Final = 8
-BLENDED: Final = 16
-STAND_IN: Final = 32
-STALE: Final = 64
-FLAG_NAMES: Final = {
-    LIMITED_VOLTAGE: "limited_voltage",
-    LIMITED_SLEW: "limited_slew",
-    OUTSIDE_DOMAIN: "outside_domain",
-    NOT_FINITE_REPLACED: "not_finite_replaced",
-    BLENDED: "blended",
-    STAND_IN: "stand_in",
-    STALE: "stale",
-}
 
 
 def flag_names(bits: int) -> list[str]:

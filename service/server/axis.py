@@ -28,7 +28,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
 from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import FeedforwardReply
+from service.protocol.reply import Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.axis_counting import AxisCounting
 from service.server.model_watch import Watch, WatchConfig
@@ -174,7 +174,7 @@ class Axis(AxisCounting):
         """Bring the tally up to date; in the thread that handles samples."""
         self.tally = Tally(self.handled_seq, self.sequence.counters(), self.gates)
 
-    def answer(self, query: FeedforwardQuery) -> FeedforwardReply:
+    def answer(self, query: FeedforwardQuery) -> Trajectory:
         """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for."""
         handled = self.handled_seq  # read before the ring: what is missing then is really not there yet
         return answer(query, self._ring, handled, self.config, self.limits, self.age_s)

@@ -14,9 +14,10 @@ from typing import Any
 import psutil
 import pytest
 
-from service.client.client import Client, Point
+from service.client.client import Client
 from service.protocol.errors import ServiceError
 from service.protocol.keys import AUTO
+from service.protocol.reply import Point
 from tests.e2e.scale_client import LEARNT
 from tests.e2e.scale_hosts import ENTER, namespaces_missing
 from tests.service.conftest import unused_port, write_config

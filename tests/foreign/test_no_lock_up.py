@@ -37,7 +37,7 @@ from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
 from lab.rehearsal.disturbance import Line, Message, Sensor, World
 from lab.rehearsal.identification import approach, excited
 from lab.rehearsal.reference import Excursion, Reference, Step
-from service.client.answers import Commanded
+from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import MAX_SEQ, SampleBatch
@@ -84,7 +84,7 @@ class Bench:
         low_V, _ = excited(factory(), CONFIG)
         self.now: dict[str, Any] = {
             "plant": factory(), "tick": 0, "number": 1, "clock_s": 0.0, "count": 1, "newest": -1, "before_V": low_V,
-            "commanded": Commanded(), "message": None, "gain": 1.0, "zero": 0.0,
+            "commanded": PendingCommands(), "message": None, "gain": 1.0, "zero": 0.0,
         }  # fmt: skip
         approach(self.now["plant"], low_V)
         #: (BLOCK,) errors, shares of the range, and what was called wrong, by block since the last begin.

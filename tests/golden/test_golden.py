@@ -53,7 +53,7 @@ from service.answers.guard import Limits
 from service.config.config import AxisConfig
 from service.protocol.model import decode_model, encode_model
 from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
-from service.protocol.reply import FeedforwardReply, decode_reply, encode_reply
+from service.protocol.reply import Answer, decode_reply, encode_reply
 from service.protocol.samples import (
     SampleBatch,
     decode_samples,
@@ -535,7 +535,7 @@ def columns(batch: Batch) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
 def constant_payloads() -> dict[str, str]:
     """Payloads of every small message from constants, as hexadecimal bytes."""
     half, std = np.array([0.5, 1.5, -2.25]), np.array([0.25, np.nan, 0.125])
-    reply = FeedforwardReply(half, std, np.array([0, 5, 96], np.uint8), half[:2], 41, "auto")
+    reply = Answer(half, std, np.array([0, 5, 96], np.uint8), half[:2], 41, "auto")
     under_way = Pending(7, np.array([1.0, 2.0]), np.array([0.5, 0.75]))
     made = {
         "samples": encode_samples([3, 4], [0.003, 0.004], [1.25, np.nan], [np.inf, -7.5]),

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from service.client.client import Client, Point
+from service.client.client import Client
 from service.protocol import samples as wire
+from service.protocol.reply import Point
 from service.runtime.session import open_client
 
 DT_S = 1e-3

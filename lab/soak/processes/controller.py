@@ -21,10 +21,11 @@ import zenoh
 from adaptive.errors import DehystError, InputError
 from lab.soak.processes.control import AXIS, STAGE, Control
 from lab.soak.reference import SoakReference
-from service.client.client import Client, Trajectory
+from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
+from service.protocol.reply import Trajectory
 from service.runtime.delivery import SURELY
 from service.runtime.stopping import StopSignal
 from service.stage_node.node import status_key

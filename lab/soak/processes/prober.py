@@ -23,10 +23,10 @@ from adaptive.errors import DehystError, InputError
 from lab.soak.processes.control import AXIS, STAGE, Control
 from lab.soak.processes.extras import ECHO_KEY
 from lab.soak.processes.retry import MOST, Outcome, Patience
-from service.client.client import Client, Point
+from service.client.client import Client
 from service.protocol.errors import NoReplyError
 from service.protocol.query import encode_query
-from service.protocol.reply import FeedforwardReply, encode_reply
+from service.protocol.reply import Answer, Point, encode_reply
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 
@@ -120,9 +120,7 @@ def main(argv: list[str]) -> int:
         with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
             first = client.point(y_um)
             payload = encode_query([0.0], [0.0], [0.0], memory=first.memory, model=first.model)
-            nothing = FeedforwardReply(
-                np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model
-            )
+            nothing = Answer(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model)
             key = f"{ECHO_KEY}/{len(encode_reply(nothing))}"
             with open_client(argv[1], 10.0) as session, ExitStack() as stack:
                 # A client is not for several threads at once.

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from service.client.client import Client, Trajectory
+from service.client.client import Client
 from service.protocol.errors import FieldError
 from service.protocol.query import NEWEST
-from service.protocol.reply import flag_names
+from service.protocol.reply import Trajectory, flag_names
 from service.runtime.session import DEFAULT_ENDPOINT
 
 

@@ -18,8 +18,8 @@ from lab.soak.processes.prober import Prober
 from lab.soak.processes.retry import Patience
 from lab.soak.verdict.ledger import Happened, Ledger
 from lab.soak.verdict.outcome import COLUMNS, write_seconds
-from service.client.client import Point
 from service.protocol.errors import NoReplyError
+from service.protocol.reply import Answer, Point
 from tests.lab.soak.soaked import healthy
 
 AGAIN_S = 0.1
@@ -43,7 +43,7 @@ class Slow:
 
 
 def a_point(u_V: float) -> Point:
-    return Point(u_V, 0.1, 0, np.zeros(3), "lssvm", 5, False, False)
+    return Answer(u_V, 0.1, 0, np.zeros(3), 5, "lssvm")
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answers.answering import trust_by_age
-from service.answers.fallback import Answer, Rules, answer_safely, domain_weight
+from service.answers.fallback import Rules, answer_safely, domain_weight
 from service.answers.guard import Limits
 from service.config.config import AxisConfig
 from service.protocol.model import StandIn, decode_model, encode_model
@@ -27,6 +27,7 @@ from service.protocol.reply import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
+    Trajectory,
 )
 from service.server.axis import Axis
 from tests.service.conftest import DT_S, make_models
@@ -98,7 +99,7 @@ def test_inside_the_domain_the_model_answers_alone() -> None:
 def test_a_model_is_asked_once_and_its_answer_stands_where_nothing_speaks_against_it() -> None:
     y, memory, rules = np.linspace(20.0, 30.0, 5), np.zeros(1), Rules(LIMITS)
 
-    def asked(model: Says, memory: FloatArray = memory, blends: bool = True) -> Answer:
+    def asked(model: Says, memory: FloatArray = memory, blends: bool = True) -> Trajectory:
         counted = Counted(model)
         got = answer_safely(counted, memory, points(y), 1.0, rules, LINE, blends)
         assert counted.asked == 1

@@ -27,7 +27,7 @@ from service.protocol.reply import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
-    FeedforwardReply,
+    Trajectory,
 )
 from service.server.axis import Axis
 from tests.service.conftest import make_models
@@ -65,7 +65,7 @@ def one_by_one(axis: Axis, name: str, motion: tuple[FloatArray, FloatArray]) -> 
     return follower, told
 
 
-def asked(axis: Axis, name: str, motion: tuple[FloatArray, FloatArray]) -> FeedforwardReply:
+def asked(axis: Axis, name: str, motion: tuple[FloatArray, FloatArray]) -> Trajectory:
     return axis.answer(FeedforwardQuery(*motion, np.zeros(motion[0].size), model=name))
 
 

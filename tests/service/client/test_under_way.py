@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import FADE_S
-from service.client.answers import UNDER_WAY, Trajectory, as_trajectory, continued, extended, under_way
 from service.client.client import Client
+from service.client.pending import MAX_UNDER_WAY, continued, pending_before, with_pending
 from service.protocol.errors import FieldError
 from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
-from service.protocol.reply import FeedforwardReply
+from service.protocol.reply import Answer, Trajectory
 from tests.service.server.test_axis import make_axis, parts, recording
 
 FINITE = st.floats(-1e6, 1e6)
@@ -81,7 +81,7 @@ def motion(first: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("name", ["lssvm_adaptive", "auto"])
-def test_the_memory_is_that_of_the_samples_carried_along_what_is_under_way(
+def test_the_memory_is_that_of_the_samples_carried_along_what_is_pending_before(
     models: dict[str, InverseModel], name: str
 ) -> None:
     """Of what is under way only that counts which the answering snapshot has not seen; the age is then of no matter."""
@@ -124,8 +124,8 @@ def test_what_no_answer_can_have_been_is_refused(
 
 
 def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None) -> Trajectory:
-    reply = FeedforwardReply(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, 0, "m", tracked_memory=True)
-    return as_trajectory(reply, extended(under_way(before, begin), begin, y, reply.u_V))
+    reply = Answer(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, 0, "m", tracked_memory=True)
+    return with_pending(reply, pending_before(before, begin), begin, y)
 
 
 def test_answers_put_what_is_under_way_together() -> None:
@@ -136,23 +136,29 @@ def test_answers_put_what_is_under_way_together() -> None:
     np.testing.assert_array_equal(two.pending.y_um, np.arange(40.0))
     np.testing.assert_allclose(two.pending.u_V, 0.1 * np.arange(40.0))
     # Where nothing was commanded the stage holds its voltage.
-    after_a_hole = under_way(two, 145)
+    after_a_hole = pending_before(two, 145)
     assert after_a_hole is not None
     assert after_a_hole.y_um.tolist()[-6:] == [39.0] * 6
     # An answer that replaces the end of another one goes on from there.
-    replaced = under_way(two, 130)
+    replaced = pending_before(two, 130)
     assert replaced is not None
     assert replaced.y_um.tolist() == list(range(30))
-    assert under_way(two, 100) is under_way(two, 7) is under_way(None, 5) is under_way(two, 10_000) is None
+    assert (
+        pending_before(two, 100)
+        is pending_before(two, 7)
+        is pending_before(None, 5)
+        is pending_before(two, 10_000)
+        is None
+    )
     long = one
     for k in range(60):
         long = answer_of(120 + 20 * k, np.full(20, float(k)), long)
-    kept = under_way(long, 1320)
+    kept = pending_before(long, 1320)
     assert kept is not None
-    assert (kept.first, kept.y_um.size) == (1320 - UNDER_WAY, UNDER_WAY)
+    assert (kept.first, kept.y_um.size) == (1320 - MAX_UNDER_WAY, MAX_UNDER_WAY)
 
 
-def test_a_query_with_a_beginning_takes_the_voltage_before_from_what_is_under_way() -> None:
+def test_a_query_with_a_beginning_takes_the_voltage_before_from_what_is_pending_before() -> None:
     one = answer_of(100, np.arange(1.0, 21.0))
     asked = continued(None, "", math.nan, one, 110)
     assert (asked["memory"], asked["model"], asked["u_before_V"]) == (None, "m", pytest.approx(1.0))

@@ -19,7 +19,7 @@ from service.protocol import samples as wire
 from service.protocol.errors import FieldError
 from service.protocol.model import decode_model, encode_model
 from service.protocol.query import decode_query, encode_query
-from service.protocol.reply import FeedforwardReply, decode_reply, encode_reply
+from service.protocol.reply import Answer, decode_reply, encode_reply
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 ANY = st.floats()
@@ -69,7 +69,7 @@ def test_queries_come_back(
 
 
 def test_replies_come_back() -> None:
-    sent = FeedforwardReply(
+    sent = Answer(
         np.array([1.0, 2.0]), np.array([0.1, math.nan]), np.array([0, 6], dtype=np.uint8), np.array([3.0]), 77, "mpi",
         behind=True, tracked_memory=False, fallback=True,
     )  # fmt: skip
@@ -88,9 +88,7 @@ def test_the_layout_is_that_of_the_page() -> None:
     assert encode_query(1.0, 2.0, 3.0, [4.0], "mpi", 5, 6.0) == (
         struct.pack("<BBHIqdII", 1, 4, 3, 1, 5, 6.0, 1, 3) + struct.pack("<dddd", 4.0, 1.0, 2.0, 3.0) + b"mpi"
     )
-    reply = FeedforwardReply(
-        np.ones(1), np.zeros(1), np.full(1, 4, np.uint8), np.full(1, 9.0), 5, "a", tracked_memory=True
-    )
+    reply = Answer(np.ones(1), np.zeros(1), np.full(1, 4, np.uint8), np.full(1, 9.0), 5, "a", tracked_memory=True)
     assert encode_reply(reply) == (
         struct.pack("<BBHIqII", 1, 5, 2, 1, 5, 1, 1) + struct.pack("<ddd", 1.0, 0.0, 9.0) + b"\x04a"
     )
@@ -194,5 +192,5 @@ HONEST = [
     wire.encode_command(3, [1.0, 2.0]),
     encode_query([1.0, 2.0], [0.0, 0.0], [0.0, 0.0], [0.5], "mpi"),
     encode_query([1.0], [0.0], model="mpi", pending=wire_query.Pending(3, np.ones(2), np.ones(2))),
-    encode_reply(FeedforwardReply(np.ones(2), np.ones(2), np.zeros(2, np.uint8), np.ones(1), 5, "mpi")),
+    encode_reply(Answer(np.ones(2), np.ones(2), np.zeros(2, np.uint8), np.ones(1), 5, "mpi")),
 ]

@@ -19,7 +19,7 @@ from service.config.config import AxisConfig
 from service.intake.intake import Intake
 from service.intake.sequence import RESTART_AFTER
 from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import NOT_FINITE_REPLACED, FeedforwardReply
+from service.protocol.reply import NOT_FINITE_REPLACED, Trajectory
 from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
 from service.server.axis import Axis
 from service.server.models import load_axis, make_learner
@@ -48,7 +48,7 @@ def make_axis(models: dict[str, InverseModel], **changes: Any) -> Axis:
     return load_axis("demo", replace(CONFIG, **changes), make_learner, Bundle(models, META))
 
 
-def ask(axis: Axis, y: float = 40.0, n: int = 20, **fields: Any) -> FeedforwardReply:
+def ask(axis: Axis, y: float = 40.0, n: int = 20, **fields: Any) -> Trajectory:
     t = np.arange(n) * DT_S
     return axis.answer(FeedforwardQuery(y + 100.0 * t, np.full(n, 100.0), np.zeros(n), **fields))
 
