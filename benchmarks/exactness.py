@@ -16,8 +16,8 @@ import zenoh
 from threadpoolctl import threadpool_limits
 
 from adaptive.types import StateDict
-from benchmarks.latency_processes import AXIS, STAGE, sent
-from benchmarks.latency_world import READY_S, World
+from benchmarks.latency_setup import CONNECT_S, LatencySetup, RunningSetup
+from benchmarks.sample_feed import AXIS, STAGE, sent
 from service.background.retuning.adoption import Retuned
 from service.client.client import Client
 from service.config.config import AxisConfig, read_config
@@ -60,13 +60,13 @@ class Adopted:
             self.retuned.append(Retuned.from_json(told["retuned"]))
 
 
-def exactness(world: World, client: Client, adopted: Adopted) -> dict[str, Any]:
+def exactness(running: RunningSetup, client: Client, adopted: Adopted) -> dict[str, Any]:
     """End the stage, let the service handle what is queued, and compare its learner; counts and verdict for JSON."""
-    world.feed.stop()
-    count = int(world.feed.last_json()["sent"])
+    running.feed.stop()
+    count = int(running.feed.last_json()["sent"])
     status = _drained(client, count)
     live = _live_state(client)
-    axis = taught(world, count, adopted.retuned)
+    axis = taught(running.setup, count, adopted.retuned)
     differs = differing(live, offline_state(axis))
     told = fingerprint(axis.newest.models[axis.config.learn])
     if status["fingerprint"] != told:
@@ -85,20 +85,20 @@ def exactness(world: World, client: Client, adopted: Adopted) -> dict[str, Any]:
     }
 
 
-def taught(world: World, count: int, retuned: list[Retuned]) -> Axis:
+def taught(setup: LatencySetup, count: int, retuned: list[Retuned]) -> Axis:
     """An axis of the same configuration, given the first ``count`` samples of the stage here, off line."""
-    with np.load(world.samples) as kept:
+    with np.load(setup.samples) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
-    config: AxisConfig = read_config(world.config).axes[0]
+    config: AxisConfig = read_config(setup.config).axes[0]
     # One BLAS thread as in the service: several may sum in another order.
     with threadpool_limits(1):
         axis = load_axis(STAGE, config)
         for entry in retuned:
             axis.adopt_at(entry)
-        messages = count // world.batch
+        messages = count // setup.batch
         for first in range(0, messages, _PORTION):
             part = range(first, min(first + _PORTION, messages))
-            axis.handle(joined([sent(u_V, y_um, world.rate_hz, world.batch, k) for k in part]))
+            axis.handle(joined([sent(u_V, y_um, setup.rate_hz, setup.batch, k) for k in part]))
     return axis
 
 
@@ -135,9 +135,9 @@ def _drained(client: Client, count: int) -> dict[str, Any]:
 
 def _live_state(client: Client) -> StateDict:
     """The state of the service as it hands it to a standby. Raises ServiceError where it does not."""
-    until = time.monotonic() + READY_S
+    until = time.monotonic() + CONNECT_S
     while time.monotonic() < until:
-        data = ask_for_state(client._session, client.keys.state, READY_S)
+        data = ask_for_state(client._session, client.keys.state, CONNECT_S)
         if data is not None:
             return decode_checkpoint(data)[1]
         time.sleep(0.1)  # it refuses while its learner is busy for seconds

@@ -16,8 +16,10 @@ import psutil
 
 from adaptive.types import FloatArray
 from benchmarks.exactness import Adopted, exactness
-from benchmarks.latency_processes import AXIS, ECHO_KEY, STAGE
-from benchmarks.latency_world import READY_S, WINDOW, World, world
+from benchmarks.latency_setup import CONNECT_S, RunningSetup, running_setup
+from benchmarks.sample_feed import AXIS, STAGE
+from lab.testbed.identified_stage import WINDOW
+from lab.testbed.side_processes import ECHO_KEY
 from service.client.client import Client
 from service.protocol.query import encode_query
 from service.protocol.reply import Answer, Trajectory, encode_reply
@@ -36,26 +38,26 @@ def latency(
     ``every_sample``: each sample is learnt by filter and window; otherwise with the learner's own steps.
     """
     with (
-        world(rate_hz, batch, every_sample) as around,
-        _connected(around) as client,
+        running_setup(rate_hz, batch, every_sample) as running,
+        _connected(running) as client,
         Adopted(client._session, client.keys.event) as adopted,
     ):
         time.sleep(warm_s)
         report = {"rate_hz": rate_hz, "batch": batch, "learn_every": 1 if every_sample else 10}
-        report |= {"queries": _ask(around, client, rounds), "follower": _follow(around, min(rounds, 5000))}
-        report |= {"samples": _samples(around, client, 10.0 if rounds > 1000 else 2.0)}
-        exact = exactness(around, client, adopted)
+        report |= {"queries": _ask(running, client, rounds), "follower": _follow(running, min(rounds, 5000))}
+        report |= {"samples": _samples(running, client, 10.0 if rounds > 1000 else 2.0)}
+        exact = exactness(running, client, adopted)
         return report | {"learnt_exactly": exact["learnt_exactly"], "exactness": exact}
 
 
-def _connected(around: World) -> Client:
-    return Client.connect(around.serve_at, STAGE, AXIS, timeout_s=_TIMEOUT_S, wait_s=READY_S)
+def _connected(running: RunningSetup) -> Client:
+    return Client.connect(running.setup.endpoint, STAGE, AXIS, timeout_s=_TIMEOUT_S, wait_s=CONNECT_S)
 
 
-def _ask(around: World, client: Client, rounds: int) -> dict[str, Any]:
+def _ask(running: RunningSetup, client: Client, rounds: int) -> dict[str, Any]:
     """Service and echo in turns: one point, and a trajectory."""
-    y, v, a = around.motion
-    with open_client(around.echo_at, READY_S) as session:
+    y, v, a = running.setup.motion
+    with open_client(running.echo_at, CONNECT_S) as session:
         first = client.point(float(y[0]))
         report = {}
         for name, n in (("point", 1), (f"trajectory_{TRAJECTORY}", TRAJECTORY)):
@@ -85,10 +87,10 @@ def _ask(around: World, client: Client, rounds: int) -> dict[str, Any]:
         return report
 
 
-def _follow(around: World, points: int) -> dict[str, Any]:
+def _follow(running: RunningSetup, points: int) -> dict[str, Any]:
     """What a point costs in the caller's own process, and how old its model is."""
-    y, v, a = (column.tolist() for column in around.motion)
-    with _connected(around) as client:
+    y, v, a = (column.tolist() for column in running.setup.motion)
+    with _connected(running) as client:
         follower = client.follow()
         time.sleep(1.0)
         taken, spent, ages = np.empty(points), np.empty(points), np.empty(points)
@@ -109,9 +111,9 @@ def _follow(around: World, points: int) -> dict[str, Any]:
         }
 
 
-def _samples(around: World, client: Client, seconds: float) -> dict[str, Any]:
+def _samples(running: RunningSetup, client: Client, seconds: float) -> dict[str, Any]:
     """What the service made of the samples over some seconds, and what it cost it."""
-    process = psutil.Process(around.service.pid)
+    process = psutil.Process(running.service.pid)
     first, before, begin = client.status(), sum(process.cpu_times()[:2]), time.monotonic()
     time.sleep(seconds)
     last, after, taken_s = client.status(), sum(process.cpu_times()[:2]), time.monotonic() - begin

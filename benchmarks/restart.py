@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.latency_processes import AXIS, STAGE
-from benchmarks.latency_world import READY_S, prepare, start_feed, start_service
-from lab.testbed.processes import Children
+from benchmarks.latency_setup import CONNECT_S, prepare
+from benchmarks.sample_feed import AXIS, STAGE
+from lab.testbed.rig import Rig
 from service.client.client import Client
 from sim.recordings import read
 
@@ -41,22 +41,22 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
     """
     rows: dict[str, list[float]] = {"ready_s": [], "answered_s": [], "libraries_s": [], "unlearnt_ms": []}
     told: list[tuple[int, int]] = []
-    keeps = 'recorder = "rec"\ncheckpoints = "kept"\n'
-    with tempfile.TemporaryDirectory() as folder, Children(Path(folder)) as children:
-        files = prepare(Path(folder), RATE_HZ, BATCH, False, keeps)
-        service = start_service(children, files)
-        with Client.connect(files.serve_at, STAGE, AXIS, wait_s=READY_S, retry_s=READY_S) as client:
+    keeps = {"recorder": "rec", "checkpoints": "kept"}
+    with tempfile.TemporaryDirectory() as folder, Rig(Path(folder)) as rig:
+        setup = prepare(rig, Path(folder), RATE_HZ, BATCH, False, keeps)
+        service = setup.start_service()
+        with Client.connect(setup.endpoint, STAGE, AXIS, wait_s=CONNECT_S, retry_s=CONNECT_S) as client:
             first = 0
             for _ in range(rounds):
                 rows["libraries_s"].append(_libraries_s())
-                feed = start_feed(children, files, first)
+                feed = setup.start_feed(first)
                 time.sleep(learn_s)
                 before = int(client.status()["seq"])
                 killed = time.monotonic()
                 service.kill()
                 feed.kill()
                 begun = time.monotonic()
-                service = start_service(children, files)
+                service = setup.start_service()
                 rows["ready_s"].append(time.monotonic() - begun)
                 client.point(40.0)
                 rows["answered_s"].append(time.monotonic() - killed)

@@ -19,9 +19,10 @@ import numpy as np
 
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, WindowData
-from benchmarks.latency_processes import AXIS, STAGE
-from benchmarks.latency_world import WINDOW, World, world
+from benchmarks.latency_setup import LatencySetup, running_setup
 from benchmarks.measuring import DIMENSION, stream
+from benchmarks.sample_feed import AXIS, STAGE
+from lab.testbed.identified_stage import WINDOW
 from service.background.retuning.job import Job, pack
 from service.background.retuning.settings import RetuningConfig
 from service.client.client import Client
@@ -66,17 +67,17 @@ def retuning(seconds: float = 30.0, pairs: int = 4) -> dict[str, Any]:
     load_before, rows = os.getloadavg()[0], []
     tuning = Tuning()
     with (
-        world(1000.0, 1, False) as around,
-        Client.connect(around.serve_at, STAGE, AXIS, wait_s=60.0) as client,
+        running_setup(1000.0, 1, False) as running,
+        Client.connect(running.setup.endpoint, STAGE, AXIS, wait_s=60.0) as client,
     ):
-        _phase(around, client, WARM_S, None)
+        _phase(running.setup, client, WARM_S, None)
         for pair in range(pairs):
             row: dict[str, dict[str, float]] = {}
             for busy in (False, True) if pair % 2 == 0 else (True, False):
                 try:
                     if busy:
-                        _phase(around, client, WARM_S, tuning)
-                    taken = _phase(around, client, seconds, tuning if busy else None)
+                        _phase(running.setup, client, WARM_S, tuning)
+                    taken = _phase(running.setup, client, seconds, tuning if busy else None)
                 finally:
                     tuning.stop()
                 name = "with" if busy else "without"
@@ -97,9 +98,9 @@ def retuning(seconds: float = 30.0, pairs: int = 4) -> dict[str, Any]:
     }
 
 
-def _phase(around: World, client: Client, seconds: float, tuning: Tuning | None) -> FloatArray:
+def _phase(setup: LatencySetup, client: Client, seconds: float, tuning: Tuning | None) -> FloatArray:
     """Wall time of each query in a phase, µs."""
-    y, v, a = (column.tolist() for column in around.motion)
+    y, v, a = (column.tolist() for column in setup.motion)
     taken: list[float] = []
     point = client.point(y[0])
     end = time.monotonic() + seconds

@@ -42,22 +42,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the soak. Returns 0 where every invariant held, 1 where one did not, 130 where it was interrupted."""
-    from lab.soak.faults.catalogue import KINDS
-    from lab.soak.faults.plan import known_kinds, make_plan
+    from lab.soak.fault_plan import FAULT_KINDS, make_plan, select_kinds
     from service.runtime.stopping import StopSignal
 
     if args.list:
-        for name, kind in KINDS.items():
+        for name, kind in FAULT_KINDS.items():
             print(f"{name:<16}{kind.what}{'' if kind.fast else ' (not with --fast)'}")
         return 0
     duration_s = seconds(args.duration)
     if args.seed < 0:
         raise InputError(f"--seed: got {args.seed}, expected an integer from 0 on")
-    kinds = known_kinds([name.strip() for name in args.faults.split(",") if name.strip()])
+    kinds = select_kinds([name.strip() for name in args.faults.split(",") if name.strip()])
     if args.fast:
-        kinds = tuple(name for name in kinds if KINDS[name].fast)
+        kinds = tuple(name for name in kinds if FAULT_KINDS[name].fast)
     stop = StopSignal()
-    from lab.soak import run as soak
+    from lab.soak import session as soak
     from lab.soak.verdict.outcome import HELD, verdict_line
 
     done = soak.run(

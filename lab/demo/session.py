@@ -17,7 +17,8 @@ from lab.demo.own_stage import plan_for
 from lab.demo.pictures import draw_loops, draw_tracking
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
 from lab.demo.result import Run
-from lab.testbed.processes import free_port
+from lab.testbed.identified_stage import write_service_config
+from lab.testbed.rig import Rig
 from service.config.config import read_config
 from service.identification.identifying import NAMES, Stretch, identify_all
 from service.server.models import load_axis
@@ -63,7 +64,8 @@ def run(
     kind = "as fast as possible, in one process" if fast else "in real time, in processes over zenoh"
     say(f"[3/4] {plan.run_s:g} s of a reference that no model has seen, {kind}")
     say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
-    config, endpoint = _configure(plan, out, logs)
+    rig = Rig(logs)
+    config = _configure(plan, out, logs / "serve.toml", rig.endpoint)
     show = _Bar(plan.run_s, say)
 
     def progress(ticks: int, error_um: dict[str, float]) -> None:
@@ -76,7 +78,7 @@ def run(
             done = run_fast(plan, axis, recorder, progress)
         write_recording(out / "demo.rrd", _scene(plan), _records(plan, done))
     else:
-        done = run_live(plan, config, endpoint, out / "demo.rrd", view, logs, progress)
+        done = run_live(plan, config, rig, out / "demo.rrd", view, progress)
     say("[4/4] drawing")
     wanted_um = plan.reference()[0]
     summary = done.summary(plan, wanted_um) | {"mode": "fast" if fast else "real_time"}
@@ -137,27 +139,23 @@ def _identify(plan: Plan, data: Path, model: Path, say: Say) -> None:
     write_bundle(model, models, meta)
 
 
-def _configure(plan: Plan, out: Path, logs: Path) -> tuple[Path, str]:
-    """The service's configuration, as a user would write it, and the endpoint it listens at."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
+    """Write the configuration of the service to ``path``."""
     stage = plan.stage(changing=True)
-    path = logs / "serve.toml"
-    path.write_text(
-        f'stage = "{STAGE}"\n'
-        f'listen = ["{endpoint}"]\n\n'
-        "[[axis]]\n"
-        f'name = "{AXIS}"\n'
-        f"model = {json.dumps(str((out / 'model.npz').resolve()))}\n"
-        f"u_min_V = {stage.u_min_V}\n"
-        f"u_max_V = {stage.u_max_V}\n"
-        "slew_V_per_s = 4000.0\n"
-        f'learn = "{TEACHER}"\n'
-        f"snapshot_every = {plan.block}\n"
-        f"recorder = {json.dumps(str((out / 'recording').resolve()))}\n"
-        # When the background is done depends on the machine; a run in real time and a fast one are to be the same.
-        "[axis.retuning]\nperiod_s = 0.0\n"
-    )
-    return path, endpoint
+    axis = {
+        "name": AXIS,
+        "model": out / "model.npz",
+        "u_min_V": stage.u_min_V,
+        "u_max_V": stage.u_max_V,
+        "slew_V_per_s": 4000.0,
+        "learn": TEACHER,
+        "snapshot_every": plan.block,
+        "recorder": out / "recording",
+        # Background tuning ends at a time that depends on the machine; a fast run must give the same numbers.
+        "retuning": {"period_s": 0.0},
+    }
+    write_service_config(path, STAGE, axis, listen=[endpoint])
+    return path
 
 
 def _scene(plan: Plan) -> SceneConfig:

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from lab.soak.faults.plan import Planned, SoakPlan
-from lab.soak.processes.control import AXIS, SERVED, STAGE, Control
-from lab.soak.processes.world import SAMPLES_A_MESSAGE
-from lab.soak.reference import SoakReference
-from lab.soak.verdict.interim import Interim
-from lab.soak.verdict.ledger import Happened, Ledger, Row, flat
-from lab.soak.verdict.track import Track
+from lab.soak.fault_plan import PlannedFault, SoakPlan
+from lab.soak.task import AXIS, SERVED, STAGE, ControlTask, SoakReference
+from lab.soak.verdict.interim import InterimJudge
+from lab.soak.verdict.observations import Counters, FaultRecord, Observations, SampleTracker, flatten_status
+from lab.testbed.rig import SAMPLES_PER_MESSAGE
 from service.answers.guard import Limits
 from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
@@ -33,23 +31,23 @@ _PROGRESS_S = 5.0
 
 
 def run_fast(
-    out: Path, stage: StageConfig, control: Control, plan: SoakPlan, ledger: Ledger, interim: Interim,
+    out: Path, stage: StageConfig, control: ControlTask, plan: SoakPlan, observed: Observations, interim: InterimJudge,
     stopped: Callable[[], bool], say: Callable[[str], None],
 ) -> dict[str, int]:  # fmt: skip
     """Run the plan and fill the ledger; returns the counts of samples. Times are those of the stage."""
     limits = Limits(control.u_min_V, control.u_max_V, control.slew_V_per_s)
     config = AxisConfig(AXIS, out / "model.npz", limits, served=SERVED, snapshot_every=control.block)
     turn = _Turns(Stage(stage), load_axis(STAGE, config), control)
-    ledger.seconds = turn.track.seconds
+    observed.seconds = turn.track.seconds
     waiting = list(plan.faults)
-    under_way: list[tuple[float, Happened]] = []
+    under_way: list[tuple[float, FaultRecord]] = []
     begin, told_s = time.monotonic(), 0.0
     while turn.now_s < plan.duration_s and not stopped():
         while waiting and waiting[0].at_s <= turn.now_s:
             fault = waiting.pop(0)
-            happened = Happened(fault.kind, turn.now_s, value=fault.value)
+            happened = FaultRecord(fault.kind, turn.now_s, value=fault.value)
             turn.suffer(fault)
-            ledger.faults.append(happened)
+            observed.faults.append(happened)
             under_way.append((fault.end_s, happened))
         for end_s, happened in list(under_way):
             if end_s <= turn.now_s:
@@ -57,9 +55,9 @@ def run_fast(
                 under_way.remove((end_s, happened))
         turn.step()
         if turn.second_is_over():
-            ledger.counters.append((turn.now_s, "service", Row(flat(turn.status()))))
+            observed.counters.append((turn.now_s, "service", Counters(flatten_status(turn.status()))))
             # Nobody else takes them.
-            ledger.events += [{"t_s": turn.now_s, **event} for event in turn.axis.take_events()]
+            observed.events += [{"t_s": turn.now_s, **event} for event in turn.axis.take_events()]
             interim.due(turn.now_s, lambda: _samples(turn))
         if time.monotonic() - told_s >= _PROGRESS_S:
             told_s = time.monotonic()
@@ -69,11 +67,11 @@ def run_fast(
             speed = turn.now_s / max(told_s - begin, 1e-3)
             say(
                 f"  [{'#' * round(20 * min(1.0, done)):<20}] {turn.now_s:6.0f} of {plan.duration_s:g} s  {error}"
-                f"{len(ledger.faults)} of {len(plan.faults)} faults, {speed:.1f} times as fast as real time"
+                f"{len(observed.faults)} of {len(plan.faults)} faults, {speed:.1f} times as fast as real time"
             )
-    ledger.duration_s = turn.now_s
-    ledger.seconds = turn.track.seconds[:-1] or turn.track.seconds
-    ledger.notes.append("In one process: latency, memory, recordings and take-overs are not part of this run.")
+    observed.duration_s = turn.now_s
+    observed.seconds = turn.track.seconds[:-1] or turn.track.seconds
+    observed.notes.append("In one process: latency, memory, recordings and take-overs are not part of this run.")
     return _samples(turn)
 
 
@@ -87,10 +85,10 @@ def _samples(turn: _Turns) -> dict[str, int]:
 class _Turns:
     """Stage, axis and controller, a block of ticks at a time; the controller asks ``lead`` ticks ahead."""
 
-    def __init__(self, stage: Stage, axis: Axis, control: Control) -> None:
+    def __init__(self, stage: Stage, axis: Axis, control: ControlTask) -> None:
         self.axis = axis
         self.k = 0
-        self.track = Track(control, lambda: self.now_s)
+        self.track = SampleTracker(control, lambda: self.now_s)
         self.injector = Injector(control.dt_s, self._change)
         self._stage, self._state = stage, stage.initial_state()
         self._control = control
@@ -113,7 +111,7 @@ class _Turns:
         self._told = int(self.now_s)
         return True
 
-    def suffer(self, fault: Planned) -> None:
+    def suffer(self, fault: PlannedFault) -> None:
         """Let a fault begin."""
         c = self._control
         changes = {"gain": "gain_drift.gain", "payload": "resonance.payload_ratio"}
@@ -137,8 +135,8 @@ class _Turns:
             y_um[i] = self.injector.reading(self.k + i, self._stage.step(self._state, value)[0])
         seq = np.arange(self.k, self.k + size, dtype=np.int64)
         self.k += size
-        for first in range(0, size, SAMPLES_A_MESSAGE):
-            part = slice(first, first + SAMPLES_A_MESSAGE)
+        for first in range(0, size, SAMPLES_PER_MESSAGE):
+            part = slice(first, first + SAMPLES_PER_MESSAGE)
             rows = (seq[part], seq[part].astype(np.float64) * self._control.dt_s, u_V[part], y_um[part])
             for message in self.injector.deliver(rows):
                 batch = SampleBatch(*message)

@@ -1,1 +1,10 @@
-"""testbed."""
+"""A test bench of processes on loopback, which the demonstration, the soak and the benchmarks share.
+
+`Rig` starts router, service, stage, viewer, echo and paced loop, and stops them when its block ends. `identify_stage`
+identifies the models that a service needs, and `write_service_config` writes its configuration file.
+"""
+
+from lab.testbed.processes import Child, Children, free_port
+from lab.testbed.rig import READY, READY_S, SAMPLES_PER_MESSAGE, Rig
+
+__all__ = ["READY", "READY_S", "SAMPLES_PER_MESSAGE", "Child", "Children", "Rig", "free_port"]

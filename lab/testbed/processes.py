@@ -1,4 +1,4 @@
-"""Child processes that end with their parent: started in their own group, stopped in order, their words kept."""
+"""Child processes that end with their parent: each in its own process group, stopped in order, output kept."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from service.runtime.stopping import unbroken
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens at just now."""
+    """A TCP port of this machine on which nothing listens at the moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 class Child:
-    """One process: its lines are read as they come; its errors go to a log file beside the results."""
+    """One Python process. A thread reads its standard output line by line; standard error goes to a log file."""
 
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         self.name = name
@@ -33,7 +33,7 @@ class Child:
         self._log = log
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
         with log.open("w", encoding="utf-8") as errors:
-            # A session of its own: Ctrl-C reaches the parent alone, which then stops the children in order.
+            # A new session: Ctrl-C reaches only the parent, which then stops the children in order.
             self._process = subprocess.Popen(
                 [sys.executable, *arguments],
                 stdout=subprocess.PIPE,
@@ -49,8 +49,8 @@ class Child:
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        with self._process.stdout as said:
-            for line in said:
+        with self._process.stdout as output:
+            for line in output:
                 with self._changed:
                     self.lines.append(line.rstrip("\n"))
                     self._changed.notify_all()
@@ -59,16 +59,17 @@ class Child:
             self._changed.notify_all()
 
     def wait_line(self, start: str, timeout_s: float) -> str:
-        """The first line that begins with ``start``. Raises ServiceError with the child's own words if none comes."""
+        """The first output line that begins with ``start``. Raises ServiceError, with the process' output, if there is
+        none within ``timeout_s``."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or any(x.startswith(start) for x in self.lines), timeout_s)
             for line in self.lines:
                 if line.startswith(start):
                     return line
-        raise ServiceError(f"{self.name} did not get ready: {self.words()}")
+        raise ServiceError(f"{self.name} did not get ready: {self.output_tail()}")
 
     def wait(self, timeout_s: float) -> int:
-        """Its exit status. Raises ServiceError if it does not end in time."""
+        """The exit status. Raises ServiceError if the process does not end in time."""
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -78,45 +79,45 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process has not ended yet."""
         return self._process.poll() is None
 
     @property
     def pid(self) -> int:
-        """Its number, for whoever measures it or sends it a signal."""
+        """Process id."""
         return self._process.pid
 
     def send(self, number: int) -> None:
-        """Send it a signal, if it is still there."""
+        """Send a signal, if the process still runs."""
         if self.running:
             self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it at once, as kill -9 does."""
+        """End the process at once, as kill -9 does."""
         self.send(signal.SIGKILL)
         self._process.wait()
         self._reader.join(5.0)
 
     def take_lines(self) -> list[str]:
-        """What it has said since the last call; forgotten here, so that a long run does not gather it."""
+        """The output lines since the last call. They are dropped here, so that a long run does not collect them."""
         with self._changed:
             taken, self.lines = self.lines, []
         return taken
 
     def last_json(self) -> dict[str, Any]:
-        """The last line that is a JSON object. Raises ServiceError where there is none."""
+        """The last output line that is a JSON object. Raises ServiceError if there is none."""
         for line in reversed(self.lines):
             if line.startswith("{"):
                 return dict(json.loads(line))
-        raise ServiceError(f"{self.name} left no result: {self.words()}")
+        raise ServiceError(f"{self.name} left no result: {self.output_tail()}")
 
-    def words(self) -> str:
-        """The end of what it said, on either channel."""
-        told = self._log.read_text(encoding="utf-8").strip()
-        return (told or "\n".join(self.lines))[-1500:] or f"nothing (exit status {self._process.poll()})"
+    def output_tail(self) -> str:
+        """The last 1500 characters of standard error, or of standard output if there is no standard error."""
+        errors = self._log.read_text(encoding="utf-8").strip()
+        return (errors or "\n".join(self.lines))[-1500:] or f"no output (exit status {self._process.poll()})"
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Ask it to end as Ctrl-C would; kill it if it does not."""
+        """Send SIGINT, as Ctrl-C does; kill the process if it does not end within ``timeout_s``."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -128,7 +129,7 @@ class Child:
 
 
 class Children:
-    """All children of a run; leaving the block stops them, the last started first."""
+    """All child processes of a run. Leaving the block stops them, the last one started first."""
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
@@ -136,7 +137,7 @@ class Children:
         logs.mkdir(parents=True, exist_ok=True)
 
     def start(self, name: str, arguments: list[str]) -> Child:
-        """Start ``python ARGUMENTS``."""
+        """Start ``python ARGUMENTS``; its standard error goes to ``NAME.log``."""
         with unbroken():
             child = Child(name, arguments, self._logs / f"{name}.log")
             self._children = [other for other in self._children if other.running]
@@ -149,7 +150,7 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # Who presses Ctrl-C twice is not to be left with what was not stopped yet.
+        # A second Ctrl-C must not leave processes behind.
         with unbroken():
             for child in reversed(self._children):
                 child.stop()

@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.exactness import differing, offline_state, taught
 from benchmarks.latency import TRAJECTORY, latency, page
-from benchmarks.latency_processes import AXIS, STAGE, sent
+from benchmarks.sample_feed import AXIS, STAGE, sent
 from service.config.config import AxisConfig
 from service.server.axis_state import fingerprint
 from service.storage.model_file import BundleMeta, write_bundle
@@ -72,8 +72,8 @@ def test_a_live_service_learns_exactly_what_the_samples_teach(report: dict[str, 
     assert exact["fingerprint"] == exact["fingerprint_offline"] != ""
 
 
-def small_world(folder: Path, samples: int = 600) -> Any:
-    """What the comparison needs of a world: a configuration, and the samples of its stage."""
+def small_setup(folder: Path, samples: int = 600) -> Any:
+    """What the comparison needs of a set-up: a configuration, and the samples of its stage."""
     meta = BundleMeta(STAGE, AXIS, DT_S, y_min_um=0.0, y_max_um=90.0)
     write_bundle(folder / "model.npz", make_models(), meta)
     (folder / "serve.toml").write_text(
@@ -89,24 +89,24 @@ def small_world(folder: Path, samples: int = 600) -> Any:
 
 
 def test_the_comparison_sees_one_sample_and_the_last_bit_of_it(tmp_path: Path) -> None:
-    world = small_world(tmp_path)
+    setup = small_setup(tmp_path)
     count = 900  # beyond the end of what is kept: it begins again
-    axis = taught(world, count, [])
+    axis = taught(setup, count, [])
     state = offline_state(axis)
     assert axis.sequence.received == count
-    assert differing(state, offline_state(taught(world, count, []))) == []
+    assert differing(state, offline_state(taught(setup, count, []))) == []
     # However they were gathered on the way.
-    one_by_one = taught(world, 0, [])
-    with np.load(world.samples) as kept:
+    one_by_one = taught(setup, 0, [])
+    with np.load(setup.samples) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
     for k in range(count // BATCH):
-        one_by_one.handle(sent(u_V, y_um, world.rate_hz, BATCH, k))
+        one_by_one.handle(sent(u_V, y_um, setup.rate_hz, BATCH, k))
     assert differing(state, offline_state(one_by_one)) == []
     # A message that was lost, and a voltage that is another in its last bit.
-    assert differing(state, offline_state(taught(world, count - BATCH, [])))
+    assert differing(state, offline_state(taught(setup, count - BATCH, [])))
     u_V[450] = np.nextafter(u_V[450], 11.0)
-    np.savez(world.samples, u_V=u_V, y_um=y_um)
-    other = taught(world, count, [])
+    np.savez(setup.samples, u_V=u_V, y_um=y_um)
+    other = taught(setup, count, [])
     assert any(name.startswith("learner.") for name in differing(state, offline_state(other)))
     learn = axis.config.learn
     assert fingerprint(other.newest.models[learn]) != fingerprint(axis.newest.models[learn])

@@ -11,7 +11,7 @@ import time
 import pytest
 import zenoh
 
-from lab.soak.processes.control import AXIS, STAGE
+from lab.soak.task import AXIS, STAGE
 from service.protocol.keys import Keys
 from service.runtime.session import LEASE_S, open_client
 from tests.service.conftest import unused_port
@@ -50,7 +50,7 @@ def test_a_slow_subscriber_holds_nobody_up() -> None:
             sender = threading.Thread(target=send, args=(other,))
             sender.start()
             try:
-                children.append(started("lab.soak.processes.extras", "slow", endpoint))
+                children.append(started("lab.soak.disturbers", "slow", endpoint, Keys(STAGE, AXIS).base))
                 time.sleep(6.0)
                 # Others come and go meanwhile, which is when everybody would have to wait.
                 for _ in range(4):

@@ -13,23 +13,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from lab.soak.processes.machine import Machine
-from lab.soak.verdict.invariant import Invariant, added, unjudged, worse
-from lab.soak.verdict.judge import (
+from lab.soak.machine_load import MachineLoad
+from lab.soak.verdict.invariants import (
     MEMORY_KB_PER_HOUR,
     RESIDENT_MB,
     TRACKING_PCT,
+    Ages,
+    Invariant,
+    answered_again,
+    answers_safe,
     faults_told,
     mean_error,
     processes_alive,
+    queries_answered,
+    recovers,
+    safe_voltages,
     samples_accounted,
+    sum_of,
+    takeover_continuous,
     tracked,
+    unjudged,
+    worst_of,
 )
-from lab.soak.verdict.ledger import FAST, Happened, Ledger
-from lab.soak.verdict.outcome import of_kinds, summary, write_found
-from lab.soak.verdict.safety import answers_safe, safe_voltages, takeover_continuous
-from lab.soak.verdict.settling import settle
-from lab.soak.verdict.timing import Ages, answered_again, queries_answered, recovers
+from lab.soak.verdict.observations import FAST, FaultRecord, Observations, assess_recovery
+from lab.soak.verdict.outcome import of_kinds, soak_summary, write_summary
 
 T = TypeVar("T")
 
@@ -48,7 +55,7 @@ _AGES_OF_S: Final = 60
 _AT_THE_END: Final = "told at the end"
 
 
-class Interim:
+class InterimJudge:
     """Looks at a ledger that fills; see `due`.
 
     Parameters
@@ -57,13 +64,13 @@ class Interim:
     """
 
     def __init__(
-        self, ledger: Ledger, path: Path, say: Callable[[str], None], tracking_pct: float | None = TRACKING_PCT
+        self, observed: Observations, path: Path, say: Callable[[str], None], tracking_pct: float | None = TRACKING_PCT
     ) -> None:
-        self._ledger, self._path, self._say, self._tracking_pct = ledger, path, say, tracking_pct
+        self._ledger, self._path, self._say, self._tracking_pct = observed, path, say, tracking_pct
         self._next_s = EVERY_S
         #: Until when the seconds have been judged, s; of the faults so many, as they ended.
         self._until_s = 0.0
-        self._settled: list[Happened] = []
+        self._settled: list[FaultRecord] = []
         self._found: dict[str, Invariant] = {}
         self._error = [0.0, 0, 0]
         self._ages = Ages()
@@ -77,20 +84,20 @@ class Interim:
         self._next_s = now_s + EVERY_S
         found = self.look(now_s, samples())
         try:
-            write_found(self._path, found)
+            write_summary(self._path, found)
         except OSError as error:
             self._say(f"  soak.json of the run so far: {error}")
 
     def look(self, now_s: float, samples: Mapping[str, int]) -> dict[str, Any]:
         """The content of ``soak.json`` as far as it can be told at ``now_s``."""
-        ledger, until_s = self._ledger, max(now_s - _LAG_S, self._until_s)
+        observed, until_s = self._ledger, max(now_s - _LAG_S, self._until_s)
         # The statuses and seconds just before tell what those that follow have to be compared with.
-        fresh = _part(ledger, self._until_s, until_s, now_s)
-        context = _part(ledger, self._until_s - 3.0, until_s, now_s)
+        fresh = _part(observed, self._until_s, until_s, now_s)
+        context = _part(observed, self._until_s - 3.0, until_s, now_s)
         self._seconds(fresh, context)
-        if ledger.mode != FAST:
-            around = _part(ledger, self._until_s - 3.0, now_s, now_s)
-            self._times(fresh, Machine(around.bare, around.others))
+        if observed.mode != FAST:
+            around = _part(observed, self._until_s - 3.0, now_s, now_s)
+            self._times(fresh, MachineLoad(around.loop_delays, around.other_load))
         self._faults(now_s)
         self._until_s = until_s
         found = self._invariants()
@@ -98,19 +105,19 @@ class Interim:
             self._broken.add(name)
             told = f"{name}: first seen broken at {now_s:.0f} s"
             self._say(f"  (!) {told}: {_value(found[name])}, {found[name].text}")
-            ledger.notes.append(told)
+            observed.notes.append(told)
         counts = dict(samples) | {"without_their_voltage_in_time": self._held}
         # Latencies are those of this stretch: those of all days would have to be sorted anew each time.
-        stretch = summary(replace(fresh, counters=[]), found, counts, over=False)
+        stretch = soak_summary(replace(fresh, counters=[]), found, counts, over=False)
         return stretch | {"duration_s": round(now_s, 1), "faults": of_kinds(self._settled)}
 
     def _add(self, found: Mapping[str, Invariant]) -> None:
         for name, one in found.items():
             before = self._found.get(name)
-            merge = added if name in _COUNTED else worse
+            merge = sum_of if name in _COUNTED else worst_of
             self._found[name] = one if before is None else merge(before, one)
 
-    def _seconds(self, fresh: Ledger, context: Ledger) -> None:
+    def _seconds(self, fresh: Observations, context: Observations) -> None:
         """Voltages, samples and the error of the seconds since the last look."""
         self._add(safe_voltages(fresh) | {"answers_safe": answers_safe(fresh)})
         self._add({"samples_accounted": samples_accounted(context)})
@@ -122,7 +129,7 @@ class Interim:
                 for i, value in enumerate((second.error_sum_um, second.judged, 1)):
                     self._error[i] += value
 
-    def _times(self, fresh: Ledger, machine: Machine) -> None:
+    def _times(self, fresh: Observations, machine: MachineLoad) -> None:
         """How long nobody answered, and how old the followed snapshot was, outside fault windows."""
         self._add({"queries_answered": queries_answered(fresh, machine)})
         self._ages.add(fresh, machine)
@@ -138,51 +145,51 @@ class Interim:
         part = _part(self._ledger, faults[first].begin_s - _BEFORE_S, now_s, now_s)
         # With the one that follows, from which on a silence is its own.
         part.faults = [replace(fault) for fault in faults[first : last + 1]]
-        settle(part, last - first)
+        assess_recovery(part, last - first)
         part.faults = part.faults[: last - first]
         self._settled += part.faults
         self._add({"recovers_by_itself": recovers(part), "faults_told": faults_told(part)})
         if part.mode != FAST:
-            self._add({"answered_again": answered_again(part, Machine(part.bare, part.others))})
+            self._add({"answered_again": answered_again(part, MachineLoad(part.loop_delays, part.other_load))})
 
     def _invariants(self) -> dict[str, Invariant]:
-        ledger = self._ledger
+        observed = self._ledger
         found = dict(self._found)
         # What the controller counts it counts from its beginning.
-        found["answers_safe"] = added(found["answers_safe"], answers_safe(replace(ledger, probes=[])))
-        found["processes_alive"] = processes_alive(ledger)
+        found["answers_safe"] = sum_of(found["answers_safe"], answers_safe(replace(observed, query_seconds=[])))
+        found["processes_alive"] = processes_alive(observed)
         found["faults_happened"] = unjudged(0, "runs", _AT_THE_END)
-        if ledger.mode != FAST:
+        if observed.mode != FAST:
             found["follower_age"] = self._ages.invariant(_AGES_OF_S)
             found["no_record_lost"] = unjudged(0, "samples", _AT_THE_END)
         sum_um, judged, seconds = self._error
         found["tracking"] = (
             unjudged(TRACKING_PCT, "% of range", _AT_THE_END)
             if self._tracking_pct is None
-            else mean_error(sum_um, int(judged), int(seconds), ledger.range_um, self._tracking_pct)
+            else mean_error(sum_um, int(judged), int(seconds), observed.range_um, self._tracking_pct)
         )
         found["memory"] = unjudged(MEMORY_KB_PER_HOUR, "kB/hour", _AT_THE_END)
         found["memory_resident"] = unjudged(RESIDENT_MB, "MB", _AT_THE_END)
         return found
 
 
-def _part(ledger: Ledger, begin_s: float, end_s: float, now_s: float) -> Ledger:
+def _part(observed: Observations, begin_s: float, end_s: float, now_s: float) -> Observations:
     """What happened from ``begin_s`` on and before ``end_s``; a fault that is not over lasts until ``now_s``."""
 
     def cut(rows: Sequence[T], time_of: Callable[[T], float]) -> list[T]:
         return list(rows[bisect_left(rows, begin_s, key=time_of) : bisect_left(rows, end_s, key=time_of)])
 
-    faults = ledger.faults[bisect_left(ledger.faults, begin_s - _PAST_S, key=lambda fault: fault.begin_s) :]
+    faults = observed.faults[bisect_left(observed.faults, begin_s - _PAST_S, key=lambda fault: fault.begin_s) :]
     return replace(
-        ledger,
+        observed,
         duration_s=now_s,
         faults=[fault if fault.ended else replace(fault, end_s=now_s) for fault in faults],
-        seconds=cut(ledger.seconds, lambda second: second.t_s),
-        probes=cut(ledger.probes, lambda probe: probe.t_s),
-        counters=cut(ledger.counters, lambda row: row[0]),
-        events=cut(ledger.events, lambda event: float(event["t_s"])),
-        bare=cut(ledger.bare, lambda row: row[0]),
-        others=cut(ledger.others, lambda row: row[0]),
+        seconds=cut(observed.seconds, lambda second: second.t_s),
+        query_seconds=cut(observed.query_seconds, lambda probe: probe.t_s),
+        counters=cut(observed.counters, lambda row: row[0]),
+        events=cut(observed.events, lambda event: float(event["t_s"])),
+        loop_delays=cut(observed.loop_delays, lambda row: row[0]),
+        other_load=cut(observed.other_load, lambda row: row[0]),
         memory={},
         cpu={},
         ended=[],

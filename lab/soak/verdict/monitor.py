@@ -11,8 +11,8 @@ from typing import Any
 import zenoh
 
 from adaptive.errors import InputError
-from lab.soak.processes.control import AXIS, STAGE, Control
-from lab.soak.verdict.track import Second, Track
+from lab.soak.task import AXIS, STAGE, ControlTask
+from lab.soak.verdict.observations import SampleSecond, SampleTracker
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.delivery import SURELY
@@ -26,9 +26,9 @@ _MAX_EVENTS = 500_000
 class Monitor:
     """Subscribes through the router, and asks all instances for their status; times are s from ``start_s``."""
 
-    def __init__(self, endpoint: str, control: Control, start_s: float) -> None:
+    def __init__(self, endpoint: str, control: ControlTask, start_s: float) -> None:
         self.start_s = start_s
-        self.track = Track(control, self.now)
+        self.track = SampleTracker(control, self.now)
         self.events: list[dict[str, Any]] = []
         #: By instance the newest status, and when it came.
         self.statuses: dict[str, tuple[float, dict[str, Any]]] = {}
@@ -128,7 +128,7 @@ class Monitor:
         with self._lock:
             return {"seen": len(self.track.seen), "received_by_monitor": self.track.received}
 
-    def latest(self) -> tuple[Second | None, int]:
+    def latest(self) -> tuple[SampleSecond | None, int]:
         """The second before the present one, and the newest number."""
         with self._lock:
             seconds = self.track.seconds

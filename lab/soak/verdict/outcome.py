@@ -1,4 +1,4 @@
-"""``soak.json``: what is in it, how it is written, and its verdict in one line."""
+"""The files of a soak: ``soak.json`` with the verdict, ``seconds.csv``, and ``report.md``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from adaptive.types import FloatArray
-from lab.soak.verdict.invariant import Invariant
-from lab.soak.verdict.ledger import Happened, Ledger, Probe
-from lab.soak.verdict.memory import memory_slopes
-from lab.soak.verdict.track import Second
+from lab.soak.fault_plan import FAULT_KINDS, SoakPlan
+from lab.soak.verdict.invariants import Invariant, memory_slopes
+from lab.soak.verdict.observations import REAL_TIME, FaultRecord, Observations, QuerySecond, SampleSecond
 from service.storage.atomic_write import atomic_write
 
 #: Verdicts of a run that is over, and of one that goes on.
@@ -25,22 +24,22 @@ HELD, BROKEN = "held", "broken"
 RUNNING, BROKEN_SO_FAR = "running", "broken so far"
 
 
-def summary(
-    ledger: Ledger, invariants: Mapping[str, Invariant], samples: Mapping[str, int], *, over: bool = True
+def soak_summary(
+    observed: Observations, invariants: Mapping[str, Invariant], samples: Mapping[str, int], *, over: bool = True
 ) -> dict[str, Any]:
     """The content of ``soak.json``; ``over``: whether the run is."""
     broken = any(i.held is False for i in invariants.values())
-    service, echo = ledger.latency_us("service"), ledger.latency_us("echo")
+    service, echo = observed.latency_us("service"), observed.latency_us("echo")
 
     def at(values: FloatArray, percent: float) -> float | None:
         return round(float(np.percentile(values, percent)), 1) if values.size else None
 
-    trends = memory_slopes(ledger)
+    trends = memory_slopes(observed)
     return {
         "verdict": (BROKEN if broken else HELD) if over else (BROKEN_SO_FAR if broken else RUNNING),
         "not_judged": [name for name, invariant in invariants.items() if invariant.held is None],
-        "duration_s": round(ledger.duration_s, 1),
-        "faults": of_kinds(ledger.faults),
+        "duration_s": round(observed.duration_s, 1),
+        "faults": of_kinds(observed.faults),
         "invariants": {name: invariant.as_dict() for name, invariant in invariants.items()},
         "latency": {
             "p50_us": at(service, 50),
@@ -54,22 +53,22 @@ def summary(
     }
 
 
-def of_kinds(faults: Iterable[Happened]) -> dict[str, Any]:
+def of_kinds(faults: Iterable[FaultRecord]) -> dict[str, Any]:
     """By kind: how many faults, and how they ended."""
-    kinds: dict[str, list[Happened]] = {}
+    kinds: dict[str, list[FaultRecord]] = {}
     for fault in faults:
         kinds.setdefault(fault.kind, []).append(fault)
     return {kind: _of_kind(those) for kind, those in kinds.items()}
 
 
-def _of_kind(faults: list[Happened]) -> dict[str, Any]:
+def _of_kind(faults: list[FaultRecord]) -> dict[str, Any]:
     took = [f.recovered_s - (f.end_s if math.isfinite(f.end_s) else f.begin_s) for f in faults]
     return {
         "count": len(faults),
         "recovered": sum(1 for f in faults if math.isfinite(f.recovered_s)),
         "worst_recovery_s": _most([value for value in took if math.isfinite(value)]),
         "worst_silence_s": _most([f.silent_s for f in faults]),
-        "told_by": sorted({f.told for f in faults if f.told}),
+        "told_by": sorted({f.reported_by for f in faults if f.reported_by}),
     }
 
 
@@ -83,7 +82,7 @@ def verdict_line(found: Mapping[str, Any]) -> str:
     return str(found["verdict"]) + (f"; not judged: {', '.join(left)}" if left else "")
 
 
-def write_found(path: Path, found: Mapping[str, Any]) -> None:
+def write_summary(path: Path, found: Mapping[str, Any]) -> None:
     """Write ``soak.json`` atomically."""
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
     with atomic_write(path) as file:
@@ -106,37 +105,37 @@ COLUMNS: Final = (
 T = TypeVar("T")
 
 
-def write_seconds(path: Path, ledger: Ledger) -> None:
+def write_seconds(path: Path, observed: Observations) -> None:
     """Write a row for every second of the run. What is told at the end of a second is in the row of that end.
 
     Raises OSError.
     """
-    seconds = _by_second(ledger.seconds, lambda second: second.t_s)
-    probes = _by_second(ledger.probes, lambda probe: probe.t_s)
-    bare, others = (_by_second(rows, lambda row: row[0]) for rows in (ledger.bare, ledger.others))
-    faults = _faults_by_second(ledger)
+    seconds = _by_second(observed.seconds, lambda second: second.t_s)
+    probes = _by_second(observed.query_seconds, lambda probe: probe.t_s)
+    bare, others = (_by_second(rows, lambda row: row[0]) for rows in (observed.loop_delays, observed.other_load))
+    faults = _faults_by_second(observed)
     with path.open("w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(COLUMNS)
-        for k in range(math.ceil(ledger.duration_s)):
+        for k in range(math.ceil(observed.duration_s)):
             lines.writerow([
-                k, int(ledger.quiet(float(k)) and ledger.quiet(k + 1.0)), " ".join(faults[k]),
-                *_of_stage(seconds.get(k, ()), ledger.range_um), *_of_prober(probes.get(k, ())),
+                k, int(observed.quiet(float(k)) and observed.quiet(k + 1.0)), " ".join(faults[k]),
+                *_of_stage(seconds.get(k, ()), observed.range_um), *_of_prober(probes.get(k, ())),
                 *(_number(max((row[1] for row in rows.get(k, ())), default=math.nan), 5) for rows in (bare, others)),
             ])  # fmt: skip
 
 
-def _faults_by_second(ledger: Ledger) -> defaultdict[int, list[str]]:
+def _faults_by_second(observed: Observations) -> defaultdict[int, list[str]]:
     """Kinds of the faults that were on in each whole second; one that has not ended is on until the end of the run."""
     on: defaultdict[int, list[str]] = defaultdict(list)
-    for fault in ledger.faults:
-        end_s = fault.end_s if fault.ended else ledger.duration_s
+    for fault in observed.faults:
+        end_s = fault.end_s if fault.ended else observed.duration_s
         for k in range(math.floor(fault.begin_s), math.floor(end_s) + 1):
             on[k].append(fault.kind)
     return on
 
 
-def _of_stage(rows: Sequence[Second], range_um: float) -> list[object]:
+def _of_stage(rows: Sequence[SampleSecond], range_um: float) -> list[object]:
     judged, share = sum(row.judged for row in rows), 100.0 / range_um
     return [
         sum(row.samples for row in rows),
@@ -146,12 +145,12 @@ def _of_stage(rows: Sequence[Second], range_um: float) -> list[object]:
     ]
 
 
-def _of_prober(rows: Sequence[Probe]) -> list[object]:
+def _of_prober(rows: Sequence[QuerySecond]) -> list[object]:
     if not rows:
         return [""] * 9
     service, echo, ages_s = (
-        np.concatenate([np.asarray(getattr(row, name), dtype=np.float64) for row in rows])
-        for name in ("service_us", "echo_us", "ages_s")
+        np.concatenate([np.asarray(values, dtype=np.float64) for values in columns])
+        for columns in ([r.service_us for r in rows], [r.echo_us for r in rows], [r.ages_s for r in rows])
     )
     trips = [_number(float(of(us)) if us.size else math.nan, 0) for us in (service, echo) for of in (np.median, np.max)]
     return [
@@ -167,3 +166,65 @@ def _by_second(rows: Iterable[T], at: Callable[[T], float]) -> dict[int, list[T]
 
 def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+# --- report.md
+
+
+def report(
+    found: dict[str, Any], observed: Observations, plan: SoakPlan, pictures: list[str], interrupted: bool
+) -> str:
+    """The page, from what is in ``soak.json`` and what it leaves out."""
+    lines = [f"# Soak: {verdict_line(found)}", ""]
+    how = "in real time, in processes" if observed.mode == REAL_TIME else "in one process, as fast as it goes"
+    lines.append(
+        f"{found['duration_s']:g} s of {plan.duration_s:g} s {how}; seed {plan.seed}; {len(observed.faults)} of "
+        f"{len(plan.faults)} planned faults." + (" Interrupted: this is what ran." if interrupted else "")
+    )
+    if plan.left_out:
+        lines += ["", f"No time was left for: {', '.join(plan.left_out)}."]
+    lines += ["", *(f"- {note}" for note in dict.fromkeys(observed.notes))]
+    lines += ["", "## What must hold", "", "| invariant | held | worst | limit | |", "|---|---|---|---|---|"]
+    for name, row in found["invariants"].items():
+        worst = "-" if row["worst"] is None else f"{row['worst']:.4g}"
+        held = {True: "yes", False: "**no**", None: "not judged"}[row["held"]]
+        lines.append(f"| {name} | {held} | {worst} | {row['limit']:.4g} {row['unit']} | {row['text']} |")
+    lines += ["", "## Faults", ""]
+    lines += [
+        "| fault | | how often | well again after, s | allowed | silence, s | told by |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for kind, row in found["faults"].items():
+        recovery = "never" if row["recovered"] < row["count"] else _two_digits(row["worst_recovery_s"])
+        told = (
+            ", ".join(row["told_by"]).replace("-", "nobody is to", 1)
+            if row["told_by"] == ["-"]
+            else ", ".join(row["told_by"])
+        )
+        lines.append(
+            f"| {kind} | {FAULT_KINDS[kind].what} | {row['count']} | {recovery} | {FAULT_KINDS[kind].recover_s:g} | "
+            f"{_two_digits(row['worst_silence_s'])} | {told or '**nobody**'} |"
+        )
+    for end_s, name in observed.ended:
+        lines += ["", f"**{name} ended by itself at {end_s:.1f} s**; see `logs/`."]
+    latency = found["latency"]
+    if latency["p50_us"] is not None and latency["echo_p50_us"]:
+        ratios = [latency[q] / latency[f"echo_{q}"] for q in ("p50_us", "p99_us")]
+        lines += [
+            "", "## Latency outside fault windows", "",
+            f"A point: median {latency['p50_us']:.0f} µs, 99 % within {latency['p99_us']:.0f} µs, 99.9 % within "
+            f"{latency['p999_us']:.0f} µs. A bare echo of as many bytes through the same router, in turns with it: "
+            f"median {latency['echo_p50_us']:.0f} µs, 99 % within {latency['echo_p99_us']:.0f} µs. That is "
+            f"{ratios[0]:.2f} and {ratios[1]:.2f} times.",
+        ]  # fmt: skip
+    slope = found["memory_slope_kb_per_hour"]
+    lines += ["", "## Memory", "", "Not judged." if slope is None else f"{slope:.0f} kB an hour."]
+    samples = ", ".join(f"{name} {value}" for name, value in found["samples"].items())
+    lines += ["", "## Samples", "", f"{samples}.", ""]
+    lines += [f"Second by second in `{SECONDS}`.", ""]
+    lines += [f"![{name}]({name})" for name in pictures]
+    return "\n".join(lines) + "\n"
+
+
+def _two_digits(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from lab.soak.verdict.judge import judge
-from lab.soak.verdict.ledger import Happened, Ledger, Probe
-from lab.soak.verdict.outcome import summary
-from lab.soak.verdict.settling import settle
-from lab.soak.verdict.track import Second
+from lab.soak.verdict.invariants import judge
+from lab.soak.verdict.observations import FaultRecord, Observations, QuerySecond, SampleSecond, assess_recovery
+from lab.soak.verdict.outcome import soak_summary
 
 
-def healthy(duration_s: int = 40) -> Ledger:
+def healthy(duration_s: int = 40) -> Observations:
     """A run in which a sample stream broke off for a second, and all was as it should be."""
-    ledger = Ledger(float(duration_s), 76.0, 4.0, "real_time")
-    ledger.faults = [Happened("gap", 10.0, 11.0)]
+    observed = Observations(float(duration_s), 76.0, 4.0, "real_time")
+    observed.faults = [FaultRecord("gap", 10.0, 11.0)]
     lost = 0
     for k in range(duration_s):
         bad = 10 <= k < 12
-        ledger.seconds.append(Second(float(k), 1000 * k, 1000, 1000, 1000 * (2.0 if bad else 0.03), 2.0, 0.2))
-        ledger.probes.append(Probe(k + 0.9, [200.0, 220.0], [150.0, 160.0], [0.02, 0.03], 0, 0, 0.02))
+        observed.seconds.append(SampleSecond(float(k), 1000 * k, 1000, 1000, 1000 * (2.0 if bad else 0.03), 2.0, 0.2))
+        observed.query_seconds.append(QuerySecond(k + 0.9, [200.0, 220.0], [150.0, 160.0], [0.02, 0.03], 0, 0, 0.02))
         lost += 1000 if k == 10 else 0
-        ledger.counters.append(
+        observed.counters.append(
             (
                 k + 0.5, "i1-a",
                 {"seq": 1000.0 * k, "samples.received": 1000.0 * k - lost, "samples.late": 0.0,
@@ -29,12 +27,12 @@ def healthy(duration_s: int = 40) -> Ledger:
                  "samples.gates.learnt": 1000.0 * k - lost},
             )
         )  # fmt: skip
-    return ledger
+    return observed
 
 
-def verdict(ledger: Ledger, missing: int = 0) -> dict[str, Any]:
-    settle(ledger)
-    return summary(ledger, judge(ledger, missing), {"seen": 1})
+def verdict(observed: Observations, missing: int = 0) -> dict[str, Any]:
+    assess_recovery(observed)
+    return soak_summary(observed, judge(observed, missing), {"seen": 1})
 
 
 def broken(found: dict[str, Any]) -> set[str]:

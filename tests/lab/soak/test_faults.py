@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from lab.soak.faults import bad_client as rubbish_module
-from lab.soak.faults.bad_client import AIMS, PAYLOADS, RATE_HZ, bad_query, bad_request, bad_samples
-from lab.soak.faults.catalogue import KINDS
-from lab.soak.processes.controller import StageClock
-from lab.soak.verdict.settling import TELLERS, settle
+from lab.soak import malformed_client
+from lab.soak.controller import StageClock
+from lab.soak.fault_plan import FAULT_KINDS
+from lab.soak.malformed_client import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
+from lab.soak.verdict.observations import INDICATORS, assess_recovery
 from service.operating.request import decode_request
 from service.protocol import query as wire_query
 from service.protocol import samples as wire
@@ -51,8 +51,8 @@ PROMISED = {
 
 
 def test_every_kind_that_was_promised_is_there_and_no_other() -> None:
-    assert set(PROMISED.values()) == set(KINDS)
-    assert set(TELLERS) <= set(KINDS)
+    assert set(PROMISED.values()) == set(FAULT_KINDS)
+    assert set(INDICATORS) <= set(FAULT_KINDS)
 
 
 DECODERS: dict[str, Callable[[bytes], object]] = {"sample": wire.decode_samples, "operate": decode_request}
@@ -71,7 +71,7 @@ def test_rubbish_is_refused_by_whoever_reads_it(key: str) -> None:
 
 
 def test_rubbish_goes_to_every_key_in_turns() -> None:
-    assert set(AIMS) == set(PAYLOADS) == {"feedforward", "sample", "model", "status", "operate"}
+    assert set(TARGETS) == set(PAYLOADS) == {"feedforward", "sample", "model", "status", "operate"}
     assert (PAYLOADS["feedforward"], PAYLOADS["sample"], PAYLOADS["operate"]) == (bad_query, bad_samples, bad_request)
     rng = np.random.default_rng(3)
     # Some of the queries can be read, and ask what cannot be answered.
@@ -107,17 +107,17 @@ class Session:
 
 def test_rubbish_comes_at_a_bounded_rate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     session, until = Session(), time.monotonic() + 0.5
-    monkeypatch.setattr(rubbish_module, "open_client", lambda *_: session)
+    monkeypatch.setattr(malformed_client, "open_client", lambda *_: session)
 
     class Stop:
         @property
         def reason(self) -> str:
             return "over" if time.monotonic() > until else ""
 
-    monkeypatch.setattr(rubbish_module, "StopSignal", Stop)
-    assert rubbish_module.rubbish("nowhere", 1) == 0
+    monkeypatch.setattr(malformed_client, "StopSignal", Stop)
+    assert malformed_client.send_malformed("nowhere", "dehyst/soak/x", 1) == 0
     assert 8 < len(session.sent) <= 0.5 * RATE_HZ + 5
-    assert {key.rsplit("/", 1)[1].split("?")[0] for key in session.sent} == set(AIMS)
+    assert {key.rsplit("/", 1)[1].split("?")[0] for key in session.sent} == set(TARGETS)
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told["published"] == sum(key.endswith("/sample") for key in session.sent)
     assert told["nothing"] == len(session.sent) - told["published"]
@@ -139,10 +139,10 @@ def test_a_controller_follows_the_stage_through_rubbish() -> None:
 def test_bad_messages_are_told_where_queries_and_samples_are_counted() -> None:
     """Of both: a service that counts the queries alone has not told of the samples."""
     for names, told in ((("queries.errors", "samples.malformed"), True), (("queries.errors",), False)):
-        ledger = healthy()
-        ledger.faults[0].kind = "bad_queries"
-        for t_s, _, counters in ledger.counters:
+        observed = healthy()
+        observed.faults[0].kind = "bad_queries"
+        for t_s, _, counters in observed.counters:
             for name in names:
                 counters[name] = 5.0 if t_s > 10.0 else 0.0  # type: ignore[index]
-        settle(ledger)
-        assert bool(ledger.faults[0].told) is told
+        assess_recovery(observed)
+        assert bool(observed.faults[0].reported_by) is told

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from lab.soak.verdict import outcome
-from lab.soak.verdict.interim import EVERY_S, Interim
-from lab.soak.verdict.judge import TRACKING_PCT
-from lab.soak.verdict.ledger import Happened, Ledger
+from lab.soak.verdict.interim import EVERY_S, InterimJudge
+from lab.soak.verdict.invariants import TRACKING_PCT
+from lab.soak.verdict.observations import FaultRecord, Observations
 from service.storage import atomic_write
 from tests.lab.soak.soaked import healthy, verdict
 
@@ -23,16 +23,16 @@ class Run:
 
     def __init__(self, folder: Path, duration_s: int = 200, tracking_pct: float | None = TRACKING_PCT) -> None:
         self.whole = healthy(duration_s)
-        self.seen = replace(self.whole, seconds=[], probes=[], counters=[], faults=[])
+        self.seen = replace(self.whole, seconds=[], query_seconds=[], counters=[], faults=[])
         self.path = folder / "soak.json"
         self.said: list[str] = []
-        self.interim = Interim(self.seen, self.path, self.said.append, tracking_pct)
+        self.interim = InterimJudge(self.seen, self.path, self.said.append, tracking_pct)
 
     def until(self, end_s: int) -> dict[str, Any]:
         """What ``soak.json`` holds after the seconds to ``end_s``; {} where there is none."""
         for k in range(len(self.seen.seconds), end_s):
             self.seen.seconds.append(self.whole.seconds[k])
-            self.seen.probes.append(self.whole.probes[k])
+            self.seen.query_seconds.append(self.whole.query_seconds[k])
             self.seen.counters.append(self.whole.counters[k])
             # A fault is there when it begins, and ended when it is over.
             self.seen.faults = [f if f.end_s <= k else replace(f, end_s=float("nan"))
@@ -62,11 +62,11 @@ def test_every_minute_there_is_a_file_of_the_promised_form(tmp_path: Path) -> No
 
 def test_a_stretch_at_a_time_tells_what_the_whole_does(tmp_path: Path) -> None:
     run = Run(tmp_path, 250)
-    run.whole.faults += [Happened("gap", 70.2, 71.0), Happened("gap", 118.0, 119.0)]
+    run.whole.faults += [FaultRecord("gap", 70.2, 71.0), FaultRecord("gap", 118.0, 119.0)]
     for k in (71, 118, 119):
         run.whole.seconds[k].error_sum_um *= 50.0
     run.whole.seconds[130].held = 3
-    run.whole.probes[130].silent_s = 0.11
+    run.whole.query_seconds[130].silent_s = 0.11
     run.whole.seconds[190].error_sum_um *= 1.5
     for _, _, counters in run.whole.counters[70:]:
         counters["samples.lost"] += 5.0
@@ -77,7 +77,7 @@ def test_a_stretch_at_a_time_tells_what_the_whole_does(tmp_path: Path) -> None:
         counters["samples.received"] -= 5.0
         counters["samples.gates.learnt"] -= 5.0
     found = run.until(250)
-    end = verdict(replace(run.whole, seconds=run.whole.seconds[:236], probes=run.whole.probes[:236]))
+    end = verdict(replace(run.whole, seconds=run.whole.seconds[:236], query_seconds=run.whole.query_seconds[:236]))
     assert found["faults"] == end["faults"]
     for name, one in found["invariants"].items():
         if name not in found["not_judged"]:
@@ -85,36 +85,36 @@ def test_a_stretch_at_a_time_tells_what_the_whole_does(tmp_path: Path) -> None:
             assert one["worst"] == pytest.approx(end["invariants"][name]["worst"], abs=1e-6), name
 
 
-def spoil(ledger: Ledger, name: str) -> None:
+def spoil(observed: Observations, name: str) -> None:
     if name == "voltages_finite":
-        ledger.seconds[80].sent_not_finite = 1
+        observed.seconds[80].sent_not_finite = 1
     elif name == "voltages_within_slew":
-        ledger.seconds[80].sent_step_V = 5.0
+        observed.seconds[80].sent_step_V = 5.0
     elif name == "voltages_within_limits":
-        ledger.seconds[80].sent_beyond_V = 0.5
+        observed.seconds[80].sent_beyond_V = 0.5
     elif name == "answers_safe":
-        ledger.probes[80].unsafe = 1
+        observed.query_seconds[80].unsafe = 1
     elif name == "queries_answered":
-        ledger.probes[80].silent_s = 1.0
+        observed.query_seconds[80].silent_s = 1.0
     elif name == "follower_age":
-        for probe in ledger.probes[66:]:
+        for probe in observed.query_seconds[66:]:
             probe.ages_s = [0.2, 0.01]
     elif name == "tracking":
-        for second in ledger.seconds[66:]:
+        for second in observed.seconds[66:]:
             second.error_sum_um *= 20.0
     elif name == "samples_accounted":
-        ledger.counters[80][2]["samples.gates.learnt"] -= 100.0
+        observed.counters[80][2]["samples.gates.learnt"] -= 100.0
     elif name == "processes_alive":
-        ledger.ended.append((80.0, "viewer"))
+        observed.ended.append((80.0, "viewer"))
     elif name == "faults_told":
-        ledger.faults.append(Happened("gap", 75.0, 76.0))
+        observed.faults.append(FaultRecord("gap", 75.0, 76.0))
     elif name == "recovers_by_itself":
-        ledger.faults.append(Happened("payload", 75.0, 75.1))
-        for second in ledger.seconds[75:88]:
+        observed.faults.append(FaultRecord("payload", 75.0, 75.1))
+        for second in observed.seconds[75:88]:
             second.error_sum_um = 300.0
     elif name == "answered_again":
-        ledger.faults.append(Happened("payload", 75.0, 75.1))
-        ledger.probes[76].silent_s = 3.0
+        observed.faults.append(FaultRecord("payload", 75.0, 75.1))
+        observed.query_seconds[76].silent_s = 3.0
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_the_first_breach_is_told_when_it_shows_and_is_not_forgotten(tmp_path: P
 def test_a_slow_start_is_no_alarm(tmp_path: Path) -> None:
     """A share of a hundredth is not told by the few looks of the first minute."""
     run = Run(tmp_path, 200)
-    run.whole.probes[2].ages_s = [0.33, 0.33]
+    run.whole.query_seconds[2].ages_s = [0.33, 0.33]
     found = run.until(61)["invariants"]["follower_age"]
     assert (found["held"], found["why"]) == (None, "47 seconds so far")
     assert run.until(125)["invariants"]["follower_age"]["held"] is True
@@ -151,13 +151,13 @@ def test_a_slow_start_is_no_alarm(tmp_path: Path) -> None:
 
 def test_a_fault_that_is_still_open_is_not_settled(tmp_path: Path) -> None:
     run = Run(tmp_path, 200)
-    run.whole.faults.append(Happened("gap", 55.0, 57.0))
+    run.whole.faults.append(FaultRecord("gap", 55.0, 57.0))
     for second in run.whole.seconds[55:62]:
         second.error_sum_um = 1000.0
     found = run.until(61)
     assert found["faults"]["gap"]["count"] == 1, "only the one before it"
     assert found["verdict"] == "running"
-    assert all(not fault.told and not fault.silent_s for fault in run.seen.faults), "the end settles them"
+    assert all(not fault.reported_by and not fault.silent_s for fault in run.seen.faults), "the end settles them"
     found = run.until(125)
     assert found["faults"]["gap"]["count"] == 2
     assert found["invariants"]["faults_told"]["held"] is False, "nobody told of the second"
@@ -190,13 +190,13 @@ def test_a_look_at_the_third_day_takes_no_more_than_one_at_the_first(tmp_path: P
     for turn in range(20):
         shift = 1200.0 * turn
         day.seconds += [replace(s, t_s=s.t_s + shift) for s in run.whole.seconds]
-        day.probes += [replace(p, t_s=p.t_s + shift) for p in run.whole.probes]
+        day.query_seconds += [replace(p, t_s=p.t_s + shift) for p in run.whole.query_seconds]
         day.counters += [(t_s + shift, who, counters) for t_s, who, counters in run.whole.counters]
         for begin_s in range(10, 1190, 15):
-            day.faults.append(Happened("payload", shift + begin_s, shift + begin_s))
+            day.faults.append(FaultRecord("payload", shift + begin_s, shift + begin_s))
     now_s = 20 * 1200.0
     run.interim.look(now_s - 60.0, {})
-    for name in ("seconds", "probes", "counters", "faults"):
+    for name in ("seconds", "query_seconds", "counters", "faults"):
         setattr(day, name, Rows(getattr(day, name)))
     begin = time.process_time()
     found = run.interim.look(now_s, {})
@@ -207,14 +207,14 @@ def test_a_look_at_the_third_day_takes_no_more_than_one_at_the_first(tmp_path: P
 
 def test_a_file_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "soak.json"
-    outcome.write_found(path, {"verdict": "running"})
+    outcome.write_summary(path, {"verdict": "running"})
 
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
     monkeypatch.setattr(atomic_write.os, "replace", fail)
     with pytest.raises(OSError, match="no space"):
-        outcome.write_found(path, {"verdict": "held"})
+        outcome.write_summary(path, {"verdict": "held"})
     assert json.loads(path.read_text()) == {"verdict": "running"}
     # A soak goes on without the file.
     run = Run(tmp_path)

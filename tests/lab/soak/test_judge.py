@@ -10,20 +10,24 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from lab.soak.faults.catalogue import KINDS
-from lab.soak.faults.plan import make_plan
-from lab.soak.processes.control import Control
-from lab.soak.run import _excused
-from lab.soak.verdict.judge import TRACKING_PCT
-from lab.soak.verdict.ledger import Happened, Ledger, Row, flat, probe_of
-from lab.soak.verdict.outcome import verdict_line
-from lab.soak.verdict.report import report
-from lab.soak.verdict.settling import settle
-from lab.soak.verdict.track import Track
+from lab.soak.fault_plan import FAULT_KINDS, make_plan
+from lab.soak.session import _excused
+from lab.soak.task import ControlTask
+from lab.soak.verdict.invariants import TRACKING_PCT
+from lab.soak.verdict.observations import (
+    Counters,
+    FaultRecord,
+    Observations,
+    SampleTracker,
+    assess_recovery,
+    flatten_status,
+    query_second,
+)
+from lab.soak.verdict.outcome import report, verdict_line
 from service.protocol.samples import SampleBatch
 from tests.lab.soak.soaked import broken, healthy, verdict
 
-CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
+CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 
 
 def batch(first: int, u_V: list[float], y_um: list[float]) -> SampleBatch:
@@ -33,7 +37,7 @@ def batch(first: int, u_V: list[float], y_um: list[float]) -> SampleBatch:
 
 def test_track_measures_errors_steps_and_holds() -> None:
     now = 0.0
-    track = Track(CONTROL, lambda: now)
+    track = SampleTracker(CONTROL, lambda: now)
     track.want(0, np.array([1.0, 2.0, 3.0, 4.0]))
     track.command(0, np.array([0.0, 1.0, 1.5]))
     track.take(batch(0, [0.0, 1.0], [1.5, 2.0]))
@@ -64,8 +68,8 @@ def test_a_healthy_run_holds_and_has_the_promised_form() -> None:
     json.dumps(found, allow_nan=False)
 
 
-def spoil(ledger: Ledger, what: str) -> None:
-    second = ledger.seconds[30]
+def spoil(observed: Observations, what: str) -> None:
+    second = observed.seconds[30]
     if what == "voltages_finite":
         second.not_finite = 1
     elif what == "voltages_within_limits":
@@ -73,31 +77,31 @@ def spoil(ledger: Ledger, what: str) -> None:
     elif what == "voltages_within_slew":
         second.step_max_V = 4.1
     elif what == "answers_safe":
-        ledger.probes[5].unsafe = 1
+        observed.query_seconds[5].unsafe = 1
     elif what == "queries_answered":
-        ledger.probes[30].silent_s = 0.4
+        observed.query_seconds[30].silent_s = 0.4
     elif what == "follower_age":
-        ledger.probes[30].ages_s = [0.3]
+        observed.query_seconds[30].ages_s = [0.3]
     elif what == "answered_again":
-        ledger.probes[11].silent_s = 2.0
+        observed.query_seconds[11].silent_s = 2.0
     elif what == "recovers_by_itself":
-        for late in ledger.seconds[12:25]:
+        for late in observed.seconds[12:25]:
             late.error_sum_um = 1000.0
     elif what == "faults_told":
-        for _, _, counters in ledger.counters:
+        for _, _, counters in observed.counters:
             counters["samples.received"] += counters["samples.lost"]
             counters["samples.gates.learnt"] = counters["samples.received"]
             counters["samples.lost"] = 0.0
     elif what == "samples_accounted":
-        ledger.counters[30][2]["samples.gates.learnt"] -= 100.0
+        observed.counters[30][2]["samples.gates.learnt"] -= 100.0
     elif what == "processes_alive":
-        ledger.ended.append((3.0, "viewer"))
+        observed.ended.append((3.0, "viewer"))
     elif what == "tracking":
-        for late in ledger.seconds[20:]:
+        for late in observed.seconds[20:]:
             late.error_sum_um = 1000.0 * 2.0 * TRACKING_PCT / 100.0 * 76.0
     elif what == "memory":
         t = np.arange(0.0, 900.0, 1.0)
-        ledger.memory["a"] = [(float(s), 200_000.0 + 60.0 * s, 17) for s in t]
+        observed.memory["a"] = [(float(s), 200_000.0 + 60.0 * s, 17) for s in t]
 
 
 @pytest.mark.parametrize(
@@ -107,54 +111,54 @@ def spoil(ledger: Ledger, what: str) -> None:
      "processes_alive", "tracking", "memory"],
 )  # fmt: skip
 def test_every_invariant_is_broken_by_what_it_is_there_for(what: str) -> None:
-    ledger = healthy()
-    spoil(ledger, what)
-    found = verdict(ledger)
+    observed = healthy()
+    spoil(observed, what)
+    found = verdict(observed)
     assert what in broken(found)
     assert found["verdict"] == "broken"
 
 
-def late_machine(ledger: Ledger, late_s: float, others: float = 0.0) -> Ledger:
-    ledger.bare = [(k + 0.95, late_s) for k in range(int(ledger.duration_s))]
-    ledger.others = [(k + 0.95, others) for k in range(int(ledger.duration_s))]
-    return ledger
+def late_machine(observed: Observations, late_s: float, others: float = 0.0) -> Observations:
+    observed.loop_delays = [(k + 0.95, late_s) for k in range(int(observed.duration_s))]
+    observed.other_load = [(k + 0.95, others) for k in range(int(observed.duration_s))]
+    return observed
 
 
 def test_a_fault_of_which_there_was_no_time_to_tell_is_not_judged() -> None:
     for duration_s, held in ((17.9, True), (18.1, False)):
-        ledger = healthy()
-        spoil(ledger, "faults_told")
-        ledger.duration_s = duration_s
-        told = verdict(ledger)["invariants"]["faults_told"]
+        observed = healthy()
+        spoil(observed, "faults_told")
+        observed.duration_s = duration_s
+        told = verdict(observed)["invariants"]["faults_told"]
         assert told["held"] is held
         assert ("1 of 1 not judged: the run was over" in told["text"]) is held
 
 
 @pytest.mark.parametrize(("late_s", "held"), [(0.001, False), (0.02, True)])
 def test_on_a_busy_machine_a_fault_is_told_of_later(late_s: float, held: bool) -> None:
-    ledger = late_machine(healthy(), late_s)
-    for _, _, counters in ledger.counters[:20]:
+    observed = late_machine(healthy(), late_s)
+    for _, _, counters in observed.counters[:20]:
         lost, counters["samples.lost"] = counters["samples.lost"], 0.0
         counters["samples.received"] += lost
         counters["samples.gates.learnt"] = counters["samples.received"]
-    assert verdict(ledger)["invariants"]["faults_told"]["held"] is held
+    assert verdict(observed)["invariants"]["faults_told"]["held"] is held
 
 
 @pytest.mark.parametrize(("late_s", "silent_s", "held"), [(0.001, 0.3, False), (0.02, 0.3, True), (0.02, 0.5, False)])
 def test_a_time_is_judged_beside_that_of_the_bare_loop(late_s: float, silent_s: float, held: bool) -> None:
-    ledger = late_machine(healthy(), late_s)
-    ledger.probes[30].silent_s = silent_s
-    assert verdict(ledger)["invariants"]["queries_answered"]["held"] is held
+    observed = late_machine(healthy(), late_s)
+    observed.query_seconds[30].silent_s = silent_s
+    assert verdict(observed)["invariants"]["queries_answered"]["held"] is held
 
 
 @pytest.mark.parametrize(("late_s", "others"), [(0.2, 0.0), (0.001, 0.9)])
 def test_what_a_machine_that_stood_still_shows_is_not_judged(late_s: float, others: float) -> None:
-    ledger = late_machine(healthy(), late_s, others)
-    ledger.probes[30].silent_s = 5.0
-    for second in ledger.seconds[12:]:
+    observed = late_machine(healthy(), late_s, others)
+    observed.query_seconds[30].silent_s = 5.0
+    for second in observed.seconds[12:]:
         second.error_sum_um = 1000.0
         second.held = 1
-    found = verdict(ledger)
+    found = verdict(observed)
     assert [name for name, said in found["invariants"].items() if said["held"] is None] == [
         "queries_answered",
         "answered_again",
@@ -167,35 +171,35 @@ def test_what_a_machine_that_stood_still_shows_is_not_judged(late_s: float, othe
     assert "not judged" in found["invariants"]["queries_answered"]["text"]
     assert found["verdict"] == "held"
     # What is not about time is judged as ever.
-    ledger.seconds[30].beyond_V = 0.01
-    assert verdict(ledger)["verdict"] == "broken"
+    observed.seconds[30].beyond_V = 0.01
+    assert verdict(observed)["verdict"] == "broken"
 
 
 def test_a_snapshot_that_is_followed_may_be_old_during_a_fault_and_as_late_as_the_machine() -> None:
-    ledger = healthy()
-    for probe in ledger.probes[11:14]:
+    observed = healthy()
+    for probe in observed.query_seconds[11:14]:
         probe.ages_s = [5.0]
-    ledger = late_machine(ledger, 0.01)
-    for probe in ledger.probes[20:]:
+    observed = late_machine(observed, 0.01)
+    for probe in observed.query_seconds[20:]:
         probe.ages_s = [0.12]
-    found = verdict(ledger)["invariants"]["follower_age"]
+    found = verdict(observed)["invariants"]["follower_age"]
     assert (found["held"], found["worst"], found["limit"]) == (True, pytest.approx(0.04), 0.05)
     # One look in a hundred may be worse.
-    ledger = late_machine(healthy(240), 0.0)
-    ledger.probes[200].ages_s = [0.4, 0.01]
-    assert verdict(ledger)["invariants"]["follower_age"]["held"] is True
-    for probe in ledger.probes[200:210]:
+    observed = late_machine(healthy(240), 0.0)
+    observed.query_seconds[200].ages_s = [0.4, 0.01]
+    assert verdict(observed)["invariants"]["follower_age"]["held"] is True
+    for probe in observed.query_seconds[200:210]:
         probe.ages_s = [0.4, 0.01]
-    assert verdict(ledger)["invariants"]["follower_age"]["worst"] == pytest.approx(0.4)
-    assert "follower_age" in broken(verdict(ledger))
+    assert verdict(observed)["invariants"]["follower_age"]["worst"] == pytest.approx(0.4)
+    assert "follower_age" in broken(verdict(observed))
     # A second that began before the run, when no samples came yet, says nothing of it.
     early = late_machine(healthy(), 0.0)
-    early.probes[0].ages_s = [0.6] * 100
+    early.query_seconds[0].ages_s = [0.6] * 100
     assert verdict(early)["invariants"]["follower_age"]["held"] is True
-    early.probes[2].ages_s = [0.6] * 100
+    early.query_seconds[2].ages_s = [0.6] * 100
     assert "follower_age" in broken(verdict(early))
     # Where others have the processor a learner waits for it, though a loop that only wakes up does not.
-    assert "follower_age" in verdict(late_machine(ledger, 0.001, 0.3))["not_judged"]
+    assert "follower_age" in verdict(late_machine(observed, 0.001, 0.3))["not_judged"]
 
 
 def test_what_a_run_does_not_tell_is_named_with_the_reason() -> None:
@@ -203,63 +207,65 @@ def test_what_a_run_does_not_tell_is_named_with_the_reason() -> None:
     assert (found["verdict"], found["not_judged"]) == ("held", ["memory", "memory_resident"])
     assert found["invariants"]["memory"]["held"] is None
     assert verdict_line(found) == "held; not judged: memory (too short a run), memory_resident (too short a run)"
-    ledger = healthy()
-    ledger.seconds[30].sent_step_V = 9.0
-    for second in ledger.seconds:
+    observed = healthy()
+    observed.seconds[30].sent_step_V = 9.0
+    for second in observed.seconds:
         second.held = 1
-    line = verdict_line(verdict(ledger))
+    line = verdict_line(verdict(observed))
     assert line.startswith("broken; not judged: tracking (no such second), memory (too short a run)")
     plan = make_plan(40.0, 1, ("gap",))
-    assert report(verdict(ledger), ledger, plan, [], False).startswith(f"# Soak: {line}\n")
+    assert report(verdict(observed), observed, plan, [], False).startswith(f"# Soak: {line}\n")
     assert verdict_line({"verdict": "held", "not_judged": [], "invariants": {}}) == "held"
     # Where every second is one of a fault nobody can say how soon queries are answered without one.
-    ledger.faults = [Happened("gain", 0.0, 30.0)]
-    assert {"queries_answered", "follower_age"} <= set(verdict(ledger)["not_judged"])
+    observed.faults = [FaultRecord("gain", 0.0, 30.0)]
+    assert {"queries_answered", "follower_age"} <= set(verdict(observed)["not_judged"])
 
 
 @given(
-    starts=st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 20.0), st.sampled_from(sorted(KINDS))), max_size=8),
+    starts=st.lists(
+        st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 20.0), st.sampled_from(sorted(FAULT_KINDS))), max_size=8
+    ),
     t_s=st.floats(-5.0, 400.0),
 )
 @example(starts=[(5.0, 0.0, "gain"), (0.5, 0.1, "bad_queries")], t_s=14.0)
 def test_a_time_is_quiet_where_no_fault_is_near(starts: list[tuple[float, float, str]], t_s: float) -> None:
-    ledger, at_s = healthy(), 0.0
-    ledger.faults = []
+    observed, at_s = healthy(), 0.0
+    observed.faults = []
     for pause_s, lasts_s, kind in starts:
-        ledger.faults.append(Happened(kind, at_s + pause_s, at_s + pause_s + lasts_s))
+        observed.faults.append(FaultRecord(kind, at_s + pause_s, at_s + pause_s + lasts_s))
         at_s += pause_s + lasts_s
-    windows = [fault.window_s for fault in ledger.faults]
-    assert ledger.quiet(t_s) is not any(begin - 1.0 <= t_s <= end for begin, end in windows)
+    windows = [fault.window_s for fault in observed.faults]
+    assert observed.quiet(t_s) is not any(begin - 1.0 <= t_s <= end for begin, end in windows)
 
 
 def test_a_fault_whose_time_the_run_did_not_have_is_not_judged() -> None:
-    ledger = healthy()
-    for second in ledger.seconds[36:]:
+    observed = healthy()
+    for second in observed.seconds[36:]:
         second.error_sum_um = 1000.0
-    ledger.faults.append(Happened("gap", 36.0, 38.5))
-    found = verdict(ledger)
+    observed.faults.append(FaultRecord("gap", 36.0, 38.5))
+    found = verdict(observed)
     assert found["invariants"]["recovers_by_itself"]["held"] is True
     assert "1 of 2 faults not judged" in found["invariants"]["recovers_by_itself"]["text"]
-    ledger = healthy()
-    for second in ledger.seconds[32:]:
+    observed = healthy()
+    for second in observed.seconds[32:]:
         second.error_sum_um = 1000.0
-    ledger.faults.append(Happened("gap", 32.0, 33.0))
-    assert "recovers_by_itself" in broken(verdict(ledger))
+    observed.faults.append(FaultRecord("gap", 32.0, 33.0))
+    assert "recovers_by_itself" in broken(verdict(observed))
 
 
 def test_a_silence_belongs_to_the_fault_that_made_it() -> None:
-    ledger = healthy()
-    ledger.faults.append(Happened("restart_router", 16.0, 16.3))
-    ledger.probes[16].silent_s = 2.7
-    settle(ledger)
-    assert [fault.silent_s for fault in ledger.faults] == [0.02, 2.7]
+    observed = healthy()
+    observed.faults.append(FaultRecord("restart_router", 16.0, 16.3))
+    observed.query_seconds[16].silent_s = 2.7
+    assess_recovery(observed)
+    assert [fault.silent_s for fault in observed.faults] == [0.02, 2.7]
 
 
 def test_a_plan_of_which_nothing_happened_proves_nothing() -> None:
-    ledger = healthy()
-    ledger.faults = []
-    ledger.planned = 3
-    assert "faults_happened" in broken(verdict(ledger))
+    observed = healthy()
+    observed.faults = []
+    observed.planned = 3
+    assert "faults_happened" in broken(verdict(observed))
 
 
 def test_a_lost_record_breaks_the_run() -> None:
@@ -268,29 +274,29 @@ def test_a_lost_record_breaks_the_run() -> None:
 
 def test_what_was_seen_just_before_the_router_went_proves_nothing() -> None:
     """The second in which 640 samples never came has fewer samples than numbers; all its numbers are excused."""
-    ledger = healthy()
+    observed = healthy()
     first = 0
-    for k, second in enumerate(ledger.seconds):
+    for k, second in enumerate(observed.seconds):
         first += 1640 if k == 10 else 1000
         second.seq = first - 1
-    ledger.faults = [Happened("restart_router", 10.4, 10.5)]
-    ((start, stop),) = _excused(ledger).spans
+    observed.faults = [FaultRecord("restart_router", 10.4, 10.5)]
+    ((start, stop),) = _excused(observed).spans
     # From what was not written yet before the fault to the end of the time in which all must be well again.
     assert start == 9_000
-    assert stop == 10_000 + 1640 + 1000 * (math.floor(10.5 + KINDS["restart_router"].recover_s) - 10)
-    ledger.faults = [Happened("gap", 10.4, 10.5)]
-    assert len(_excused(ledger)) == 0
+    assert stop == 10_000 + 1640 + 1000 * (math.floor(10.5 + FAULT_KINDS["restart_router"].recover_s) - 10)
+    observed.faults = [FaultRecord("gap", 10.4, 10.5)]
+    assert len(_excused(observed)) == 0
 
 
 def test_status_is_flattened() -> None:
     told = {"seq": 5, "samples": {"received": 6, "gates": {"learnt": 4}}, "recorder": None, "stage": "x"}
-    assert flat(told) == {"samples.received": 6.0, "samples.gates.learnt": 4.0, "seq": 5.0, "serves": 1.0}
+    assert flatten_status(told) == {"samples.received": 6.0, "samples.gates.learnt": 4.0, "seq": 5.0, "serves": 1.0}
 
 
 def test_packed_counters_are_those_that_were_given() -> None:
-    rows = [Row({"a": 1.0, "b": 2.0}), Row({"a": 3.0, "b": 4.0}), Row({"c": 5.0})]
+    rows = [Counters({"a": 1.0, "b": 2.0}), Counters({"a": 3.0, "b": 4.0}), Counters({"c": 5.0})]
     assert [dict(row) for row in rows] == [{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 4.0}, {"c": 5.0}]
     assert rows[2].get("a", 0.0) == 0.0
-    probe = probe_of({"service_us": [1.5], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.1, "ages_s": [0.5],
-                      "error": ""}, 3.0)  # fmt: skip
+    line = {"service_us": [1.5], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.1, "ages_s": [0.5], "error": ""}
+    probe = query_second(line, 3.0)
     assert (list(probe.service_us), len(probe.echo_us), probe.t_s) == ([1.5], 0, 3.0)

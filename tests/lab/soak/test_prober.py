@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from lab.soak.processes.control import Control
-from lab.soak.processes.prober import Prober
-from lab.soak.processes.retry import Patience
-from lab.soak.verdict.ledger import Happened, Ledger
+from lab.soak.prober import OverlappingQueries, Prober
+from lab.soak.task import ControlTask
+from lab.soak.verdict.observations import FaultRecord, Observations
 from lab.soak.verdict.outcome import COLUMNS, write_seconds
 from service.protocol.errors import NoReplyError
 from service.protocol.reply import Answer, Point
@@ -48,8 +47,8 @@ def a_point(u_V: float) -> Point:
 
 @contextmanager
 def probing(answers: Slow, ways: int = 4) -> Iterator[Prober]:
-    control = Control(1e-3, 10.0, 90.0, 1, 0.0, 100.0, 1000.0)
-    with Patience([answers] * ways, AGAIN_S) as points, Patience([len], AGAIN_S) as echoes:
+    control = ControlTask(1e-3, 10.0, 90.0, 1, 0.0, 100.0, 1000.0)
+    with OverlappingQueries([answers] * ways, AGAIN_S) as points, OverlappingQueries([len], AGAIN_S) as echoes:
         yield Prober(control, points, echoes)
 
 
@@ -64,7 +63,7 @@ def test_answers_slower_than_the_next_question_end_the_silence() -> None:
     """Each takes half as long again as an answer is waited for: given up at that time there would never be one."""
     with probing(Slow((1.5 * AGAIN_S, a_point(50.0)))) as prober:
         ask_for(prober, 8 * AGAIN_S)
-    told = prober.told
+    told = prober.counts
     assert len(told["service_us"]) >= 4
     assert min(told["service_us"]) >= 1.5e6 * AGAIN_S, "their whole time"
     assert told["silent_s"] < 4 * AGAIN_S
@@ -76,14 +75,14 @@ def test_a_lost_answer_costs_no_more_than_asking_again() -> None:
     answers = Slow((8 * AGAIN_S, NoReplyError("lost")), (0.0, a_point(50.0)))
     with probing(answers) as prober:
         prober.ask()
-        assert not prober.told["service_us"]
+        assert not prober.counts["service_us"]
         prober.ask()
-        assert len(prober.told["service_us"]) == 1
+        assert len(prober.counts["service_us"]) == 1
         assert answers.asked_s[1] - answers.asked_s[0] < 4 * AGAIN_S
         time.sleep(9 * AGAIN_S)
         prober.ask()
-    assert prober.told["failed"] == 1
-    assert prober.told["error"] == "lost"
+    assert prober.counts["failed"] == 1
+    assert prober.counts["error"] == "lost"
 
 
 def test_a_silence_is_told_while_it_lasts_and_no_more_are_asked_than_there_are_ways() -> None:
@@ -94,8 +93,8 @@ def test_a_silence_is_told_while_it_lasts_and_no_more_are_asked_than_there_are_w
         assert len(answers.asked_s) == 2
         assert '"silent_s": 0.' in prober.report()
         ask_for(prober, 4 * AGAIN_S)
-        assert prober.told["failed"] >= 2
-        assert not prober.told["service_us"]
+        assert prober.counts["failed"] >= 2
+        assert not prober.counts["service_us"]
 
 
 @pytest.mark.parametrize(("second_V", "unsafe"), [(51.0, 0), (51.1, 1), (float("nan"), 1), (-0.5, 1)])
@@ -103,28 +102,28 @@ def test_what_an_answer_promised_is_held_against_the_voltage_before(second_V: fl
     with probing(Slow((0.0, a_point(50.0)), (0.0, a_point(second_V)))) as prober:
         prober.ask()
         prober.ask()
-    assert prober.told["unsafe"] == unsafe
-    assert len(prober.told["service_us"]) == 2
+    assert prober.counts["unsafe"] == unsafe
+    assert len(prober.counts["service_us"]) == 2
 
 
 def test_an_answer_that_cannot_be_read_is_unsafe() -> None:
     with probing(Slow((0.0, InputError("u_V: 3 bytes")))) as prober:
         prober.ask()
-    assert (prober.told["unsafe"], prober.told["failed"], prober.told["error"]) == (1, 0, "u_V: 3 bytes")
+    assert (prober.counts["unsafe"], prober.counts["failed"], prober.counts["error"]) == (1, 0, "u_V: 3 bytes")
 
 
-def rows_of(ledger: Ledger, path: Path) -> list[dict[str, str]]:
-    write_seconds(path, ledger)
+def rows_of(observed: Observations, path: Path) -> list[dict[str, str]]:
+    write_seconds(path, observed)
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def test_every_second_of_a_run_has_its_row(tmp_path: Path) -> None:
-    ledger = healthy(40)
-    ledger.faults.append(Happened("nan", 38.5))
-    ledger.bare, ledger.others = [(20.4, 0.012), (20.9, 0.3)], [(20.2, 0.25)]
-    del ledger.probes[30], ledger.seconds[30]
-    rows = rows_of(ledger, tmp_path / "seconds.csv")
+    observed = healthy(40)
+    observed.faults.append(FaultRecord("nan", 38.5))
+    observed.loop_delays, observed.other_load = [(20.4, 0.012), (20.9, 0.3)], [(20.2, 0.25)]
+    del observed.query_seconds[30], observed.seconds[30]
+    rows = rows_of(observed, tmp_path / "seconds.csv")
     assert tuple(rows[0]) == COLUMNS
     assert [row["t_s"] for row in rows] == [str(k) for k in range(40)]
     assert [row["fault"] for row in rows] == [""] * 10 + ["gap"] * 2 + [""] * 26 + ["nan"] * 2

@@ -5,15 +5,14 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lab.soak.faults.catalogue import KINDS
-from lab.soak.faults.plan import LATE_S, Planned, Schedule, SoakPlan, make_plan
+from lab.soak.fault_plan import FAULT_KINDS, LATE_S, PlannedFault, Schedule, SoakPlan, make_plan
 
 
-def plan_of(*faults: Planned, duration_s: float = 60.0) -> SoakPlan:
+def plan_of(*faults: PlannedFault, duration_s: float = 60.0) -> SoakPlan:
     return SoakPlan(duration_s, 1, faults, ())
 
 
-GAP, NAN = Planned("gap", 6.0, 1.0), Planned("nan", 20.0, 1.0)
+GAP, NAN = PlannedFault("gap", 6.0, 1.0), PlannedFault("nan", 20.0, 1.0)
 
 
 def test_a_fault_comes_when_it_is_planned() -> None:
@@ -49,7 +48,7 @@ def test_one_that_may_not_happen_yet_waits_and_so_do_those_behind_it() -> None:
 
 
 def test_what_has_no_time_left_to_recover_is_left_out_and_said() -> None:
-    last = Planned("restart_stage", 45.0, 1.0)
+    last = PlannedFault("restart_stage", 45.0, 1.0)
     schedule = Schedule(plan_of(GAP, last, NAN), lambda _: True)
     assert schedule.due(6.0) == (0, GAP)
     schedule.over(0, 12.0)
@@ -66,7 +65,7 @@ def test_what_has_no_time_left_to_recover_is_left_out_and_said() -> None:
 @settings(max_examples=40, deadline=None)
 def test_however_long_a_machine_takes_to_begin_them_each_has_its_time(seed: int, starts_s: list[float]) -> None:
     """Once a fault began when the run was as good as over, and that nobody had told of it was held against the rest."""
-    plan = make_plan(200.0, seed, tuple(KINDS))
+    plan = make_plan(200.0, seed, tuple(FAULT_KINDS))
     schedule = Schedule(plan, lambda _: True)
     now_s, well_s, began = 0.0, 0.0, []
     while now_s < plan.duration_s:
@@ -78,9 +77,9 @@ def test_however_long_a_machine_takes_to_begin_them_each_has_its_time(seed: int,
         assert now_s >= well_s - LATE_S
         start_s = starts_s[len(began) % len(starts_s)]
         began.append(index)
-        assert now_s + fault.duration_s + KINDS[fault.kind].recover_s <= plan.duration_s + LATE_S
+        assert now_s + fault.duration_s + FAULT_KINDS[fault.kind].recover_s <= plan.duration_s + LATE_S
         now_s += start_s + fault.duration_s
         schedule.over(index, now_s)
-        well_s = now_s + KINDS[fault.kind].recover_s
+        well_s = now_s + FAULT_KINDS[fault.kind].recover_s
     assert began == sorted(set(began))
     assert len(began) + len(schedule.left_out()) == len(plan.faults)

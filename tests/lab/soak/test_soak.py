@@ -19,15 +19,13 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from lab.commands.soak import seconds
-from lab.soak.faults.catalogue import KINDS
-from lab.soak.faults.plan import TAIL_S, WARM_S, known_kinds, make_plan
-from lab.soak.processes.control import Control
-from lab.soak.processes.machine import Others, taken_s
-from lab.soak.reference import PERIOD_S, SoakReference
-from lab.soak.verdict.track import Intervals
+from lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
+from lab.soak.machine_load import OtherLoad, processor_times_s
+from lab.soak.task import PERIOD_S, ControlTask, SoakReference
+from lab.soak.verdict.observations import Intervals
 from service.stage_node.faults import Fault, Injector, decode_fault
 
-CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
+CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 
 
 # ---- the plan
@@ -36,33 +34,33 @@ CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 @given(seed=st.integers(0, 2**31), duration_s=st.floats(15.0, 4000.0))
 @settings(max_examples=30, deadline=None)
 def test_faults_follow_one_another_with_time_to_recover(seed: int, duration_s: float) -> None:
-    plan = make_plan(duration_s, seed, tuple(KINDS))
-    assert plan == make_plan(duration_s, seed, tuple(KINDS))
+    plan = make_plan(duration_s, seed, tuple(FAULT_KINDS))
+    assert plan == make_plan(duration_s, seed, tuple(FAULT_KINDS))
     last = WARM_S
     for fault in plan.faults:
         assert fault.at_s >= last
-        low, high = KINDS[fault.kind].duration_s
+        low, high = FAULT_KINDS[fault.kind].duration_s
         assert low <= fault.duration_s <= high + 1e-3
         last = fault.window_s[1]
     assert not plan.faults or last <= duration_s - TAIL_S
-    assert set(plan.left_out) | {fault.kind for fault in plan.faults} == set(KINDS)
+    assert set(plan.left_out) | {fault.kind for fault in plan.faults} == set(FAULT_KINDS)
 
 
 def test_what_ends_a_service_comes_early_in_a_long_run() -> None:
-    plan = make_plan(1800.0, 1, tuple(KINDS))
+    plan = make_plan(1800.0, 1, tuple(FAULT_KINDS))
     assert not plan.left_out
-    ends = [fault.at_s for fault in plan.faults if KINDS[fault.kind].ends_service]
+    ends = [fault.at_s for fault in plan.faults if FAULT_KINDS[fault.kind].ends_service]
     assert len(ends) >= 4
     assert max(ends) <= 0.4 * 1800.0
-    assert make_plan(1800.0, 2, tuple(KINDS)).faults != plan.faults
+    assert make_plan(1800.0, 2, tuple(FAULT_KINDS)).faults != plan.faults
     gains = [fault.value for fault in plan.faults if fault.kind == "gain"]
     assert gains[0] < 0.0 == gains[1], "there and back again"
 
 
 def test_unknown_kinds_and_odd_durations_are_refused() -> None:
     with pytest.raises(InputError, match="--faults: got 'fire', expected none, or some of: kill_primary"):
-        known_kinds(["nan", "fire"])
-    assert known_kinds([]) == tuple(KINDS)
+        select_kinds(["nan", "fire"])
+    assert select_kinds([]) == tuple(FAULT_KINDS)
     asked = {"90s": 90.0, "30m": 1800.0, "2h": 7200.0, "3d": 259_200.0, "45": 45.0}
     assert {text: seconds(text) for text in asked} == asked
     for text in ("3s", "abc", "10x", "1e9h", ""):
@@ -201,7 +199,7 @@ def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
 
 
 def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> None:
-    others = Others()
+    others = OtherLoad()
     assert others.share({1: 0.0}) is None, "a moment ago"
     time.sleep(0.25)
     assert others.share({1: 0.0}) is None, "the first look only begins"
@@ -241,24 +239,24 @@ def test_what_a_process_has_begun_is_its_own_while_it_lives_and_after() -> None:
         assert parent.stdin is not None
         assert parent.stdout is not None
         assert parent.stdout.readline() == "burnt\n"
-        living = taken_s([parent.pid, os.getpid()])
+        living = processor_times_s([parent.pid, os.getpid()])
         assert living[parent.pid] >= 0.3
         (child,) = psutil.Process(parent.pid).children()
-        apart = taken_s([parent.pid, child.pid])
+        apart = processor_times_s([parent.pid, child.pid])
         assert apart[child.pid] >= 0.3
         assert apart[parent.pid] < living[parent.pid], "one that is a root itself is not counted twice"
         parent.stdin.write("\n")
         parent.stdin.flush()
         assert parent.stdout.readline() == "reaped\n"
         # In ticks of a hundredth: sums of the same ticks in another order differ in the last bit.
-        alive, reaped = (round(100.0 * took[parent.pid]) for took in (living, taken_s([parent.pid])))
+        alive, reaped = (round(100.0 * took[parent.pid]) for took in (living, processor_times_s([parent.pid])))
         assert alive <= reaped < alive + 30
-    before = taken_s([os.getpid()])[os.getpid()]
+    before = processor_times_s([os.getpid()])[os.getpid()]
     assert before == pytest.approx(sum(psutil.Process().cpu_times()[:2]), abs=0.2), "none that it has outlived"
-    assert parent.pid not in taken_s([parent.pid])
+    assert parent.pid not in processor_times_s([parent.pid])
 
 
 def test_control_goes_through_its_file(tmp_path: Path) -> None:
     CONTROL.write(tmp_path / "c.json")
-    assert Control(**json.loads((tmp_path / "c.json").read_text())) == CONTROL
+    assert ControlTask(**json.loads((tmp_path / "c.json").read_text())) == CONTROL
     assert replace(CONTROL, seed=4) != CONTROL

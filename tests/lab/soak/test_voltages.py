@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.soak.processes.control import AXIS, STAGE, Control
-from lab.soak.verdict.ledger import Happened, Ledger
+from lab.soak.task import AXIS, STAGE, ControlTask
 from lab.soak.verdict.monitor import Monitor
-from lab.soak.verdict.track import Track
+from lab.soak.verdict.observations import FaultRecord, Observations, SampleTracker
 from service.protocol import samples as wire
 from service.runtime.session import open_router
 from tests.lab.soak.soaked import broken, healthy, verdict
 
-CONTROL = Control(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
+CONTROL = ControlTask(1e-3, 4.0, 80.0, 3, -2.0, 10.0, 4000.0)
 STEP_V = 4.0
 FIRST = 1_000_000_000
 
@@ -28,7 +27,7 @@ class Driven:
 
     def __init__(self, first: int = FIRST) -> None:
         self.now = 10.0
-        self.track = Track(CONTROL, lambda: self.now)
+        self.track = SampleTracker(CONTROL, lambda: self.now)
         self.rest(first)
 
     def rest(self, first: int) -> None:
@@ -52,11 +51,11 @@ class Driven:
             self.track.take(wire.SampleBatch(one, one * 1e-3, np.array([self._u_V]), np.array([40.0])))
         self._k = stop
 
-    def broken(self, *faults: Happened) -> set[str]:
-        ledger = healthy()
-        ledger.faults += faults
-        ledger.seconds += [second for second in self.track.seconds if second.t_s >= 40.0]
-        return {name for name in broken(verdict(ledger)) if name.startswith(("voltages", "takeover"))}
+    def broken(self, *faults: FaultRecord) -> set[str]:
+        observed = healthy()
+        observed.faults += faults
+        observed.seconds += [second for second in self.track.seconds if second.t_s >= 40.0]
+        return {name for name in broken(verdict(observed)) if name.startswith(("voltages", "takeover"))}
 
 
 @pytest.fixture
@@ -98,7 +97,7 @@ def test_what_the_stage_clamps_breaks_the_run_as_it_was_sent(
 def test_a_jump_at_a_take_over_is_one_of_what_was_sent(driven: Driven) -> None:
     driven.send(FIRST + 3, 8.0)
     driven.run(FIRST + 4)
-    fault = Happened("kill_primary", 44.5, 44.5)
+    fault = FaultRecord("kill_primary", 44.5, 44.5)
     assert "takeover_continuous" in driven.broken(fault)
 
 
@@ -134,7 +133,7 @@ def test_while_no_router_is_there_what_was_sent_may_have_come_to_nobody(driven: 
     driven.send(FIRST + 3, 6.0, 10.0, reaches=False, seen=False)
     driven.send(FIRST + 5, 9.0)
     driven.run(FIRST + 6)
-    assert driven.broken(Happened("restart_router", 44.5, 44.6)) == set()
+    assert driven.broken(FaultRecord("restart_router", 44.5, 44.6)) == set()
     assert driven.broken() == {"voltages_within_slew"}
 
 
@@ -173,9 +172,9 @@ def test_a_command_that_cannot_be_read_is_no_safe_one(free_port: int) -> None:
             server.put(key, poisoned)
             _until(lambda: monitor.malformed > 0)
             assert sum(s.sent_not_finite for s in monitor.track.seconds) == 1
-            ledger: Ledger = healthy()
-            ledger.seconds += monitor.track.seconds
-            assert broken(verdict(ledger)) == {"voltages_finite"}
+            observed: Observations = healthy()
+            observed.seconds += monitor.track.seconds
+            assert broken(verdict(observed)) == {"voltages_finite"}
         finally:
             monitor.close()
 

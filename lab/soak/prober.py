@@ -1,8 +1,7 @@
-"""A second client of a soak as a process: asks for points and a bare echo in turns, and follows the model.
+"""A measuring client of a soak as a process: it asks for points and for a bare echo in turns, and follows the model.
 
-``python -m lab.soak.processes.prober CONTROL.json ENDPOINT`` prints a line of JSON every second: round trips in µs,
-how long
-nobody answered, voltages that were not as promised, and with every query how old the followed model was.
+``python -m lab.soak.prober TASK.json ENDPOINT`` prints a line of JSON every second: round trips in µs, the longest
+time without an answer, answers that broke a promise, and the age of the followed model at each query.
 """
 
 from __future__ import annotations
@@ -11,18 +10,21 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError, InputError
-from lab.soak.processes.control import AXIS, STAGE, Control
-from lab.soak.processes.extras import ECHO_KEY
-from lab.soak.processes.retry import MOST, Outcome, Patience
+from lab.soak.task import AXIS, STAGE, ControlTask
+from lab.testbed.side_processes import ECHO_KEY
 from service.client.client import Client
 from service.protocol.errors import NoReplyError
 from service.protocol.query import encode_query
@@ -30,11 +32,87 @@ from service.protocol.reply import Answer, Point, encode_reply
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 
+# --- Queries that overlap
+
+Asks = TypeVar("Asks")
+Gets = TypeVar("Gets")
+
+#: Most questions without an answer at a time.
+MOST: Final = 12
+
+
+@dataclass(frozen=True, slots=True)
+class QueryOutcome(Generic[Asks, Gets]):
+    """What became of a question.
+
+    Attributes
+    ----------
+    asked : the question. answer : None where there was none, for the reason in ``error``. took_us : round trip, µs.
+    at_s : when it was over, s of the monotonic clock.
+    """
+
+    asked: Asks
+    answer: Gets | None
+    error: DehystError | None
+    took_us: float
+    at_s: float
+
+
+class OverlappingQueries(Generic[Asks, Gets]):
+    """Asks in threads of its own; use as a context manager.
+
+    Parameters
+    ----------
+    ways : functions that ask and wait for the answer, one for each question that may be under way at a time: none is
+        called while its last call lasts. They raise DehystError where there is no answer, after at most a second or so.
+    again_s : how long :meth:`ask` waits for an answer, s.
+    """
+
+    def __init__(self, ways: Sequence[Callable[[Asks], Gets]], again_s: float) -> None:
+        self._idle = list(ways)
+        self._again_s = again_s
+        self._pool = ThreadPoolExecutor(len(ways), thread_name_prefix="soak-ask")
+        self._under_way: dict[Future[QueryOutcome[Asks, Gets]], Callable[[Asks], Gets]] = {}
+
+    def __enter__(self) -> OverlappingQueries[Asks, Gets]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown()
+
+    def ask(self, question: Asks) -> list[QueryOutcome[Asks, Gets]]:
+        """Ask, wait until this or an earlier question is over, and return all that are, in that order.
+
+        Empty where none was over in ``again_s``; what is under way is then left so, and another call asks beside it.
+        """
+        if self._idle:
+            way = self._idle.pop()
+            self._under_way[self._pool.submit(_asked, way, question)] = way
+        over, _ = wait(self._under_way, self._again_s, return_when=FIRST_COMPLETED)
+        self._idle += [self._under_way.pop(future) for future in over]
+        return sorted((future.result() for future in over), key=lambda outcome: outcome.at_s)
+
+
+def _asked(way: Callable[[Asks], Gets], question: Asks) -> QueryOutcome[Asks, Gets]:
+    begin = time.perf_counter()
+    answer: Gets | None = None
+    failure: DehystError | None = None
+    try:
+        answer = way(question)
+    except DehystError as error:
+        failure = error
+    return QueryOutcome(question, answer, failure, 1e6 * (time.perf_counter() - begin), time.monotonic())
+
+
+# --- The prober
+
 #: Pause between two rounds of one query and one echo; how long an answer is waited for before another is asked for
 #: beside it; and the time-out of both, s.
 PAUSE_S, AGAIN_S, TIMEOUT_S = 0.01, 0.1, 1.0
 
-Told = Outcome[Point | None, Point]
+Told = QueryOutcome[Point | None, Point]
 
 
 class Prober:
@@ -43,14 +121,19 @@ class Prober:
     ``points`` asks for a point after another one; ``echoes`` sends so many bytes there and back.
     """
 
-    def __init__(self, control: Control, points: Patience[Point | None, Point], echoes: Patience[bytes, int]) -> None:
+    def __init__(
+        self,
+        control: ControlTask,
+        points: OverlappingQueries[Point | None, Point],
+        echoes: OverlappingQueries[bytes, int],
+    ) -> None:
         self._control, self._points, self._echoes = control, points, echoes
         self._last: Point | None = None
         self._answered_s = time.monotonic()
         self._clear()
 
     def _clear(self) -> None:
-        self.told: dict[str, Any] = {
+        self.counts: dict[str, Any] = {
             "service_us": [], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.0, "error": "", "ages_s": [],
         }  # fmt: skip
 
@@ -60,7 +143,7 @@ class Prober:
             self._take(outcome)
 
     def _take(self, outcome: Told) -> None:
-        told = self.told
+        told = self.counts
         if outcome.answer is None:
             # What could be read, but not as an answer, is worse than none.
             told["unsafe" if isinstance(outcome.error, InputError) else "failed"] += 1
@@ -83,17 +166,17 @@ class Prober:
 
     def echo(self, payload: bytes) -> None:
         """The bare round trip of as many bytes there and back."""
-        self.told["echo_us"] += [round(o.took_us, 1) for o in self._echoes.ask(payload) if o.answer is not None]
+        self.counts["echo_us"] += [round(o.took_us, 1) for o in self._echoes.ask(payload) if o.answer is not None]
 
     def look(self, age_s: float) -> None:
         """At the age of the followed model, s."""
-        self.told["ages_s"].append(round(age_s, 4))
+        self.counts["ages_s"].append(round(age_s, 4))
 
     def report(self) -> str:
         """The second's line, and a new second."""
         # A silence that has not ended is told too.
-        self.told["silent_s"] = round(max(self.told["silent_s"], time.monotonic() - self._answered_s), 4)
-        line = json.dumps({"t_s": round(time.monotonic(), 3), **self.told})
+        self.counts["silent_s"] = round(max(self.counts["silent_s"], time.monotonic() - self._answered_s), 4)
+        line = json.dumps({"t_s": round(time.monotonic(), 3), **self.counts})
         self._clear()
         return line
 
@@ -110,7 +193,7 @@ def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
     stop = StopSignal()
     sys.setswitchinterval(5e-5)
-    control = Control(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
+    control = ControlTask(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     y_um = 0.5 * (control.low_um + control.high_um)
 
     def point(client: Client, before: Point | None) -> Point:
@@ -128,8 +211,8 @@ def main(argv: list[str]) -> int:
                     stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)
                 ]
                 queriers = [session.declare_querier(key, timeout=TIMEOUT_S, express=True) for _ in range(MOST)]
-                points = stack.enter_context(Patience([partial(point, each) for each in clients], AGAIN_S))
-                echoes = stack.enter_context(Patience([partial(_echo, each) for each in queriers], AGAIN_S))
+                points = stack.enter_context(OverlappingQueries([partial(point, each) for each in clients], AGAIN_S))
+                echoes = stack.enter_context(OverlappingQueries([partial(_echo, each) for each in queriers], AGAIN_S))
                 prober = Prober(control, points, echoes)
                 follower = client.follow()
                 print("ready", flush=True)

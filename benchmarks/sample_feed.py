@@ -1,6 +1,6 @@
-"""The processes beside a latency benchmark: a bare zenoh echo, and a stage that sends samples at a steady rate.
+"""The stage of a latency benchmark as a process: it publishes recorded samples over and over at a steady rate.
 
-``python -m benchmarks.latency_processes echo ENDPOINT`` and ``... feed ENDPOINT FILE.npz RATE_HZ BATCH MESSAGE``.
+``python -m benchmarks.sample_feed ENDPOINT FILE.npz RATE_HZ BATCH MESSAGE``.
 """
 
 from __future__ import annotations
@@ -11,47 +11,24 @@ import time
 from pathlib import Path
 
 import numpy as np
-import zenoh
 
 from adaptive.types import FloatArray
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
 from service.runtime.delivery import SURELY, wait_followed
-from service.runtime.session import open_client, open_service
+from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
-from service.server.process import tune_process
 
-#: Where the echo answers: the number of bytes of its reply stands in the key.
-ECHO_KEY = "echo"
 STAGE, AXIS = "bench", "x"
-#: How long the stage waits for somebody to listen before its first sample, and for its last one to be on its way, s.
-_HEARD_S = 20.0
+#: How long the stage waits for a subscriber before its first sample, s.
+_SUBSCRIBED_S = 20.0
+#: How long the last message may take to leave the process, s.
 _FLUSH_S = 0.3
 
 
-def echo(endpoint: str) -> int:
-    """Answer every query on ``echo/BYTES`` with as many bytes, the payload read as the service reads it."""
-    tune_process()
-    stop = StopSignal()
-
-    def answer(query: zenoh.Query) -> None:
-        with query:
-            key = str(query.key_expr)
-            if query.payload is not None:
-                query.payload.to_bytes()
-            query.reply(key, bytes(int(key.rpartition("/")[2])))
-
-    with open_service([endpoint]) as session:
-        queryable = session.declare_queryable(f"{ECHO_KEY}/*", answer)
-        print("ready", flush=True)
-        stop.wait()
-        queryable.undeclare()
-    return 0
-
-
 def sent(u_V: FloatArray, y_um: FloatArray, rate_hz: float, batch: int, message: int) -> SampleBatch:
-    """The samples of message number ``message``: (n,) voltages V and readings µm over and over, ``batch`` a message."""
+    """The samples of message number ``message``, ``batch`` of them, from (n,) voltages, V, and readings, µm."""
     seq = np.arange(message * batch, (message + 1) * batch)
     at = message % (u_V.size // batch) * batch
     return SampleBatch(seq, seq / rate_hz, u_V[at : at + batch], y_um[at : at + batch])
@@ -61,15 +38,15 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
     """Publish the samples in ``path`` (arrays u_V and y_um) at ``rate_hz``, over and over, ``batch`` a message, from
     message number ``first`` on.
 
-    Begins when it is heard, so that the first sample that it counts is the first that arrives.
+    Begins when there is a subscriber, so that the first sample counted is the first that arrives.
     """
     stop = StopSignal()
     with np.load(path) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
     with open_client(endpoint, 10.0) as session:
         publisher = session.declare_publisher(Keys(STAGE, AXIS).sample, congestion_control=SURELY, express=True)
-        if not wait_followed(publisher, _HEARD_S):
-            print("nobody listens to the samples", file=sys.stderr)
+        if not wait_followed(publisher, _SUBSCRIBED_S):
+            print("no subscriber to the samples", file=sys.stderr)
             return 1
         print("ready", flush=True)
         start, k, late, worst_s = time.perf_counter(), 0, 0, 0.0
@@ -93,6 +70,4 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "echo":
-        sys.exit(echo(sys.argv[2]))
-    sys.exit(feed(sys.argv[2], Path(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5]), int(sys.argv[6])))
+    sys.exit(feed(sys.argv[1], Path(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]), int(sys.argv[5])))

@@ -1,8 +1,7 @@
-"""``dehyst`` with a wall clock that can be set back from outside.
+"""``dehyst`` with a wall clock that another process can set back.
 
-``python -m lab.soak.processes.clocked FILE COMMAND ...``: the seconds in FILE (8 bytes, a double) are added to what
-Python's
-``time.time`` says. The clock of the machine belongs to others, and to set it takes rights that a soak should not have.
+``python -m lab.testbed.shifted_clock FILE COMMAND ...`` adds the seconds in FILE (8 bytes, a double) to ``time.time``
+of this process. The system clock stays as it is: to set it needs rights that a test should not have.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ _SECONDS = struct.Struct("<d")
 
 
 def write_offset(path: Path, seconds: float) -> None:
-    """Set the clock of whoever runs with ``path``; the file keeps its place, since it is mapped."""
+    """Set the clock of the process that runs with ``path``. The file is mapped, so it is written in place."""
     if not path.exists():
         path.write_bytes(_SECONDS.pack(seconds))
         return
@@ -26,7 +25,7 @@ def write_offset(path: Path, seconds: float) -> None:
 
 
 def patch_clock(path: Path) -> None:
-    """Let ``time.time`` and ``time.time_ns`` of this process follow the file."""
+    """Make ``time.time`` and ``time.time_ns`` of this process follow the file."""
     real, real_ns = time.time, time.time_ns
     with path.open("rb") as file:
         shared = mmap.mmap(file.fileno(), _SECONDS.size, access=mmap.ACCESS_READ)

@@ -1,8 +1,7 @@
-"""The controller of a soak as a process: it asks ahead, sends what it gets, and never gives up.
+"""The controller of a soak as a process: it asks for voltages ahead of time and sends them until it is stopped.
 
-``python -m lab.soak.processes.controller CONTROL.json ENDPOINT``. Where no answer comes before a block is due the
-stage holds
-its last voltage, and the controller goes on with the next block.
+``python -m lab.soak.controller TASK.json ENDPOINT``. If no answer comes before a block is due, the stage holds its
+last voltage and the controller goes on with the next block.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError, InputError
-from lab.soak.processes.control import AXIS, STAGE, Control
-from lab.soak.reference import SoakReference
+from lab.soak.task import AXIS, STAGE, ControlTask, SoakReference, dwell_key
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
@@ -36,11 +34,6 @@ REPORT_S = 1.0
 #: An answer that comes less than so many ticks before its block is due may not reach the stage in time: it is not sent,
 #: since a block that arrives half over would make the stage jump.
 MARGIN = 10
-
-
-def control_key() -> str:
-    """Where the controller of a soak is told to rest: JSON {"first": tick, "ticks": n}."""
-    return f"{Keys(STAGE, AXIS).base}/soak_dwell"
 
 
 class StageClock:
@@ -97,13 +90,13 @@ class StageClock:
 class Controller:
     """One run; `run` returns when stopped."""
 
-    def __init__(self, control: Control, client: Client, session: zenoh.Session) -> None:
+    def __init__(self, control: ControlTask, client: Client, session: zenoh.Session) -> None:
         self.control = control
         self.reference = SoakReference(control.dt_s, control.low_um, control.high_um, control.seed)
         self.counts = {"blocks": 0, "answered": 0, "given_up": 0, "retries": 0, "errors": 0, "fallback": 0, "unsafe": 0}
         self._client = client
         self._session = session
-        self._dwells = session.declare_subscriber(control_key(), self._rest)
+        self._dwells = session.declare_subscriber(dwell_key(), self._rest)
         key = Keys(STAGE, AXIS).command
         self._commands = session.declare_publisher(key, congestion_control=SURELY, express=True)
         self._last_V = math.nan
@@ -185,7 +178,7 @@ def main(argv: list[str]) -> int:
     stop = StopSignal()
     # The wire's threads must not wait 5 ms for the interpreter.
     sys.setswitchinterval(5e-5)
-    control = Control(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
+    control = ControlTask(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     from service.runtime.session import open_client
 
     try:

@@ -1,4 +1,4 @@
-"""A client that sends what nobody can use, to every key of an axis that is open to clients."""
+"""A client that sends malformed messages to every key of an axis that is open to clients."""
 
 from __future__ import annotations
 
@@ -10,63 +10,60 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from lab.soak.processes.control import AXIS, STAGE
 from service.operating.request import MAX_BYTES
-from service.protocol.keys import Keys
 from service.protocol.query import encode_query
 from service.protocol.samples import encode_reference, encode_samples
 from service.runtime.delivery import SURELY
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 
-#: Messages a second. Nobody is to be kept from asking: a burst is many, not all there is room for.
+#: Messages per second: many, but other clients must still get through.
 RATE_HZ: Final = 200.0
-#: Whom it is sent to, in turns: samples are published, the others are queries. The status takes none, and answers.
-AIMS: Final = (
+#: Keys in turn. Samples are published, the others are queries. The status takes no payload and answers anyway.
+TARGETS: Final = (
     "feedforward", "sample", "model", "feedforward", "operate", "feedforward", "sample", "status",
 )  # fmt: skip
 
 
-def rubbish(endpoint: str, seed: int) -> int:
-    """Send until stopped; prints how many queries got an error, an answer, nothing, and how many were published."""
+def send_malformed(endpoint: str, base_key: str, seed: int) -> int:
+    """Send until stopped. Prints how many queries got an error, an answer or nothing, and how many were published."""
     stop = StopSignal()
     rng = np.random.default_rng(seed)
-    keys = Keys(STAGE, AXIS)
-    got = {"error": 0, "answer": 0, "nothing": 0, "published": 0}
+    counts = {"error": 0, "answer": 0, "nothing": 0, "published": 0}
     with open_client(endpoint, 20.0) as session:
         print("ready", flush=True)
         due = time.monotonic()
         count = 0
         while not stop.reason:
-            what = AIMS[count % len(AIMS)]
+            target = TARGETS[count % len(TARGETS)]
             count += 1
-            payload = PAYLOADS[what](rng)
-            if what == "sample":
-                session.put(keys.sample, payload, congestion_control=SURELY)
-                got["published"] += 1
+            payload = PAYLOADS[target](rng)
+            if target == "sample":
+                session.put(f"{base_key}/sample", payload, congestion_control=SURELY)
+                counts["published"] += 1
             else:
-                got[_asked(session, f"{keys.base}/{what}{_parameters(what, rng)}", payload)] += 1
-            # What an answer took longer is not made up for.
+                counts[_result_of_query(session, f"{base_key}/{target}{_parameters(target, rng)}", payload)] += 1
+            # A slow answer delays all later messages; the rate stays bounded.
             due = max(due + 1.0 / RATE_HZ, time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
-    print(json.dumps(got), flush=True)
+    print(json.dumps(counts), flush=True)
     return 0
 
 
-def _asked(session: zenoh.Session, selector: str, payload: bytes) -> str:
-    said = "nothing"
+def _result_of_query(session: zenoh.Session, selector: str, payload: bytes) -> str:
+    result = "nothing"
     for reply in session.get(selector, payload=payload, timeout=1.0):
-        said = "error" if reply.err is not None else "answer"
-    return said
+        result = "error" if reply.err is not None else "answer"
+    return result
 
 
-def _parameters(what: str, rng: np.random.Generator) -> str:
-    """Of a query for a model: the name of one that there is not."""
-    return f"?name={rng.bytes(int(rng.integers(1, 60))).hex()}" if what == "model" else ""
+def _parameters(target: str, rng: np.random.Generator) -> str:
+    """For a model query: the name of a model that does not exist."""
+    return f"?name={rng.bytes(int(rng.integers(1, 60))).hex()}" if target == "model" else ""
 
 
 def bad_query(rng: np.random.Generator) -> bytes:
-    """Malformed, truncated, oversized, foreign, or of a point or a model that there is not."""
+    """A query that is malformed, truncated or oversized, or asks for a point or a model that does not exist."""
     good = encode_query([40.0], [0.0], [0.0])
     choice = int(rng.integers(6))
     if choice < 3:
@@ -79,13 +76,13 @@ def bad_query(rng: np.random.Generator) -> bytes:
 
 
 def bad_samples(rng: np.random.Generator) -> bytes:
-    """No samples, whatever else: what could be read would be believed, as it would be of any stage."""
+    """A message that cannot be decoded as samples. Samples that can be decoded would be learnt, as those of a stage."""
     good = encode_samples([1, 2, 3], [0.0, 1e-3, 2e-3], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
     choice = int(rng.integers(6))
     if choice < 3:
         return _spoilt(good, choice, rng)
     if choice == 3:
-        # Of another version of the wire.
+        # Another version of the protocol.
         return bytes([int(rng.integers(2, 256))]) + good[1:]
     if choice == 4:
         # More samples than bytes.
@@ -94,7 +91,7 @@ def bad_samples(rng: np.random.Generator) -> bytes:
 
 
 def bad_request(rng: np.random.Generator) -> bytes:
-    """No request of an operator: nothing that could be read, so that nothing is done and nothing is written down."""
+    """A message that cannot be decoded as an operator's request, so that the service changes and records nothing."""
     choice = int(rng.integers(5))
     if choice == 0:
         return _noise(rng)
@@ -108,7 +105,7 @@ def bad_request(rng: np.random.Generator) -> bytes:
 
 
 def _spoilt(good: bytes, how: int, rng: np.random.Generator) -> bytes:
-    """Something else altogether (0), ``good`` truncated (1), or with more behind it (2)."""
+    """Noise (0), ``good`` truncated (1), or ``good`` with bytes appended (2)."""
     if how == 0:
         return _noise(rng)
     if how == 1:
@@ -120,7 +117,7 @@ def _noise(rng: np.random.Generator) -> bytes:
     return rng.bytes(int(rng.integers(0, 400)))
 
 
-#: What is sent to each of them.
+#: What each key gets.
 PAYLOADS: Final[dict[str, Callable[[np.random.Generator], bytes]]] = {
     "feedforward": bad_query,
     "model": _noise,

@@ -1,14 +1,59 @@
-"""What a soak's controller wants: a stretch of the demonstration's reference that repeats, and rests on demand."""
+"""The task of the soak's controller: names on the wire, limits, and the reference."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
+from service.protocol.keys import Keys
 from sim.signals.unseen_reference import DemoReference
+
+STAGE, AXIS = "soak", "x"
+SERVED = "lssvm_adaptive"
+
+
+def dwell_key() -> str:
+    """Key on which the controller is told to hold the reference: JSON {"first": tick, "ticks": n}."""
+    return f"{Keys(STAGE, AXIS).base}/soak_dwell"
+
+
+@dataclass(frozen=True, slots=True)
+class ControlTask:
+    """What the controller does.
+
+    Attributes
+    ----------
+    dt_s : sample time, s. low_um, high_um : range of the reference, µm. seed : of the reference.
+    block, lead : ticks a query, and ticks that it is asked ahead.
+    u_min_V, u_max_V, slew_V_per_s : the limits that every voltage is checked against.
+    """
+
+    dt_s: float
+    low_um: float
+    high_um: float
+    seed: int
+    u_min_V: float
+    u_max_V: float
+    slew_V_per_s: float
+    block: int = 20
+    lead: int = 60
+
+    @property
+    def range_um(self) -> float:
+        """Commanded range, to which all percentages refer."""
+        return self.high_um - self.low_um
+
+    def write(self, path: Path) -> None:
+        """For the controller's process."""
+        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
+
+
+# --- The reference
 
 PERIOD_S = 120.0
 #: Time over which motion fades into rest, and rest into motion, s.

@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lab.soak.faults.plan import SoakPlan
+from lab.soak.fault_plan import SoakPlan
 from lab.soak.live import Say, run_live, withheld
-from lab.soak.processes.setup import identify, stage_of
-from lab.soak.verdict.interim import Interim
-from lab.soak.verdict.judge import TRACKING_PCT, judge, recorded
-from lab.soak.verdict.ledger import FAST, REAL_TIME, Ledger
-from lab.soak.verdict.outcome import SECONDS, summary, write_found, write_seconds
-from lab.soak.verdict.report import report
-from lab.soak.verdict.settling import settle
-from lab.soak.verdict.track import OTHER_LIFE, Intervals
+from lab.soak.rig import identify, stage_config
+from lab.soak.verdict.interim import InterimJudge
+from lab.soak.verdict.invariants import TRACKING_PCT, judge, recorded
+from lab.soak.verdict.observations import FAST, OTHER_LIFE, REAL_TIME, Intervals, Observations, assess_recovery
+from lab.soak.verdict.outcome import SECONDS, report, soak_summary, write_seconds, write_summary
 from service.storage.output_folder import clear_output
 
 #: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
@@ -50,67 +47,67 @@ def run(
     """
     clear_output(out, OURS)
     (out / "logs").mkdir()
-    stage = stage_of(stage_file, plan.seed)
+    stage = stage_config(stage_file, plan.seed)
     say(f"[1/3] identifying stage {stage.name!r} from 10 s of the chapter's signal")
     control = identify(stage, out / "model.npz", plan.seed)
     where = "in one process, as fast as it goes" if fast else "in real time, in processes over zenoh"
     say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, {where}")
     if plan.left_out:
         say(f"      no time for: {', '.join(plan.left_out)}")
-    ledger = Ledger(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
-    ledger.planned = len(plan.faults)
+    observed = Observations(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
+    observed.planned = len(plan.faults)
     # With a stage of one's own the limit is known when the first fault begins; the end judges it.
-    interim = Interim(ledger, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
+    interim = InterimJudge(observed, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
     missing: int | None = None
     if fast:
         from lab.soak.fast import run_fast
 
-        samples = run_fast(out, stage, control, plan, ledger, interim, stopped, say)
+        samples = run_fast(out, stage, control, plan, observed, interim, stopped, say)
     else:
-        monitor = run_live(out, stage, control, plan, ledger, interim, stopped, say)
-        missing, samples = _kept(out, ledger, monitor.track.seen, monitor.track.received)
+        monitor = run_live(out, stage, control, plan, observed, interim, stopped, say)
+        missing, samples = _kept(out, observed, monitor.track.seen, monitor.track.received)
         samples |= {"withheld_by_faults": withheld(monitor.stage)}
-        samples |= {"without_their_voltage_in_time": sum(s.held for s in ledger.seconds)}
+        samples |= {"without_their_voltage_in_time": sum(s.held for s in observed.seconds)}
     say("[3/3] judging and drawing")
-    settle(ledger)
-    invariants = judge(ledger, missing, **_tracking_limit(ledger, stage_file))
-    found = summary(ledger, invariants, samples)
-    ledger.notes += _machine(ledger)
-    interrupted = ledger.duration_s < plan.duration_s - 1.0
-    write_found(out / "soak.json", found)
-    write_seconds(out / SECONDS, ledger)
-    pictures = _draw(out, ledger)
-    text = report(found, ledger, plan, pictures, interrupted)
+    assess_recovery(observed)
+    invariants = judge(observed, missing, **_tracking_limit(observed, stage_file))
+    found = soak_summary(observed, invariants, samples)
+    observed.notes += _machine(observed)
+    interrupted = observed.duration_s < plan.duration_s - 1.0
+    write_summary(out / "soak.json", found)
+    write_seconds(out / SECONDS, observed)
+    pictures = _draw(out, observed)
+    text = report(found, observed, plan, pictures, interrupted)
     (out / "report.md").write_text(text, encoding="utf-8")
     happened = [
         {"kind": f.kind, "begin_s": f.begin_s, "end_s": f.end_s, "recovered_s": f.recovered_s, "silent_s": f.silent_s,
-         "told": f.told, "value": f.value}
-        for f in ledger.faults
+         "told": f.reported_by, "value": f.value}
+        for f in observed.faults
     ]  # fmt: skip
     kept = {"seed": plan.seed, "duration_s": plan.duration_s, "left_out": plan.left_out, "faults": happened}
-    (out / "plan.json").write_text(json.dumps({**kept, "events": ledger.events}, indent=1) + "\n", encoding="utf-8")
+    (out / "plan.json").write_text(json.dumps({**kept, "events": observed.events}, indent=1) + "\n", encoding="utf-8")
     return Done(found, interrupted)
 
 
-def _tracking_limit(ledger: Ledger, stage_file: Path | None) -> dict[str, float]:
+def _tracking_limit(observed: Observations, stage_file: Path | None) -> dict[str, float]:
     if stage_file is None:
         return {}
-    first = ledger.faults[0].begin_s if ledger.faults else ledger.duration_s
-    calm = [s for s in ledger.seconds if s.judged and 2.0 <= s.t_s < first]
+    first = observed.faults[0].begin_s if observed.faults else observed.duration_s
+    calm = [s for s in observed.seconds if s.judged and 2.0 <= s.t_s < first]
     if not calm:
         return {}
     # A second in which the stage had to hold a voltage tells of the machine.
     calm = [s for s in calm if not s.held] or calm
     mae_um = sum(s.error_sum_um for s in calm) / sum(s.judged for s in calm)
-    return {"tracking_pct": OWN_STAGE_RATIO * 100.0 * mae_um / ledger.range_um}
+    return {"tracking_pct": OWN_STAGE_RATIO * 100.0 * mae_um / observed.range_um}
 
 
-def _machine(ledger: Ledger) -> list[str]:
+def _machine(observed: Observations) -> list[str]:
     """How busy the machine was with other things, in words."""
-    if not ledger.bare or not ledger.others:
+    if not observed.loop_delays or not observed.other_load:
         return []
-    late_ms = [1e3 * late_s for _, late_s in ledger.bare]
-    share = [100.0 * share for _, share in ledger.others]
+    late_ms = [1e3 * late_s for _, late_s in observed.loop_delays]
+    share = [100.0 * share for _, share in observed.other_load]
     (usual, often), (late, later) = (_median_and_tenth(values) for values in (share, late_ms))
     return [
         f"the machine: others than the soak had {usual:.0f} % of the cores in the median second, {often:.0f} % in one "
@@ -123,7 +120,7 @@ def _median_and_tenth(values: list[float]) -> tuple[float, float]:
     return ordered[len(ordered) // 2], ordered[len(ordered) * 9 // 10]
 
 
-def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[int, dict[str, int]]:
+def _kept(out: Path, observed: Observations, seen: Intervals, received: int) -> tuple[int, dict[str, int]]:
     """How many samples that came are in no recording though they could be, and the counts of samples."""
     # One that stands by records too, in a folder of its own.
     folders = [out / name / folder for name in ("a", "b") for folder in ("recording", "recording-standby")]
@@ -131,7 +128,7 @@ def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[in
     nowhere = Intervals()
     for start, stop in seen.minus(found):
         nowhere.add(start, stop)
-    missing = sum(stop - start for start, stop in nowhere.minus(_excused(ledger)))
+    missing = sum(stop - start for start, stop in nowhere.minus(_excused(observed)))
     return missing, {
         "seen": len(seen),
         "received_by_monitor": received,
@@ -142,19 +139,19 @@ def _kept(out: Path, ledger: Ledger, seen: Intervals, received: int) -> tuple[in
     }
 
 
-def _excused(ledger: Ledger) -> Intervals:
+def _excused(observed: Observations) -> Intervals:
     """Samples of which the services could not keep what the monitor saw.
 
     While no file may grow nothing can be kept, and behind a router that is gone nothing arrives: the services count
     both, and what the monitor saw then proves nothing.
     """
     excused = Intervals()
-    for fault in ledger.faults:
+    for fault in observed.faults:
         begin, end = fault.window_s
         if fault.kind not in ("disk_full", "restart_router"):
             continue
         # From some time before: whose last second is that which the first of them follows.
-        around = ledger.seconds_between(begin - _BEFORE_S, end)
+        around = observed.seconds_between(begin - _BEFORE_S, end)
         for last, second in itertools.pairwise(around):
             if begin - WAITING_S - 1.0 <= second.t_s <= end and second.samples:
                 # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
@@ -163,16 +160,16 @@ def _excused(ledger: Ledger) -> Intervals:
     return excused
 
 
-def _draw(out: Path, ledger: Ledger) -> list[str]:
+def _draw(out: Path, observed: Observations) -> list[str]:
     from lab.soak.verdict.pictures import draw_error, draw_latency, draw_memory
 
     drawn = []
     for name, draw, there in (
-        ("error.png", draw_error, bool(ledger.seconds)),
-        ("latency.png", draw_latency, bool(ledger.probes)),
-        ("memory.png", draw_memory, bool(ledger.memory)),
+        ("error.png", draw_error, bool(observed.seconds)),
+        ("latency.png", draw_latency, bool(observed.query_seconds)),
+        ("memory.png", draw_memory, bool(observed.memory)),
     ):
         if there:
-            draw(out / name, ledger)
+            draw(out / name, observed)
             drawn.append(name)
     return drawn

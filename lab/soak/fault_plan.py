@@ -1,4 +1,4 @@
-"""The seeded plan of a soak: which fault comes when, in seconds from the start of the watch."""
+"""The faults of a soak: the kinds, the seeded plan, and the schedule that follows the run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,65 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import InputError
-from lab.soak.faults.catalogue import KINDS
+
+# --- The kinds
+
+#: Where a fault happens: to a process, to the stage's samples, to the reference, to the machine.
+PROCESS, STAGE, REFERENCE, MACHINE = "process", "stage", "reference", "machine"
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKind:
+    """One kind of fault.
+
+    Attributes
+    ----------
+    what : for people. where : see above.
+    duration_s : how long it lasts, drawn between the two, s.
+    recover_s : within this time after its end everything is as before: queries answered, tracking good.
+    answered : whether queries are to be answered in time while it lasts. silent_s : for how long they may fail.
+    ends_service : whether it ends a serving process; such come early, so that memory can be watched afterwards.
+    fast : whether a run in one process can suffer it.
+    """
+
+    what: str
+    where: str
+    duration_s: tuple[float, float]
+    recover_s: float
+    silent_s: float = 0.0
+    ends_service: bool = False
+    fast: bool = False
+
+
+FAULT_KINDS: Final[dict[str, FaultKind]] = {
+    "kill_primary": FaultKind("kill -9 of the serving process", PROCESS, (0.0, 0.0), 8.0, 0.2, True),
+    "stop_primary": FaultKind("SIGSTOP of the serving process", PROCESS, (2.0, 3.0), 8.0, 4.0),
+    "kill_standby": FaultKind("kill -9 of the standby", PROCESS, (0.0, 0.0), 8.0, 0.0, True),
+    "kill_viewer": FaultKind("kill -9 of the viewer's stream", PROCESS, (0.0, 0.0), 3.0),
+    "slow_viewer": FaultKind("a subscriber that takes 50 ms for each message", PROCESS, (2.0, 4.0), 3.0),
+    "restart_stage": FaultKind("kill -9 of the stage, and another one counting anew", PROCESS, (0.5, 1.5), 10.0),
+    "restart_router": FaultKind("kill -9 of the router, and another one in its place", PROCESS, (0.2, 0.5), 12.0, 8.0),
+    "clock_back": FaultKind("the wall clock of the service set back by an hour", MACHINE, (2.0, 4.0), 3.0),
+    "disk_full": FaultKind("no more bytes for the recordings", MACHINE, (3.0, 5.0), 10.0),
+    "cpu_stolen": FaultKind("a busy process for each core", MACHINE, (1.5, 3.0), 4.0, 0.5),
+    "bad_queries": FaultKind(
+        "a burst of malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0
+    ),
+    "gap": FaultKind("samples that never come", STAGE, (0.3, 2.0), 5.0, fast=True),
+    "duplicate": FaultKind("every sample twice", STAGE, (0.5, 2.0), 3.0, fast=True),
+    "reorder": FaultKind("messages in the wrong order", STAGE, (0.5, 2.0), 3.0, fast=True),
+    "nan": FaultKind("readings that are not numbers", STAGE, (0.5, 2.0), 5.0, fast=True),
+    "spike": FaultKind("every 25th reading off by 30 µm", STAGE, (0.5, 2.0), 5.0, fast=True),
+    "freeze": FaultKind("a sensor that repeats its last reading", STAGE, (0.5, 2.0), 8.0, fast=True),
+    "saturate": FaultKind("a sensor that ends half way", STAGE, (0.5, 2.0), 8.0, fast=True),
+    "stage_clock": FaultKind("the stage's clock set back by an hour", STAGE, (1.0, 2.0), 5.0, fast=True),
+    "gain": FaultKind("the stage's gain changes by some percent, for good", STAGE, (0.0, 0.0), 12.0, fast=True),
+    "payload": FaultKind("the moved mass doubles, or halves again", STAGE, (0.0, 0.0), 10.0, fast=True),
+    "dwell": FaultKind("the reference rests", REFERENCE, (2.0, 4.0), 4.0, fast=True),
+}
+
+
+# --- The plan
 
 #: Calm before the first fault and at the end, s; between the end of one's recovery and the next at least and at most.
 WARM_S, TAIL_S = 6.0, 3.0
@@ -22,7 +80,7 @@ KILLING_SHARE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedFault:
     """One fault of the plan: ``at_s`` after the start, for ``duration_s``; ``value`` as the kind has it."""
 
     kind: str
@@ -38,7 +96,7 @@ class Planned:
     @property
     def window_s(self) -> tuple[float, float]:
         """From its beginning until everything has to be well again."""
-        return self.at_s, self.end_s + KINDS[self.kind].recover_s
+        return self.at_s, self.end_s + FAULT_KINDS[self.kind].recover_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,18 +105,18 @@ class SoakPlan:
 
     duration_s: float
     seed: int
-    faults: tuple[Planned, ...]
+    faults: tuple[PlannedFault, ...]
     left_out: tuple[str, ...]
 
 
-def known_kinds(names: list[str]) -> tuple[str, ...]:
+def select_kinds(names: list[str]) -> tuple[str, ...]:
     """The kinds named, or all of them where none is; none of them for ``none``. Raises InputError on an unknown one."""
     if names == ["none"]:
         return ()
     for name in names:
-        if name not in KINDS:
-            raise InputError(f"--faults: got {name!r}, expected none, or some of: {', '.join(KINDS)}")
-    return tuple(dict.fromkeys(names)) or tuple(KINDS)
+        if name not in FAULT_KINDS:
+            raise InputError(f"--faults: got {name!r}, expected none, or some of: {', '.join(FAULT_KINDS)}")
+    return tuple(dict.fromkeys(names)) or tuple(FAULT_KINDS)
 
 
 def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
@@ -67,7 +125,7 @@ def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
     The same arguments give the same plan. Kinds that end a serving process come in the first rounds only.
     """
     rng = np.random.default_rng(seed)
-    faults: list[Planned] = []
+    faults: list[PlannedFault] = []
     at_s = WARM_S
     calm_s = min(max(_CALM_SHARE * duration_s, CALM_S[0]), CALM_S[1])
     done: set[str] = set()
@@ -76,12 +134,12 @@ def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
         order = [kinds[i] for i in rng.permutation(len(kinds))]
         if turn == 0:
             # The stable sort keeps the drawn order within both groups.
-            order.sort(key=lambda name: not KINDS[name].ends_service)
+            order.sort(key=lambda name: not FAULT_KINDS[name].ends_service)
         placed = False
         for name in order:
-            kind = KINDS[name]
+            kind = FAULT_KINDS[name]
             low, high = kind.duration_s
-            fault = Planned(name, at_s, round(float(rng.uniform(low, high)), 3), _value(name, rng, turn))
+            fault = PlannedFault(name, at_s, round(float(rng.uniform(low, high)), 3), _value(name, rng, turn))
             late = kind.ends_service and turn > 0 and at_s > KILLING_SHARE * duration_s
             if late or fault.window_s[1] > duration_s - TAIL_S:
                 continue
@@ -118,13 +176,13 @@ class Schedule:
     ``possible`` says, waits; those behind it come as much later. What then has no time left to recover is left out.
     """
 
-    def __init__(self, plan: SoakPlan, possible: Callable[[Planned], bool]) -> None:
+    def __init__(self, plan: SoakPlan, possible: Callable[[PlannedFault], bool]) -> None:
         self._plan, self._possible = plan, possible
         self._waiting = deque(enumerate(plan.faults))
         self._delay_s = 0.0
         self._notes: list[str] = []
 
-    def due(self, now_s: float) -> tuple[int, Planned] | None:
+    def due(self, now_s: float) -> tuple[int, PlannedFault] | None:
         """The fault that is to begin at ``now_s``, and its number in the plan; None where there is none."""
         while self._waiting:
             index, fault = self._waiting[0]
@@ -153,5 +211,5 @@ class Schedule:
         return self._notes + [_note(fault, "it did not come to it") for _, fault in self._waiting]
 
 
-def _note(fault: Planned, why: str) -> str:
+def _note(fault: PlannedFault, why: str) -> str:
     return f"{fault.kind} at {fault.at_s:.0f} s: left out, {why}"

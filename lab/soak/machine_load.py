@@ -1,9 +1,9 @@
-"""What a soak may ask of the machine that it runs on: times are judged beside what a bare loop had in the same seconds.
+"""How busy the machine was during a soak: times are judged beside the delays of a bare paced loop.
 
-A query wakes some threads one after the other (client, router, service, and back). On a machine that is busy with other
-things each of them waits about as long as the bare loop does, and so much is allowed on top of a limit. A loop that
-only wakes up sees nothing of a processor that others hold for long, so what others than the soak's own processes took
-of it is looked at too. Where the machine stood still or was taken, a time says nothing about the service.
+A query wakes several threads one after the other (client, router, service, and back). On a busy machine each of them
+waits about as long as the bare loop does, so that much is added to a limit. A loop that only wakes up does not notice
+if other processes keep the cores busy, so their processor time is measured too. If the machine stalled or other
+processes occupied it, a time says nothing about the service and is not judged.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BUSY_SHARE: Final = 0.25
 Rows = Sequence[tuple[float, float]]
 
 
-class Machine:
+class MachineLoad:
     """``bare``: the most that the bare loop was late, s; ``others``: their share of all cores, 0 to 1.
 
     Where nothing was measured it is a machine that is free.
@@ -73,7 +73,7 @@ class Machine:
 _LEAST_S = 0.2
 
 
-class Others:
+class OtherLoad:
     """Asked now and then with the processor time of one's own processes so far."""
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ class Others:
         return None if first else min(1.0, max(0.0, others_s / (passed_s * self._cores)))
 
 
-def taken_s(roots: Iterable[int]) -> dict[int, float]:
+def processor_times_s(roots: Iterable[int]) -> dict[int, float]:
     """By number of the process, seconds of processor time so far of each root that lives and of all that it has begun.
 
     Of a tree each process counts, and those that it has outlived, so that it only grows; a root within the tree of
@@ -122,5 +122,6 @@ def taken_s(roots: Iterable[int]) -> dict[int, float]:
 
 def _busy_s() -> float:
     times = psutil.cpu_times()
-    waiting = times.idle + getattr(times, "iowait", 0.0) + getattr(times, "guest", 0.0)
-    return float(sum(times) - waiting - getattr(times, "guest_nice", 0.0))
+    # Fields beside these depend on the platform.
+    fields = times._asdict()
+    return float(sum(times) - sum(fields.get(name, 0.0) for name in ("idle", "iowait", "guest", "guest_nice")))

@@ -1,0 +1,530 @@
+"""What a soak observes: samples and voltages by second, queries by second, faults, and when the service recovered.
+
+Seconds are kept, not samples, so that a run of days fits into memory. The stage limits the voltages that it receives,
+so both the voltages sent and those applied are checked.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.types import FloatArray
+from lab.soak.fault_plan import FAULT_KINDS
+from lab.soak.machine_load import MachineLoad
+from lab.soak.task import ControlTask
+from service.protocol import samples as wire
+
+# --- Samples and voltages
+
+# --- Which sample numbers have been seen, as few intervals as they make.
+
+
+class Intervals:
+    """A set of integers that come mostly in order; memory grows with the number of gaps only."""
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._stops: list[int] = []
+
+    def __len__(self) -> int:
+        return sum(stop - start for start, stop in zip(self._starts, self._stops, strict=True))
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """The intervals, in order, as (first, one past the last)."""
+        return list(zip(self._starts, self._stops, strict=True))
+
+    def add(self, start: int, stop: int) -> None:
+        """Take the numbers from ``start`` to ``stop`` - 1."""
+        if stop <= start:
+            return
+        i = bisect_right(self._starts, start)
+        # All that touch the new one are joined with it.
+        first = i - 1 if i and self._stops[i - 1] >= start else i
+        last = first
+        while last < len(self._starts) and self._starts[last] <= stop:
+            start, stop = min(start, self._starts[last]), max(stop, self._stops[last])
+            last += 1
+        self._starts[first:last] = [start]
+        self._stops[first:last] = [stop]
+
+    def add_all(self, numbers: NDArray[np.int64]) -> None:
+        """Take numbers in any order."""
+        if not numbers.size:
+            return
+        if numbers[-1] - numbers[0] + 1 == numbers.size and (np.diff(numbers) == 1).all():
+            self.add(int(numbers[0]), int(numbers[-1]) + 1)
+            return
+        distinct = np.unique(numbers)
+        breaks = np.flatnonzero(np.diff(distinct) != 1)
+        for start, stop in zip(np.r_[0, breaks + 1], np.r_[breaks, distinct.size - 1], strict=True):
+            self.add(int(distinct[start]), int(distinct[stop]) + 1)
+
+    def minus(self, other: Intervals) -> list[tuple[int, int]]:
+        """What is here and not in ``other``, as (first, one past the last)."""
+        missing = []
+        for start, stop in self.spans:
+            at = start
+            for other_start, other_stop in other.spans:
+                if other_stop <= at or other_start >= stop:
+                    continue
+                if other_start > at:
+                    missing.append((at, other_start))
+                at = max(at, other_stop)
+            if at < stop:
+                missing.append((at, stop))
+        return missing
+
+
+#: Samples for which the reference and the voltages sent are remembered.
+_RING = 16_384
+#: Numbers further apart than this are those of two lives of the stage.
+OTHER_LIFE = 10_000_000
+#: What stands at the slew limit by round-off alone is not beyond it.
+ROUND_OFF = 1.0 + 1e-6
+#: Blocks that wait for the sample that they begin with.
+_MAX_WAITING = 64
+
+
+@dataclass(slots=True)
+class SampleSecond:
+    """One second of samples: how many, the sums and worst of |error| in µm, and of the voltages what was worst.
+
+    ``held`` samples had no command of their own in time: the stage held the last one. ``step_max_V``, ``beyond_V`` and
+    ``not_finite`` are of the voltages that the stage applied; ``sent_``... the same of those that it was sent.
+    ``resumed_V`` is the step with which a block began where none was seen for the samples before it.
+    """
+
+    t_s: float
+    seq: int = 0
+    samples: int = 0
+    judged: int = 0
+    error_sum_um: float = 0.0
+    error_max_um: float = 0.0
+    step_max_V: float = 0.0
+    beyond_V: float = 0.0
+    held: int = 0
+    not_finite: int = 0
+    sent_step_V: float = 0.0
+    sent_beyond_V: float = 0.0
+    sent_not_finite: int = 0
+    resumed_V: float = 0.0
+
+    @property
+    def mae_um(self) -> float:
+        """Mean |error|, µm; NaN where nothing could be judged."""
+        return self.error_sum_um / self.judged if self.judged else math.nan
+
+
+@dataclass
+class SampleTracker:
+    """Fed with references, commands and batches of samples, in the order of arrival.
+
+    ``clock`` tells the time of a batch, s, on the axis of the report.
+    """
+
+    control: ControlTask
+    clock: Callable[[], float]
+    seconds: list[SampleSecond] = field(default_factory=list)
+    seen: Intervals = field(default_factory=Intervals)
+
+    def __post_init__(self) -> None:
+        self._wanted = np.full(_RING, np.nan)
+        self._wanted_seq = np.full(_RING, -1, dtype=np.int64)
+        self._commanded_V = np.full(_RING, np.nan)
+        self._commanded_seq = np.full(_RING, -1, dtype=np.int64)
+        self._u_V, self._seq = math.nan, -2
+        #: The voltage sent for the furthest sample, and its number.
+        self._sent_V, self._sent_seq = math.nan, -2
+        #: By its first sample, a block that began too far from the last one sent: its voltage there, and that step.
+        self._resumed: dict[int, tuple[float, float]] = {}
+        self.newest = -1
+        self.received = 0
+        self.repeated = 0
+
+    def want(self, first: int, y_um: FloatArray) -> None:
+        """The reference from sample ``first`` on, µm."""
+        numbers = np.arange(first, first + y_um.size)
+        self._wanted[numbers % _RING] = y_um
+        self._wanted_seq[numbers % _RING] = numbers
+
+    def command(self, first: int, u_V: FloatArray) -> None:
+        """Voltages sent for the samples from ``first`` on, V: as they are, whatever the stage will make of them.
+
+        The first of them follows what was last sent for the sample before it, also where a block replaces another.
+        """
+        second = self._second()
+        finite = np.isfinite(u_V)
+        second.sent_not_finite += int(np.count_nonzero(~finite))
+        if finite.any():
+            second.sent_beyond_V = max(second.sent_beyond_V, self._beyond_V(u_V[finite]))
+        slot = (first - 1) % _RING
+        before_V = float(self._commanded_V[slot]) if self._commanded_seq[slot] == first - 1 else math.nan
+        with np.errstate(invalid="ignore"):
+            steps = np.abs(np.diff(u_V, prepend=before_V))
+        known = steps[np.isfinite(steps)]
+        if known.size:
+            second.sent_step_V = max(second.sent_step_V, float(known.max()))
+        if math.isnan(before_V) and finite[0]:
+            self._resume(first, float(u_V[0]))
+        numbers = np.arange(first, first + u_V.size)
+        self._commanded_V[numbers % _RING] = u_V
+        self._commanded_seq[numbers % _RING] = numbers
+        if not 0 < self._sent_seq - int(numbers[-1]) < OTHER_LIFE:
+            self._sent_V, self._sent_seq = float(u_V[-1]), int(numbers[-1])
+
+    def refuse_command(self) -> None:
+        """A command that could not be read: no voltage that anybody may apply came of it."""
+        self._second().sent_not_finite += 1
+
+    def take(self, batch: wire.SampleBatch) -> None:
+        """Samples as they came."""
+        second = self._second()
+        seq, u_V = batch.seq, batch.u_V
+        self.received += len(batch)
+        fresh = seq > self.newest if abs(int(seq[0]) - self.newest) < OTHER_LIFE else np.ones(len(batch), dtype=bool)
+        self.repeated += len(batch) - int(np.count_nonzero(fresh))
+        self.seen.add_all(seq)
+        second.samples += len(batch)
+        second.seq = int(seq[-1])
+        slots = seq % _RING
+        in_time = (self._commanded_seq[slots] == seq) & (self._commanded_V[slots] == u_V)
+        second.held += len(batch) - int(np.count_nonzero(in_time))
+        finite = np.isfinite(u_V)
+        second.not_finite += int(np.count_nonzero(~finite))
+        if finite.any():
+            second.beyond_V = max(second.beyond_V, self._beyond_V(u_V[finite]))
+        if fresh.all():
+            # The step is that of samples that follow one another; what lies between others nobody saw.
+            before = np.concatenate(([self._u_V], u_V[:-1]))
+            follows = np.diff(seq, prepend=self._seq) == 1
+            if follows.any():
+                second.step_max_V = max(second.step_max_V, float(np.max(np.abs(u_V - before)[follows])))
+            if self._resumed:
+                self._judge_resumed(second, seq, np.where(follows, before, np.nan))
+            self._u_V, self._seq = float(u_V[-1]), int(seq[-1])
+            self.newest = int(seq[-1])
+        known = (self._wanted_seq[seq % _RING] == seq) & np.isfinite(batch.y_um)
+        if known.any():
+            error = np.abs(self._wanted[seq % _RING] - batch.y_um)[known]
+            second.judged += error.size
+            second.error_sum_um += float(error.sum())
+            second.error_max_um = max(second.error_max_um, float(error.max()))
+
+    def _second(self) -> SampleSecond:
+        """The second that is under way. One that no sample has come in ends with the number of the one before."""
+        now = self.clock()
+        if not self.seconds or now - self.seconds[-1].t_s >= 1.0:
+            self.seconds.append(SampleSecond(math.floor(now), self.seconds[-1].seq if self.seconds else 0))
+        return self.seconds[-1]
+
+    def _beyond_V(self, u_V: FloatArray) -> float:
+        return max(float(u_V.max()) - self.control.u_max_V, self.control.u_min_V - float(u_V.min()))
+
+    def _resume(self, first: int, u_V: float) -> None:
+        """A block for which none was seen before: its controller gave one up, or what it sent did not come here.
+
+        A stage without a command holds the last one, so the block has to begin where that ended; where it does not, the
+        voltage that the stage applies until then decides. Where neither is known, as at the beginning of a stage's
+        life, there is nothing to begin from.
+        """
+        control = self.control
+        follows = 0 < first - self._sent_seq < OTHER_LIFE and math.isfinite(self._sent_V)
+        step_V = abs(u_V - self._sent_V) if follows else math.inf
+        if step_V > control.slew_V_per_s * control.dt_s * ROUND_OFF:
+            self._resumed[first] = u_V, step_V
+            if len(self._resumed) > _MAX_WAITING:
+                self._resumed.pop(next(iter(self._resumed)))
+
+    def _judge_resumed(self, second: SampleSecond, seq: NDArray[np.int64], before_V: FloatArray) -> None:
+        """``before_V``: by sample, the voltage applied before it; NaN where that sample was not seen."""
+        for first in [first for first in self._resumed if seq[0] <= first <= seq[-1] or first < seq[0] < first + _RING]:
+            u_V, step_V = self._resumed.pop(first)
+            at = np.flatnonzero((seq == first) & np.isfinite(before_V))
+            if at.size:
+                step_V = min(step_V, abs(u_V - float(before_V[at[0]])))
+            if math.isfinite(step_V):
+                second.resumed_V = max(second.resumed_V, step_V)
+
+
+# --- All observations
+
+#: The mode of a run in one process, and of one in real time.
+FAST: Final = "fast"
+REAL_TIME: Final = "real_time"
+#: What the prober asks in turns.
+Target = Literal["service", "echo"]
+#: Longest time that anything may take to be well again, s.
+_LONGEST_S: Final = max(kind.recover_s for kind in FAULT_KINDS.values())
+
+
+@dataclass
+class FaultRecord:
+    """A fault as it really was: from ``begin_s`` to ``end_s``, and when all was well again (NaN: not, or unknown)."""
+
+    kind: str
+    begin_s: float
+    end_s: float = float("nan")
+    recovered_s: float = float("nan")
+    silent_s: float = 0.0
+    #: Seconds from its end until all was well in which the machine was too busy to tell.
+    busy_s: float = 0.0
+    reported_by: str = ""
+    #: Until when somebody might have told of it.
+    look_until_s: float = 0.0
+    value: float = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is over."""
+        return math.isfinite(self.end_s)
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """From its beginning until everything has to be well again."""
+        end = self.end_s if self.ended else self.begin_s
+        return self.begin_s, end + FAULT_KINDS[self.kind].recover_s
+
+
+@dataclass
+class QuerySecond:
+    """A second of the prober: round trips in µs, ages of the followed model in s, and what else it counted."""
+
+    t_s: float
+    service_us: Sequence[float]
+    echo_us: Sequence[float]
+    ages_s: Sequence[float]
+    failed: int
+    unsafe: int
+    silent_s: float
+    error: str = ""
+
+    def round_trips_us(self, which: Target) -> Sequence[float]:
+        """Round trips to the service or to the echo, µs."""
+        return self.service_us if which == "service" else self.echo_us
+
+
+def query_second(line: dict[str, Any], t_s: float) -> QuerySecond:
+    """The prober's line as a probe at ``t_s``."""
+    # Packed: a run may last for days.
+    service_us, echo_us, ages_s = (array("f", line[name]) for name in ("service_us", "echo_us", "ages_s"))
+    names = ("failed", "unsafe", "silent_s", "error")
+    return QuerySecond(t_s, service_us, echo_us, ages_s, **{name: line[name] for name in names})
+
+
+@dataclass
+class Observations:
+    """What happened in a run of ``duration_s`` seconds.
+
+    Attributes
+    ----------
+    seconds, probes : of the stage's samples and of the prober. memory : by process, (t_s, kB, its number).
+    cpu : by process, (t_s, seconds of processor time so far, its number).
+    planned : faults of the plan.
+    ended : processes that ended by themselves. unsafe_blocks : answers to the controller that broke a promise.
+    bare : by second, (t_s, the most that a bare loop was late, s). others : by second, (t_s, share of all cores
+    that other processes than the soak's had).
+    counters : per service and second, what its status said: (t_s, instance, flat counters).
+    """
+
+    duration_s: float
+    range_um: float
+    step_limit_V: float
+    mode: str
+    faults: list[FaultRecord] = field(default_factory=list)
+    seconds: list[SampleSecond] = field(default_factory=list)
+    query_seconds: list[QuerySecond] = field(default_factory=list)
+    memory: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    cpu: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    counters: list[tuple[float, str, Mapping[str, float]]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    ended: list[tuple[float, str]] = field(default_factory=list)
+    unsafe_blocks: int = 0
+    planned: int = 0
+    loop_delays: list[tuple[float, float]] = field(default_factory=list)
+    other_load: list[tuple[float, float]] = field(default_factory=list)
+
+    def quiet(self, t_s: float) -> bool:
+        """Whether no fault, and no recovery from one, is under way at ``t_s``.
+
+        Faults are in order, and none begins before the one before it has ended.
+        """
+        at = bisect_right(self.faults, t_s + 1.0, key=lambda fault: fault.begin_s)
+        for i in range(at - 1, -1, -1):
+            if t_s <= self.faults[i].window_s[1]:
+                return False
+            if self.faults[i].begin_s + _LONGEST_S < t_s:
+                return True
+        return True
+
+    def seconds_between(self, begin_s: float, end_s: float) -> list[SampleSecond]:
+        """Those that begin from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.seconds, begin_s, key=lambda second: second.t_s)
+        return self.seconds[first : bisect_right(self.seconds, end_s, key=lambda second: second.t_s)]
+
+    def query_seconds_between(self, begin_s: float, end_s: float) -> list[QuerySecond]:
+        """Those that were told from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.query_seconds, begin_s, key=lambda probe: probe.t_s)
+        return self.query_seconds[first : bisect_right(self.query_seconds, end_s, key=lambda probe: probe.t_s)]
+
+    def events_between(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
+        """Those that came from ``begin_s`` to ``end_s``."""
+        first = bisect_left(self.events, begin_s, key=lambda event: event["t_s"])
+        return self.events[first : bisect_right(self.events, end_s, key=lambda event: event["t_s"])]
+
+    def counters_between(self, begin_s: float, end_s: float) -> list[tuple[float, str, Mapping[str, float]]]:
+        """The counters from ``begin_s`` to ``end_s``. They come in order but for a second or two."""
+        first = bisect_left(self.counters, begin_s - 5.0, key=lambda row: row[0])
+        last = bisect_left(self.counters, end_s + 5.0, key=lambda row: row[0])
+        return [row for row in self.counters[first:last] if begin_s <= row[0] <= end_s]
+
+    def latency_us(self, which: Target) -> FloatArray:
+        """Round trips outside the fault windows, µs: of the ``service`` or of the ``echo``."""
+        found = [np.asarray(p.round_trips_us(which)) for p in self.query_seconds if self.quiet(p.t_s)]
+        return np.concatenate(found) if found else np.zeros(0)
+
+
+class Counters(Mapping[str, float]):
+    """Named numbers, packed: rows of the same names share them."""
+
+    _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
+    __slots__ = ("_at", "_values")
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        names = tuple(values)
+        self._at = self._shared.setdefault(names, {name: i for i, name in enumerate(names)})
+        self._values = array("d", values.values())
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[self._at[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._at)
+
+    def __len__(self) -> int:
+        return len(self._at)
+
+
+def flatten_status(status: dict[str, Any]) -> dict[str, float]:
+    """The numbers in a status under dotted names."""
+    found: dict[str, float] = {}
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                walk(f"{prefix}.{name}" if prefix else str(name), inner)
+        elif isinstance(value, (bool, int, float)):
+            found[prefix] = float(value)
+
+    for part in ("samples", "learner", "recorder", "queries", "seq", "checkpoints", "fallback", "memory"):
+        walk(part, status.get(part))
+    found["serves"] = float(status.get("role", "primary") == "primary")
+    return found
+
+
+# --- Recovery from faults
+
+#: Mean |error| in a second that counts as well again, in percent of the commanded range.
+WELL_PCT: Final = 0.3
+
+#: What tells of a fault: counters of the status of which one grows (with a "+": all of them in one service), ``event``
+#: for any event, ``instance`` for another instance that answers. Kinds that are missing are nobody's business.
+INDICATORS: Final[dict[str, tuple[str, ...]]] = {
+    "kill_primary": ("instance", "event"),
+    "stop_primary": ("instance", "event", "samples.lost"),
+    "kill_standby": ("instance", "event"),
+    "restart_stage": ("samples.restarts",),
+    "restart_router": ("samples.lost", "event"),
+    "disk_full": ("recorder.errors", "recorder.lost", "event"),
+    "bad_queries": ("queries.errors+samples.malformed",),
+    "gap": ("samples.lost",),
+    "duplicate": ("samples.late",),
+    "reorder": ("samples.late",),
+    "nan": ("samples.gates.not_finite",),
+    "spike": ("samples.gates.glitch", "samples.gates.outlier"),
+    "freeze": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.unexcited", "learner.jumps", "event"),
+    # A reading that stays at its end looks like a stage at rest.
+    "saturate": (
+        "samples.gates.glitch",
+        "samples.gates.outlier",
+        "samples.gates.saturated",
+        "learner.jumps",
+        "samples.gates.unexcited",
+        "event",
+    ),
+    "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
+    "dwell": ("samples.gates.unexcited",),
+}
+
+
+def assess_recovery(observed: Observations, count: int | None = None) -> None:
+    """Fill in when all was well again, for how long nobody answered, and who told of it: for every fault, or the first
+    ``count``."""
+    mae = {round(s.t_s): 100.0 * s.mae_um / observed.range_um for s in observed.seconds if s.judged}
+    machine = MachineLoad(observed.loop_delays, observed.other_load)
+    begins = [fault.begin_s for fault in observed.faults[1:]]
+    for fault, next_s in islice(zip(observed.faults, [*begins, math.inf], strict=False), count):
+        end = fault.end_s if math.isfinite(fault.end_s) else fault.begin_s
+        last = fault.window_s[1] + 2.0
+        # On a machine that is busy all takes longer: as many seconds as it was are looked at on top.
+        last += machine.busy_s(end, last)
+        within = observed.query_seconds_between(fault.begin_s, last + 1.0)
+        fault.silent_s = max((p.silent_s for p in within if p.t_s <= next_s), default=0.0)
+        for p in within:
+            second = round(math.floor(p.t_s))
+            good = [mae.get(second + i, math.inf) <= WELL_PCT for i in (0, 1)]
+            if p.t_s - 1.0 >= end and not p.failed and len(p.service_us) and all(good):
+                fault.recovered_s = p.t_s - 1.0
+                break
+        fault.busy_s = machine.busy_s(end, min(fault.recovered_s, last) if math.isfinite(fault.recovered_s) else last)
+        if observed.mode == "fast":
+            for second in range(math.ceil(end), math.floor(last) + 1):
+                if mae.get(second, math.inf) <= WELL_PCT:
+                    fault.recovered_s = float(second)
+                    break
+        fault.reported_by, fault.look_until_s = _told(observed, fault, last), last
+
+
+def _told(observed: Observations, fault: FaultRecord, end: float) -> str:
+    """Which counter or event told of a fault until ``end``, s; "" for none, "-" where none is asked for."""
+    tellers = INDICATORS.get(fault.kind)
+    if tellers is None:
+        return "-"
+    begin = fault.begin_s
+    counters = observed.counters_between(begin - 30.0, end)
+    for teller in tellers:
+        if teller == "event":
+            # Who comes and goes is of no interest but for those who were killed.
+            alive = ("came", "gone") if not FAULT_KINDS[fault.kind].ends_service else ()
+            said = [e for e in observed.events_between(begin, end) if e.get("event") not in alive]
+            if said:
+                return f"event {said[0].get('event')}"
+        elif teller == "instance":
+            before = {name for t, name, _ in counters if begin - 5.0 <= t <= begin}
+            new = {name for t, name, _ in counters if begin < t <= end} - before
+            gone = before - {name for t, name, _ in counters if begin + 1.5 < t <= end}
+            if new or gone:
+                return "another instance"
+        else:
+            names = teller.split("+")
+            for who in {who for _, who, _ in counters}:
+                if all(_grew([row for row in counters if row[1] == who], name, begin) for name in names):
+                    return teller
+    return ""
+
+
+def _grew(rows: list[tuple[float, str, Mapping[str, float]]], name: str, begin_s: float) -> bool:
+    """Whether a counter of one service was higher after ``begin_s`` than at last before it."""
+    was = [row.get(name, 0.0) for t_s, _, row in rows if t_s <= begin_s]
+    now = [row.get(name, 0.0) for t_s, _, row in rows if t_s > begin_s]
+    return bool(now) and max(now) > (was[-1] if was else 0.0)
