@@ -15,7 +15,7 @@ from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.storage.recorder import Recorder
-from service.viewer.feed import Diagnostics
+from service.viewer.records import Diagnostics
 from sim.stage.stage import Stage
 
 #: Called with the number of ticks done and, by model, the mean absolute error of the last second in µm.

@@ -25,8 +25,8 @@ from service.server.models import load_axis
 from service.storage.model_file import BundleMeta, write_bundle
 from service.storage.output_folder import clear_output
 from service.storage.recorder import Recorder, RecorderConfig
-from service.viewer.feed import Event, Record, SceneConfig, Tracking
 from service.viewer.offline import write_recording
+from service.viewer.records import Event, Record, SceneConfig, Tracking
 from sim.recordings import read, repaired
 from sim.stage.stage import Stage
 

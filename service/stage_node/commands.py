@@ -1,4 +1,4 @@
-"""The commands of a stage node: voltages by sequence number, late and missing ones counted."""
+"""The commands of a stage node: voltages by sequence number. Late and missing ones are counted."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from adaptive.errors import InputError
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError
 
-#: Commands further ahead than this many ticks are refused.
+#: Commands for more than this many ticks ahead are refused.
 AHEAD = 65_536
 
 
 class CommandBuffer:
-    """Voltages by sequence number, written by the wire's thread and taken by the loop.
+    """Voltages by sequence number, written by zenoh's thread and read by the loop.
 
-    A ring of values and of the numbers they belong to: a slot whose number is not the one asked for holds nothing
-    for it. The value is written before its number, so that a reader of both never sees half a command. ``begin`` is
-    the first tick of all, whose command sets ``first``.
+    A ring of values and of their sequence numbers: a slot whose number differs from the one asked for is empty for it.
+    The value is written before its number, so that the reader never sees half a command. ``begin`` is the first tick;
+    its command sets ``first``.
     """
 
     def __init__(self, size: int = AHEAD, begin: int = 0) -> None:
@@ -34,7 +34,7 @@ class CommandBuffer:
         self._last_V = 0.0
 
     def receive(self, payload: bytes) -> None:
-        """A message of the wire; malformed ones are counted, and the last one's fault is kept."""
+        """Take a message. A malformed one is counted, and the error text of the last one is kept."""
         try:
             self.put(wire.decode_command(payload))
         except InputError as error:
@@ -42,7 +42,10 @@ class CommandBuffer:
             self.error = str(error)
 
     def put(self, block: wire.Block) -> None:
-        """Voltages from ``block.seq`` on; what is over already is counted as late, what is too far ahead refused."""
+        """Take voltages from ``block.seq`` on. Voltages for past ticks are counted as late.
+
+        Raises FieldError if the block ends beyond the ring.
+        """
         now = self._next
         if block.seq + len(block) > now + self.size:
             raise FieldError("seq", block.seq + len(block) - 1, f"at most {now + self.size - 1}, the ring's end")
@@ -58,7 +61,7 @@ class CommandBuffer:
             self.first.set()
 
     def take(self, k: int) -> float:
-        """The voltage for tick k, V; the last one, counted as missing, where none came in time."""
+        """The voltage for tick k, V; if none came in time the last one, counted as missing."""
         self._next = k + 1
         slot = k % self.size
         if self._numbers.item(slot) == k:

@@ -1,7 +1,7 @@
-"""Faults of a stage on command: readings that lie, samples that never come, come twice or out of order.
+"""Faults of a simulated stage on command: wrong readings, samples that are lost, doubled or out of order.
 
-Only a stage that was started to be hurt (``dehyst stage --inject``) listens. A fault is JSON on ``.../stage_fault``:
-``{"fault": NAME, "duration_s": 1.0, "value": 0.0}``, or ``{"fault": "change", "values": {"gain_drift.gain": -0.06}}``.
+Only a stage started with ``dehyst stage --inject`` accepts them. A fault is JSON on ``.../stage_fault``: ``{"fault":
+NAME, "duration_s": 1.0, "value": 0.0}``, or ``{"fault": "change", "values": {"gain_drift.gain": -0.06}}``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
 
-#: What a reading suffers, and what ``value`` is for it.
+#: Faults of a reading, and the meaning of ``value``.
 READING: Final = {
     "nan": "not used: the reading is not a number",
     "spike": "µm added to every 25th reading",
@@ -29,7 +29,7 @@ READING: Final = {
     "saturate": "µm beyond which the reading does not go",
     "offset": "µm added to every reading",
 }
-#: What a sample suffers on its way, and what ``value`` is for it.
+#: Faults of a message, and the meaning of ``value``.
 DELIVERY: Final = {
     "gap": "not used: nothing is sent",
     "duplicate": "not used: every message is sent twice",
@@ -46,13 +46,13 @@ Rows = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
 
 
 def fault_key(stage: str, axis: str) -> str:
-    """Where a stage that was started to be hurt takes its faults."""
+    """Key on which a stage started with ``--inject`` accepts faults."""
     return f"{Keys(stage, axis).base}/stage_fault"
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: its kind, how long it lasts in s, and what its kind says of ``value``; ``values`` for a change."""
+    """One fault: its kind, its length in s, and the ``value`` of its kind; ``values`` for a change."""
 
     kind: str
     duration_s: float = 0.0
@@ -61,15 +61,13 @@ class Fault:
 
 
 def decode_fault(payload: bytes) -> Fault:
-    """The fault in a message. Raises InputError naming what does not fit."""
+    """Decode a fault. Raises InputError that names the field."""
     try:
         data = json.loads(payload)
     except (ValueError, RecursionError) as error:
-        raise FieldError(
-            "payload", f"no JSON ({error})", 'an object such as {"fault": "nan", "duration_s": 1}'
-        ) from None
+        raise FieldError("payload", f"no JSON ({error})", _EXPECTED) from None
     if not isinstance(data, dict):
-        raise FieldError("payload", repr(data)[:80], 'an object such as {"fault": "nan", "duration_s": 1}')
+        raise FieldError("payload", repr(data)[:80], _EXPECTED)
     kind = data.get("fault")
     if kind == CHANGE:
         values = data.get("values")
@@ -88,7 +86,7 @@ def _number(field: str, value: Any) -> float:
     try:
         if not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value):
             return float(value)
-    except OverflowError:  # an integer beyond all doubles
+    except OverflowError:  # an integer above the range of doubles
         pass
     raise FieldError(field, repr(value)[:80], "a finite number")
 
@@ -101,12 +99,12 @@ class _Active:
 
 
 class Injector:
-    """The faults of one axis: given by any thread, suffered by the loop (readings) and by the sender (messages).
+    """The faults of one axis: added by any thread, applied by the loop (readings) and by the sender (messages).
 
     Parameters
     ----------
     dt_s : sample time, s.
-    apply : applies changed parameters to the stage, from the loop; raises InputError on names and ranges.
+    apply : applies changed parameters to the stage, called by the loop; raises InputError on names and ranges.
     """
 
     def __init__(self, dt_s: float, apply: Callable[[dict[str, float]], None]) -> None:
@@ -116,14 +114,14 @@ class Injector:
         self._apply = apply
         self._lock = threading.Lock()
         self._waiting: list[Fault] = []
-        #: Replaced whole, so that the sender reads it without the lock.
+        #: Always replaced as a whole, so that the sender reads it without the lock.
         self._active: tuple[_Active, ...] = ()
         self._frozen_um = math.nan
         self._last_um = 0.0
         self._held: Rows | None = None
 
     def receive(self, payload: bytes) -> None:
-        """A message of the wire; what is malformed is counted, and the last one's fault is kept."""
+        """Take a message. A malformed one is counted, and the error text of the last one is kept."""
         try:
             self.add(decode_fault(payload))
         except InputError as error:
@@ -131,12 +129,12 @@ class Injector:
             self.error = str(error)
 
     def add(self, fault: Fault) -> None:
-        """Suffer ``fault`` from the next tick on."""
+        """Apply ``fault`` from the next tick on."""
         with self._lock:
             self._waiting.append(fault)
 
     def reading(self, k: int, y_um: float) -> float:
-        """What the sensor says at tick k where it would have said ``y_um``. Called by the loop, tick by tick."""
+        """The reading at tick k, given that of a sound sensor, µm. Called by the loop, tick by tick."""
         if self._waiting:
             self._begin(k)
         for active in self._active:
@@ -146,7 +144,7 @@ class Injector:
             if kind == "nan":
                 y_um = math.nan
             elif kind == "freeze":
-                # What it said last before the fault began.
+                # The last reading before the fault began.
                 y_um = self._last_um if k == active.first else self._frozen_um
                 self._frozen_um = y_um
             elif kind == "spike" and (k - active.first) % SPIKE_EVERY == 0:
@@ -162,7 +160,7 @@ class Injector:
         return y_um
 
     def deliver(self, rows: Rows) -> list[Rows]:
-        """The messages that leave in place of one of ``rows``. Called by the sender, in order."""
+        """The messages that are sent in place of one message ``rows``. Called by the sender, in order."""
         sent = [rows]
         reordering = False
         for active in self._active:
@@ -187,14 +185,14 @@ class Injector:
         return [r for r in sent if r[0].size]
 
     def flush(self) -> list[Rows]:
-        """What is still held back, at the end."""
+        """The message that is still held back, at the end."""
         held, self._held = self._held, None
         return [] if held is None else [held]
 
     def _begin(self, k: int) -> None:
         with self._lock:
             waiting, self._waiting = self._waiting, []
-        # What is over stays for a while: the sender may be behind the loop by as much as the ring holds.
+        # Keep past faults for a while: the sender may be behind the loop by the length of its ring.
         active = [a for a in self._active if a.stop > k - 65_536]
         for fault in waiting:
             if fault.kind == CHANGE:

@@ -1,11 +1,11 @@
 """A simulated stage as a process: voltages in by sequence number, samples out in real time.
 
-One process may hold several *units*: twins of one configuration and one seed, each driven by commands of its own
-under its own axis name, so that models are compared on the same stage with the same noise.
+One process may hold several units: twins of one configuration and one seed, each with its own axis name and commands,
+so that models are compared on the same stage with the same noise.
 
-Tick k is due at ``start + k dt`` by a monotonic clock, computed from k and never summed. At a tick every unit's
-sensor is read, then the voltage with that sequence number is applied; where none has come in time, the last one is
-held and counted. A tick that begins a full period late is counted and made up for at once: no sample is left out.
+Tick k is due at ``start + k dt`` of a monotonic clock, computed from k and not summed. At each tick the sensor of
+every unit is read, then the voltage with that sequence number is applied; if none came in time, the last one is held
+and counted. A tick that begins a full period late is counted, and the loop catches up at once: no sample is left out.
 """
 
 from __future__ import annotations
@@ -16,34 +16,162 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import zenoh
 
 from service.protocol import samples as wire
-from service.protocol.samples import MAX_SEQ
-from service.stage_node.port import NodeConfig, Port, status_key
-from service.stage_node.sender import Sender
+from service.protocol.errors import FieldError
+from service.protocol.keys import Keys
+from service.protocol.samples import MAX_SEQ, check_seq
+from service.runtime.delivery import SURELY
+from service.stage_node.commands import CommandBuffer
+from service.stage_node.faults import Injector, fault_key
+from service.stage_node.sender import SampleRing, Sender
+from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
+
+# --- One axis on the wire
+
+
+def status_key(stage: str, axis: str) -> str:
+    """Key of the stage node's own status, JSON at 1 Hz. The service's status is on ``.../status``."""
+    return f"{Keys(stage, axis).base}/stage_status"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfig:
+    """What a stage node does.
+
+    Attributes
+    ----------
+    stage : the simulated stage with its changes. name : of the stage in keys.
+    units : axis names in keys, one twin each.
+    batch : samples per message; more if the network is slow.
+    ticks : length of the run in ticks; None: until stopped.
+    free_run : start at once instead of with the first commands.
+    second : axis name in keys of the first unit's second axis; empty: that axis is held at 0 V.
+    inject : accept faults on command, see `service.stage_node.faults`.
+    first : number of the first sample; a restarted stage may begin at any number.
+    slew_V_per_s : slew limit of the voltage, V/s, as a driver has one: a command that comes in the middle of its block
+    then makes no jump.
+
+    Raises FieldError on values that do not fit.
+    """
+
+    stage: StageConfig
+    name: str
+    units: tuple[str, ...]
+    batch: int = 1
+    ticks: int | None = None
+    free_run: bool = False
+    second: str = ""
+    inject: bool = False
+    first: int = 0
+    slew_V_per_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.units or len(set(self.units)) < len(self.units):
+            raise FieldError("units", ", ".join(self.units) or "none", "one or more different axis names")
+        for unit in self.units:
+            Keys(self.name, unit)
+        if self.second:
+            Keys(self.name, self.second)
+            if self.second in self.units:
+                raise FieldError("second", self.second, "another name than those of the units")
+            if self.stage.second_axis is None:
+                raise FieldError("second", self.second, f"nothing: stage {self.stage.name!r} has one axis")
+        if not 1 <= self.batch <= 10_000:
+            raise FieldError("batch", self.batch, "1 to 10000 samples a message")
+        check_seq("first", self.first)
+        if not self.slew_V_per_s > 0.0:
+            raise FieldError("slew_V_per_s", self.slew_V_per_s, "a positive limit in V/s")
+        if self.ticks is not None and self.ticks < 1:
+            raise FieldError("ticks", self.ticks, "at least 1")
+
+
+class AxisPort:
+    """One axis in the network: its commands, samples, publishers and faults."""
+
+    def __init__(
+        self, config: NodeConfig, axis: str, session: zenoh.Session, apply: Callable[[dict[str, float]], None]
+    ) -> None:
+        keys = Keys(config.name, axis)
+        self.axis = axis
+        self.limits = (config.stage.u_min_V, config.stage.u_max_V)
+        self.step_V = config.slew_V_per_s * config.stage.dt_s
+        self.limited = 0
+        self._u_V = 0.0
+        self.commands = CommandBuffer(begin=config.first)
+        self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
+        # Samples must not be lost: a full channel blocks the sender thread, not the loop, and drops nothing.
+        self._publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
+        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first)
+        self.status = session.declare_publisher(status_key(config.name, axis))
+        self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
+        if self.injector is not None:
+            self._subscribers.append(session.declare_subscriber(fault_key(config.name, axis), self._take_fault))
+
+    def _take_command(self, sample: zenoh.Sample) -> None:
+        self.commands.receive(sample.payload.to_bytes())
+
+    def _take_fault(self, sample: zenoh.Sample) -> None:
+        assert self.injector is not None
+        self.injector.receive(sample.payload.to_bytes())
+
+    def take(self, k: int) -> float:
+        """The voltage for tick k, V, within range and slew limit."""
+        low, high = self.limits
+        wanted = min(max(self.commands.take(k), low), high)
+        # A step that equals the limit up to round-off is not limited, or it would differ from its command.
+        step = self.step_V * (1.0 + 1e-9)
+        u_V = min(max(wanted, self._u_V - step), self._u_V + step)
+        self.limited += u_V != wanted
+        self._u_V = u_V
+        return u_V
+
+    def write(self, k: int, u_V: float, y_um: float) -> None:
+        """Write sample k: the voltage that the stage gets, and its reading."""
+        self.ring.write(k, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+
+    def summary(self) -> dict[str, Any]:
+        summary: dict[str, Any] = {
+            "published": self.ring.published,
+            "lost": self.ring.lost,
+            "slew_limited": self.limited,
+            "commands": dict(self.commands.counts),
+            "error": self.commands.error,
+        }
+        if self.injector is not None:
+            summary["faults"] = {**self.injector.counts, "error": self.injector.error}
+        return summary
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        self.status.undeclare()  # type: ignore[no-untyped-call]
+
+
+# --- The node
 
 STATUS_S = 1.0
 
-__all__ = ["NodeConfig", "StageNode", "status_key"]
-
 
 class _Unit:
-    """One stage: its state, and a port for each axis that is driven."""
+    """One twin: the state of its stage, and a port for each axis that is driven."""
 
     def __init__(self, config: NodeConfig, stage: Stage, axis: str, second: str, session: zenoh.Session) -> None:
         self.stage = stage
         self.state = stage.initial_state()
-        self.ports = [Port(config, name, session, self._change) for name in (axis, second) if name]
+        self.ports = [AxisPort(config, name, session, self._change) for name in (axis, second) if name]
 
     def _change(self, values: dict[str, float]) -> None:
         self.state = self.stage.with_changes(self.state, values)
 
     def step(self, k: int) -> None:
-        """Read, then apply: the sample's voltage is the one that the stage really gets."""
+        """Read, then apply. The sample holds the voltage that the stage really gets."""
         if len(self.ports) == 1:
             port = self.ports[0]
             u_V = port.take(k)
@@ -55,7 +183,7 @@ class _Unit:
 
 
 class StageNode:
-    """Runs the units of a configuration on an open zenoh session; :meth:`run` returns the summary."""
+    """Runs the units of a configuration on an open zenoh session; `run` returns the summary."""
 
     def __init__(self, config: NodeConfig, session: zenoh.Session) -> None:
         self.config = config
@@ -72,11 +200,11 @@ class StageNode:
         }  # fmt: skip
 
     def stop(self) -> None:
-        """End the run at the next tick; from any thread or signal handler."""
+        """End the run at the next tick; callable from any thread or signal handler."""
         self._stop = True
 
     def summary(self) -> dict[str, Any]:
-        """What happened so far: ticks, late ones, and per unit samples published and commands counted."""
+        """Ticks, late ticks, and per unit the counts of samples and commands so far."""
         units = {port.axis: port.summary() for port in self._ports}
         return {
             "stage": self.config.name,
@@ -86,7 +214,7 @@ class StageNode:
         }
 
     def run(self, started: Callable[[], None] = lambda: None) -> dict[str, Any]:
-        """Wait for the first commands of every unit (or not, in free run), then tick until the end or a stop.
+        """Wait for the first commands of every unit (not in free run), then tick until the end or a stop.
 
         ``started`` is called when the clock starts. Returns the summary; the session stays open.
         """
@@ -105,7 +233,7 @@ class StageNode:
         return self.summary()
 
     def _warm(self) -> None:
-        """Everything the loop calls is called once before the clock runs, on a state that is thrown away."""
+        """Call everything that the loop calls once before the clock runs, on a state that is thrown away."""
         unit = self._units[0]
         state = unit.state.copy()
         for _ in range(50):
@@ -160,6 +288,6 @@ class StageNode:
     def _publish_status(self) -> None:
         common = {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}
         for port in self._ports:
-            # A status that does not get through is followed by another.
+            # A lost status is followed by another.
             with contextlib.suppress(zenoh.ZError):
                 port.status.put(json.dumps({**common, "axis": port.axis, **port.summary()}))

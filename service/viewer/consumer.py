@@ -1,7 +1,7 @@
-"""Listens to a stage and its service over zenoh and hands what it hears to the outputs, in batches.
+"""Subscribes to a stage and its service over zenoh and passes batches of records to the outputs.
 
-Nobody waits for this process: callbacks only put a payload into a bounded inbox; one thread decodes it and offers
-batches to outputs that drop what they cannot take. All that is lost on the way is counted.
+The stream costs the service no time: callbacks only put a payload into a bounded inbox; the thread ``view-batches``
+decodes it and offers batches to outputs that drop what they cannot take. Everything that is lost is counted.
 """
 
 from __future__ import annotations
@@ -11,24 +11,114 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import zenoh
 
 from adaptive.errors import InputError
+from adaptive.types import FloatArray
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
-from service.viewer.feed import Diagnostics, Event, Health, Record, Status, event_record
-from service.viewer.join import ReferenceRing, UnitJoin
+from service.viewer.records import Diagnostics, Event, Health, IntArray, Record, Status, Tracking, event_record
 
-#: What is said of a sample may come so long before that sample, s of the stage's time: it has another key.
+# --- Samples and their references
+
+
+@dataclass(slots=True)
+class ReferenceRing:
+    """The last ``size`` references by sequence number. Each slot stores its number: an old value is never returned."""
+
+    size: int = 1 << 16
+    _seq: IntArray = field(init=False)
+    _value_um: FloatArray = field(init=False)
+    newest: int = field(init=False, default=-1)
+
+    def __post_init__(self) -> None:
+        self._seq = np.full(self.size, -1, dtype=np.int64)
+        self._value_um = np.full(self.size, np.nan)
+
+    def put(self, seq: IntArray, value_um: FloatArray) -> None:
+        """Store references; (n,) each. Negative sequence numbers are left out."""
+        keep = seq >= 0
+        seq, value_um = seq[keep][-self.size :], value_um[keep][-self.size :]
+        if seq.size:
+            slot = seq % self.size
+            self._seq[slot] = seq
+            self._value_um[slot] = value_um
+            self.newest = max(self.newest, int(seq.max()))
+
+    def get(self, seq: IntArray) -> FloatArray:
+        """References of these sequence numbers, µm; NaN where there is none, or none any more."""
+        slot = seq % self.size
+        return np.where((self._seq[slot] == seq) & (seq >= 0), self._value_um[slot], np.nan)
+
+
+@dataclass(slots=True)
+class SampleReferenceJoin:
+    """Pairs the samples of one unit with the references of the same sequence number, whichever comes first.
+
+    A sample waits for its reference for at most ``patience_s`` of the stage's time, since references usually arrive
+    before the samples; then it goes on without. ``fallback`` holds the references of the unit that this one shares its
+    reference with.
+    """
+
+    model: str
+    ring: ReferenceRing
+    fallback: ReferenceRing | None = None
+    patience_s: float = 0.5
+    restarts: int = 0
+    _rows: FloatArray = field(init=False)
+    _seq: IntArray = field(init=False)
+    _newest_s: float = field(init=False, default=-np.inf)
+
+    def __post_init__(self) -> None:
+        self._rows = np.empty((0, 3))
+        self._seq = np.empty(0, dtype=np.int64)
+
+    def put(self, seq: IntArray, t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
+        """Take n samples, (n,) each. If time runs backwards the stage has restarted: waiting samples are dropped."""
+        finite = np.abs(t_s) < 9e9  # Range of Rerun's nanoseconds in 64 bits; also drops NaN.
+        seq, t_s, u_V, y_um = seq[finite], t_s[finite], u_V[finite], y_um[finite]
+        if not seq.size:
+            return
+        if t_s[0] < self._newest_s:
+            self.restarts += 1
+            self._seq, self._rows = self._seq[:0], self._rows[:0]
+        self._newest_s = float(t_s[-1])
+        self._seq = np.concatenate([self._seq, seq])
+        self._rows = np.concatenate([self._rows, np.column_stack([t_s, u_V, y_um])])
+
+    def take(self, everything: bool = False) -> Tracking | None:
+        """The samples that are ready, in order, or None. ``everything``: all of them, at the end of a run."""
+        if not self._seq.size:
+            return None
+        reference = self.ring.get(self._seq)
+        if self.fallback is not None:
+            reference = np.where(np.isnan(reference), self.fallback.get(self._seq), reference)
+        late = self._rows[:, 0] < self._rows[-1, 0] - self.patience_s
+        ready = ~np.isnan(reference) | late | everything
+        # In order: a sample with its reference waits behind one whose reference may still come.
+        n = int(np.argmin(ready)) if not ready.all() else ready.size
+        if n == 0:
+            return None
+        done, seq = self._rows[:n], self._seq[:n]
+        self._rows, self._seq = self._rows[n:], self._seq[n:]
+        return Tracking(
+            self.model, seq, np.ascontiguousarray(done[:, 0]), np.ascontiguousarray(done[:, 1]),
+            np.ascontiguousarray(done[:, 2]), reference[:n],
+        )  # fmt: skip
+
+
+# --- The consumer
+
+#: A message about a sample may come so long before the sample itself, s of the stage's time: it has another key.
 _AHEAD_S = 1.0
 
 
-class Taker(Protocol):
-    """What takes batches: an `Output`."""
+class BatchOutput(Protocol):
+    """Takes batches of records, as `service.viewer.output.Output` does."""
 
     dropped: int
 
@@ -37,14 +127,16 @@ class Taker(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ConsumerConfig:
-    """What to listen to.
+    """What to subscribe to.
 
     Attributes
     ----------
-    stage, axis : the unit that the service teaches and serves. model : what steers it.
-    twins : pairs (axis of the same stage, model that steers it), for comparison.
+    stage, axis : the unit that the service serves and learns from. model : the model that drives it.
+    twins : pairs (axis of the same stage, model that drives it), for comparison.
     changes_s : times of the stage at which it is known to change, s; loops are drawn before and after.
-    batch_s : how often the outputs get a batch, s. inbox : messages that may wait for that, at most.
+    batch_s : period of the batches, s. inbox : messages that may wait for the next batch, at most.
+
+    Raises InputError on values that do not fit.
     """
 
     stage: str
@@ -73,19 +165,19 @@ class ConsumerConfig:
 
 
 class Consumer:
-    """Runs from its construction until `close`; declares its subscribers on ``session``, which stays the caller's."""
+    """Runs from its construction until `close`. Declares its subscribers on ``session``, which the caller closes."""
 
-    def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[Taker]) -> None:
+    def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[BatchOutput]) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
         self._outputs = outputs
         self._inbox: deque[tuple[str, str, bytes]] = deque()
         main = ReferenceRing()
         self._rings = {config.model: main}
-        self._joins = {config.model: UnitJoin(config.model, main)}
+        self._joins = {config.model: SampleReferenceJoin(config.model, main)}
         for _, model in config.twins:
             self._rings[model] = ReferenceRing()
-            self._joins[model] = UnitJoin(model, self._rings[model], fallback=main)
+            self._joins[model] = SampleReferenceJoin(model, self._rings[model], fallback=main)
         self._t_s, self._seq, self._dt_s = 0.0, 0, 0.0
         self._next_health = 0.0
         self._changes_s = sorted(config.changes_s)
@@ -98,12 +190,12 @@ class Consumer:
         self._thread.start()
 
     def pump(self) -> None:
-        """Decode what waits and offer it as one batch; the thread does this every ``batch_s``."""
+        """Decode the waiting messages and offer them as one batch; the thread does this every ``batch_s``."""
         with self._lock:
             self._offer(everything=False)
 
     def close(self) -> None:
-        """Stop listening, hand on the rest, end the thread. May be called twice."""
+        """Unsubscribe, pass on the rest, end the thread. May be called twice."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._subscribers = []
@@ -130,12 +222,12 @@ class Consumer:
 
     def _offer(self, everything: bool) -> None:
         said: list[Record] = []
-        # Only what waits now: a flood must not keep us here.
+        # Only what waits now, so that a flood of messages does not keep this loop running.
         for _ in range(len(self._inbox)):
             kind, model, payload = self._inbox.popleft()
             try:
                 record = self._decode(kind, model, payload)
-            except Exception:  # Whatever a peer may have sent: it must not end the stream.
+            except Exception:  # A peer may send anything; it must not end the stream.
                 self.counts["malformed"] += 1
                 continue
             if record is not None:
@@ -145,7 +237,7 @@ class Consumer:
             change_s = self._changes_s.pop(0)
             ago = round((self._t_s - change_s) / self._dt_s) if self._dt_s else 0
             said.append(Event(change_s, max(0, self._seq - ago), "change, as announced", "WARN", change=True))
-        # Events first: a change is known before the samples that follow it are drawn.
+        # Events first: a change must be known before the samples after it are drawn.
         batch: list[Record] = [r for r in said if isinstance(r, Event)]
         batch += tracking
         batch += [r for r in said if not isinstance(r, Event)]
@@ -182,7 +274,7 @@ class Consumer:
         return event_record(t_s, seq, fields)
 
     def _clock(self, samples: wire.SampleBatch) -> None:
-        """Keep the newest pair of number and time of the stage, and how far apart its samples are."""
+        """Keep the newest pair of sequence number and time of the stage, and the sample time."""
         t_s, seq = float(samples.t_s[-1]), int(samples.seq[-1])
         if not _is_time(t_s):
             return
@@ -191,24 +283,24 @@ class Consumer:
         self._t_s, self._seq = t_s, seq
 
     def _when(self, fields: Mapping[str, Any]) -> tuple[float, int]:
-        """When a message speaks of: its own words, what its sequence number tells, else the newest sample heard."""
+        """Time and number of a message: from its fields, from the time of its number, or those of the newest sample."""
         t_s, seq = fields.get("t_s"), fields.get("seq")
         if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq <= wire.MAX_SEQ:
             return (float(t_s) if _is_time(t_s) else self._t_s), self._seq
         if _is_time(t_s):
             return float(t_s), seq
         ago_s = (self._seq - seq) * self._dt_s
-        # A number from another life of the stage says nothing about its time; one that is a little ahead does.
+        # A number from before a restart of the stage has no time here; one that is slightly ahead does.
         return (self._t_s - ago_s if -_AHEAD_S <= ago_s <= self._t_s else self._t_s), seq
 
 
 def _is_time(value: Any) -> TypeGuard[float]:
-    """Whether this can be drawn as a time: Rerun holds nanoseconds in 64 bits."""
+    """Whether this can be drawn as a time: Rerun stores nanoseconds in 64 bits."""
     return isinstance(value, (int, float)) and -9e9 < value < 9e9
 
 
 def _subscriptions(config: ConsumerConfig) -> list[tuple[str, str, str]]:
-    """(kind, model, key) of everything that is listened to."""
+    """(kind, model, key) of every subscription."""
     main = Keys(config.stage, config.axis)
     found = [
         ("sample", config.model, main.sample),

@@ -1,4 +1,4 @@
-"""Which curve stands where: the layout as data, so that it can be read, tested and kept apart from Rerun."""
+"""Which curve is in which view: the layout as data, independent of Rerun, so that it can be tested."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from service.viewer import style
-from service.viewer.feed import SceneConfig
+from service.viewer.records import SceneConfig
 
-# --- A plane with axes: data in their own units, drawn into a box of fixed size.
+# --- A plane with axes
 #
 # Rerun's 2-D views have no axes, one scale for both directions, and y pointing down. So data are mapped to a box
-# of ``WIDTH`` by ``HEIGHT`` with y turned over, and frame, ticks and labels are drawn as lines and points.
-
+# of ``WIDTH`` by ``HEIGHT`` with y reversed, and frame, ticks and labels are drawn as lines and points.
 
 WIDTH, HEIGHT = 180.0, 100.0
-#: What a view of the box should show, x and y: the box with room for the labels.
+#: Range of a view, x and y: the box with room for the labels.
 BOUNDS = ((-20.0, WIDTH + 8.0), (-HEIGHT - 8.0, 22.0))
 
 
@@ -55,7 +54,7 @@ class Plane:
         return x, y
 
     def frame(self) -> list[FloatArray]:
-        """The box and a grid line for every tick, as line strips (k, 2)."""
+        """The box and a grid line at every tick, as line strips (k, 2)."""
         lines = [np.array([[0, 0], [WIDTH, 0], [WIDTH, -HEIGHT], [0, -HEIGHT], [0, 0]], dtype=np.float64)]
         for x, _ in self._at(self.x_limits, WIDTH):
             lines.append(np.array([[x, 0.0], [x, -HEIGHT]]))
@@ -64,7 +63,7 @@ class Plane:
         return lines
 
     def labels(self) -> tuple[FloatArray, list[str]]:
-        """Where tick labels and axis names stand, (m, 2), and what they say."""
+        """Positions (m, 2) and texts of tick labels and axis names."""
         where: list[tuple[float, float]] = []
         what: list[str] = []
         for x, text in self._at(self.x_limits, WIDTH):
@@ -84,8 +83,8 @@ class Plane:
 
 
 def grown(limits: tuple[float, float] | None, values: FloatArray) -> tuple[float, float] | None:
-    """Limits that hold all finite values too: unchanged while they do, else grown to round numbers with room."""
-    # What no sensor can mean does not set the axes for ever.
+    """Limits that contain all finite values: unchanged if they do already, else extended to round numbers."""
+    # Values that no sensor can produce must not set the axes.
     values = values[np.isfinite(values) & (np.abs(values) < 1e12)]
     if not values.size:
         return limits
@@ -102,7 +101,7 @@ def grown(limits: tuple[float, float] | None, values: FloatArray) -> tuple[float
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """Curves over time. ``range`` fixes the value axis; None lets it follow the data."""
+    """Curves over time. ``range`` fixes the value axis; None: it follows the data."""
 
     name: str
     paths: tuple[str, ...]
@@ -111,7 +110,7 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class PlaneView:
-    """A plane with its axes, see `service.viewer.layout`."""
+    """A plane with its axes."""
 
     name: str
     origin: str
@@ -120,7 +119,7 @@ class PlaneView:
 
 @dataclass(frozen=True, slots=True)
 class TextView:
-    """Events, one a line; or with ``document`` the newest text at a path."""
+    """Events, one per line; with ``document`` the newest text at a path."""
 
     name: str
     path: str
@@ -129,7 +128,7 @@ class TextView:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Views beside each other (``row``), above each other (``column``) or behind each other (``tabs``)."""
+    """Views side by side (``row``), one above the other (``column``) or as ``tabs``."""
 
     kind: str
     parts: tuple[Part, ...]
@@ -140,7 +139,7 @@ Part = Plot | PlaneView | TextView | Box
 
 
 def layout(config: SceneConfig) -> Box:
-    """The engineer's desk: tracking on the left, the shape of the hysteresis in the middle, health on the right."""
+    """The views: tracking on the left, hysteresis in the middle, health of service and stream on the right."""
     models = config.models
     main = models[0]
     seconds = f"{config.loop_s:g} s"

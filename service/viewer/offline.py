@@ -1,4 +1,4 @@
-"""The same scene from arrays: for a run that has been computed rather than watched."""
+"""Draws a run that was computed: the same scene as live, from arrays."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from service.viewer.feed import Event, Record, SceneConfig, Tracking
+from service.viewer.records import Event, Record, SceneConfig, Tracking
 from service.viewer.rerun_sink import RerunSink
 from service.viewer.scene import Scene
 
-#: How much of the stage's time goes into one piece: what a live stream would bring at once.
+#: Length of the pieces that a record is cut into, s: like the batches of a live stream.
 PIECE_S = 0.5
 
 
 def write_recording(path: Path, config: SceneConfig, records: Iterable[Record]) -> None:
     """Write an ``.rrd`` of a whole run, overwriting ``path``.
 
-    ``records`` may come in any order; a `Tracking` may hold a unit's whole run. They are cut into pieces and
-    drawn in order of time, as a live stream would have been. Raises InputError if the file cannot be written.
+    ``records`` may come in any order; a `Tracking` may hold a whole run. They are cut into pieces and drawn in order
+    of time, as in a live stream. Raises InputError if the file cannot be written.
     """
     path.unlink(missing_ok=True)
     sink = RerunSink(config, rrd=path)
@@ -29,7 +29,7 @@ def write_recording(path: Path, config: SceneConfig, records: Iterable[Record]) 
 
 
 def in_order(records: Iterable[Record]) -> list[Record]:
-    """All records in order of time, long ones cut into pieces; events before the samples of the same time."""
+    """All records in order of time, long ones cut into pieces; events come before the samples of the same time."""
     pieces: list[tuple[float, int, Record]] = []
     for record in records:
         if isinstance(record, Tracking):

@@ -1,8 +1,8 @@
-"""A sink in a process of its own behind a bounded queue: a viewer that is slow, gone or stuck costs nobody anything.
+"""A sink in a process of its own behind a bounded queue, so that a slow, dead or stuck viewer holds up nothing else.
 
-The stream to a viewer that has gone blocks whoever writes to it, for ever. So the writer is a child process; the
-queue to it holds a bounded number of batches; what does not fit is dropped and counted; and at the end the child
-gets a bounded time to finish before it is ended.
+A stream to a viewer that has gone blocks its writer for ever. So the writer is a child process, and its queue holds a
+bounded number of batches; further batches are dropped and counted. At the end the child has a bounded time to finish
+before it is terminated.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from typing import Final
 from adaptive.errors import InputError
 from service.background.priority import step_back
 from service.protocol.errors import ServiceError
-from service.viewer.feed import Record, SceneConfig
+from service.viewer.records import Record, SceneConfig
 
-#: How long a child may take to start: Rerun and numpy are imported anew in it.
+#: How long a child may take to start, s: it imports Rerun and numpy.
 START_S = 60.0
 _NICE: Final = 5
 _URL = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy\Z")
@@ -37,7 +37,7 @@ _URL = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy\Z")
 class OutputConfig:
     """Where to draw: ``rrd``, a file, or ``connect``, the URL of a viewer; exactly one of them.
 
-    ``queue_batches`` bounds what waits; at 0.2 s a batch, 100 of them are 20 s.
+    ``queue_batches`` limits the waiting batches; at 0.2 s a batch, 100 of them are 20 s. Raises InputError.
     """
 
     scene: SceneConfig
@@ -60,12 +60,13 @@ class OutputConfig:
 
 
 class Output:
-    """A running sink. Raises InputError if it cannot be had: a file in no folder, a URL that is none."""
+    """A running sink. Raises InputError if the file cannot be written or the URL is invalid, ServiceError if the child
+    does not start."""
 
     def __init__(self, config: OutputConfig) -> None:
         self.config = config
         self.dropped = 0
-        # A fresh interpreter: zenoh's threads of this one do not survive a fork.
+        # Spawn: zenoh's threads of this process do not survive a fork.
         context = multiprocessing.get_context("spawn")
         self._queue: Queue[Sequence[Record] | None] = context.Queue(config.queue_batches)
         ours, theirs = context.Pipe(duplex=False)
@@ -80,7 +81,7 @@ class Output:
 
     @property
     def alive(self) -> bool:
-        """Whether the child still draws."""
+        """Whether the child still runs."""
         return self._process.is_alive()
 
     @property
@@ -89,7 +90,7 @@ class Output:
         return self._process.pid
 
     def offer(self, batch: Sequence[Record]) -> bool:
-        """Hand a batch over, or drop and count it; never waits. Returns whether it was taken."""
+        """Pass a batch to the child, or drop and count it; never waits. Returns whether it was taken."""
         if self._process.is_alive():
             with contextlib.suppress(queue.Full):
                 self._queue.put_nowait(batch)
@@ -98,7 +99,7 @@ class Output:
         return False
 
     def close(self, timeout_s: float = 10.0) -> bool:
-        """Finish what waits, for at most ``timeout_s``; then end the child. Returns whether all was drawn."""
+        """Draw what waits, for at most ``timeout_s``; then end the child. Returns whether everything was drawn."""
         until = time.monotonic() + timeout_s
         try:
             self._queue.put(None, timeout=max(timeout_s, 1e-3))
@@ -113,7 +114,7 @@ class Output:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-        # What still waits has nobody to read it: without this the interpreter would wait for ever at its end.
+        # No process reads the rest of the queue: without this the interpreter would wait for it at exit.
         self._queue.cancel_join_thread()
         self._queue.close()
         self._process.close()
@@ -130,10 +131,10 @@ class Output:
 
 
 def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greeting: Connection) -> None:
-    """The child: draws batches until None comes or its parent is gone."""
-    # An interrupt at the terminal reaches the whole group; the parent decides when to stop.
+    """The child process: draw batches until None comes or the parent is gone."""
+    # Ctrl-C reaches the whole process group; the parent decides when to stop.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Drawing must never take the processor from those it watches: in a session of its own, which is nice as a whole.
+    # Low priority, in a session of its own: drawing must not take processor time from the service.
     with contextlib.suppress(OSError, AttributeError):
         os.setsid()
     step_back(_NICE)
@@ -141,7 +142,7 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     from service.viewer.scene import Scene
 
     if config.connect is not None:
-        greeting.send("")  # A viewer that is stuck blocks whoever connects to it, so nobody waits for that.
+        greeting.send("")  # Do not wait for the connection: a stuck viewer blocks it.
     try:
         sink = RerunSink(config.scene, rrd=config.rrd, connect=config.connect, recording_id=config.recording_id)
     except InputError as error:
@@ -167,4 +168,4 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     try:
         sink.close()
     except ServiceError:
-        sys.exit(1)  # The parent says so; Rerun has already said why.
+        sys.exit(1)  # The parent reports it; Rerun has already printed the reason.

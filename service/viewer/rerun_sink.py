@@ -1,7 +1,7 @@
-"""The one module that knows Rerun: a canvas that draws into a viewer or an ``.rrd`` file.
+"""The only module that knows Rerun: a canvas that draws into a viewer or an ``.rrd`` file.
 
-Not safe against blocking: a stream to a viewer that has gone blocks the caller once its buffers are full. Whatever
-must not wait stands behind `service.viewer.output`.
+Drawing may block: a stream to a viewer that has gone blocks the caller once its buffers are full. Use it behind
+`service.viewer.output` where nothing may wait.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.protocol.errors import ServiceError
 from service.viewer import style
-from service.viewer.feed import IntArray, SceneConfig
 from service.viewer.layout import Box, Part, PlaneView, Plot, layout
+from service.viewer.records import IntArray, SceneConfig
 
 APPLICATION = "dehyst"
 TIMELINE, SEQUENCE = "t_s", "seq"
 DEFAULT_PORT = 9876
-#: Of the viewer that is spawned: its own store and its server's buffer of messages.
+#: Memory of a viewer that is started here: its store, and the message buffer of its server.
 VIEWER_MEMORY, SERVER_MEMORY = "1GiB", "64MiB"
 
 
 class RerunSink:
-    """Draws into one place: the file ``rrd`` or the viewer at ``connect``. Close it, or the end may be missing.
+    """Draws into the file ``rrd`` or the viewer at ``connect``. Close it, or the end of the run may be missing.
 
     Raises
     ------
@@ -47,20 +47,20 @@ class RerunSink:
     ) -> None:
         if (rrd is None) == (connect is None):
             raise InputError(f"rrd, connect: got {rrd!r} and {connect!r}, expected exactly one of them")
-        desk = blueprint(config)
-        # The live stream and the file of one run carry the same id, so that the viewer knows them for the same.
+        views = blueprint(config)
+        # The live stream and the file of one run have the same id, so that the viewer shows them as one.
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id or str(uuid.uuid4()))
         if rrd is not None:
             try:
                 rrd.parent.mkdir(parents=True, exist_ok=True)
                 rrd.open("ab").close()
-                self._stream.save(rrd, default_blueprint=desk)
+                self._stream.save(rrd, default_blueprint=views)
             except (OSError, RuntimeError) as error:
                 raise InputError(
                     f"rrd: cannot write {rrd}: {error}; name a file in a folder you may write to"
                 ) from error
         else:
-            self._stream.connect_grpc(connect, default_blueprint=desk)
+            self._stream.connect_grpc(connect, default_blueprint=views)
         self._stream.send_recording_name(config.title)
         for path, line in style.lines(config).items():
             self._stream.log(
@@ -107,7 +107,7 @@ class RerunSink:
         self._stream.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
     def close(self) -> None:
-        """Flush and let go of file or viewer; a file is complete afterwards. Raises ServiceError if it is not."""
+        """Flush and close the file or connection; a file is complete afterwards. Raises ServiceError if it is not."""
         try:
             self._stream.flush()
         except RuntimeError as error:
@@ -121,7 +121,7 @@ class RerunSink:
 
 
 def blueprint(config: SceneConfig) -> rrb.Blueprint:
-    """The layout of `service.viewer.layout` in Rerun's words."""
+    """The layout of `service.viewer.layout` as a Rerun blueprint."""
     start = (
         rrb.TimeRangeBoundary.infinite()
         if config.history_s is None
@@ -172,8 +172,8 @@ def _part(part: Part, ranges: rrb.VisibleTimeRange) -> rrb.Container | rrb.View:
 
 
 def viewer_command(port: int, *, headless: bool = False) -> list[str]:
-    """The command that starts a viewer of one's own, bound to the loopback alone (Rerun's default is every host)."""
-    # The program itself, not its Python wrapper, which would leave a child behind.
+    """The command that starts a viewer on the loopback interface (Rerun's default is all interfaces)."""
+    # The program itself: its Python wrapper would leave a child process behind.
     binary = Path(rr.__file__).parents[1] / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
     command = [
         str(binary), "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen",
@@ -183,6 +183,6 @@ def viewer_command(port: int, *, headless: bool = False) -> list[str]:
 
 
 def spawn_viewer(port: int = DEFAULT_PORT, *, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
-    """Start a viewer; returns its process and the URL to connect to. It outlives us unless it is ended."""
+    """Start a viewer; returns its process and the URL to connect to. It keeps running until it is ended."""
     process = subprocess.Popen(viewer_command(port, headless=headless), start_new_session=True)
     return process, f"rerun+http://127.0.0.1:{port}/proxy"

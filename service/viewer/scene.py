@@ -1,18 +1,18 @@
-"""Turns records into curves, planes and text: what is drawn, without knowing who draws it."""
+"""Turns records into curves, planes and text and draws them on a canvas; it does not know which program draws."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from service.viewer import style
-from service.viewer.canvas import Canvas
-from service.viewer.feed import (
+from service.viewer.layout import Plane, grown
+from service.viewer.records import (
     Diagnostics,
     Event,
     Health,
@@ -21,41 +21,99 @@ from service.viewer.feed import (
     SceneConfig,
     Status,
     Tracking,
-    as_markdown,
-    column,
-    number,
 )
-from service.viewer.layout import Plane, grown
-
-# --- The trail that a unit leaves: its last samples, and what is due to be drawn of them, at a pace of its own.
 
 
-#: How often the planes and the averages are drawn again, s of the stage's time.
+class Canvas(Protocol):
+    """Draws curves, planes and text. Times are those of the stage, s; ``seq`` is the number of the newest sample."""
+
+    def scalars(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None: ...
+    def strips(
+        self, path: str, t_s: float, seq: int, strips: Sequence[FloatArray], colour: style.Colour, radius: float
+    ) -> None: ...
+    def points(
+        self,
+        path: str,
+        t_s: float,
+        seq: int,
+        positions: FloatArray,
+        colour: style.Colour,
+        radius: float,
+        labels: Sequence[str] | None = None,
+    ) -> None: ...
+    def text(self, path: str, t_s: float, seq: int, text: str, level: str) -> None: ...
+    def document(self, path: str, t_s: float, seq: int, markdown: str) -> None: ...
+
+
+# --- JSON values of a peer, which may contain anything
+
+
+def number(value: Any) -> float | None:
+    """``value`` as a finite float, or None if it is none."""
+    if not isinstance(value, (int, float, np.integer, np.floating)):
+        return None
+    try:
+        value = float(value)
+    except OverflowError:  # JSON allows integers of any length.
+        return None
+    return value if math.isfinite(value) else None
+
+
+def column(value: Any) -> FloatArray | None:
+    """``value`` as (n,) float64 if it is a list of numbers, else None."""
+    if not isinstance(value, (list, tuple, np.ndarray)) or not len(value):
+        return None
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return array if array.ndim == 1 else None
+
+
+def as_markdown(title: str, fields: Mapping[str, Any], depth: int = 2) -> str:
+    """A status as a Markdown table; nested names are joined by dots, long values are cut."""
+    rows: list[str] = []
+
+    def walk(prefix: str, part: Mapping[str, Any], left: int) -> None:
+        for name, value in part.items():
+            if isinstance(value, Mapping) and left:
+                walk(f"{prefix}{name}.", value, left - 1)
+            else:
+                shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+                rows.append(f"| {prefix}{name} | {shown[:80].replace('|', '/')} |")
+
+    walk("", fields, depth)
+    return "\n".join([f"**{title}**", "", "| what | value |", "|---|---|", *rows])
+
+
+# --- The recent samples of a unit
+
+#: Period of drawing the planes and the averages, s of the stage's time.
 PLANE_EVERY_S = 0.25
 MEAN_EVERY_S = 0.05
 
 
 @dataclass(slots=True)
-class Trail:
-    """The last samples of one unit: columns t_s, u_V, y_um, reference_um."""
+class RecentSamples:
+    """The last samples of one unit, with columns t_s, u_V, y_um, reference_um, and what of them is due to be drawn."""
 
     rows: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
     next_mean_s: float = -math.inf
     next_plane_s: float = -math.inf
 
     def add(self, record: Tracking) -> None:
-        """Go on by the samples of ``record``, later than all before."""
+        """Append the samples of ``record``, which are later than all before."""
         self.rows = np.concatenate(
             [self.rows, np.column_stack([record.t_s, record.u_V, record.y_um, record.reference_um])]
         )
 
     def forget(self, before_s: float) -> None:
-        """Only what is later than ``before_s`` is kept."""
+        """Drop the samples up to ``before_s``."""
         self.rows = self.rows[self.rows[:, 0] > before_s]
 
     def loops_due(self, record: Tracking, loop_s: float) -> Iterator[tuple[float, FloatArray]]:
-        """Instants of ``record`` at which planes are due, s, and the rows of the last ``loop_s`` before each."""
-        # Planes are drawn as they stood every PLANE_EVERY_S, however long the record is (offline: all of a run).
+        """Instants of ``record`` at which planes are due, s, with the rows of the last ``loop_s`` before each."""
+        # Every PLANE_EVERY_S, however long the record is (offline it holds a whole run).
         first, last = float(record.t_s[0]), float(record.t_s[-1])
         due = max(self.next_plane_s, math.ceil(first / PLANE_EVERY_S - 1e-6) * PLANE_EVERY_S)
         while due <= last:
@@ -63,14 +121,14 @@ class Trail:
             if stop > start:
                 yield due, self.rows[start:stop]
             due = (math.floor(due / PLANE_EVERY_S + 1e-6) + 1) * PLANE_EVERY_S
-            if stop < len(self.rows):  # Nothing is drawn for a time in which there are no samples.
+            if stop < len(self.rows):  # No planes for a time without samples.
                 due = max(due, math.ceil(self.rows[stop, 0] / PLANE_EVERY_S - 1e-6) * PLANE_EVERY_S)
         self.next_plane_s = due
 
     def mean_errors_due(self, record: Tracking, mae_s: float, range_um: float) -> tuple[FloatArray, FloatArray]:
-        """Instants of ``record`` when averages are due, s, and the mean |error| of ``mae_s`` before each, % of range.
+        """Instants of ``record`` at which averages are due, s, and the mean |error| of the last ``mae_s``, % of range.
 
-        Instants before which nothing is known are left out.
+        Instants without a known error before them are left out.
         """
         t_s, size = self.rows[:, 0], np.abs(self.rows[:, 3] - self.rows[:, 2])
         known = np.isfinite(size)
@@ -89,13 +147,13 @@ class Trail:
         return at_s[some], 100.0 / range_um * (total[high] - total[low])[some] / n[some]
 
 
-#: Points of one loop: enough for the eye, few enough to send again and again.
+#: Points of one loop; the loop is sent again every PLANE_EVERY_S.
 LOOP_POINTS = 600
-#: Units run at the same time; one that is this far behind the last reference drawn has begun anew, s.
+#: A unit whose samples are this far behind the last reference drawn has restarted, s.
 REFERENCE_AHEAD_S = 2.0
-#: Single values that make a column of their own; a column of one row costs Rerun as much as one of a hundred.
+#: Single values are sent in columns of so many rows: Rerun needs as much time for one row as for a hundred.
 SINGLES = 64
-#: One change is often noted by several: what comes this soon after a change is part of it, s.
+#: Several events often report one change: within this time after a change they belong to it, s.
 CHANGES_APART_S = 5.0
 
 
@@ -107,7 +165,7 @@ class Scene:
     config: SceneConfig
     t_s: float = field(init=False, default=0.0)
     seq: int = field(init=False, default=0)
-    _trails: dict[str, Trail] = field(init=False, default_factory=dict)
+    _trails: dict[str, RecentSamples] = field(init=False, default_factory=dict)
     _reference_limits: tuple[float, float] | None = field(init=False, default=None)
     _referenced_s: float = field(init=False, default=-math.inf)
     _planes: dict[str, Plane] = field(init=False, default_factory=dict)
@@ -118,18 +176,18 @@ class Scene:
     _singles: dict[str, list[tuple[float, int, float]]] = field(init=False, default_factory=dict)
 
     def take_all(self, records: Iterable[Record]) -> None:
-        """Draw a batch of records, and nothing is held back."""
+        """Draw a batch of records completely."""
         for record in records:
             self.take(record)
         self.flush()
 
     def flush(self) -> None:
-        """Draw the single values that were gathered into columns."""
+        """Draw the single values collected so far."""
         for path in list(self._singles):
             self._flush(path)
 
     def take(self, record: Record) -> None:
-        """Draw one record; single values may wait for more of their kind, until `flush`."""
+        """Draw one record. Single values may wait for more of their kind until `flush`."""
         if isinstance(record, Tracking):
             self._tracking(record)
         elif isinstance(record, Diagnostics):
@@ -139,7 +197,7 @@ class Scene:
         elif isinstance(record, Event):
             if record.change and record.t_s - self._change_s >= CHANGES_APART_S:
                 self._change_s = record.t_s
-            # The viewer's own time column is too narrow to read, so the time stands in the text.
+            # The viewer's time column is too narrow to read, so the time is part of the text.
             self.canvas.text(style.EVENTS, record.t_s, record.seq, f"{record.t_s:.3f} s  {record.text}", record.level)
         elif isinstance(record, Health):
             for name, count in record.counts.items():
@@ -159,7 +217,7 @@ class Scene:
             self._referenced_s = -math.inf
         new = t_s > self._referenced_s
         if new.any():
-            # All units are given the same reference; whichever brings it first draws it.
+            # All units have the same reference; the first that brings it draws it.
             self._columns(style.REFERENCE, t_s[new], seq[new], record.reference_um[new])
             if np.isfinite(record.reference_um[new]).any():
                 self._referenced_s = float(t_s[-1])
@@ -177,10 +235,10 @@ class Scene:
         self._trail(record, main)
 
     def _trail(self, record: Tracking, main: bool) -> None:
-        """Averages and planes, at their own pace, from the trail that the unit leaves."""
-        trail = self._trails.setdefault(record.model, Trail())
+        """Draw averages and planes, at their own pace, from the recent samples of the unit."""
+        trail = self._trails.setdefault(record.model, RecentSamples())
         if len(trail.rows) and record.t_s[0] < trail.rows[-1, 0]:
-            trail = self._trails[record.model] = Trail()  # The stage has begun anew.
+            trail = self._trails[record.model] = RecentSamples()  # The stage has restarted.
         trail.add(record)
         self._mean_errors(record, trail)
         for due, rows in trail.loops_due(record, self.config.loop_s):
@@ -188,7 +246,7 @@ class Scene:
         keep_s = max(self.config.loop_s, self.config.mae_s) + 2 * PLANE_EVERY_S
         trail.forget(float(record.t_s[-1]) - keep_s)
 
-    def _mean_errors(self, record: Tracking, trail: Trail) -> None:
+    def _mean_errors(self, record: Tracking, trail: RecentSamples) -> None:
         range_um = self.config.range_um
         if range_um is None and self._reference_limits is not None:
             range_um = self._reference_limits[1] - self._reference_limits[0]
@@ -198,7 +256,7 @@ class Scene:
         if at_s.size:
             seq = np.interp(at_s, record.t_s, record.seq).astype(np.int64)
             self.canvas.scalars(style.mean_error(record.model), at_s, seq, mean_pct)
-            # Rerun has no logarithmic axis, and the models lie two decades apart.
+            # Rerun has no logarithmic axis, and the models' errors differ by a factor of 100.
             decades = np.log10(np.maximum(mean_pct, 1e-6))
             self.canvas.scalars(style.mean_error_log(record.model), at_s, seq, decades)
 
@@ -216,14 +274,14 @@ class Scene:
         self._loops(rows[:, :3], hue, at_s, seq)
 
     def _loops(self, rows: FloatArray, hue: style.Colour, at_s: float, seq: int) -> None:
-        """The loop as it is now, and since the last change of the stage also the last one from before it."""
+        """Draw the present loop and, after a change of the stage, the last loop before it."""
         old = self._planes.get(style.LOOP_PLANE)
         plane = self._plane(style.LOOP_PLANE, rows[:, 1], rows[:, 2], at_s, seq)
         if plane is None:
             return
         changed = len(self._now) > 0 and self._now[0, 0] < self._change_s <= at_s
         if changed:
-            # Word of a change may come late: what the last loop holds from after it does not belong to before.
+            # The event may arrive late: drop the part of the last loop that is after the change.
             self._before = self._now[self._now[:, 0] < self._change_s]
         if len(self._before) and (changed or plane is not old):
             line = [plane.points(self._before[:, 1], self._before[:, 2])]
@@ -232,7 +290,7 @@ class Scene:
         self.canvas.strips(style.LOOP_NOW, at_s, seq, [plane.points(self._now[:, 1], self._now[:, 2])], hue, 0.4)
 
     def _plane(self, name: str, x: FloatArray, y: FloatArray, t_s: float, seq: int) -> Plane | None:
-        """The axes that hold these data, drawn anew whenever they have to grow; None while nothing is finite."""
+        """The axes that contain these data, drawn again when they have to grow; None while nothing is finite."""
         old = self._planes.get(name)
         x_fixed, y_fixed = None, None
         if name == style.LOOP_PLANE:
@@ -254,7 +312,7 @@ class Scene:
         self.canvas.points(f"{name}/axes/labels", t_s, seq, where, style.LABEL, 0.01, what)
         return plane
 
-    # -- the learner's own words ---------------------------------------------------------------------------------
+    # -- diagnostics of the learner ------------------------------------------------------------------------------
 
     def _diagnostics(self, record: Diagnostics) -> None:
         t_s, seq, fields = record.t_s, record.seq, record.fields
@@ -288,7 +346,7 @@ class Scene:
                 self.canvas.points(style.WINDOW_POINTS, t_s, seq, plane.points(y_um, v_um_per_s), hue, 0.7)
 
     def _counter(self, name: str, t_s: float, seq: int, value: Any) -> None:
-        """A count, and its rate over the last second at least, so that the curve is readable."""
+        """A count, and its rate over at least the last second so that the curve is smooth enough to read."""
         count = number(value)
         if count is None:
             return
@@ -297,7 +355,7 @@ class Scene:
         if t_s - since_s >= 1.0:
             self._one(f"rate/{name}", t_s, seq, (count - before) / (t_s - since_s))
             self._counters[name] = (t_s, count)
-        elif t_s < since_s or count < before:  # The service has started anew.
+        elif t_s < since_s or count < before:  # The service has restarted.
             self._counters[name] = (t_s, count)
 
     def _columns(self, path: str, t_s: FloatArray, seq: IntArray, values: FloatArray) -> None:

@@ -1,14 +1,14 @@
-"""Entity paths, colours and names of the curves: one place, so that scene, blueprint and tests agree."""
+"""Entity paths, colours and names of the curves, shared by scene, blueprint and tests."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.viewer.feed import SceneConfig
+from service.viewer.records import SceneConfig
 
 Colour = tuple[int, int, int]
 
-#: Colour-blind safe on the viewer's dark ground; the adaptive model is the bright one.
+#: Colour-blind safe on the viewer's dark background; the adaptive model is the brightest.
 COLOURS: dict[str, Colour] = {
     "linear": (150, 150, 150),
     "bouc_wen": (204, 121, 167),
@@ -24,7 +24,7 @@ RED: Colour = (255, 90, 80)
 FRAME: Colour = (70, 70, 74)
 LABEL: Colour = (190, 190, 190)
 
-#: What the models are called in legends.
+#: Names of the models in legends.
 NAMES: dict[str, str] = {
     "linear": "linear",
     "bouc_wen": "Bouc-Wen",
@@ -67,11 +67,11 @@ def deviation(model: str) -> str:
 
 
 def colour(model: str, models: tuple[str, ...]) -> Colour:
-    """The colour of a model: its own if it is one of ours, else a spare one by its place in ``models``."""
+    """The colour of a model: its own if it is a known one, else a spare one by its place in ``models``."""
     if model in COLOURS:
         return COLOURS[model]
-    strangers = [m for m in models if m not in COLOURS]
-    return SPARE_COLOURS[strangers.index(model) % len(SPARE_COLOURS)] if model in strangers else WHITE
+    others = [m for m in models if m not in COLOURS]
+    return SPARE_COLOURS[others.index(model) % len(SPARE_COLOURS)] if model in others else WHITE
 
 
 def name(model: str) -> str:
@@ -80,7 +80,7 @@ def name(model: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """How one curve is drawn: ``width`` in points of the screen. Units stand in the titles of the plots."""
+    """How one curve is drawn: ``width`` in points of the screen. The titles of the plots give the units."""
 
     name: str
     colour: Colour
@@ -88,7 +88,7 @@ class Line:
 
 
 def lines(config: SceneConfig) -> dict[str, Line]:
-    """Every curve that is known before the first record, by its path."""
+    """Every curve that is known before the first record, by path."""
     main = config.models[0]
     found = {REFERENCE: Line("wanted", WHITE, 1.0)}
     for model in config.models:

@@ -22,7 +22,7 @@ from service.protocol import samples as wire
 from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN, Trajectory
 from service.runtime.session import open_client
 from service.stage_node.faults import fault_key
-from service.stage_node.port import status_key
+from service.stage_node.node import status_key
 from service.storage.model_file import BundleMeta, write_bundle
 from sim.signals.signals import training_input
 from sim.stage.presets import preset

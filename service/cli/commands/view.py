@@ -15,8 +15,8 @@ from service.protocol.errors import ServiceError
 from service.runtime.session import DEFAULT_ENDPOINT, open_client
 from service.runtime.stopping import StopSignal
 from service.viewer.consumer import Consumer, ConsumerConfig
-from service.viewer.feed import SceneConfig
 from service.viewer.output import Output, OutputConfig
+from service.viewer.records import SceneConfig
 
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 #: What the live plots show unless told otherwise, s; a file shows all of it.

@@ -23,7 +23,7 @@ FIRST = 1_000_000_000
 
 
 class Driven:
-    """A stage of a soak that clamps what it is sent as `service.stage_node.port` does, and the track that sees both."""
+    """A stage of a soak that clamps what it is sent as `service.stage_node.node` does, and the track that sees both."""
 
     def __init__(self, first: int = FIRST) -> None:
         self.now = 10.0

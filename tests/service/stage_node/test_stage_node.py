@@ -25,7 +25,7 @@ from service.runtime.session import open_client
 from service.stage_node.commands import CommandBuffer
 from service.stage_node.faults import fault_key
 from service.stage_node.node import NodeConfig, status_key
-from service.stage_node.sender import MOST, RING, SampleRing, Sender
+from service.stage_node.sender import MAX_MESSAGE, RING_SIZE, SampleRing, Sender
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 
@@ -308,7 +308,7 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
     ring.write(0, 0.0, 0.0)
     sender.wake()
     start = time.monotonic()
-    n = RING + 5000
+    n = RING_SIZE + 5000
     for k in range(1, n):
         ring.write(k, float(k), -float(k))
         sender.wake()
@@ -322,5 +322,5 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
     assert seq[-1] == n - 1
     assert ring.published == len(seq)
     assert ring.lost == n - len(seq)
-    assert 5000 <= ring.lost <= 5000 + 2 * MOST
-    assert max(len(batch) for batch in sent) <= MOST
+    assert 5000 <= ring.lost <= 5000 + 2 * MAX_MESSAGE
+    assert max(len(batch) for batch in sent) <= MAX_MESSAGE

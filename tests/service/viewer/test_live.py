@@ -21,7 +21,7 @@ from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import open_service
 from service.viewer.consumer import Consumer, ConsumerConfig
-from service.viewer.feed import Diagnostics, Event, Health, Record, Status, Tracking, event_record
+from service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking, event_record
 
 DT_S = 1e-3
 BATCH = 20

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.viewer import style
-from service.viewer.feed import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
-from service.viewer.join import ReferenceRing, UnitJoin
+from service.viewer.consumer import ReferenceRing, SampleReferenceJoin
 from service.viewer.layout import HEIGHT, WIDTH, Box, Part, Plane, PlaneView, Plot, TextView, grown, layout, ticks
 from service.viewer.offline import cut, in_order
+from service.viewer.records import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
 from service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")
@@ -82,7 +82,7 @@ def drawn(records: Sequence[Any], **config: Any) -> Memory:
 @settings(deadline=None, max_examples=60)
 def test_every_sample_comes_out_once_in_order_with_its_own_reference(blocks: list[Any], rng: Any) -> None:
     ring = ReferenceRing(size=256)
-    join = UnitJoin("linear", ring, patience_s=0.02)
+    join = SampleReferenceJoin("linear", ring, patience_s=0.02)
     known: dict[int, float] = {}
     taken: list[Tracking] = []
     now = 0
@@ -111,7 +111,7 @@ def test_a_twin_without_a_reference_takes_that_of_the_main_unit() -> None:
     main, own = ReferenceRing(), ReferenceRing()
     main.put(np.arange(4), np.array([1.0, 2.0, 3.0, 4.0]))
     own.put(np.array([2]), np.array([30.0]))
-    join = UnitJoin("linear", own, fallback=main)
+    join = SampleReferenceJoin("linear", own, fallback=main)
     k = np.arange(4)
     join.put(k, k * 1e-3, k * 0.0, k * 0.0)
     got = join.take()
@@ -128,7 +128,7 @@ def test_a_ring_never_gives_away_what_it_has_overwritten() -> None:
 
 
 def test_a_stage_that_begins_anew_is_counted_and_followed() -> None:
-    join = UnitJoin("linear", ReferenceRing())
+    join = SampleReferenceJoin("linear", ReferenceRing())
     k = np.arange(100, 110)
     join.put(k, k * 1e-3, k * 0.0, k * 0.0)
     join.put(k - 100, (k - 100) * 1e-3, k * 0.0, k * 0.0)

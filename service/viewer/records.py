@@ -1,0 +1,170 @@
+"""The records of the viewer stream: arrays and JSON values, so that they can pass between processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+
+IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Tracking:
+    """n samples of the unit that ``model`` drives, in order of time.
+
+    Attributes
+    ----------
+    model : name of the model whose voltages drive this unit; it names the curves.
+    seq : (n,) sequence numbers.
+    t_s : (n,) time of the stage, s.
+    u_V : (n,) voltage applied, V.
+    y_um : (n,) displacement measured, µm.
+    reference_um : (n,) reference, µm; NaN where unknown.
+    std_V : (n,) one standard deviation of the voltage, V; NaN where unknown; None if it is unknown for all.
+
+    Raises InputError if the shapes differ.
+    """
+
+    model: str
+    seq: IntArray
+    t_s: FloatArray
+    u_V: FloatArray
+    y_um: FloatArray
+    reference_um: FloatArray
+    std_V: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.seq)
+        columns = {
+            "t_s": self.t_s, "u_V": self.u_V, "y_um": self.y_um, "reference_um": self.reference_um, "std_V": self.std_V,
+        }  # fmt: skip
+        for name, value in columns.items():
+            if value is not None and np.shape(value) != (n,):
+                raise InputError(
+                    f"{name}: got shape {np.shape(value)}, expected ({n},), one value for each sequence number"
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """Diagnostics of the learner, about 20 times a second; every field may be missing (docs/viewer.md)."""
+
+    t_s: float
+    seq: int
+    fields: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The service's status, about once a second."""
+
+    t_s: float
+    seq: int
+    fields: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event. ``change`` marks a change of the stage: loops are drawn before and after it."""
+
+    t_s: float
+    seq: int
+    text: str
+    level: str = "INFO"
+    change: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Counts of the stream itself since its start, by name: received, malformed, dropped."""
+
+    t_s: float
+    seq: int
+    counts: Mapping[str, int]
+
+
+Record = Tracking | Diagnostics | Status | Event | Health
+
+
+@dataclass(frozen=True, slots=True)
+class SceneConfig:
+    """What is known before the first record.
+
+    Attributes
+    ----------
+    title : name of the recording, for example ``demo/x``.
+    models : the models whose units are shown; the first is the one that the service serves and that learns.
+    range_um : motion range that percentages refer to, µm; None: the span of the reference so far.
+    u_limits_V, y_limits_um : limits of the (u, y) plane; None: they grow with the data.
+    loop_s : length of the past that one loop shows, s.
+    mae_s : time over which the absolute error is averaged, s.
+    history_s : length of the past that the plots show, s; None: all of it.
+    notes : texts that the recording carries, by name.
+    """
+
+    title: str
+    models: tuple[str, ...] = ("lssvm_adaptive",)
+    range_um: float | None = None
+    u_limits_V: tuple[float, float] | None = None
+    y_limits_um: tuple[float, float] | None = None
+    loop_s: float = 2.0
+    mae_s: float = 0.5
+    history_s: float | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.models or len(set(self.models)) != len(self.models):
+            raise InputError(f"models: got {self.models!r}, expected at least one name and none of them twice")
+        lengths = {"range_um": self.range_um, "loop_s": self.loop_s, "mae_s": self.mae_s, "history_s": self.history_s}
+        for name, length in lengths.items():
+            if length is not None and not (np.isfinite(length) and length > 0):
+                raise InputError(f"{name}: got {length!r}, expected a positive number")
+        for name, limits in (("u_limits_V", self.u_limits_V), ("y_limits_um", self.y_limits_um)):
+            if limits is not None and not (np.all(np.isfinite(limits)) and limits[0] < limits[1]):
+                raise InputError(f"{name}: got {limits!r}, expected (low, high) with low < high")
+
+
+# --- Events of the protocol
+
+
+#: Events that mark a change of the stage.
+CHANGES = frozenset({"change", "stage_change", "stage_changed"})
+_LEVELS = {"ERROR": "ERROR", "WARN": "WARN", "WARNING": "WARN", "INFO": "INFO", "DEBUG": "DEBUG"}
+_FAILING = ("error", "fail")
+_ALARMING = (
+    "change",
+    "drift",
+    "drop",
+    "full",
+    "gap",
+    "late",
+    "lost",
+    "malformed",
+    "refus",
+    "restart",
+    "rolled",
+    "stall",
+)
+
+
+def event_record(t_s: float, seq: int, fields: Mapping[str, Any]) -> Event:
+    """An event of the protocol as a line of text: its ``event`` and ``detail``, or all fields if these are missing."""
+    kind = str(fields.get("event", fields.get("kind", "")))
+    detail = fields.get("detail", fields.get("message", fields.get("text")))
+    if detail is None:
+        detail = ", ".join(f"{k} {v}" for k, v in fields.items() if k not in ("event", "kind", "seq", "t_s", "level"))
+    level = _LEVELS.get(str(fields.get("level", "")).upper())
+    if level is None:
+        level = "INFO"
+        if any(word in kind.lower() for word in _ALARMING):
+            level = "WARN"
+        if any(word in kind.lower() for word in _FAILING):
+            level = "ERROR"
+    text = f"{kind}: {detail}" if kind and detail else kind or str(detail)
+    return Event(t_s, seq, text, level, change=kind in CHANGES)
