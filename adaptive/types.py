@@ -118,7 +118,7 @@ class OnlineModel(Protocol):
 
     Deterministic: the same samples in the same order give the same snapshots to the last bit. Not for several threads
     at once. All that a service needs of a learner is declared here, so that a type checker sees each use. A model that
-    lacks an ability implements it trivially and says so; see ``baselines.online.OnlineBaseline``.
+    lacks an ability implements it trivially and says so; see ``baselines.online_baseline.OnlineBaseline``.
     """
 
     # ---- samples in

@@ -1,1 +1,72 @@
-"""Bouc-Wen, Prandtl-Ishlinskii and its modified form: models, exact inverses, identification, online forms."""
+"""Reference models of hysteresis to compare the LSSVM with, and the competition that serves the best model.
+
+A linear, a Bouc-Wen and a Prandtl-Ishlinskii (MPI) model, each with identification, exact inverse and an online form::
+
+    >>> import numpy as np
+    >>> from baselines import fit_linear
+    >>> u_V = np.linspace(0.0, 8.0, 50)
+    >>> model, report = fit_linear(u_V, 2.0 + 11.0 * u_V, dt_s=1e-3)
+    >>> y_um, still = np.array([24.0]), np.zeros(1)
+    >>> round(float(model.feedforward(y_um, still, still, model.rest_memory(24.0)).u_V[0]), 6)
+    2.0
+
+Names are imported when they are first used, because some of them load compiled code.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from baselines.bouc_wen.inverse import BoucWenInverse as BoucWenInverse
+    from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
+    from baselines.competition.champion import ChampionInverse as ChampionInverse
+    from baselines.competition.competition import Competition as Competition
+    from baselines.competition.config import CompetitionConfig as CompetitionConfig
+    from baselines.fit import fit_bouc_wen as fit_bouc_wen
+    from baselines.fit import fit_linear as fit_linear
+    from baselines.fit import fit_mpi as fit_mpi
+    from baselines.fit_report import FitReport as FitReport
+    from baselines.linear import LinearInverse as LinearInverse
+    from baselines.linear import LinearOnline as LinearOnline
+    from baselines.prandtl_ishlinskii.inverse import MpiInverse as MpiInverse
+    from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
+
+_MODULES = {
+    "BoucWenInverse": "bouc_wen.inverse",
+    "BoucWenOnline": "bouc_wen.online",
+    "ChampionInverse": "competition.champion",
+    "Competition": "competition.competition",
+    "CompetitionConfig": "competition.config",
+    "FitReport": "fit_report",
+    "LinearInverse": "linear",
+    "LinearOnline": "linear",
+    "MpiInverse": "prandtl_ishlinskii.inverse",
+    "MpiOnline": "prandtl_ishlinskii.online",
+    "fit_bouc_wen": "fit",
+    "fit_linear": "fit",
+    "fit_mpi": "fit",
+}
+
+__all__ = [
+    "BoucWenInverse",
+    "BoucWenOnline",
+    "ChampionInverse",
+    "Competition",
+    "CompetitionConfig",
+    "FitReport",
+    "LinearInverse",
+    "LinearOnline",
+    "MpiInverse",
+    "MpiOnline",
+    "fit_bouc_wen",
+    "fit_linear",
+    "fit_mpi",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

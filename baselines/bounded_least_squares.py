@@ -1,9 +1,9 @@
-"""Least squares with lower bounds from normal equations, compiled: what the online fits solve while they serve.
+"""Least squares with lower bounds on the unknowns: from the rows, and from a normal matrix.
 
-The active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974, ch. 23) as in ``scipy.optimize.nnls``,
-on the normal matrix that a fit with forgetting keeps anyway, and with unknowns that are free. The serving process needs
-no ``scipy.optimize`` by it, whose import is a tenth of its start. The identification from a recording, which has the
-rows themselves, solves by those (``baselines.prandtl_ishlinskii.identify.bounded_least_squares``).
+`bounded_least_squares` solves from the rows with ``scipy.optimize.nnls``; the identification of a recording uses it.
+`bounded_minimum` solves from the normal matrix that an online fit keeps, with the same active-set method (Lawson and
+Hanson, Solving Least Squares Problems, 1974, ch. 23) in compiled code. A serving process therefore does not import
+``scipy.optimize``, which would take a tenth of its start-up time.
 """
 
 from __future__ import annotations
@@ -15,15 +15,35 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.types import BoolArray, FloatArray
 
+#: Least slope of an invertible curve, as a share of its mean slope.
+SLOPE_FLOOR = 0.02
 #: Share of the largest right-hand side below which a gradient counts as zero.
 _FLAT = 1e-12
+
+
+def bounded_least_squares(matrix: FloatArray, target: FloatArray, lower: FloatArray) -> FloatArray:
+    """Minimise |matrix x - target| over x >= lower (p,); a bound of -inf leaves an unknown free. Returns (p,)."""
+    from scipy.optimize import nnls  # slow to import, and a serving process may never need it
+
+    free = np.isneginf(lower)
+    shift = np.where(free, 0.0, lower)
+    wide = np.hstack([matrix, -matrix[:, free]])
+    scale = np.linalg.norm(wide, axis=0)
+    scale[scale == 0.0] = 1.0
+    solution = nnls(wide / scale, target - matrix @ shift, maxiter=50 * wide.shape[1])[0] / scale
+    out: FloatArray = shift + solution[: matrix.shape[1]]
+    out[free] -= solution[matrix.shape[1] :]
+    return out
 
 
 @compiled
 def _solve_passive(
     A: FloatArray, b: FloatArray, passive: BoolArray, L: FloatArray, s: FloatArray
 ) -> bool:  # pragma: no cover - compiled
-    """Minimum over the unknowns in ``passive``, the others 0, into ``s``; False where A is not positive there."""
+    """Minimise over the unknowns in ``passive``, with the others 0, into ``s`` (p,).
+
+    Returns False where A (p, p) is not positive definite in these unknowns. ``L`` (p, p) is work space.
+    """
     p = b.shape[0]
     for i in range(p):
         s[i] = 0.0
@@ -61,7 +81,7 @@ def _solve_passive(
 
 @compiled
 def _active_set(A: FloatArray, b: FloatArray, free: BoolArray, z: FloatArray) -> bool:  # pragma: no cover - compiled
-    """Minimise z'Az/2 - b'z with z >= 0 but for the ``free``, into ``z``; False where it does not come to an end."""
+    """Minimise z'Az/2 - b'z into ``z`` (p,), with z >= 0 except where ``free``; False where it does not converge."""
     p = b.shape[0]
     L, s, passive = np.zeros((p, p)), np.zeros(p), free.copy()
     largest = 0.0
@@ -105,9 +125,9 @@ def _active_set(A: FloatArray, b: FloatArray, free: BoolArray, z: FloatArray) ->
 
 
 def bounded_minimum(normal: FloatArray, right: FloatArray, lower: FloatArray) -> FloatArray:
-    """Minimise x'Nx/2 - r'x over x >= lower, N (p, p) positive definite; a bound of -inf leaves an unknown free.
+    """Minimise x'Nx/2 - r'x over x >= lower (p,), N (p, p) positive definite; a bound of -inf leaves an unknown free.
 
-    Returns (p,). Raises RuntimeError where N is not positive definite in double precision or the search has no end.
+    Returns (p,). Raises RuntimeError where N is not positive definite in double precision or the search does not end.
     """
     free = np.isneginf(lower)
     shift = np.where(free, 0.0, lower)
@@ -115,7 +135,7 @@ def bounded_minimum(normal: FloatArray, right: FloatArray, lower: FloatArray) ->
     scale[~(scale > 0.0)] = 1.0
     z = np.empty(lower.size)
     scaled, scaled_right = normal / np.outer(scale, scale), (right - normal @ shift) / scale
-    # A slope that is not a number would count as none.
+    # The search would take a NaN gradient for zero.
     finite = np.isfinite(scaled).all() and np.isfinite(scaled_right).all()
     if not (finite and _active_set(scaled, scaled_right, free, z)):
         raise RuntimeError("the normal matrix is not positive definite")

@@ -1,20 +1,34 @@
-"""The plainest model: displacement is gain times voltage plus an offset. No memory."""
+"""The linear model: displacement is gain times voltage plus an offset. Identification, inverse, and online form."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from adaptive.errors import InputError
+from adaptive.state_codec import prefixed, under
 from adaptive.types import Feedforward, FloatArray, StateDict
-from baselines.validation import Domain, deviation, memory_copy, model_fields, model_state, points, positive
+from baselines.bounded_least_squares import SLOPE_FLOOR
+from baselines.fit_report import Domain, FitReport
+from baselines.online_baseline import field_of
+from baselines.recursive_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
+from baselines.validation import (
+    checked_memory,
+    checked_motion,
+    checked_recording,
+    common_fields,
+    common_state,
+    positive,
+    std_or_nan,
+)
 
 
 @dataclass(frozen=True)
 class LinearParameters:
-    """``y = gain u + offset``; gain µm/V, not zero; offset µm."""
+    """``y = gain u + offset``. Raises InputError unless both are finite and the gain is not zero."""
 
     gain_um_per_V: float
     offset_um: float = 0.0
@@ -26,15 +40,27 @@ class LinearParameters:
             raise InputError(f"offset_um: got {self.offset_um!r}, expected a finite value")
 
     def simulate(self, u_V: FloatArray, dt_s: float) -> FloatArray:
-        """Displacement (n,) µm for voltages (n,) V; ``dt_s`` does not matter."""
+        """Displacement (n,) µm for voltages (n,) V; ``dt_s`` has no influence."""
         return np.asarray(u_V, dtype=np.float64) * self.gain_um_per_V + self.offset_um
+
+
+def identify_linear(u_V: ArrayLike, y_um: ArrayLike, dt_s: float) -> tuple[LinearParameters, FitReport]:
+    """Gain and offset by least squares; ``u_V`` V and ``y_um`` µm are (n,), n >= 3, ``dt_s`` s apart.
+
+    Raises InputError on an unusable recording.
+    """
+    u, y, dt = checked_recording(u_V, y_um, dt_s, 3)
+    gain, offset = np.polynomial.polynomial.polyfit(u, y, 1)[::-1]
+    parameters = LinearParameters(float(gain), float(offset))
+    report = FitReport.of("linear", "least squares", y, parameters.simulate(u, dt), dt, 1, True)
+    return parameters, report
 
 
 @dataclass(frozen=True)
 class LinearInverse:
     """Inverse of :class:`LinearParameters`; implements ``adaptive.types.InverseModel`` under the name ``linear``.
 
-    ``voltage_std_V`` is one standard deviation of the voltage, from the residual of the identification.
+    ``voltage_std_V`` is one standard deviation of the voltage, from the residual of the identification; NaN: unknown.
     """
 
     parameters: LinearParameters
@@ -45,11 +71,11 @@ class LinearInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
-        deviation("voltage_std_V", self.voltage_std_V, "V")
+        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
 
     @property
     def memory_size(self) -> int:
-        """0: a line remembers nothing."""
+        """0: the model has no memory."""
         return 0
 
     def rest_memory(self, y_um: float) -> FloatArray:
@@ -59,14 +85,14 @@ class LinearInverse:
     def feedforward(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """Voltages (n,) V for displacements (n,) µm; raises InputError on bad shapes."""
-        y, _, _ = points(y_um, v_um_per_s, a_um_per_s2)
+        """Voltages (n,) V for displacements (n,) µm. Raises InputError on bad shapes."""
+        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
         p, domain = self.parameters, self.domain
         return Feedforward(
             u_V=(y - p.offset_um) / p.gain_um_per_V,
             std_V=np.full(y.size, self.voltage_std_V),
             inside=(y >= domain.y_min_um) & (y <= domain.y_max_um),
-            memory=memory_copy(memory, 0),
+            memory=checked_memory(memory, 0),
         )
 
     def track(
@@ -78,20 +104,80 @@ class LinearInverse:
         memory: FloatArray,
     ) -> FloatArray:
         """Empty (0,)."""
-        return memory_copy(memory, 0)
+        return checked_memory(memory, 0)
 
     def state_dict(self) -> StateDict:
         """Flat numbers by name."""
         p = self.parameters
-        state = model_state(self.dt_s, self.voltage_std_V, self.domain)
+        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
         return {**state, "name": self.name, "gain_um_per_V": p.gain_um_per_V, "offset_um": p.offset_um}
 
     @staticmethod
     def from_state(state: StateDict) -> LinearInverse:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
-        dt_s, std_V, domain = model_fields("linear", state)
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
+        dt_s, std_V, domain = common_fields("linear", state)
         try:
             parameters = LinearParameters(float(state["gain_um_per_V"]), float(state["offset_um"]))
         except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of a linear model; write it anew") from None
+            raise InputError(f"{missing.args[0]}: missing in the state of a linear model; write it again") from None
         return LinearInverse(parameters, dt_s, domain, std_V, str(state.get("name", "linear")))
+
+
+class LinearOnline(LeastSquaresOnline):
+    """Gain and offset by least squares with forgetting; the gain keeps its sign. Implements ``OnlineModel``.
+
+    By default a sample is remembered for 100 samples that teach.
+    """
+
+    def __init__(self, model: LinearInverse, config: LeastSquaresConfig | None = None) -> None:
+        p, domain = model.parameters, model.domain
+        y = np.linspace(domain.y_min_um, domain.y_max_um, 50)
+        u = (y - p.offset_um) / p.gain_um_per_V
+        super().__init__(
+            model.dt_s,
+            float(abs(u[-1] - u[0])),
+            config or LeastSquaresConfig(remember=100.0),
+            np.column_stack([u, np.ones(50), y]),
+        )
+        self.base = model
+        self._gain, self._offset, self._sign = p.gain_um_per_V, p.offset_um, np.sign(p.gain_um_per_V)
+        self._square = (model.voltage_std_V * p.gain_um_per_V) ** 2 if np.isfinite(model.voltage_std_V) else 0.0
+
+    def _regressors_now(self) -> FloatArray:
+        return np.array([self._recent[-1][0], 1.0])
+
+    def _row(self, pending: FloatArray, y_um: float, v_um_per_s: float) -> FloatArray:
+        return np.append(pending, y_um)
+
+    def _residual(self, row: FloatArray) -> float:
+        return float(self._gain * row[0] + self._offset - row[2])
+
+    def _solve(self) -> bool:
+        # A lower bound keeps the sign of the gain; the problem is mirrored where displacement falls with voltage.
+        signs = np.array([self._sign, 1.0, 1.0])
+        floor = SLOPE_FLOOR * abs(self.base.parameters.gain_um_per_V)
+        try:
+            gain, offset = self._minimum(self._normal * np.outer(signs, signs), np.array([floor, -np.inf]))
+        except RuntimeError:
+            return False
+        self._gain, self._offset = float(gain * self._sign), float(offset)
+        return True
+
+    def snapshot(self) -> LinearInverse:
+        """The present line; its standard deviation is that of the recent residuals."""
+        std = float(np.sqrt(self._square)) / abs(self._gain)
+        return replace(self.base, parameters=LinearParameters(self._gain, self._offset), voltage_std_V=std)
+
+    def state_dict(self) -> StateDict:
+        """The whole state; ``from_state`` continues to the same last bit."""
+        now = {"gain_now": self._gain, "offset_now": self._offset}
+        return {**self._learning_state(), **now, **prefixed("base_", self.base.state_dict())}
+
+    @classmethod
+    def from_state(cls, state: StateDict) -> LinearOnline:
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
+        made = cls(LinearInverse.from_state(under("base_", state)), config_from(state))
+        made._restore_learning(state)
+        made._gain = float(field_of(state, "gain_now", "linear"))
+        made._offset = float(field_of(state, "offset_now", "linear"))
+        return made

@@ -1,4 +1,4 @@
-"""Compile the compiled loops of this package once, so that no process pays for it at start."""
+"""Compiles the loops of this package once, so that no process waits for it at start."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import TABLE_2_1
 from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 from baselines.bounded_least_squares import bounded_minimum
-from baselines.least_squares import LeastSquaresConfig
+from baselines.fit_report import Domain
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from baselines.prandtl_ishlinskii.play import play_run
+from baselines.prandtl_ishlinskii.operators import play_run
+from baselines.recursive_least_squares import LeastSquaresConfig
 from baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
-from baselines.validation import Domain
 
 
 def warm() -> None:
-    """Call every compiled function on tiny inputs of the types that it is called with."""
+    """Call every compiled function on tiny inputs of the types that it is used with."""
     u, rest, domain = np.array([0.0, 1.0, 0.2]), np.zeros(3), Domain(0.0, 20.0, 1e4)
     TABLE_2_1.simulate(u, 1e-3)
     TABLE_2_1.with_gain(11.0, 0.0).motion(u, 1e-3)

@@ -18,8 +18,8 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
+from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.validation import Domain
 from service.failover.state_transfer import join
 from service.operating.request import Request, decode_request, encode_request
 from service.protocol import model as wire_model

@@ -12,7 +12,7 @@ from adaptive.online.learner import Learner
 from adaptive.types import InverseModel, OnlineModel
 from baselines.bouc_wen.online import BoucWenOnline
 from baselines.competition.competition import Competition
-from baselines.linear_online import LinearOnline
+from baselines.linear import LinearOnline
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from service.server.competing import Competing
 from tests.online_models import PlainModel

@@ -1,15 +1,15 @@
 """Identification of the Bouc-Wen stage (2.3) by bounded least squares from several starts.
 
-For given hysteresis (alpha, beta, gamma) and modes (b/k, m/k) the displacement is linear in d, in the offset and
-in the size of the initial transient: those three are solved for exactly inside the cost (variable projection),
-which leaves five unknowns, in a space where every point is a stage that can be inverted:
+For given hysteresis (alpha, beta, gamma) and modes (b/k, m/k) the displacement is linear in d, in the offset and in
+the size of the initial transient. These three are solved for exactly inside the cost (variable projection). Five
+unknowns remain, in a space where every point is a stage that can be inverted:
 
     alpha = 0.98 share/max(1, 2 rho),   beta = rho lambda,   gamma = (1 - rho) lambda,   log lambda, log b/k, log m/k
 
-Only m/k and b/k show in a recording, never m, b, k alone: the stiffness is what the caller says. Of an overdamped
-stage sampled slower than its fast mode not even m/k shows. It is therefore kept only if the fit is significantly
-worse without it, and else set to Table 2.1's, which is as good as none: an inverse multiplies it by accelerations
-far beyond those of the recording.
+A recording shows m/k and b/k only, never m, b, k alone; the caller states the stiffness. For an overdamped stage
+sampled more slowly than its fast mode, it does not show m/k either. m/k is therefore kept only where the fit is
+significantly worse without it. Otherwise it is set to the negligible value of Table 2.1, because the inverse
+multiplies it by accelerations far above those of the recording.
 """
 
 from __future__ import annotations
@@ -24,35 +24,36 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from baselines.validation import IdentificationReport, record
+from baselines.fit_report import FitReport
+from baselines.validation import checked_recording
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])
 _UPPER = np.array([1.0, 3.0, math.log(50.0), math.log(0.5), math.log(1e-2), 1.0])
-#: Starts: the chapter's result, and around it what loops of other shapes need.
+#: Starts: the chapter's result, and values for loops of other shapes.
 _STARTS = (
     (0.49, 0.47, math.log(1.86), math.log(2.5e-3), math.log(8e-10)),
     (0.30, 0.50, math.log(0.5), math.log(5e-4), math.log(1e-8)),
     (0.25, 0.90, math.log(5.0), math.log(1e-3), math.log(3e-7)),
     (0.60, 0.30, math.log(0.15), math.log(1e-2), math.log(1e-9)),
 )
-#: m/k as good as none: that of Table 2.1, log s².
-_NO_INERTIA = math.log(TABLE_2_1.inertia_s2)
-#: Rise of the squared error, in units of the residual's variance, that keeps m/k in the model.
+#: Logarithm of a negligible m/k (s²), that of Table 2.1.
+_NEGLIGIBLE_INERTIA = math.log(TABLE_2_1.inertia_s2)
+#: Least rise of the squared error, in units of the residual's variance, for which m/k is kept.
 _SIGNIFICANT = 12.0
 _SEARCH_SAMPLES = 1500
 _SEARCH_DT_S = 0.004
 
 
 def _unpack(theta: FloatArray) -> tuple[FloatArray, float, float]:
-    """(alpha, beta, gamma), lag s, inertia s² of the unknowns."""
+    """(alpha, beta, gamma), lag s, inertia s² of the unknowns (5,) or (6,)."""
     rho, rate = float(theta[1]), math.exp(theta[2])
     alpha = 0.98 * float(theta[0]) / max(1.0, 2.0 * rho)
     return np.array([alpha, rho * rate, (1.0 - rho) * rate]), math.exp(theta[3]), math.exp(theta[4])
 
 
 class _Fit:
-    """The residual of one recording at one sample time as a function of the unknowns."""
+    """The residual of a recording as a function of the unknowns."""
 
     def __init__(self, u_V: FloatArray, y_um: FloatArray, dt_s: float, hold: str, free_start: bool) -> None:
         self.u, self.y, self.dt, self.linear, self.free_start = u_V, y_um, dt_s, hold == "linear", free_start
@@ -61,35 +62,35 @@ class _Fit:
         self._t = np.arange(u_V.size) * dt_s
 
     def columns(self, theta: FloatArray) -> FloatArray:
-        """(n, 3): displacement for d = 1, constant, decay of the slow mode."""
+        """(n, 3) columns: displacement for d = 1, constant, decay of the slow mode."""
         self.evaluations += 1
         shape, lag, inertia = _unpack(theta)
         u0 = float(self.u[0])
         if self.free_start:
             g = float(theta[5]) * shape[0] / (shape[1] + shape[2])
         else:
-            g = hysteresis_step(0.0, u0, 0.0, shape[0], shape[1], shape[2])
+            g = hysteresis_step(0.0, u0, shape[0], shape[1], shape[2])
         p1, p2 = poles(lag, inertia)
         run_stage(self.u, self.dt, p1, p2, shape, self.linear, settled(u0, g), self._out)
         decay = np.exp(np.maximum(p1.real * self._t, -700.0))
         return np.column_stack([self._out[:, 0], np.ones(self.u.size), decay])
 
-    def linear_part(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residual (n,) µm and the coefficients d, offset, transient."""
+    def project(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residual (n,) µm and the best coefficients d, offset, transient."""
         columns = self.columns(theta)
         coefficients = np.asarray(np.linalg.lstsq(columns, self.y, rcond=None)[0], dtype=np.float64)
         return columns @ coefficients - self.y, coefficients
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """Residual (n,) µm."""
-        return self.linear_part(theta)[0]
+        return self.project(theta)[0]
 
     def solve(self, start: FloatArray, limit: int, inertia: bool = True) -> OptimizeResult:
-        """Trust-region least squares within the bounds; without ``inertia`` m/k rests at Table 2.1's."""
+        """Trust-region least squares within the bounds; without ``inertia`` m/k stays negligible."""
         theta = np.clip(start, _LOWER[: start.size] + 1e-9, _UPPER[: start.size] - 1e-9)
         free = np.ones(theta.size, dtype=np.bool_)
         if not inertia:
-            free[4], theta[4] = False, _NO_INERTIA
+            free[4], theta[4] = False, _NEGLIGIBLE_INERTIA
 
         def residual(part: FloatArray) -> FloatArray:
             theta[free] = part
@@ -110,10 +111,10 @@ class _Fit:
         return found
 
 
-def _independent(residual: FloatArray) -> float:
-    """How many independent samples a residual is worth, by its first autocorrelation.
+def _independent_samples(residual: FloatArray) -> float:
+    """Number of independent samples in a residual, from its first autocorrelation.
 
-    What a model cannot follow is no white noise: 10,000 samples of it may be worth ten.
+    Model errors are not white: 10,000 samples of them may be worth ten.
     """
     centred = residual - residual.mean()
     power = float(centred @ centred)
@@ -129,21 +130,21 @@ def identify_bouc_wen(
     hold: str = "linear",
     initial: str = "auto",
     k_N_per_m: float = TABLE_2_1.k_N_per_m,
-) -> tuple[BoucWenParameters, IdentificationReport]:
-    """Bouc-Wen stage of a recording; the better route beside the swarm of (2.3).
+) -> tuple[BoucWenParameters, FitReport]:
+    """Bouc-Wen stage of a recording, by least squares.
 
     Parameters
     ----------
-    u_V, y_um : (n,) voltage V and displacement µm, ``dt_s`` apart, n >= 20.
+    u_V, y_um : (n,) voltage V and displacement µm, ``dt_s`` s apart, n >= 20.
     hold : how the voltage runs within a step, see :mod:`baselines.bouc_wen.model`.
-    initial : "rest": the stage came monotonously from 0 V to the first voltage; "free": its hysteresis at the
-        start is one more unknown; "auto": free where the first voltage is above 5 % of the largest.
-    k_N_per_m : the stiffness to express m and b with, N/m; it cannot be seen in a recording.
+    initial : "rest": the stage came monotonically from 0 V to the first voltage; "free": its initial hysteresis is an
+        unknown; "auto": free where the first voltage is above 5 % of the largest.
+    k_N_per_m : stiffness to express m and b with, N/m; a recording does not show it.
 
-    Returns the parameters and a report; its errors are those with the initial transient and hysteresis found.
-    Raises InputError on a bad recording, or where displacement falls with voltage.
+    Returns the parameters and a report. Its errors are those with the initial transient and hysteresis that were
+    found. Raises InputError on an unusable recording, and where displacement falls with voltage.
     """
-    u, y, dt = record(u_V, y_um, dt_s, 20)
+    u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
     if initial not in ("auto", "rest", "free"):
         raise InputError(f"initial: got {initial!r}, expected 'auto', 'rest' or 'free'")
     free = initial == "free" or (initial == "auto" and abs(u[0]) > 0.05 * float(np.max(np.abs(u))))
@@ -156,13 +157,13 @@ def identify_bouc_wen(
     if stride > 1:
         full = _Fit(u, y, dt, hold, free)
         best = full.solve(best.x, 25)
-    plain = full.solve(best.x, 25, inertia=False)
-    if (plain.cost - best.cost) * _independent(full.residual(best.x)) < _SIGNIFICANT * best.cost:
-        best = plain
-    residual, (d, offset, transient) = full.linear_part(best.x)
+    without = full.solve(best.x, 25, inertia=False)
+    if (without.cost - best.cost) * _independent_samples(full.residual(best.x)) < _SIGNIFICANT * best.cost:
+        best = without
+    residual, (d, offset, transient) = full.project(best.x)
     if not d > 0.0:
         raise InputError(
-            f"y_um: falls with the voltage (gain {d:.3g} µm/V), expected a rising one; check the sign or the columns"
+            f"y_um: falls with the voltage (gain {d:.3g} µm/V), expected a rising one; check the sign and the columns"
         )
     shape, lag, inertia = _unpack(best.x)
     parameters = BoucWenParameters(
@@ -180,10 +181,12 @@ def identify_bouc_wen(
     notes = (
         f"initial transient {transient:.4g} µm",
         "RMSE reached from each start: " + ", ".join(f"{value:.4g}" for value in starts) + " µm",
-        "m/k does not show and is set as good as none" if best is plain else f"m/k shows: {inertia:.4g} s²",
+        "the recording does not show m/k; it is set to a negligible value"
+        if best is without
+        else f"m/k identified: {inertia:.4g} s²",
         f"k_N_per_m is given, not identified: {k_N_per_m:.6g}",
     )
     evaluations = thin.evaluations + (full.evaluations if full is not thin else 0)
     method = f"least squares from {len(found)} starts, {hold} hold, initial hysteresis {'free' if free else 'rest'}"
-    report = IdentificationReport.of("bouc_wen", method, y, y + residual, dt, evaluations, bool(best.status > 0), notes)
+    report = FitReport.of("bouc_wen", method, y, y + residual, dt, evaluations, bool(best.status > 0), notes)
     return parameters, report

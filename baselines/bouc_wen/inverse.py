@@ -1,9 +1,9 @@
-"""The inverse Bouc-Wen model (Fig. 2.5) as it is served: motion in, voltage out, (u, g) as memory.
+"""The inverse Bouc-Wen model (Fig. 2.5): motion in, voltage out, (u, g) as memory.
 
-At each point (2.1) gives the drive that the motion needs, ``w = (y - y0 + (b/k) v + (m/k) a)/d``, and the
-voltage is the root of ``u - g(u) = w`` on the branch that leaves the remembered (u, g). In the way s = |u -
-u_prev| this is ``s - (q(s) - q0) = |w - w_prev|``, a line plus an exponential on each side of q = 0. Newton's
-method from the side where it cannot overshoot converges to round-off in a few steps.
+At each point (2.1) gives the drive that the motion needs, ``w = (y - y0 + (b/k) v + (m/k) a)/d``. The voltage is the
+root of ``u - g(u) = w`` on the branch that leaves the remembered (u, g). With s = |u - u_prev| this reads
+``s - (q(s) - q0) = |w - w_prev|``, a line plus an exponential on each side of q = 0. Newton's method, started from the
+side where it cannot overshoot, converges to round-off in a few steps.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from adaptive.compiled import compiled
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.bouc_wen.step import crossing, hysteresis_step
+from baselines.fit_report import Domain
 from baselines.validation import (
-    Domain,
-    deviation,
-    memory_copy,
-    model_fields,
-    model_state,
-    points,
+    checked_memory,
+    checked_motion,
+    common_fields,
+    common_state,
+    of_length,
     positive,
-    same_length,
+    std_or_nan,
 )
 
 _FLAT = 1e-7
@@ -36,8 +36,8 @@ _NEWTON_LIMIT = 60
 def _solve(q: float, target: float, alpha: float, rate: float) -> float:
     """Root s >= 0 of s - (q(s) - q) = target with q' = alpha - rate q.
 
-    The left side rises; it is convex for rate > 0 and concave for rate < 0 (q' > 0 here). The first tangent's
-    root then lies right of the solution, or left of it, and every further one stays on that side.
+    The left side rises; it is convex for rate > 0 and concave for rate < 0 (q' > 0 here). The root of the first
+    tangent lies right of the solution, or left of it, and all further ones stay on that side.
     """
     if abs(rate) < _FLAT:
         return target / (1.0 - alpha)
@@ -54,7 +54,7 @@ def _solve(q: float, target: float, alpha: float, rate: float) -> float:
 
 @compiled
 def voltage(w_V: float, u0_V: float, g0_V: float, alpha: float, beta: float, gamma: float) -> float:
-    """The voltage whose drive u - g is ``w_V``, on the branch that leaves (u0, g0)."""
+    """The voltage u with the drive u - g = ``w_V``, on the branch that leaves (u0, g0)."""
     target = w_V - (u0_V - g0_V)
     sign = 1.0 if target > 0.0 else -1.0
     target = abs(target)
@@ -78,14 +78,14 @@ def run_inverse(
     u_V: FloatArray,
     inside: BoolArray,
 ) -> None:
-    """Voltages for points; ``memory_V`` = (u, g) is advanced in place.
+    """Voltages ``u_V`` (n,) for points (n,); ``memory_V`` = (u, g) is advanced in place.
 
-    ``constants``: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max. A point that is not finite
-    gets NaN and leaves no trace.
+    ``constants``: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max. A point that is not finite gets NaN
+    and does not change the memory.
     """
     per_um, offset, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max = constants
     bound = alpha / (beta + gamma)
-    u, g = memory_V[0], min(max(memory_V[1], -bound), bound)  # a memory of other parameters stays reachable
+    u, g = memory_V[0], min(max(memory_V[1], -bound), bound)  # so that a memory of other parameters is reachable
     for k in range(y_um.size):
         y, v = y_um[k], v_um_per_s[k]
         w = (y - offset + lag * v + inertia * a_um_per_s2[k]) * per_um
@@ -94,7 +94,7 @@ def run_inverse(
             inside[k] = False
             continue
         new = voltage(w, u, g, alpha, beta, gamma)
-        g = hysteresis_step(u, new, g, alpha, beta, gamma)
+        g = hysteresis_step(g, new - u, alpha, beta, gamma)
         u = new
         u_V[k] = u
         inside[k] = y_min <= y <= y_max and abs(v) <= v_max
@@ -105,7 +105,7 @@ def run_inverse(
 def _track(u_V: FloatArray, shape: FloatArray, memory_V: FloatArray) -> None:
     for k in range(u_V.size):
         if math.isfinite(u_V[k]):
-            memory_V[1] = hysteresis_step(memory_V[0], u_V[k], memory_V[1], shape[0], shape[1], shape[2])
+            memory_V[1] = hysteresis_step(memory_V[1], u_V[k] - memory_V[0], shape[0], shape[1], shape[2])
             memory_V[0] = u_V[k]
 
 
@@ -113,12 +113,12 @@ def _track(u_V: FloatArray, shape: FloatArray, memory_V: FloatArray) -> None:
 class BoucWenInverse:
     """Inverse of a Bouc-Wen stage; implements ``adaptive.types.InverseModel`` under the name ``bouc_wen``.
 
-    Under the zero-order hold the voltage acts, on average, half a sample after its instant; the inverse then
-    looks half a sample ahead by the motion's Taylor series, ``w(t + T/2)``. Under the linear hold the
-    identification has put that delay into b/k, and nothing is added.
+    Under the zero-order hold the voltage acts half a sample after its instant on average. The inverse then looks half
+    a sample ahead by the Taylor series of the motion, ``w(t + T/2)``. Under the linear hold the identification has put
+    that delay into b/k, and nothing is added.
 
-    The memory is (u, g) in V, driven by the voltage alone: ``track`` uses the voltages really applied and not
-    the measured motion, whose noise would wear the hysteresis off (2.2 counts every reversal).
+    The memory is (u, g) in V, driven by the voltage alone. ``track`` uses the applied voltages and not the measured
+    motion, because (2.2) responds to every reversal and sensor noise would wear the hysteresis off.
     """
 
     parameters: BoucWenParameters
@@ -130,7 +130,7 @@ class BoucWenInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
-        deviation("voltage_std_V", self.voltage_std_V, "V")
+        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
         p, domain = self.parameters, self.domain
         ahead = 0.5 * self.dt_s if p.hold == "zero_order" else 0.0
         constants = [
@@ -153,16 +153,16 @@ class BoucWenInverse:
         return 2
 
     def rest_memory(self, y_um: float) -> FloatArray:
-        """(u, g) V after a monotone way from rest at 0 V to ``y_um`` µm."""
+        """(u, g) V after a monotone motion from rest at 0 V to ``y_um`` µm."""
         y, rest = np.array([float(y_um)]), np.zeros(1)
         return self.feedforward(y, rest, rest, np.zeros(2)).memory
 
     def feedforward(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """Voltages (n,) V for points (n,); raises InputError on bad shapes."""
-        y, v, a = points(y_um, v_um_per_s, a_um_per_s2)
-        after = memory_copy(memory, 2)
+        """Voltages (n,) V for points (n,). Raises InputError on bad shapes."""
+        y, v, a = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, 2)
         u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
         run_inverse(y, v, a, self._constants, after, u, inside)
         std = np.empty(y.size)
@@ -177,24 +177,24 @@ class BoucWenInverse:
         u_V: FloatArray,
         memory: FloatArray,
     ) -> FloatArray:
-        """(u, g) after the voltages ``u_V`` (n,) were applied; voltages that are not finite are passed over."""
-        y, _, _ = points(y_um, v_um_per_s, a_um_per_s2)
-        after = memory_copy(memory, 2)
-        _track(same_length("u_V", u_V, y.size), self.parameters.shape, after)
+        """(u, g) after the voltages ``u_V`` (n,) were applied; values that are not finite are skipped."""
+        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, 2)
+        _track(of_length("u_V", u_V, y.size), self.parameters.shape, after)
         return after
 
     def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """``track`` in place and without its checks: (n,) contiguous voltages, V, that somebody else answered."""
+        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
         _track(u_V, self.parameters.shape, memory)
 
     def state_dict(self) -> StateDict:
         """Flat numbers by name."""
-        state = model_state(self.dt_s, self.voltage_std_V, self.domain)
+        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
         return {**state, "name": self.name, **self.parameters.state_dict()}
 
     @staticmethod
     def from_state(state: StateDict) -> BoucWenInverse:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing or wrong."""
-        dt_s, std_V, domain = model_fields("bouc_wen", state)
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
+        dt_s, std_V, domain = common_fields("bouc_wen", state)
         parameters = BoucWenParameters.from_state(state)
         return BoucWenInverse(parameters, dt_s, domain, std_V, str(state.get("name", "bouc_wen")))

@@ -1,21 +1,21 @@
-"""Bouc-Wen oscillator driven by a force, its hysteresis acting on the displacement.
+"""Bouc-Wen oscillator driven by a force, with the hysteresis in its restoring force.
 
     m y'' + c y' + k y + z = u
     z' = alpha y' - beta (gamma |y'| |z|^(nu-1) z + delta y' |z|^nu)
 
-Unlike (2.2), where the voltage drives the hysteresis and the stage only follows, z here depends on the motion that it
-brakes: there is no closed form, and the model is integrated. Of beta, gamma, delta only two products show, and with
-the force written as ``z = alpha s w`` for a displacement scale s, all that is left is dimensionless::
+In (2.2) the voltage drives the hysteresis and the stage follows. Here z depends on the motion that it brakes: there is
+no closed form, and the model is integrated numerically. Of beta, gamma, delta only two products can be identified.
+With the force written as ``z = alpha s w`` for a displacement scale s, the rest is dimensionless::
 
     s w' = y' - (g |y'| |w|^(nu-1) w + d y' |w|^nu)
 
-**Integration.** Classical Runge-Kutta at ``oversample`` steps a sample. The input between samples is band-limited:
+**Integration.** Classical Runge-Kutta with ``oversample`` steps per sample. The input between samples is band-limited:
 a periodic record is interpolated by its Fourier series, exactly. Reference: J. P. Noël, M. Schoukens, "Hysteretic
-benchmark with a dynamic nonlinearity", 2016, whose records are such periods.
+benchmark with a dynamic nonlinearity", 2016, whose records are periodic.
 
-**Identification.** Mean and deviation of whole periods are taken first, then the steady-state response to the
-periodic input is fitted by least squares over all seven parameters, from several starts whose linear part is that
-of the best linear approximation.
+**Identification.** The mean and the scatter of whole periods are taken first. Then the steady-state response to the
+periodic input is fitted by least squares over all seven parameters, from several starts whose linear part is the best
+linear approximation.
 """
 
 from __future__ import annotations
@@ -30,15 +30,75 @@ from scipy.optimize import least_squares
 from adaptive.compiled import compiled
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray
-from baselines.bouc_wen.periodic_record import PeriodicRecord, between_samples, linear_part
-from baselines.validation import positive, series
+from baselines.validation import finite_series, positive
+
+
+def between_samples(u: FloatArray, factor: int) -> FloatArray:
+    """A periodic signal (n,) at ``factor`` times its rate, (n factor,), by its Fourier series."""
+    n = u.size
+    spectrum = np.fft.rfft(u)
+    if n % 2 == 0:
+        spectrum[-1] *= 0.5  # the Nyquist line belongs to both of its frequencies
+    padded = np.zeros(n * factor // 2 + 1, dtype=np.complex128)
+    padded[: spectrum.size] = spectrum
+    return np.asarray(np.fft.irfft(padded, n * factor) * factor, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodicRecord:
+    """One period of a force and of the displacement it causes, averaged over many periods.
+
+    Attributes
+    ----------
+    u_N : (n,) force, N. y_m : (n,) mean displacement of ``periods`` periods, m. dt_s : sample time, s.
+    noise_m : standard deviation of that mean, from the scatter of the periods, m; NaN for a single period.
+    """
+
+    u_N: FloatArray
+    y_m: FloatArray
+    dt_s: float
+    periods: int
+    noise_m: float
+
+    @staticmethod
+    def of(u_N: FloatArray, y_m: FloatArray, dt_s: float, length: int, skip: int = 0) -> PeriodicRecord:
+        """Average whole periods of ``length`` samples; the first ``skip`` periods are left out.
+
+        Raises InputError where the force is not periodic or the periods are not whole.
+        """
+        u, y = finite_series("u_N", u_N, 8), finite_series("y_m", y_m, 8)
+        count = u.size // length if length > 0 else 0
+        if u.size != y.size or count * length != u.size or count <= skip:
+            raise InputError(f"u_N, y_m: got {u.size} and {y.size} samples, expected whole periods of {length}")
+        us, ys = u.reshape(count, length)[skip:], y.reshape(count, length)[skip:]
+        if float(np.max(np.abs(us - us[0]))) > 1e-9 * float(np.max(np.abs(u))):
+            raise InputError("u_N: differs from period to period, expected one period repeated")
+        kept = count - skip
+        noise = float(np.sqrt(np.mean(np.var(ys, axis=0, ddof=1)) / kept)) if kept > 1 else math.nan
+        return PeriodicRecord(us[0].copy(), ys.mean(axis=0), positive("dt_s", dt_s, "s"), kept, noise)
+
+
+def best_linear_approximation(records: Sequence[PeriodicRecord]) -> tuple[float, float, float]:
+    """m kg, c N s/m, k N/m by least squares of the force spectrum on the spectra of y'', y' and y."""
+    rows, targets = [], []
+    for record in records:
+        force, motion = np.fft.rfft(record.u_N), np.fft.rfft(record.y_m)
+        used = np.abs(force) > 1e-3 * np.abs(force).max()
+        s = 2j * np.pi * np.fft.rfftfreq(record.u_N.size, record.dt_s)[used]
+        x, f = motion[used], force[used]
+        rows += [np.column_stack([s * s * x, s * x, x]).view(np.float64).reshape(x.size, 3, 2)]
+        targets += [f.view(np.float64).reshape(f.size, 2)]
+    table = np.concatenate([np.swapaxes(row, 1, 2).reshape(-1, 3) for row in rows])
+    size = np.linalg.norm(table, axis=0)
+    m, c, k = np.linalg.lstsq(table / size, np.concatenate(targets).ravel(), rcond=None)[0] / size
+    return float(m), float(c), float(k)
 
 
 @compiled
 def _slope(
     y: float, v: float, w: float, u: float, theta: FloatArray, unit: bool
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """(v', w') at a point; theta = m, c, k, alpha, g, d, nu, s."""
+    """(v', w') at a state; theta = m, c, k, alpha, g, d, nu, s; ``unit``: nu is 1."""
     size = abs(w)
     power = size if unit else size ** theta[6]
     sign = 1.0 if w > 0.0 else -1.0
@@ -50,9 +110,9 @@ def _slope(
 def _integrate(
     u: FloatArray, h: float, every: int, theta: FloatArray, state: FloatArray, out: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    """Displacement at every ``every``-th step into ``out``; ``u`` holds the force at steps and half steps.
+    """Write the displacement at every ``every``-th step of ``h`` s to ``out``; ``u``: force at steps and half steps.
 
-    ``state`` (y, v, w) is advanced in place. ``out[0]`` is the state before the first step.
+    ``state`` (y, v, w) is advanced in place. ``out[0]`` is the displacement before the first step.
     """
     y, v, w = state[0], state[1], state[2]
     unit = abs(theta[6] - 1.0) < 1e-12
@@ -76,10 +136,16 @@ def _integrate(
 
 @dataclass(frozen=True, slots=True)
 class MechanicalBoucWen:
-    """The oscillator's seven parameters and its displacement scale.
+    """The seven parameters of the oscillator and its displacement scale.
 
-    m_kg, c_N_s_per_m, k_N_per_m, alpha_N_per_m : as in the module's equation. g, d : dimensionless,
-    g = beta gamma (alpha s)^nu/alpha, d likewise with delta. nu : power. scale_m : s, m, given, no parameter.
+    Attributes
+    ----------
+    m_kg, c_N_s_per_m, k_N_per_m, alpha_N_per_m : as in the equation of the module.
+    g, d : dimensionless; g = beta gamma (alpha s)^nu/alpha, d likewise with delta.
+    nu : exponent.
+    scale_m : displacement scale s, m; chosen, not identified.
+
+    Raises InputError on values that are not finite or, except c, g and d, not positive.
     """
 
     m_kg: float
@@ -99,17 +165,17 @@ class MechanicalBoucWen:
 
     @property
     def products(self) -> tuple[float, float]:
-        """beta gamma and beta delta of the module's equation, 1/m for nu = 1."""
+        """beta gamma and beta delta of the equation of the module, 1/m for nu = 1."""
         share = self.alpha_N_per_m * (self.alpha_N_per_m * self.scale_m) ** -self.nu
         return self.g * share, self.d * share
 
     def steady_state(self, u_N: FloatArray, dt_s: float, oversample: int = 20, settle: float = 0.5) -> FloatArray:
-        """Displacement (n,) m over one period of the force ``u_N`` (n,) N, repeated for ever.
+        """Steady-state displacement (n,) m over one period of the periodic force ``u_N`` (n,) N, ``dt_s`` s apart.
 
-        ``settle`` : periods run from rest before; they must outlast the transient. Raises InputError on the
-        arguments, NumericsError where the integration leaves the finite numbers.
+        ``settle`` : periods that are run from rest first; they must outlast the transient. Raises InputError on bad
+        arguments, NumericsError where the integration diverges.
         """
-        u = series("u_N", u_N, 8)
+        u = finite_series("u_N", u_N, 8)
         if oversample < 1 or not 0.0 < settle < 100.0:
             raise InputError(f"oversample, settle: got {oversample}, {settle}, expected >= 1 and above 0")
         fine = between_samples(u, 2 * oversample)
@@ -132,14 +198,21 @@ class MechanicalBoucWen:
 
 @dataclass(frozen=True, slots=True)
 class MechanicalReport:
-    """How the fit went: RMSE against the mean periods and the noise expected there, both m; cost per start."""
+    """Result of an identification.
+
+    Attributes
+    ----------
+    rmse_m, noise_m : RMSE against the mean periods, and the noise of these, m.
+    starts_m : RMSE reached from each start, m.
+    evaluations : runs of the model.
+    std : (7,) standard deviations of m, c, k, alpha, g, d, nu; relative for the first four.
+    """
 
     rmse_m: float
     noise_m: float
     starts_m: tuple[float, ...]
     evaluations: int
     std: FloatArray
-    """(7,) standard deviations of m, c, k, alpha, g, d, nu, relative for the first four."""
 
 
 #: Starts: share of the linear stiffness that is hysteretic, g, d.
@@ -155,13 +228,14 @@ def identify_mechanical(
 ) -> tuple[MechanicalBoucWen, MechanicalReport]:
     """All seven parameters from periodic steady-state records, by least squares from several starts.
 
-    Coarse steps (``search_oversample`` a sample) find the basin, ``oversample`` finishes. Raises InputError without
-    records, NumericsError where no start can be followed.
+    The search uses ``search_oversample`` steps per sample, the final fit ``oversample``. ``progress`` gets one line of
+    text per start. Raises InputError on records without a positive mass and stiffness, NumericsError where the
+    integration diverges.
     """
     if not records:
         raise InputError("records: got none, expected at least one periodic record")
     s = float(np.sqrt(np.mean(np.concatenate([r.y_m for r in records]) ** 2)))
-    m, c, k = linear_part(records)
+    m, c, k = best_linear_approximation(records)
     if not (m > 0.0 and k > 0.0):
         raise InputError(
             f"records: their linear part has mass {m:.3g} kg, stiffness {k:.3g} N/m, expected both above 0"

@@ -1,17 +1,17 @@
-"""The Bouc-Wen stage (2.1), (2.2) with n = 1, without a step-size error.
+"""The Bouc-Wen stage (2.1), (2.2) with n = 1, simulated without step-size error.
 
-Divided by k, (2.1) is a unit-gain second-order system of the *drive* ``w = u - g`` in volts::
+Divided by k, (2.1) is a second-order system of unit gain, driven by ``w = u - g`` in volts::
 
     (m/k) y'' + (b/k) y' + y = d w + y0,        g = h/d
 
-so that of m, b, k only the two ratios matter, and the hysteresis (2.2) runs in volts and knows nothing of d.
+so only the ratios m/k and b/k matter, and the hysteresis (2.2) runs in volts, independent of d.
 
-**Hold.** ``hold="linear"`` (default) joins the voltages by lines: right for recordings of smooth signals at any
-sample time, also decimated ones. Behind a D/A converter the half step of delay and the convention that y is
-read before u is applied then appear as part of b/k, where the inverse leads them. ``hold="zero_order"`` lets u
-jump at t_k and rest until t_{k+1}, as the converter does; y_k is then read before the jump.
+**Hold.** ``hold="linear"`` (default) joins the voltages by straight lines. That is right for recordings of smooth
+signals at any sample time, decimated ones too. For a stage behind a D/A converter, the converter's half step of delay
+and the convention that y is read before u is applied then appear as part of b/k, which the inverse leads.
+``hold="zero_order"`` lets u jump at t_k and rest until t_{k+1}, as the converter does; y_k is read before the jump.
 
-The steps themselves are in `baselines.bouc_wen.step`.
+`baselines.bouc_wen.step` holds the steps.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
 
 @dataclass(frozen=True)
 class BoucWenParameters:
-    """The seven parameters of (2.1), (2.2), an offset, and the hold convention (see the module's text).
+    """The seven parameters of (2.1), (2.2), an offset, and the hold convention of the module.
 
     Units: m kg, b N s/m, k N/m, d µm/V, alpha 1, beta and gamma 1/V, offset µm.
-    Raises InputError unless m, b, k, d are positive and the drive u - g rises with u along every branch, which
-    the inverse needs: alpha < 1 and 2 alpha beta < beta + gamma, beta + gamma > 0.
+
+    Raises InputError unless m, b, k, d are positive and the drive u - g rises with u along every branch, which the
+    inverse needs: alpha < 1, 2 alpha beta < beta + gamma, and beta + gamma > 0.
     """
 
     m_kg: float
@@ -58,7 +59,7 @@ class BoucWenParameters:
         if not (0.0 <= alpha < 1.0 and beta >= 0.0 and beta + gamma > 0.0 and 2.0 * alpha * beta < beta + gamma):
             raise InputError(
                 f"alpha, beta_per_V, gamma_per_V: got {alpha!r}, {beta!r}, {gamma!r}, expected 0 <= alpha < 1, "
-                "beta >= 0 and 2 alpha beta < beta + gamma; else displacement does not rise with voltage"
+                "beta >= 0 and 2 alpha beta < beta + gamma; otherwise displacement does not rise with voltage"
             )
         if self.hold not in ("linear", "zero_order"):
             raise InputError(f"hold: got {self.hold!r}, expected 'linear' or 'zero_order'")
@@ -76,12 +77,12 @@ class BoucWenParameters:
         return self.m_kg / self.k_N_per_m
 
     def at_rest(self, u_V: float = 0.0) -> FloatArray:
-        """State (6,) of a stage that went monotonously from rest at 0 V to ``u_V`` and settled there."""
-        g = hysteresis_step(0.0, float(u_V), 0.0, self.alpha, self.beta_per_V, self.gamma_per_V)
+        """State (6,) after a monotone change from rest at 0 V to ``u_V``, settled there."""
+        g = hysteresis_step(0.0, float(u_V), self.alpha, self.beta_per_V, self.gamma_per_V)
         return settled(float(u_V), g)
 
     def simulate(self, u_V: FloatArray, dt_s: float, state: FloatArray | None = None) -> FloatArray:
-        """Displacement (n,) µm for voltages (n,) V, ``dt_s`` apart; see :meth:`motion`."""
+        """Displacement (n,) µm for voltages (n,) V, ``dt_s`` s apart; see :meth:`motion`."""
         return self.motion(u_V, dt_s, state)[0]
 
     def motion(
@@ -89,8 +90,8 @@ class BoucWenParameters:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Displacement µm, velocity µm/s and acceleration µm/s², (n,) each, for voltages (n,) V.
 
-        Starts from ``state`` (6,) (not changed), or settled: at ``u_V[0]`` under the linear hold, at 0 V under
-        the zero-order hold. The acceleration under the zero-order hold is that after the jump.
+        Starts from a copy of ``state`` (6,); by default settled at ``u_V[0]`` under the linear hold and at 0 V under
+        the zero-order hold. Under the zero-order hold the acceleration is that after the jump.
         """
         u = np.ascontiguousarray(u_V, dtype=np.float64)
         out = np.empty((u.size, 3))
@@ -107,19 +108,19 @@ class BoucWenParameters:
         return replace(self, d_um_per_V=d_um_per_V, offset_um=offset_um)
 
     def state_dict(self) -> StateDict:
-        """Flat, by the field's own names."""
+        """Values by field name."""
         names = ("m_kg", "b_N_s_per_m", "k_N_per_m", "d_um_per_V", "alpha", "beta_per_V", "gamma_per_V")
         return {**{name: getattr(self, name) for name in names}, "offset_um": self.offset_um, "hold": self.hold}
 
     @staticmethod
     def from_state(state: StateDict) -> BoucWenParameters:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing or wrong."""
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
         names = ("m_kg", "b_N_s_per_m", "k_N_per_m", "d_um_per_V", "alpha", "beta_per_V", "gamma_per_V", "offset_um")
         try:
             numbers = {name: float(state[name]) for name in names}
             return BoucWenParameters(**numbers, hold=str(state["hold"]))
         except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of a bouc_wen model; write it anew") from None
+            raise InputError(f"{missing.args[0]}: missing in the state of a bouc_wen model; write it again") from None
 
 
 #: The chapter's identified stage, Table 2.1 (d: 1.1351e-5 m/V).

@@ -1,11 +1,11 @@
-"""A Bouc-Wen model that learns online: an extended Kalman filter on gain, offset and the shape of the loop.
+"""A Bouc-Wen model that learns online: an extended Kalman filter of gain, offset and the shape of the loop.
 
-The model runs beside the stage on the voltages applied. It is linear in gain and offset; how its output changes
-with the shape is had from three copies that run with one parameter 0.1 % larger each, hysteresis and dynamics
-included, so that the filter's slopes carry the whole history. The modes (b/k, m/k) stay as identified.
+The model runs beside the stage on the applied voltages. It is linear in gain and offset. Its derivatives by the shape
+come from three copies that run with one parameter 0.1 % larger each, hysteresis and dynamics included, so the slopes
+of the filter carry the whole history. The modes (b/k, m/k) stay as identified.
 
 Parameters are relative: d/d0, (y0 - y00)/range, alpha/alpha0, lambda/lambda0, rho/rho0 with lambda = beta + gamma and
-rho = beta/lambda. They walk at random only while samples teach, within bounds that keep the model invertible.
+rho = beta/lambda. They are random walks in the time that samples teach, within bounds that keep the model invertible.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
-from baselines.online import OnlineBaseline, field_of
+from baselines.online_baseline import OnlineBaseline, field_of
 
+#: Relative increase of one shape parameter in each copy of the model.
 _NUDGE = 1e-3
 #: Bounds of the relative parameters.
 _LOWEST = np.array([0.3, -1.0, 0.3, 0.3, 0.3])
@@ -35,11 +36,18 @@ _HIGHEST = np.array([3.0, 1.0, 3.0, 3.0, 3.0])
 class TrackingConfig:
     """How fast the filter follows.
 
-    learn_every : samples between two updates. first_std, walk_std : of (gain, offset, alpha, lambda, rho), relative;
-    at the start, and per root of a second of teaching. model_error : measurement deviation as a multiple of the
-    identification's residual, larger than 1 because model errors last for many samples.
-    outlier_sigma, outlier_persistence : an innovation beyond is refused, unless so many in a row are: then the
-    variance is raised instead. excitation, settle : as in ``LeastSquaresConfig``.
+    Attributes
+    ----------
+    learn_every : samples between two updates.
+    first_std : initial standard deviation of (gain, offset, alpha, lambda, rho), relative.
+    walk_std : random walk of the same, per square root of a second of teaching.
+    model_error : measurement noise as a multiple of the identification's residual; above 1 because model errors last
+        for many samples.
+    outlier_sigma : an innovation beyond this many standard deviations is refused.
+    outlier_persistence : after this many refusals in a row the variance is raised instead.
+    excitation, settle : as in ``LeastSquaresConfig``.
+
+    Raises InputError on a value out of range.
     """
 
     learn_every: int = 10
@@ -72,7 +80,7 @@ def _copies_step(
     linear: bool,
     out: FloatArray,
 ) -> None:
-    """Advance all copies by one sample and read their outputs (V) at its instant."""
+    """Advance all copies, ``states`` (c, 6), by one sample; ``out`` (c,) are their outputs at its instant, V."""
     for i in range(states.shape[0]):
         if linear:
             stage_step(states[i], u_V, p1, p2, T, shapes[i])
@@ -81,12 +89,12 @@ def _copies_step(
             stage_step(states[i], states[i, 0], p1, p2, T, shapes[i])
             out[i] = stage_output(states[i], p1, p2)
             a, b, c = shapes[i]
-            states[i, 1] = hysteresis_step(states[i, 0], u_V, states[i, 1], a, b, c)
+            states[i, 1] = hysteresis_step(states[i, 1], u_V - states[i, 0], a, b, c)
             states[i, 0] = u_V
 
 
 class BoucWenOnline(OnlineBaseline):
-    """Bouc-Wen stage that follows the real one. Implements ``adaptive.types.OnlineModel``."""
+    """Bouc-Wen stage whose parameters follow the samples. Implements ``adaptive.types.OnlineModel``."""
 
     def __init__(self, model: BoucWenInverse, config: TrackingConfig | None = None) -> None:
         self.config = config or TrackingConfig()
@@ -113,7 +121,7 @@ class BoucWenOnline(OnlineBaseline):
         self._refused = 0
 
     def _shape(self, x: FloatArray) -> tuple[float, float, float]:
-        """alpha, beta, gamma of relative parameters, within the bounds of an invertible model."""
+        """alpha, beta, gamma of relative parameters (5,), limited to an invertible model."""
         alpha0, rate0, rho0 = self._base_shape
         rho = min(max(rho0 * float(x[4]), 0.01), 5.0)
         rate = rate0 * float(x[3])
@@ -130,7 +138,7 @@ class BoucWenOnline(OnlineBaseline):
     def _restart(self, u_V: float, y_um: float, first: bool) -> None:
         linear = self.base.parameters.hold == "linear"
         for state, shape in zip(self._states, self._shapes, strict=True):
-            g = hysteresis_step(float(state[0]), u_V, float(state[1]), *shape)
+            g = hysteresis_step(float(state[1]), u_V - float(state[0]), *shape)
             state[:] = settled(u_V, g)
             if first and not linear:
                 state[2] = state[4] = 0.0
@@ -165,7 +173,7 @@ class BoucWenOnline(OnlineBaseline):
                 self._P, self._refused = self._P + np.diag(self._first), 0
             return OUTLIER
         self._refused = 0
-        # Joseph's form stays positive; the cap keeps what is not excited from growing for ever.
+        # Joseph's form keeps P positive definite; the limit below stops the growth in directions without excitation.
         drift_step.joseph(moved, P, slopes, innovation, self._noise, np.empty(5), row)
         x = self._x + moved
         if not (all_finite(x) and all_finite(P.reshape(-1))):
@@ -179,7 +187,7 @@ class BoucWenOnline(OnlineBaseline):
         return LEARNT
 
     def snapshot(self) -> BoucWenInverse:
-        """The stage as it stands, inverted; its deviation is that of the recent innovations."""
+        """The inverse of the present stage; its standard deviation is that of the recent innovations."""
         p = self.base.parameters
         alpha, beta, gamma = (float(value) for value in self._shapes[0])
         now = replace(
@@ -193,7 +201,7 @@ class BoucWenOnline(OnlineBaseline):
         return replace(self.base, parameters=now, voltage_std_V=float(np.sqrt(self._square)) / now.d_um_per_V)
 
     def state_dict(self) -> StateDict:
-        """Everything; ``from_state`` continues to the same last bit."""
+        """The whole state; ``from_state`` continues to the same last bit."""
         config = asdict(self.config)
         config.update(first_std=np.array(self.config.first_std), walk_std=np.array(self.config.walk_std))
         return {
@@ -209,7 +217,7 @@ class BoucWenOnline(OnlineBaseline):
 
     @classmethod
     def from_state(cls, state: StateDict) -> BoucWenOnline:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
         values = under("config_", state)
         for name in ("first_std", "walk_std"):
             values[name] = tuple(float(value) for value in field_of(values, name, "bouc_wen"))

@@ -1,12 +1,13 @@
-"""Exact steps of the Bouc-Wen stage, compiled; `baselines.bouc_wen.model` says which equations and units these are of.
+"""Exact steps of the Bouc-Wen stage, compiled; `baselines.bouc_wen.model` gives the equations and units.
 
-**Hysteresis.** Where u is monotone, with s = |du| and q = sgn(du) g, (2.2) reads dq/ds = alpha - (beta +
-gamma sgn q) q: a constant-coefficient equation on each side of q = 0, solved by an exponential in s.
+**Hysteresis.** Where u is monotone, with s = |du| and q = sgn(du) h, (2.2) with n = 1 reads dq/ds = drive - (beta +
+gamma sgn q) q. On each side of q = 0 this is linear with constant coefficients and solved by an exponential in s.
+`hysteresis_step` is the only implementation of it: the models here and the effects in ``sim`` use it, in their units.
 
-**Dynamics.** Two modes p1, p2 (real or a conjugate pair). With u linear within a step, w is a line plus an
-exponential of time, whose response is closed too. Nothing is stepped, so stiffness (Table 2.1: p = -400 and
--3.2e6 per s) does not matter. Within 1e-5 of critical damping the modes are split by that much, which moves the
-response by some 1e-10.
+**Dynamics.** Two modes p1, p2 (real or a conjugate pair). With u linear within a step, the drive is a line plus an
+exponential of time, whose response is closed too. Nothing is integrated numerically, so stiffness does not matter
+(Table 2.1: p = -400 and -3.2e6 per s). Within 1e-5 of critical damping the modes are split by that much, which moves
+the response by about 1e-10.
 """
 
 from __future__ import annotations
@@ -19,47 +20,51 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
 
-#: Below this |rate| (1/V) the exponential of (2.2) is taken as a line: better conditioned, and equal to 1e-8 V.
+#: Below this |rate| (1/V) a line replaces the exponential of (2.2): better conditioned, and equal to 1e-8 V.
 _FLAT = 1e-7
 
 
 @compiled
-def _grow(q: float, s: float, alpha: float, rate: float) -> float:
-    """Solution of dq/ds = alpha - rate q after s."""
+def _grow(q: float, s: float, drive: float, rate: float) -> float:
+    """Solution of dq/ds = drive - rate q after s."""
     if abs(rate) < _FLAT:
-        return q + alpha * s
-    return q - (q - alpha / rate) * -math.expm1(-rate * s)
+        return q + drive * s
+    return q - (q - drive / rate) * -math.expm1(-rate * s)
 
 
 @compiled
-def crossing(q: float, alpha: float, rate: float) -> float:
-    """Way s (V) until q < 0 has grown to zero; infinite where it never does."""
+def crossing(q: float, drive: float, rate: float) -> float:
+    """Change s of the input until q < 0 has grown to zero; infinite where it never does."""
     if abs(rate) < _FLAT:
-        return -q / alpha if alpha > 0.0 else math.inf
-    if alpha <= 0.0 or -q * rate / alpha <= -1.0:
+        return -q / drive if drive > 0.0 else math.inf
+    if drive <= 0.0 or -q * rate / drive <= -1.0:
         return math.inf
-    return math.log1p(-q * rate / alpha) / rate
+    return math.log1p(-q * rate / drive) / rate
 
 
 @compiled
-def hysteresis_step(u0_V: float, u1_V: float, g_V: float, alpha: float, beta: float, gamma: float) -> float:
-    """g after u went monotonously from ``u0_V`` to ``u1_V``; exact."""
-    s = abs(u1_V - u0_V)
+def hysteresis_step(h: float, rise: float, drive: float, beta: float, gamma: float) -> float:
+    """``h`` after a monotone change ``rise`` of the input: (2.2) with n = 1, exact for any length of the step.
+
+    The units are free: ``drive`` is in units of h per unit of input, beta and gamma in 1 per unit of input. In volts
+    (h/d for h) ``drive`` is alpha; in µm it is alpha d.
+    """
+    s = abs(rise)
     if s == 0.0:
-        return g_V
-    sign = 1.0 if u1_V > u0_V else -1.0
-    q = sign * g_V
+        return h
+    sign = 1.0 if rise > 0.0 else -1.0
+    q = sign * h
     if q < 0.0:
-        s0 = crossing(q, alpha, beta - gamma)
+        s0 = crossing(q, drive, beta - gamma)
         if s < s0:
-            return sign * _grow(q, s, alpha, beta - gamma)
+            return sign * _grow(q, s, drive, beta - gamma)
         q, s = 0.0, s - s0
-    return sign * _grow(q, s, alpha, beta + gamma)
+    return sign * _grow(q, s, drive, beta + gamma)
 
 
 @compiled
 def _mode(z: complex, p: complex, T: float, w0: float, slope: float, c: float, rate: float) -> complex:
-    """z' = p (z - w) over T with w = w0 + slope t + c (exp(-rate t) - 1)."""
+    """Solution of z' = p (z - w) after T, with w = w0 + slope t + c (exp(-rate t) - 1)."""
     decay = cmath.exp(p * T)
     rest = 1.0 - decay
     z = decay * z + rest * (w0 - c) + slope * (T + rest / p)
@@ -76,7 +81,7 @@ def _mode(z: complex, p: complex, T: float, w0: float, slope: float, c: float, r
 def _piece(
     state: FloatArray, p1: complex, p2: complex, T: float, ds: float, sign: float, alpha: float, rate: float
 ) -> None:
-    """One piece of a linear-hold step on which q keeps its sign; ``ds``: the way of u over it, V."""
+    """Advance ``state`` over T s of a linear-hold step, on which q keeps its sign and u changes by ``ds`` V."""
     u0, g0 = state[0], state[1]
     slope = sign * ds / T
     c = 0.0
@@ -95,7 +100,7 @@ def _piece(
 
 @compiled
 def _relax(state: FloatArray, p1: complex, p2: complex, T: float) -> None:
-    """The modes over T under a resting voltage."""
+    """Advance the modes by T s at constant voltage."""
     w = state[0] - state[1]
     z1 = _mode(complex(state[2], state[3]), p1, T, w, 0.0, 0.0, 0.0)
     z2 = _mode(complex(state[4], state[5]), p2, T, w, 0.0, 0.0, 0.0)
@@ -104,7 +109,7 @@ def _relax(state: FloatArray, p1: complex, p2: complex, T: float) -> None:
 
 @compiled
 def stage_step(state: FloatArray, u_V: float, p1: complex, p2: complex, T: float, shape: FloatArray) -> None:
-    """Advance (u, g, z1 re, im, z2 re, im) by a step at whose end the voltage is ``u_V``, linear within it.
+    """Advance ``state`` (u, g, Re z1, Im z1, Re z2, Im z2) by T s, over which the voltage goes linearly to ``u_V``.
 
     ``shape``: alpha, beta, gamma.
     """
@@ -132,14 +137,14 @@ def stage_step(state: FloatArray, u_V: float, p1: complex, p2: complex, T: float
 
 @compiled
 def stage_output(state: FloatArray, p1: complex, p2: complex) -> float:
-    """(y - y0)/d in volts."""
+    """(y - y0)/d, V."""
     z1, z2 = complex(state[2], state[3]), complex(state[4], state[5])
     return ((p1 * z2 - p2 * z1) / (p1 - p2)).real
 
 
 @compiled
 def stage_rate(state: FloatArray, p1: complex, p2: complex) -> float:
-    """y'/d in V/s."""
+    """y'/d, V/s."""
     z1, z2 = complex(state[2], state[3]), complex(state[4], state[5])
     return (p1 * p2 * (z2 - z1) / (p1 - p2)).real
 
@@ -155,9 +160,10 @@ def run_stage(
     state: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Rows (y - y0)/d, y'/d, drive w of each sample into ``out`` (n, 3); ``state`` is advanced in place.
+    """Write (y - y0)/d V, y'/d V/s and the drive w V of each sample to ``out`` (n, 3); ``state`` is advanced in place.
 
-    The state before the first sample is that of the first sample's instant: its voltage is not stepped to.
+    ``u_V`` (n,) V is T s apart. ``linear``: linear hold, else zero-order hold. ``state`` is that at the instant of the
+    first sample.
     """
     for k in range(u_V.size):
         if k > 0:
@@ -168,14 +174,14 @@ def run_stage(
         out[k, 0] = stage_output(state, p1, p2)
         out[k, 1] = stage_rate(state, p1, p2)
         if not linear:
-            state[1] = hysteresis_step(state[0], u_V[k], state[1], shape[0], shape[1], shape[2])
+            state[1] = hysteresis_step(state[1], u_V[k] - state[0], shape[0], shape[1], shape[2])
             state[0] = u_V[k]
         out[k, 2] = state[0] - state[1]
 
 
 @compiled
 def poles(lag_s: float, inertia_s2: float) -> tuple[complex, complex]:
-    """Modes of ``inertia y'' + lag y' + y`` (b/k in s, m/k in s²), slow one first, 1/s; never exactly equal."""
+    """Modes of ``inertia y'' + lag y' + y`` (lag = b/k in s, inertia = m/k in s²), slow one first, 1/s; never equal."""
     discriminant = lag_s * lag_s - 4.0 * inertia_s2
     if abs(discriminant) < (1e-5 * lag_s) ** 2 + 1e-10 * inertia_s2:
         discriminant = max(4e-10 * inertia_s2, (1e-5 * lag_s) ** 2)
@@ -184,6 +190,6 @@ def poles(lag_s: float, inertia_s2: float) -> tuple[complex, complex]:
 
 
 def settled(u_V: float, g_V: float) -> FloatArray:
-    """State (6,) with voltage and hysteresis as given and no motion."""
+    """State (6,) at rest with the given voltage and hysteresis."""
     w = u_V - g_V
     return np.array([u_V, g_V, w, 0.0, w, 0.0])

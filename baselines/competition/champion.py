@@ -1,17 +1,19 @@
-"""What a competition serves: the champion's answer, blended from the one before it, all memories carried along.
+"""The inverse model that a competition serves: the champion's answer, with the memories of all contestants.
 
-The caller's memory holds one share a contestant and then every contestant's own memory. Point by point the shares move
-to the champion, at a rate of one over ``blend_s``: after a change of champion every caller goes over in its own
-stream, without a jump, and a call is still a pure function of its arguments.
+The caller's memory holds one weight per contestant, then the memory of every contestant. From point to point the
+weights move to the champion within ``blend_s``. After a change of champion, every caller therefore passes to the new
+one in its own stream of points, without a jump, and a call is still a pure function of its arguments.
 
-The memory of a contestant that has no share follows the motion and the voltages that are answered (``carry``), as it
-would follow those of the stage: that costs next to nothing, where its own answer, which nobody asks for, would not.
+The memory of a contestant with weight 0 is advanced with the requested motion and the answered voltages, as it would
+be with those of the stage. That costs far less than an answer of its own, which is not needed.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,18 +23,84 @@ from adaptive.inverse_model import LssvmInverse, evaluate_point
 from adaptive.state_codec import prefixed, under
 from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
 from adaptive.window.arrays import IntArray
-from baselines.competition.kinds import KINDS, Carry, carries, carry_of, kind_of
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.linear import LinearInverse
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+
+#: Class of a contestant's inverse model by the name that stored states use.
+INVERSE_KINDS: Final[dict[str, Any]] = {
+    "lssvm": LssvmInverse,
+    "linear": LinearInverse,
+    "bouc_wen": BoucWenInverse,
+    "mpi": MpiInverse,
+}
+#: Advances a memory in place: (n,) motion µm, (n,) voltages answered for it V, memory (m,).
+AdvanceMemory = Callable[[FloatArray, FloatArray, FloatArray], None]
+
+
+@runtime_checkable
+class AdvancesMemory(Protocol):
+    """An inverse model with a fast ``track``: in place and without checks."""
+
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """Advance ``memory`` (m,) in place over (n,) points with the voltages ``u_V``."""
+        ...
+
+
+@runtime_checkable
+class StatesValidity(Protocol):
+    """An inverse model that can declare itself unusable."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether its answers can be used."""
+        ...
+
+
+def memory_advance_of(model: InverseModel) -> AdvanceMemory:
+    """The function that advances the memory of ``model`` over answers of another model."""
+    if isinstance(model, AdvancesMemory):
+        return model.carry
+
+    def track(y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        still = np.zeros(np.asarray(y_um).size)
+        memory[:] = model.track(y_um, still, still, u_V, memory)
+
+    return track
+
+
+def _advances_but(
+    models: Sequence[InverseModel], parts: Sequence[slice], champion: int
+) -> tuple[tuple[AdvanceMemory, slice], ...]:
+    """The advance functions of all models with a memory except the champion, with their parts of the whole memory."""
+    return tuple(
+        (memory_advance_of(model), part)
+        for i, (model, part) in enumerate(zip(models, parts, strict=True))
+        if i != champion and part.stop > part.start
+    )
+
+
+def inverse_kind_of(model: InverseModel) -> str:
+    """Name of the model's class in stored states. Raises InputError for a class that has none."""
+    for kind, known in INVERSE_KINDS.items():
+        if type(model) is known:
+            return kind
+    raise InputError(
+        f"model {model.name!r}: got a {type(model).__name__}, expected one of the kinds {', '.join(INVERSE_KINDS)}"
+    )
 
 
 @dataclass(frozen=True)
 class ChampionInverse:
-    """Immutable; implements ``adaptive.types.InverseModel``.
+    """The models of all contestants and which of them answers. Immutable; implements ``adaptive.types.InverseModel``.
 
     Parameters
     ----------
-    names, models : of the contestants, in order, all of one sample time.
-    champion : index of the one that answers.
-    blend_s : how long a change of champion takes in a caller's stream of points, s.
+    names, models : the contestants, in order; all models have one sample time.
+    champion : index of the contestant that answers.
+    blend_s : duration of a change of champion in a caller's stream of points, s.
+
+    Raises InputError where names, models and champion do not fit together.
     """
 
     names: tuple[str, ...]
@@ -40,61 +108,70 @@ class ChampionInverse:
     champion: int
     blend_s: float = 0.05
     name: str = "auto"
-    _cuts: tuple[int, ...] = field(init=False, repr=False, compare=False)
-    #: The shares of a stream that is wholly the champion's, as bytes; and of the others what carries their memories.
-    _alone: bytes = field(init=False, repr=False, compare=False)
-    _others: tuple[tuple[Carry, slice], ...] = field(init=False, repr=False, compare=False)
-    #: The champion's part of a memory, and the champion itself as compiled code takes it; None for another kind.
-    _own: slice = field(init=False, repr=False, compare=False)
+    #: Ends of the parts of a memory: the weights, then the memory of each contestant.
+    _ends: tuple[int, ...] = field(init=False, repr=False, compare=False)
+    #: The weights of a stream that belongs to the champion alone, as bytes.
+    _settled_bytes: bytes = field(init=False, repr=False, compare=False)
+    #: How the memories of the other contestants advance, and where they lie.
+    _others: tuple[tuple[AdvanceMemory, slice], ...] = field(init=False, repr=False, compare=False)
+    #: The champion's part of a memory.
+    _champion_part: slice = field(init=False, repr=False, compare=False)
+    #: The champion's arrays for compiled code; None unless it is an LSSVM.
     _packed: tuple[FloatArray, IntArray] | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.models or len(self.names) != len(self.models) or not 0 <= self.champion < len(self.models):
             raise InputError(
                 f"names, models, champion: got {len(self.names)}, {len(self.models)}, {self.champion}, "
-                "expected as many names as models, and the index of one of them"
+                "expected one name per model and the index of one of them"
             )
         if len({model.dt_s for model in self.models}) != 1 or not self.blend_s >= 0.0:
-            raise InputError("models, blend_s: expected models of one sample time, and a time of at least 0 s")
+            raise InputError("models, blend_s: expected models of one sample time and a blend time of at least 0 s")
         sizes = [len(self.models), *(model.memory_size for model in self.models)]
-        cuts = tuple(int(cut) for cut in np.cumsum(sizes))
-        object.__setattr__(self, "_cuts", cuts)
-        object.__setattr__(self, "_alone", self._settled().tobytes())
-        parts = [slice(begin, end) for begin, end in itertools.pairwise(cuts)]
-        object.__setattr__(self, "_others", carries(self.models, parts, self.champion))
-        object.__setattr__(self, "_own", parts[self.champion])
+        ends = tuple(int(end) for end in np.cumsum(sizes))
+        object.__setattr__(self, "_ends", ends)
+        object.__setattr__(self, "_settled_bytes", self._settled_weights().tobytes())
+        parts = [slice(start, stop) for start, stop in itertools.pairwise(ends)]
+        object.__setattr__(self, "_others", _advances_but(self.models, parts, self.champion))
+        object.__setattr__(self, "_champion_part", parts[self.champion])
         served = self.served
         object.__setattr__(self, "_packed", served.packed if type(served) is LssvmInverse else None)
 
     @property
     def dt_s(self) -> float:
+        """Sample time of all contestants, s."""
         return self.models[0].dt_s
 
     @property
     def memory_size(self) -> int:
-        """One share a contestant, then their memories in order."""
-        return self._cuts[-1]
+        """Number of values in a memory: one weight per contestant, then their memories in order."""
+        return self._ends[-1]
 
     @property
     def served(self) -> InverseModel:
-        """The champion's model itself."""
+        """The champion's model."""
         return self.models[self.champion]
 
     @property
     def valid(self) -> bool:
-        """Whether the champion vouches for itself."""
-        return bool(getattr(self.served, "valid", True))
+        """Whether the champion's answers can be used."""
+        served = self.served
+        return not isinstance(served, StatesValidity) or bool(served.valid)
 
     def rest_memory(self, y_um: float) -> FloatArray:
-        """(m,) memory of a stage at rest at ``y_um``, wholly the champion's."""
-        return np.concatenate([self._settled(), *(model.rest_memory(y_um) for model in self.models)])
+        """(m,) memory of a stage at rest at ``y_um`` µm; the champion has all the weight."""
+        return np.concatenate([self._settled_weights(), *(model.rest_memory(y_um) for model in self.models)])
 
     def feedforward(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """Voltages for (n,) points; pure. Raises InputError on shapes that do not fit together."""
+        """Voltages for (n,) points. Pure. Raises InputError on shapes that do not fit together.
+
+        During a change of champion the voltage is the weighted mean of the contestants with a weight, ``std_V``
+        includes their spread, and a point is inside only where all of them say so.
+        """
         if self._is_settled(memory):
-            return self._champions(y_um, v_um_per_s, a_um_per_s2, memory)
+            return self._champion_alone(y_um, v_um_per_s, a_um_per_s2, memory)
         shares, parts = self._parts(memory)
         champion = self.served.feedforward(y_um, v_um_per_s, a_um_per_s2, parts[self.champion])
         n = champion.u_V.size
@@ -108,7 +185,7 @@ class ChampionInverse:
         if len(answers) > 1:
             u, variance, inside = np.zeros(n), np.zeros(n), inside.copy()
             for i, answer in answers.items():
-                # A contestant that has nothing finite to say leaves its share to the champion.
+                # Where a contestant has no finite answer, the champion's takes its place.
                 u += weights[:, i] * np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V)
             for i, answer in answers.items():
                 apart = np.where(np.isfinite(answer.u_V), answer.u_V, champion.u_V) - u
@@ -119,14 +196,14 @@ class ChampionInverse:
         for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
             end = answers[i].memory if i in answers else part.copy()
             if i not in answers and part.size:
-                carry_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+                memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
             ends.append(end if np.isfinite(end).all() else part)
         return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 
     def track(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, u_V: FloatArray, memory: FloatArray
     ) -> FloatArray:
-        """(m,) memory after (n,) measured points with the voltages applied."""
+        """(m,) memory after (n,) measured points with the applied voltages ``u_V``."""
         shares, parts = self._parts(memory)
         ends = []
         for model, part in zip(self.models, parts, strict=True):
@@ -136,36 +213,36 @@ class ChampionInverse:
         return np.concatenate([self._weights(shares, n)[-1] if n else shares, *ends])
 
     def with_model(self, name: str, model: InverseModel) -> ChampionInverse:
-        """The same with another model of the contestant called ``name``."""
+        """A copy in which the contestant ``name`` has another model."""
         models = tuple(model if name == own else old for own, old in zip(self.names, self.models, strict=True))
         return replace(self, models=models)
 
     def with_memory(self, memory: FloatArray, name: str, own: FloatArray) -> FloatArray:
-        """``memory`` (m,) with that of the contestant called ``name`` replaced by ``own``. Not changed in place."""
+        """A copy of ``memory`` (m,) in which ``own`` is the memory of the contestant ``name``."""
         i = self.names.index(name)
         after = memory.copy()
-        after[self._cuts[i] : self._cuts[i + 1]] = own
+        after[self._ends[i] : self._ends[i + 1]] = own
         return after
 
     def _is_settled(self, memory: FloatArray) -> bool:
-        """Whether a caller's stream of points is wholly the champion's: almost always."""
-        if type(memory) is not np.ndarray or memory.dtype is not DOUBLE or memory.shape != self._cuts[-1:]:
+        """Whether the champion has all the weight in a caller's memory, which is almost always so."""
+        if type(memory) is not np.ndarray or memory.dtype is not DOUBLE or memory.shape != self._ends[-1:]:
             return False
-        # As it leaves this class; anything else goes the long way, where it is judged.
-        return memory[: len(self.models)].tobytes() == self._alone
+        # Compares with the weights as this class writes them; any others take the general path, which checks them.
+        return memory[: len(self.models)].tobytes() == self._settled_bytes
 
-    def _champions(
+    def _champion_alone(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """The champion's answer, and all memories after it."""
-        answer = self.models[self.champion].feedforward(y_um, v_um_per_s, a_um_per_s2, memory[self._own])
+        """The champion's answer and all memories after it."""
+        answer = self.models[self.champion].feedforward(y_um, v_um_per_s, a_um_per_s2, memory[self._champion_part])
         after = memory.copy()
-        after[self._own] = answer.memory
-        for carry, part in self._others:
-            carry(y_um, answer.u_V, after[part])
+        after[self._champion_part] = answer.memory
+        for advance, part in self._others:
+            advance(y_um, answer.u_V, after[part])
         if not all_finite(after):
-            # One that cannot go on stays where it was; it is no reason for the others to.
-            for first, stop in itertools.pairwise(self._cuts):
+            # A memory that is not finite is set back alone; the others keep their progress.
+            for first, stop in itertools.pairwise(self._ends):
                 if not np.isfinite(after[first:stop]).all():
                     after[first:stop] = memory[first:stop]
         return Feedforward(answer.u_V, answer.std_V, answer.inside, after)
@@ -173,34 +250,34 @@ class ChampionInverse:
     def evaluate_point(
         self, y_um: float, v_um_per_s: float, a_um_per_s2: float, memory: FloatArray, one: tuple[FloatArray, FloatArray]
     ) -> tuple[float, float, bool] | None:
-        """``feedforward`` of one point, (voltage, deviation, inside), without its checks: three floats and no others.
+        """``feedforward`` of one point without checks, for calls at a controller's rate: (voltage, deviation, inside).
 
-        ``memory`` (m,) is advanced in place; ``one``: two arrays (1,) that are overwritten. None for another kind of
-        champion, a stream that is not wholly its own, a memory that does not stay finite: ask ``feedforward`` with the
-        memory from before. For who asks point by point at a controller's rate.
+        ``memory`` (m,) is advanced in place; ``one`` holds two work arrays (1,). Returns None where the champion is no
+        LSSVM, where it does not have all the weight, or where the memory does not stay finite. Then call
+        ``feedforward`` with a copy of the memory from before.
         """
         packed = self._packed
         if packed is None or not self._is_settled(memory):
             return None
         answer: tuple[float, float, bool] = evaluate_point(
-            y_um, v_um_per_s, a_um_per_s2, memory[self._own], packed[0], packed[1]
+            y_um, v_um_per_s, a_um_per_s2, memory[self._champion_part], packed[0], packed[1]
         )
         motion, voltage = one
         motion[0], voltage[0] = y_um, answer[0]
-        for carry, part in self._others:
-            carry(motion, voltage, memory[part])
+        for advance, part in self._others:
+            advance(motion, voltage, memory[part])
         return answer if all_finite_doubles(memory) else None
 
-    def _settled(self) -> FloatArray:
+    def _settled_weights(self) -> FloatArray:
         shares = np.zeros(len(self.models))
         shares[self.champion] = 1.0
         return shares
 
     def _weights(self, shares: FloatArray, n: int) -> FloatArray:
-        """(n, k) shares at each of n points, going over to the champion from ``shares`` (k,)."""
+        """(n, k) weights at each of n points, moving from ``shares`` (k,) to the champion."""
         at = float(shares[self.champion])
         if at >= 1.0 or self.blend_s <= 0.0:
-            return np.tile(self._settled(), (n, 1))
+            return np.tile(self._settled_weights(), (n, 1))
         own = np.minimum(1.0, at + np.arange(1, n + 1) * (self.dt_s / self.blend_s))
         weights = np.outer((1.0 - own) / (1.0 - at), shares)
         weights[:, self.champion] = own
@@ -211,18 +288,18 @@ class ChampionInverse:
         if memory.shape != (self.memory_size,):
             raise InputError(
                 f"memory: got shape {memory.shape}, expected ({self.memory_size},);"
-                " start from rest_memory() or bring back the memory of the last reply"
+                " start from rest_memory() or send the memory of the last reply"
             )
-        first, *rest = np.split(memory, self._cuts[:-1])
+        first, *rest = np.split(memory, self._ends[:-1])
         total = float(first.sum())
-        # Shares that are none, such as those of a memory made elsewhere, are taken for the champion's alone.
+        # Weights that are not valid, such as those of a memory from elsewhere, become the champion's alone.
         if not (np.all(np.isfinite(first)) and np.all(first >= 0.0) and total > 0.0):
-            return self._settled(), rest
+            return self._settled_weights(), rest
         return first / total if total != 1.0 else first.copy(), rest
 
     def state_dict(self) -> StateDict:
-        """Flat names: the contestants' own under ``NAME.``."""
-        kinds = [kind_of(model) for model in self.models]
+        """Flat entries; contestants under ``NAME.``. Raises InputError for a class that cannot be stored."""
+        kinds = [inverse_kind_of(model) for model in self.models]
         state: StateDict = {
             "name": self.name,
             "names": ",".join(self.names),
@@ -236,12 +313,12 @@ class ChampionInverse:
 
     @classmethod
     def from_state(cls, state: StateDict) -> ChampionInverse:
-        """Inverse of ``state_dict``. Raises ModelFileError on missing or misfit entries."""
+        """Inverse of ``state_dict``. Raises ModelFileError on missing or damaged entries."""
         try:
             names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
             models = []
             for name, kind in zip(names, kinds, strict=True):
-                models.append(KINDS[kind].from_state(under(f"{name}.", state)))
+                models.append(INVERSE_KINDS[kind].from_state(under(f"{name}.", state)))
             return cls(tuple(names), tuple(models), int(state["champion"]), float(state["blend_s"]), str(state["name"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(

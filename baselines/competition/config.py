@@ -1,4 +1,4 @@
-"""How a competition judges and exchanges its contestants. Imports nothing heavy: a configuration is read by it."""
+"""Configuration of a competition. Imports no numerics, because the service configuration imports it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,24 @@ from adaptive.types import StateDict
 
 @dataclass(frozen=True, slots=True)
 class CompetitionConfig:
-    """How contestants are judged and exchanged.
+    """How contestants are scored and how the champion is replaced.
 
-    block : samples between two judgements. serving_age_s : age of the snapshots that are judged, s.
-    horizon_s : time constant of the mean square error, s of motion.
-    margin, floor : a challenger must beat the champion's rms error by this factor, and by this share of the voltage
-    span, ... patience_s : ... for this long, s of motion. The favourite needs no margin and no floor to come back.
-    blend_s : how long callers take to go over, s. cutoff_hz : of the smoother.
-    rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
+    Attributes
+    ----------
+    block : samples between two judgements.
+    serving_age_s : age of the snapshots that are scored, s; that of the models in the hands of callers.
+    horizon_s : time constant of the mean square error, s of scored motion.
+    margin : a challenger's rms error times this factor must stay below that of the champion, ...
+    floor : ... by at least this share of the voltage span, ...
+    patience_s : ... for this long, s of scored motion. The favourite returns without margin and floor.
+    blend_s : duration of a change of champion in a caller's stream of points, s.
+    cutoff_hz : bandwidth of the smoother, Hz.
+    rest_share, rest_s : a stage that stays within this share of the range for this long, s, is at rest.
     glitch_share : a reading this far from the smoother's prediction, as a share of the range, is not scored.
     settle : samples after a start, a gap or a jump that are not scored.
-    revive_s : time after which a favourite that has failed begins anew, s.
+    revive_s : time after which a failed favourite restarts, s.
+
+    Raises InputError on a value out of range.
     """
 
     block: int = 20
@@ -50,4 +57,5 @@ class CompetitionConfig:
                 raise InputError(f"{name}: got {getattr(self, name)}, expected 0 to 100 s")
 
     def state_dict(self) -> StateDict:
+        """Values by field name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}

@@ -1,4 +1,4 @@
-"""Who may compete: the online forms of the models, by kind, to be begun from an identified model or a kept state."""
+"""Which online models can compete, how a stored state names them, and how an identified baseline starts one."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from adaptive.online.learner import Learner
 from adaptive.types import InverseModel, OnlineModel
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
-from baselines.linear import LinearInverse
-from baselines.linear_online import LinearOnline
-from baselines.online import OnlineBaseline
+from baselines.linear import LinearInverse, LinearOnline
+from baselines.online_baseline import OnlineBaseline
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.online import MpiOnline
 
-#: Makes a model that has failed anew, from its last snapshot.
-Revive = Callable[[InverseModel], OnlineModel]
-#: Kinds of contestants that a state can be read back into.
+#: Makes a new online model from the last snapshot of one that has failed.
+Restart = Callable[[InverseModel], OnlineModel]
+#: Class of a contestant by the name that stored states use.
 ONLINE_KINDS: Final[dict[str, type[Learner] | type[OnlineBaseline]]] = {
     "learner": Learner,
     "linear": LinearOnline,
     "mpi": MpiOnline,
     "bouc_wen": BoucWenOnline,
 }
+#: Inverse models whose stated deviation is that of a fit, not of served answers.
+_BASELINES = (LinearInverse, MpiInverse, BoucWenInverse)
 
 
-def challenger(model: InverseModel) -> OnlineModel | None:
-    """The online form of an identified baseline; None where it has none."""
+def online_form(model: InverseModel) -> OnlineModel | None:
+    """A new online model that starts from an identified baseline; None where the model has no online form."""
     if isinstance(model, LinearInverse):
         return LinearOnline(model)
     if isinstance(model, MpiInverse):
@@ -43,20 +44,20 @@ def challenger(model: InverseModel) -> OnlineModel | None:
     return None
 
 
-def stating(model: InverseModel, rms_V: float) -> InverseModel:
-    """``model`` with a deviation of at least ``rms_V``, V, what its answers were judged to be wrong by.
+def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseModel:
+    """``model`` with a stated standard deviation of at least ``rms_V``, V, the error measured on served answers.
 
-    A baseline knows the residuals of its own fit, which say little of an answer as old as callers' are. An LSSVM
-    is calibrated on its own predictions, and stays as it is.
+    A baseline states the residual of its own fit, which is too small for answers as old as those of callers. An LSSVM
+    calibrates its deviation on its own predictions and is returned unchanged. An ``rms_V`` of 0 means that nothing
+    has been scored yet; the model is then returned unchanged too.
     """
-    # Before any answer was judged nothing is known, which is not that nothing is wrong.
-    if not isinstance(model, LinearInverse | MpiInverse | BoucWenInverse) or not 0.0 < rms_V < math.inf:
+    if not isinstance(model, _BASELINES) or not 0.0 < rms_V < math.inf:
         return model
     return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
 
 
 def fingerprint(model: InverseModel) -> str:
-    """A short digest of a model's numbers."""
+    """Digest of a model's parameters, 16 hexadecimal digits."""
     sha = hashlib.blake2b(digest_size=8)
     for name, value in sorted(model.state_dict().items()):
         array = isinstance(value, np.ndarray)

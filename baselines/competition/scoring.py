@@ -1,8 +1,8 @@
-"""The score of a competition: what each contestant would have answered for the motion that was measured.
+"""Scores of a competition: the voltage each contestant would have answered, against the voltage that was applied.
 
-A contestant is judged by the snapshot that callers had when the motion happened (``serving_age_s`` old), on samples
-that had taught it nothing. Displacement, velocity and acceleration are those of the fixed-lag smoother. Only motion
-counts: a stage at rest is foretold by anybody.
+A contestant is scored by the snapshot that callers had when the motion happened (``serving_age_s`` old), so the scored
+samples have not taught it. Displacement, velocity and acceleration come from the fixed-lag smoother. Only motion is
+scored, because every model predicts a stage at rest.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from typing import Final
 
 import numpy as np
 
-from adaptive.online import gates as admission
+from adaptive.online import gates
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
 from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from baselines.competition.champion import ChampionInverse
 from baselines.competition.config import CompetitionConfig
 
-#: Verdicts on a sample that speak against scoring the pair.
+#: Verdicts on a sample that exclude it from scoring.
 NOT_SCORED: Final = frozenset(
-    {admission.GLITCH, admission.RINGING, admission.UNTRUSTED, admission.SATURATED}
-    | {admission.OUT_OF_RANGE, admission.SETTLING, admission.GAP}
+    {gates.GLITCH, gates.RINGING, gates.UNTRUSTED, gates.SATURATED, gates.OUT_OF_RANGE, gates.SETTLING, gates.GAP}
 )
-#: Sample time up to which ``glitch_share`` holds as it is, s; it grows with longer ones.
+#: Sample time up to which ``glitch_share`` is used as given, s; it grows in proportion to longer ones.
 _GLITCH_DT_S = 1e-3
-#: Missing samples that are bridged; beyond, smoothing begins anew.
+#: Most missing samples that the smoother bridges; after more it restarts.
 _MAX_GAP = 5
-#: Readings in a row that surprise the smoother before the stage is taken to have really moved.
-_GLITCHES = 3
+#: Readings in a row that may differ from the prediction as glitches; after more the stage is taken to have moved.
+_MAX_GLITCHES = 3
 
 
-class Motion:
-    """Collects smoothed motion with the voltage of the same instant, block by block, and says what of it counts."""
+class SmoothedMotion:
+    """Collects the smoothed motion with the voltage of the same instant, and marks the samples that are scored."""
 
     def __init__(self, config: CompetitionConfig, dt_s: float, range_um: float) -> None:
         self._config = config
@@ -54,7 +54,7 @@ class Motion:
         self._anchor_um = 0.0
 
     def take(self, sample: Sample, missing: int, counts: bool) -> None:
-        """One good sample after ``missing`` others; ``counts``: nothing speaks against scoring its pair."""
+        """Take a good sample that follows ``missing`` lost ones; ``counts``: its verdict allows scoring."""
         state = self._state
         if state is None or missing > _MAX_GAP:
             self._restart(sample.y_um)
@@ -65,7 +65,7 @@ class Motion:
         assert state is not None
         if abs(sample.y_um - float(state.x[0])) > self._glitch_um and self._since_start > self.lag:
             self._glitches += 1
-            if self._glitches <= _GLITCHES:
+            if self._glitches <= _MAX_GLITCHES:
                 self._step(state, None, sample.u_V, False)
                 return
             self._restart(sample.y_um)
@@ -96,12 +96,13 @@ class Motion:
         self._rows.append((y, v, a, self._u[0], float(scored)))
 
     def block(self) -> FloatArray:
-        """(5, n) rows y, v, a, u, scored of the motion since the last call."""
+        """(5, n) rows y µm, v µm/s, a µm/s², u V, scored (0 or 1) of the motion since the last call."""
         rows = np.ascontiguousarray(np.array(self._rows, dtype=np.float64).reshape(-1, 5).T)
         self._rows.clear()
         return rows
 
     def state_dict(self) -> StateDict:
+        """The whole state; copies."""
         state: StateDict = {
             "u": np.array(self._u, dtype=np.float64),
             "rows": np.array(self._rows, dtype=np.float64).reshape(-1, 5),
@@ -115,7 +116,7 @@ class Motion:
         return state
 
     def restore(self, state: StateDict) -> None:
-        """Go on from a ``state_dict``."""
+        """Continue from a ``state_dict``."""
         self._u.extend(float(u) for u in state["u"])
         self._rows = [tuple(float(x) for x in row) for row in np.asarray(state["rows"]).reshape(-1, 5)]  # type: ignore[misc]
         self._glitches, self._since_start = int(state["glitches"]), int(state["since_start"])
@@ -125,8 +126,11 @@ class Motion:
 
 
 @dataclass(slots=True)
-class Score:
-    """Exponentially weighted mean square error of one contestant, V², and the memory that its answers carry."""
+class RunningError:
+    """Exponentially weighted mean square error of one contestant, V², and the memory that its answers carry.
+
+    ``weight`` rises from 0 to 1 as scored motion fills the horizon.
+    """
 
     memory: FloatArray
     square_V2: float = 0.0
@@ -134,11 +138,14 @@ class Score:
 
     @property
     def mean_V2(self) -> float:
-        """Mean square error, V²; infinite where a prediction was not finite, 0 before any."""
+        """Mean square error, V²; 0 before the first scored sample."""
         return self.square_V2 / self.weight if self.weight > 0.0 else 0.0
 
-    def take(self, model: InverseModel, rows: FloatArray, share: float, worst_V: float) -> bool:
-        """Judge ``model`` on a block (5, n), whose mean weighs ``share``; False where its answer is not finite."""
+    def add_block(self, model: InverseModel, rows: FloatArray, share: float, worst_V: float) -> bool:
+        """Score ``model`` on a block (5, n) whose mean gets the weight ``share``; False where an answer is not finite.
+
+        An error counts at most ``worst_V``, so that a single absurd answer is forgotten as soon as any other.
+        """
         forward = model.feedforward(rows[0], rows[1], rows[2], self.memory)
         if np.isfinite(forward.memory).all():
             self.memory = forward.memory
@@ -146,77 +153,101 @@ class Score:
         error = forward.u_V[scored] - rows[3][scored]
         finite = bool(np.isfinite(error).all())
         if error.size:
-            # One absurd answer is as bad as the whole span, and forgotten as soon.
             size = np.minimum(np.where(np.isfinite(error), np.abs(error), worst_V), worst_V)
             self.square_V2 += share * (float(size @ size) / error.size - self.square_V2)
             self.weight += share * (1.0 - self.weight)
         return finite
 
 
-# --- The judges of a competition: each block of motion is foretold by the snapshots that callers had when it happened.
+#: One snapshot per contestant.
+Snapshots = tuple[InverseModel, ...]
 
 
-Models = tuple[InverseModel, ...]
-
-
-class Judging:
-    """Scores of all contestants, and the snapshots of theirs that are still to be judged.
+class Judge:
+    """The running errors of all contestants, and the past snapshots that are still needed for scoring.
 
     Parameters
     ----------
     start : snapshots that callers had from the beginning, all of one sample time.
-    lag : by how many samples the motion comes late. span_V : voltage range of the identification.
+    lag : delay of the smoothed motion, samples.
+    span_V : voltage range of the identification, V.
     """
 
-    def __init__(self, config: CompetitionConfig, start: Models, lag: int, span_V: float) -> None:
+    def __init__(self, config: CompetitionConfig, start: Snapshots, lag: int, span_V: float) -> None:
         self._config, self._dt_s, self._lag, self._span_V = config, start[0].dt_s, lag, span_V
-        self.start = start
-        self.scores = [Score(np.empty(0)) for _ in start]
-        # (sequence number, snapshots) at the last blocks: what callers had, from the age of an answer on.
+        self._start = start
+        self.scores = [RunningError(np.empty(0)) for _ in start]
+        # (sequence number, snapshots) at the last blocks, back to the age of an answer.
         depth = math.ceil((config.serving_age_s / self._dt_s + lag) / config.block) + 2
-        self.past: deque[tuple[int, Models]] = deque(maxlen=depth)
+        self._past: deque[tuple[int, Snapshots]] = deque(maxlen=depth)
 
     def rms_V(self, i: int) -> float:
-        """rms error of a contestant, V; 0 before any."""
+        """rms error of contestant ``i``, V; 0 before the first scored sample."""
         return math.sqrt(self.scores[i].mean_V2)
 
-    def judge(self, seq: int, rows: FloatArray, out: list[bool]) -> list[bool]:
-        """Score a block (5, n) of motion that ends at the sample ``seq``; True for whoever is not to be served.
+    def score(self, seq: int, rows: FloatArray, out: list[bool]) -> list[bool]:
+        """Score a block (5, n) of motion that ends at sample ``seq``; contestants marked in ``out`` do not take part.
 
-        ``out``: who does not take part.
+        Returns for each contestant whether it cannot be served.
         """
-        bad, c = list(out), self._config
+        unusable, c = list(out), self._config
         if not rows.shape[1]:
-            return bad
+            return unusable
         share = 1.0 - math.exp(-float(rows[4].sum()) * self._dt_s / c.horizon_s)
-        for i, (score, model) in enumerate(zip(self.scores, self._judged(seq, rows.shape[1]), strict=True)):
+        for i, (score, model) in enumerate(zip(self.scores, self._served_then(seq, rows.shape[1]), strict=True)):
             if out[i]:
                 continue
             if not score.memory.size and model.memory_size:
                 score.memory = model.rest_memory(float(rows[0, 0]))
-            bad[i] = not score.take(model, rows, share, self._span_V)
-        return bad
+            unusable[i] = not score.add_block(model, rows, share, self._span_V)
+        return unusable
 
-    def correct(self, models: Sequence[OnlineModel], newest: Models) -> None:
-        """Go on from a contestant's own memory where it knows one: over lost readings ours is a guess."""
+    def adopt_tracked_memories(self, models: Sequence[OnlineModel], newest: Snapshots) -> None:
+        """Take over the hysteresis memory of contestants that track one; it is better over lost readings."""
         for model, snapshot, score in zip(models, newest, self.scores, strict=True):
-            own = model.memory_for(snapshot, True)
-            if own is not None:
-                score.memory = own
+            tracked = model.memory_for(snapshot, True)
+            if tracked is not None:
+                score.memory = tracked
 
-    def remember(self, seq: int, models: Models) -> None:
-        """Keep what callers have from the sample ``seq`` on."""
-        self.past.append((seq, models))
+    def remember(self, seq: int, snapshots: Snapshots) -> None:
+        """Keep the snapshots that callers have from sample ``seq`` on."""
+        self._past.append((seq, snapshots))
 
     def begin_anew(self, i: int) -> None:
-        """Forget a contestant's score: as bad as can be until it has been scored, and soon forgotten."""
-        self.scores[i] = Score(np.empty(0), self._span_V**2, 1.0)
+        """Reset the score of contestant ``i`` to the worst value, which new samples soon replace."""
+        self.scores[i] = RunningError(np.empty(0), self._span_V**2, 1.0)
 
-    def _judged(self, seq: int, count: int) -> Models:
-        """The snapshots that were an answer's age old at the oldest instant of a block."""
+    def _served_then(self, seq: int, count: int) -> Snapshots:
+        """The snapshots that were ``serving_age_s`` old at the first instant of a block of ``count`` samples."""
         oldest = seq - self._lag - count + 1 - round(self._config.serving_age_s / self._dt_s)
-        judged = self.past[0][1] if self.past else self.start
-        for at, models in self.past:
+        served = self._past[0][1] if self._past else self._start
+        for at, snapshots in self._past:
             if at <= oldest:
-                judged = models
-        return judged
+                served = snapshots
+        return served
+
+    def state_dict(self, names: tuple[str, ...]) -> StateDict:
+        """The whole state of the contestants ``names`` as flat entries; copies."""
+        state: StateDict = {"past_seq": np.array([seq for seq, _ in self._past], dtype=np.int64)}
+        kept = {"start": self._start} | {f"past{k}": snapshots for k, (_, snapshots) in enumerate(self._past)}
+        for where, snapshots in kept.items():
+            # A stored champion model holds the snapshots; its champion has no meaning here.
+            state |= prefixed(f"{where}.", ChampionInverse(names, snapshots, 0).state_dict())
+        for name, score in zip(names, self.scores, strict=True):
+            state |= {
+                f"score.{name}.memory": score.memory.copy(),
+                f"score.{name}.square_V2": score.square_V2,
+                f"score.{name}.weight": score.weight,
+            }
+        return state
+
+    def restore(self, names: tuple[str, ...], state: StateDict) -> None:
+        """Continue from a ``state_dict``. Raises KeyError, ValueError or TypeError where it does not fit."""
+        self._start = ChampionInverse.from_state(under("start.", state)).models
+        self._past.clear()
+        for k, seq in enumerate(np.asarray(state["past_seq"]).tolist()):
+            self.remember(int(seq), ChampionInverse.from_state(under(f"past{k}.", state)).models)
+        for name, score in zip(names, self.scores, strict=True):
+            kept = under(f"score.{name}.", state)
+            score.memory = np.array(kept["memory"], dtype=np.float64)
+            score.square_V2, score.weight = float(kept["square_V2"]), float(kept["weight"])

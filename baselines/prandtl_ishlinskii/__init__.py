@@ -1,1 +1,1 @@
-"""prandtl_ishlinskii."""
+"""The modified Prandtl-Ishlinskii model (2.4)-(2.18): operators, model, inverse, identification, online form."""

@@ -1,13 +1,13 @@
-"""Identification of the linear and of the MPI model: convex, without starting values.
+"""Identification of the MPI model: a convex problem without starting values.
 
-(2.40) is linear in the play weights and the inverse dead-zone weights together, and is **minimised by all
-weights zero**. The scale constraint used here: the inverse saturation maps the recorded stroke onto itself,
-S*(y_max - y_ref) = y_max - y_ref. It takes nothing away, because (w_h, w_s*) and any multiple of them are the same
-model. Written in the slopes of the segments instead of the weights, invertibility is a bound on each unknown, so
-that the whole is a non-negative least-squares problem with one minimum.
+(2.40) is linear in the play weights and the inverse dead-zone weights together, so all weights zero would minimise
+it. A scale constraint excludes that: the inverse saturation maps the recorded stroke onto itself,
+S*(y_max - y_ref) = y_max - y_ref. It costs no generality, because (w_h, w_s*) and any multiple of them are the same
+model. Written in the slopes of the segments instead of the weights, invertibility is a lower bound on each unknown,
+and the whole is a non-negative least-squares problem with one minimum.
 
-(2.40) measures the error in x, not in µm of displacement; dividing each row by the slope of the inverse
-saturation there makes the two equal to first order, and two such rounds suffice.
+(2.40) measures the error in x, not in µm of displacement. Dividing each row by the slope of the inverse saturation
+there makes the two equal to first order; two such rounds suffice.
 """
 
 from __future__ import annotations
@@ -19,37 +19,23 @@ from numpy.typing import ArrayLike
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.linear import LinearParameters
-from baselines.prandtl_ishlinskii.dead_zone import ramps, slopes_to_weights
+from baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
+from baselines.fit_report import FitReport
 from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
-from baselines.prandtl_ishlinskii.play import play_run, play_start
-from baselines.validation import IdentificationReport, record
+from baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
+from baselines.validation import checked_recording
 
-#: Least slope, as a share of the mean one, of the first play and of every segment of the inverse saturation.
-SLOPE_FLOOR = 0.02
-#: Weight of the scale constraint against the mean row; it is exact afterwards, by rescaling.
+#: Weight of the scale constraint relative to the mean row; rescaling makes the constraint exact afterwards.
 _SCALE_WEIGHT = 1e3
-#: A residual beyond this many RMS is no sample of this model.
-_BEYOND = 8.0
-
-
-def identify_linear(u_V: ArrayLike, y_um: ArrayLike, dt_s: float) -> tuple[LinearParameters, IdentificationReport]:
-    """Gain and offset by least squares of displacement on voltage; ``u_V`` V and ``y_um`` µm are (n,), n >= 3.
-
-    Raises InputError on a bad recording.
-    """
-    u, y, dt = record(u_V, y_um, dt_s, 3)
-    gain, offset = np.polynomial.polynomial.polyfit(u, y, 1)[::-1]
-    parameters = LinearParameters(float(gain), float(offset))
-    report = IdentificationReport.of("linear", "least squares", y, parameters.simulate(u, dt), dt, 1, True)
-    return parameters, report
+#: Samples whose residual exceeds this multiple of the RMS are left out of a second fit.
+_OUTLIER_RMS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class MpiGrid:
     """Thresholds by (2.38), (2.39): plays ``r_V`` (n+1,), inverse dead zones ``d_star_um`` (m+1,) above ``y_ref_um``.
 
-    ``stroke_um`` is the recorded stroke on which the scale is fixed.
+    ``stroke_um`` is the recorded stroke, on which the scale is fixed.
     """
 
     r_V: FloatArray
@@ -59,7 +45,7 @@ class MpiGrid:
 
     @staticmethod
     def of(u_V: FloatArray, y_um: FloatArray, n: int, m: int) -> MpiGrid:
-        """Equal intervals over the largest |u| and the stroke, as the chapter has them."""
+        """n plays and m dead zones besides the zero ones, at equal intervals over the largest |u| and the stroke."""
         if n < 1 or m < 0:
             raise InputError(f"n, m: got {n}, {m}, expected n >= 1 plays and m >= 0 dead zones; the chapter: 12, 6")
         y_ref, stroke = float(y_um.min()), float(np.ptp(y_um))
@@ -68,7 +54,7 @@ class MpiGrid:
 
     @property
     def size(self) -> int:
-        """Number of unknowns: play weights, one offset, slopes."""
+        """Number of unknowns: play weights, offset, slopes."""
         return self.r_V.size + 1 + self.d_star_um.size
 
     def scale_row(self) -> FloatArray:
@@ -78,7 +64,7 @@ class MpiGrid:
         return row
 
     def lower_bounds(self, u_span_V: float) -> FloatArray:
-        """(size,) lower bounds; -inf for the offset."""
+        """(size,) lower bounds that keep the model invertible; -inf for the offset."""
         bounds = np.zeros(self.size)
         bounds[0] = SLOPE_FLOOR * self.stroke_um / u_span_V
         bounds[self.r_V.size] = -np.inf
@@ -93,21 +79,6 @@ class MpiGrid:
         return from_inverse_saturation(
             self.r_V, scaled[:n], self.d_star_um, weights, float(scaled[n]), self.y_ref_um, lag_s
         )
-
-
-def bounded_least_squares(matrix: FloatArray, target: FloatArray, lower: FloatArray) -> FloatArray:
-    """Minimise |matrix x - target| over x >= lower; a bound of -inf leaves an unknown free. Returns (p,)."""
-    from scipy.optimize import nnls  # slow to import, and a process that serves may never need it
-
-    free = np.isneginf(lower)
-    shift = np.where(free, 0.0, lower)
-    wide = np.hstack([matrix, -matrix[:, free]])
-    scale = np.linalg.norm(wide, axis=0)
-    scale[scale == 0.0] = 1.0
-    solution = nnls(wide / scale, target - matrix @ shift, maxiter=50 * wide.shape[1])[0] / scale
-    out: FloatArray = shift + solution[: matrix.shape[1]]
-    out[free] -= solution[matrix.shape[1] :]
-    return out
 
 
 def _solve(
@@ -125,7 +96,7 @@ def _solve(
         stacked = np.vstack([rows * weight[:, None], heavy / grid.stroke_um * scale_row])
         target = np.zeros(stacked.shape[0])
         target[-1] = heavy
-        # The triangle of QR has the same minimum as thousands of rows, and NNLS then takes microseconds.
+        # The triangular factor of QR has the same minimum as thousands of rows, and NNLS on it takes microseconds.
         triangle = np.asarray(np.linalg.qr(np.column_stack([stacked, target]), mode="r"))
         unknowns = bounded_least_squares(triangle[:, :-1], triangle[:, -1], lower)
         slopes = np.maximum(unknowns[plays.shape[1] + 1 :], SLOPE_FLOOR)
@@ -137,7 +108,7 @@ def _solve(
 def _best_lag(
     plays: FloatArray, y_um: FloatArray, velocity: FloatArray, dt_s: float, grid: MpiGrid, lower: FloatArray
 ) -> tuple[float, int]:
-    """The first-order lag, s, with the smallest residual, and how many were tried; 0 where none helps."""
+    """The first-order lag with the smallest residual, s, 0 where no lag helps; and the number of lags tried."""
     thin = slice(None, None, max(1, y_um.size // 4000))
 
     def cost(lag_s: float) -> float:
@@ -158,23 +129,23 @@ def identify_mpi(
     m: int = 6,
     fit_lag: bool = False,
     rounds: int = 2,
-) -> tuple[MpiParameters, IdentificationReport]:
+) -> tuple[MpiParameters, FitReport]:
     """MPI model of a recording by non-negative least squares on (2.40).
 
     Parameters
     ----------
-    u_V, y_um : (samples,) voltage V and displacement µm, ``dt_s`` apart; u in the order it was applied, from a
-        stage that had been at rest (the initial states are those of (2.5) with y0 = 0).
-    n, m : plays and dead zones beside the zero ones, at (2.38), (2.39).
-    fit_lag : also find the first-order lag (s) that makes the residual smallest; the chapter's model has none.
+    u_V, y_um : (samples,) voltage V and displacement µm, ``dt_s`` s apart, in the order of the recording. The stage
+        was at rest before; the initial states are those of (2.5) with y0 = 0.
+    n, m : plays and dead zones besides the zero ones, at (2.38), (2.39).
+    fit_lag : also find the first-order lag, s, with the smallest residual; the chapter's model has none.
     rounds : reweighting rounds that turn the error of (2.40) into one of displacement.
 
-    Samples whose residual is beyond eight times the RMS (a transient at the start, which no
-    rate-independent model can hold) are left out of a second fit; the report counts them and its errors include them.
+    Samples with a residual above eight times the RMS, such as an initial transient, are left out of a second fit. A
+    rate-independent model cannot hold them. The report counts them and includes them in its errors.
 
-    Returns the parameters and a report. Raises InputError on a bad recording.
+    Returns the parameters and a report. Raises InputError on an unusable recording.
     """
-    u, y, dt = record(u_V, y_um, dt_s, n + m + 4)
+    u, y, dt = checked_recording(u_V, y_um, dt_s, n + m + 4)
     lower_span = float(np.ptp(u))
     velocity = np.gradient(y, dt)
     keep = np.ones(u.size, dtype=np.bool_)
@@ -192,14 +163,14 @@ def identify_mpi(
         unknowns, rms = _solve(plays[keep], lead_um, grid, lower, rounds)
         evaluations += 1 + rounds
         parameters = grid.model(unknowns, lag)
-        beyond = np.abs(parameters.simulate(u, dt) - y) > _BEYOND * rms
+        beyond = np.abs(parameters.simulate(u, dt) - y) > _OUTLIER_RMS * rms
         if not beyond.any() or beyond.sum() > 0.02 * u.size:
             break
         keep, left_out = ~beyond, int(beyond.sum())
     notes = (
         "scale: the inverse saturation maps the recorded stroke onto itself",
-        f"{left_out} samples beyond {_BEYOND:g} times the RMS left out of the fit",
+        f"{left_out} samples beyond {_OUTLIER_RMS:g} times the RMS left out of the fit",
     )
     method = f"non-negative least squares on (2.40), n={n}, m={m}"
-    report = IdentificationReport.of("mpi", method, y, parameters.simulate(u, dt), dt, evaluations, True, notes)
+    report = FitReport.of("mpi", method, y, parameters.simulate(u, dt), dt, evaluations, True, notes)
     return parameters, report

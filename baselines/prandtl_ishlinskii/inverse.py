@@ -1,4 +1,4 @@
-"""The inverse MPI model (2.11) as it is served: displacement in, voltage out, play states as memory."""
+"""The inverse MPI model (2.11): motion in, voltage out, play states as memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from baselines.prandtl_ishlinskii.dead_zone import dead_zone_sum
+from baselines.fit_report import Domain
 from baselines.prandtl_ishlinskii.model import (
     MpiParameters,
     inverse_thresholds,
@@ -17,16 +17,15 @@ from baselines.prandtl_ishlinskii.model import (
     states_from_inverse,
     states_to_inverse,
 )
-from baselines.prandtl_ishlinskii.play import play_step
+from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_step
 from baselines.validation import (
-    Domain,
-    deviation,
-    memory_copy,
-    model_fields,
-    model_state,
-    points,
+    checked_memory,
+    checked_motion,
+    common_fields,
+    common_state,
+    of_length,
     positive,
-    same_length,
+    std_or_nan,
 )
 
 
@@ -41,10 +40,10 @@ def run_inverse(
     u_V: FloatArray,
     inside: BoolArray,
 ) -> None:
-    """Voltages for points; ``memory_V`` (forward play states) is advanced in place.
+    """Voltages ``u_V`` (k,) for points (k,); ``memory_V`` (n+1,), the forward play states, is advanced in place.
 
     ``plays``: (4, n+1) rows w_h, its partial sums, r*, w_h*. ``saturation``: (2, m+1) rows d*, w_s*.
-    ``scalars``: c, y_ref, lag, y_min, y_max, v_max. A point that is not finite gets NaN and leaves no trace.
+    ``scalars``: c, y_ref, lag, y_min, y_max, v_max. A point that is not finite gets NaN and does not change the memory.
     """
     n = memory_V.size
     state = np.empty(n)
@@ -77,9 +76,9 @@ def _track(u_V: FloatArray, r_V: FloatArray, memory_V: FloatArray) -> None:
 class MpiInverse:
     """Exact inverse of an MPI model; implements ``adaptive.types.InverseModel`` under the name ``mpi``.
 
-    The memory holds the states of the forward plays, V. They are driven by the voltage alone, so ``track``
-    uses the voltages really applied, which carry no sensor noise, and ignores the measured motion. After
-    voltages that this model itself gave, ``track`` and ``feedforward`` agree on the memory to round-off.
+    The memory holds the states of the forward plays, V. Only the voltage drives them, so ``track`` uses the applied
+    voltages, which carry no sensor noise, and ignores the measured motion. After voltages that this model gave,
+    ``track`` and ``feedforward`` agree on the memory to round-off. ``voltage_std_V``: NaN where it is unknown.
     """
 
     parameters: MpiParameters
@@ -93,7 +92,7 @@ class MpiInverse:
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
-        deviation("voltage_std_V", self.voltage_std_V, "V")
+        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
         p, domain = self.parameters, self.domain
         w_h, w_s = p.w_h_, p.w_s_
         plays = np.stack([w_h, np.cumsum(w_h), inverse_thresholds(w_h, p.r_), inverse_weights(w_h)])
@@ -107,20 +106,20 @@ class MpiInverse:
 
     @property
     def memory_size(self) -> int:
-        """One state a play, V."""
+        """One state per play, V."""
         return int(self._plays.shape[1])
 
     def rest_memory(self, y_um: float) -> FloatArray:
-        """Play states (n+1,) V after a monotone way from rest at 0 V to ``y_um`` µm."""
+        """Play states (n+1,) V after a monotone motion from rest at 0 V to ``y_um`` µm."""
         y, rest = np.array([float(y_um)]), np.zeros(1)
         return self.feedforward(y, rest, rest, self.parameters.start()).memory
 
     def feedforward(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Feedforward:
-        """Voltages (n,) V for displacements (n,) µm; raises InputError on bad shapes."""
-        y, v, _ = points(y_um, v_um_per_s, a_um_per_s2)
-        after = memory_copy(memory, self._plays.shape[1])
+        """Voltages (n,) V for displacements (n,) µm. Raises InputError on bad shapes."""
+        y, v, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, self._plays.shape[1])
         u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
         run_inverse(y, v, self._plays, self._saturation, self._scalars, after, u, inside)
         std = np.empty(y.size)
@@ -135,23 +134,23 @@ class MpiInverse:
         u_V: FloatArray,
         memory: FloatArray,
     ) -> FloatArray:
-        """Play states after the voltages ``u_V`` (n,) were applied; voltages that are not finite are passed over."""
-        y, _, _ = points(y_um, v_um_per_s, a_um_per_s2)
-        after = memory_copy(memory, self._plays.shape[1])
-        _track(same_length("u_V", u_V, y.size), self.parameters.r_, after)
+        """Play states after the voltages ``u_V`` (n,) were applied; values that are not finite are skipped."""
+        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, self._plays.shape[1])
+        _track(of_length("u_V", u_V, y.size), self.parameters.r_, after)
         return after
 
     def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
-        """``track`` in place and without its checks: (n,) contiguous voltages, V, that somebody else answered."""
+        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
         _track(u_V, self.parameters.r_, memory)
 
     def state_dict(self) -> StateDict:
         """Flat numbers and vectors by name."""
-        state = model_state(self.dt_s, self.voltage_std_V, self.domain)
+        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
         return {**state, "name": self.name, **self.parameters.state_dict()}
 
     @staticmethod
     def from_state(state: StateDict) -> MpiInverse:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing or wrong."""
-        dt_s, std_V, domain = model_fields("mpi", state)
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
+        dt_s, std_V, domain = common_fields("mpi", state)
         return MpiInverse(MpiParameters.from_state(state), dt_s, domain, std_V, str(state.get("name", "mpi")))

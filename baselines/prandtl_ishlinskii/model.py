@@ -1,14 +1,15 @@
-"""Prandtl-Ishlinskii (PI) and modified PI (MPI) operators (2.4)-(2.10) and their exact inverse (2.11)-(2.18).
+"""The modified Prandtl-Ishlinskii (MPI) model (2.4)-(2.10) and what its exact inverse (2.11)-(2.18) is made of.
 
-The forward model is u -> play superposition x -> dead-zone superposition z::
+The forward model takes the voltage u through a sum of plays to x, and through a sum of dead zones to y::
 
     x = sum_i w_h[i] H_r[i][u] + c,     y - y_ref = sum_j w_s[j] S_d[j][x]
 
-``c`` and ``y_ref`` are ours: a recording's displacement at 0 V is anything. With both zero these are (2.7)-(2.10).
+``c`` and ``y_ref`` extend the chapter's model to recordings whose displacement at 0 V is not zero; with both zero
+these are (2.7)-(2.10). Without dead zones it is the Prandtl-Ishlinskii (PI) model.
 
-Memory is always the states of the *forward* plays, in volts. They do not depend on the weights, so that a
-memory stays good when the weights are learnt anew; the inverse works on (2.15) of it and converts back, which
-is exact because all partial sums of w_h are positive.
+The memory is always the states of the *forward* plays, in volts. They do not depend on the weights, so a memory stays
+valid when the weights are learnt anew. The inverse works on (2.15) of it and converts back, which is exact because
+all partial sums of w_h are positive.
 """
 
 from __future__ import annotations
@@ -21,12 +22,11 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, StateDict
-from baselines.prandtl_ishlinskii.dead_zone import dead_zone_sum
-from baselines.prandtl_ishlinskii.play import play_start, play_step
+from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
 
 
 def inverse_weights(w: FloatArray) -> FloatArray:
-    """Weights of the inverse operator, (2.12), (2.13) for plays and (2.16), (2.17) for dead zones; (n+1,)."""
+    """Weights (n+1,) of the inverse operator: (2.12), (2.13) for plays, (2.16), (2.17) for dead zones."""
     sums = np.cumsum(w)
     out = np.empty_like(w)
     out[0] = 1.0 / w[0]
@@ -35,13 +35,13 @@ def inverse_weights(w: FloatArray) -> FloatArray:
 
 
 def inverse_thresholds(w: FloatArray, r: FloatArray) -> FloatArray:
-    """Thresholds of the inverse operator, (2.14) for plays and (2.18) for dead zones; (n+1,)."""
+    """Thresholds (n+1,) of the inverse operator: (2.14) for plays, (2.18) for dead zones."""
     return np.cumsum(w) * r - np.cumsum(w * r)
 
 
 @compiled
 def states_to_inverse(w_h: FloatArray, state_V: FloatArray, out_um: FloatArray) -> None:
-    """Inverse play states from forward ones (2.15); all (n+1,)."""
+    """Inverse play states ``out_um`` from forward ones (2.15); all (n+1,)."""
     tail = 0.0
     for j in range(w_h.size):
         tail += w_h[j] * state_V[j]
@@ -54,7 +54,7 @@ def states_to_inverse(w_h: FloatArray, state_V: FloatArray, out_um: FloatArray) 
 
 @compiled
 def states_from_inverse(sum_h: FloatArray, inverse_um: FloatArray, out_V: FloatArray) -> None:
-    """(2.15) solved for the forward states; ``sum_h`` are the partial sums of w_h, all positive."""
+    """Forward play states ``out_V`` from inverse ones, (2.15) solved; ``sum_h``: partial sums of w_h, all positive."""
     n = sum_h.size
     out_V[n - 1] = inverse_um[n - 1] / sum_h[n - 1]
     for i in range(n - 2, -1, -1):
@@ -88,14 +88,16 @@ def _tuple(values: FloatArray) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class MpiParameters:
-    """An MPI model (2.10): thresholds, weights, offsets. With ``d_um = (0,)``, ``w_s = (1,)`` it is a PI model.
+    """An MPI model (2.10): thresholds, weights, offsets. The defaults of ``d_um`` and ``w_s`` make it a PI model (2.7).
 
     Attributes
     ----------
     r_V, w_h : (n+1,) play thresholds, V, ascending from 0, and weights, µm/V; partial sums positive.
     d_um, w_s : (m+1,) dead-zone thresholds, µm of x, ascending from 0, and weights; partial sums positive.
     c_um : offset of x, µm. y_ref_um : displacement where x = 0, µm.
-    lag_s : first-order lag of the stage, s, led by the inverse as y + lag v; 0 is the model of the chapter.
+    lag_s : first-order lag of the stage, s, which the inverse leads as y + lag v; 0 is the chapter's model.
+
+    Raises InputError on thresholds, weights or offsets that do not make an invertible model.
     """
 
     r_V: tuple[float, ...]
@@ -132,11 +134,11 @@ class MpiParameters:
                 raise InputError(f"{name}: got {getattr(self, name)!r}, expected a finite number")
 
     def start(self, u_V: float = 0.0) -> FloatArray:
-        """Play states (n+1,) V of a stage brought monotonously from rest at 0 V to ``u_V`` (2.5)."""
+        """Play states (n+1,) V after a monotone change from rest at 0 V to ``u_V`` (2.5)."""
         return play_start(u_V, self.r_)
 
     def simulate(self, u_V: FloatArray, dt_s: float, state_V: FloatArray | None = None) -> FloatArray:
-        """Displacement (n,) µm for voltages (n,) V, ``dt_s`` apart, from ``state_V`` (not changed) or from rest."""
+        """Displacement (n,) µm for voltages (n,) V, ``dt_s`` s apart, from a copy of ``state_V`` or from rest."""
         u = np.ascontiguousarray(u_V, dtype=np.float64)
         if u.size == 0:
             return np.empty(0)
@@ -146,7 +148,7 @@ class MpiParameters:
         return _lag(y, self.lag_s / dt_s) if self.lag_s > 0.0 else y
 
     def state_dict(self) -> StateDict:
-        """Flat: the four vectors and three scalars by their own names."""
+        """The four vectors and three scalars by name."""
         return {
             "r_V": self.r_.copy(),
             "w_h": self.w_h_.copy(),
@@ -169,12 +171,7 @@ class MpiParameters:
                 lag_s=float(state["lag_s"]),
             )
         except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of an mpi model; write the model anew") from None
-
-
-def pi_parameters(r_V: FloatArray, w_h: FloatArray) -> MpiParameters:
-    """The PI model (2.7) as the special case without dead zones."""
-    return MpiParameters(r_V=_tuple(r_V), w_h=_tuple(w_h))
+            raise InputError(f"{missing.args[0]}: missing in the state of an mpi model; write it again") from None
 
 
 def from_inverse_saturation(
@@ -186,9 +183,9 @@ def from_inverse_saturation(
     y_ref_um: float,
     lag_s: float = 0.0,
 ) -> MpiParameters:
-    """Model from plays and the *inverse* saturation (d*, w*), as (2.40) identifies them.
+    """Model from plays and the *inverse* saturation (d*, w*), which (2.40) identifies.
 
-    (2.16)-(2.18) are their own inverse, and so give w_s and d.
+    (2.16)-(2.18) are their own inverse, so they give w_s and d.
     """
     return MpiParameters(
         r_V=_tuple(r_V),
@@ -203,7 +200,7 @@ def from_inverse_saturation(
 
 @compiled
 def _lag(y_um: FloatArray, lag_samples: float) -> FloatArray:
-    """First-order lag with an input linear within each step, exact, started in equilibrium."""
+    """First-order lag, exact for an input that is linear within each step, started in equilibrium."""
     decay = math.exp(-1.0 / lag_samples)
     mean = lag_samples * (1.0 - decay)
     out = np.empty(y_um.size)

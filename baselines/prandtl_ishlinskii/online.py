@@ -1,35 +1,86 @@
-"""The MPI model that learns online: its weights by least squares with forgetting, in a frame a fast filter moves."""
+"""The MPI model that learns online: weights by least squares with forgetting, gain and offset by a fast filter."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adaptive.errors import InputError
+from adaptive.online.drift import joseph, walk
 from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, StateDict
-from baselines.gain_filter import GainFilter
-from baselines.least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
-from baselines.online import field_of
-from baselines.prandtl_ishlinskii.dead_zone import dead_zone_sum, ramps
+from baselines.online_baseline import field_of
 from baselines.prandtl_ishlinskii.identify import MpiGrid
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import inverse_thresholds, inverse_weights
-from baselines.prandtl_ishlinskii.play import play_run, play_start, play_step
+from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
+from baselines.recursive_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
 
-#: How gain and offset of the MPI model's frame walk, per root of a second of teaching: of one, and of the stroke.
+#: Random walk of gain and offset per square root of a second of teaching: relative, and as a share of the stroke.
 GAIN_WALK, OFFSET_WALK = 0.02, 0.01
-#: Errors of the model last for many samples: their deviation counts this many times. Least one, of the stroke.
+#: The filter's measurement noise is the residual times this, because model errors last for many samples; and at least
+#: this share of the stroke.
 FRAME_ERROR, FRAME_NOISE = 3.0, 1e-3
+#: Limits of the relative gain.
+_GAIN_MIN, _GAIN_MAX = 0.2, 5.0
+
+
+@dataclass(slots=True)
+class GainFilter:
+    """Kalman filter of gain and offset in y = gain · model + offset; both are random walks.
+
+    A slower least-squares fit on (y - offset)/gain then sees samples from before and after a change of the gain or of
+    the sensor's zero as samples of one stage.
+
+    Attributes
+    ----------
+    walk : (2,) variances added per sample, of the gain and of the offset (µm²).
+    covariance : (2, 2) of the estimate.
+    gain, offset_um : the estimate.
+    """
+
+    walk: FloatArray
+    covariance: FloatArray
+    gain: float = 1.0
+    offset_um: float = 0.0
+
+    @classmethod
+    def start(cls, gain_walk: float, offset_walk_um: float, step_s: float) -> GainFilter:
+        """Walks are standard deviations per square root of a second; samples are ``step_s`` s apart."""
+        walk = np.array([gain_walk, offset_walk_um]) ** 2 * step_s
+        return cls(walk, np.diag(100.0 * walk))
+
+    def update(self, y_um: float, model_um: float, noise_um2: float) -> None:
+        """Take one pair; ``noise_um2`` is the variance of the model error. An update that is not finite is dropped."""
+        x, P, h = np.array([self.gain, self.offset_um]), self.covariance.copy(), np.array([model_um, 1.0])
+        walk(x, P, self.walk, 0.0)
+        joseph(x, P, h, y_um, noise_um2, np.empty(2), np.empty(2))
+        if np.isfinite(x).all() and np.isfinite(P).all():
+            self.covariance = P
+            gain, offset_um = x.tolist()
+            self.gain, self.offset_um = min(max(gain, _GAIN_MIN), _GAIN_MAX), offset_um
+
+    def to_model(self, y_um: float) -> float:
+        """The displacement without the filter's gain and offset, in the frame of the model, µm."""
+        return (y_um - self.offset_um) / self.gain
+
+    def state_dict(self) -> StateDict:
+        """Estimate and covariance; copies."""
+        return {"gain": self.gain, "offset_um": self.offset_um, "covariance": self.covariance.copy()}
+
+    def restore(self, state: StateDict) -> None:
+        """Continue from a ``state_dict``."""
+        self.gain, self.offset_um = float(state["gain"]), float(state["offset_um"])
+        self.covariance = np.array(state["covariance"], dtype=np.float64)
 
 
 class MpiOnline(LeastSquaresOnline):
-    """Play weights, offset and inverse-saturation slopes that follow the stage, on (2.40) with its scale fixed.
+    """Play weights, offset and inverse-saturation slopes that follow the stage, fitted to (2.40) with a fixed scale.
 
-    Implements ``adaptive.types.OnlineModel``. Thresholds stay those of the identified model. A fast filter follows gain
-    and offset, and the weights are fitted in its frame: least squares over samples from before and after a change of
-    gain would else explain the difference by the shape, and be wrong for as long as it remembers.
+    Implements ``adaptive.types.OnlineModel``. The thresholds stay those of the identified model. A fast filter follows
+    gain and offset, and the weights are fitted in its frame. Without it, least squares over samples from before and
+    after a change of gain would explain the difference by the shape for as long as they are remembered.
     """
 
     def __init__(self, model: MpiInverse, config: LeastSquaresConfig | None = None) -> None:
@@ -39,7 +90,7 @@ class MpiOnline(LeastSquaresOnline):
         weights = inverse_weights(p.w_s_)
         self._unknowns = np.concatenate([p.w_h_, [p.c_um], np.cumsum(weights)])
         top = float(model.feedforward(np.array([domain.y_max_um]), np.zeros(1), np.zeros(1), p.start()).u_V[0])
-        # Samples of the identified model: loops of falling size over its range, so that every play has moved.
+        # Samples of the identified model: loops of decreasing size over its range, which move every play.
         turns = top * np.ravel(np.column_stack([np.linspace(1.0, 0.05, 12), np.zeros(12)]))
         u = np.interp(np.arange(0.0, 23.0, 0.05), np.arange(-1, 23), np.concatenate([[0.0], turns[:23]]))
         plays = play_run(u, p.r_, play_start(float(u[0]), p.r_))
@@ -66,18 +117,18 @@ class MpiOnline(LeastSquaresOnline):
         p, lead = self._shape, y_um + self.base.parameters.lag_s * v_um_per_s
         model = p.y_ref_um + float(dead_zone_sum(float(p.w_h_ @ pending[:-1]) + p.c_um, p.d_, p.w_s_))
         self._frame.update(lead, model, max(FRAME_ERROR**2 * self._square, self._floor_um2))
-        curve = ramps(np.array([self._frame.undo(lead) - self._grid.y_ref_um]), self._grid.d_star_um)[0]
+        curve = ramps(np.array([self._frame.to_model(lead) - self._grid.y_ref_um]), self._grid.d_star_um)[0]
         return np.concatenate([pending, -curve, [0.0]])
 
     def _residual(self, row: FloatArray) -> float:
-        # The slopes are one on the mean of what was visited: the error in x is one in displacement.
+        # The mean slope over the visited range is 1, so an error in x is one in displacement.
         return float(row[:-1] @ self._unknowns)
 
     def _scale_row(self) -> tuple[FloatArray, float]:
-        """(size,) row and value of the scale constraint, both in parts of the latter: cov(S*(y), y) = var(y).
+        """(size,) row and value of the scale constraint cov(S*(y), y) = var(y), both divided by its value.
 
-        Over the samples remembered, and not over the stroke of the identification: slopes that nobody visits would
-        take up the scale, all others would shrink, and with them every error.
+        It is taken over the remembered samples, not over the stroke of the identification. Slopes outside the visited
+        range could otherwise take up the scale; all others, and with them every error, would shrink.
         """
         size, n = self._grid.size, self._grid.r_V.size
         ramp = slice(n + 1, size)
@@ -88,7 +139,7 @@ class MpiOnline(LeastSquaresOnline):
         return row / float(row.sum()), 1.0
 
     def _solve(self) -> bool:
-        # The scale row is heavy against all samples; a thousandth of a sample holds each weight where it is.
+        # The scale row outweighs all samples. The weight of a thousandth of a sample holds each unknown at its value.
         size = self._grid.size
         normal = self._normal.copy()
         mass = float(np.mean(np.diag(normal)[:size]))
@@ -111,7 +162,7 @@ class MpiOnline(LeastSquaresOnline):
         return True
 
     def snapshot(self) -> MpiInverse:
-        """The model as it stands; its deviation is that of the recent residuals."""
+        """The present model; its standard deviation is that of the recent residuals."""
         f, shape = self._frame, self._shape
         w_s = tuple(f.gain * weight for weight in shape.w_s)
         now = replace(shape, w_s=w_s, y_ref_um=f.gain * shape.y_ref_um + f.offset_um)
@@ -119,7 +170,7 @@ class MpiOnline(LeastSquaresOnline):
         return replace(self.base, parameters=now, voltage_std_V=std_V)
 
     def state_dict(self) -> StateDict:
-        """Everything; ``from_state`` continues to the same last bit."""
+        """The whole state; ``from_state`` continues to the same last bit."""
         now = {
             "unknowns": self._unknowns.copy(),
             "states_V": self._states.copy(),
@@ -130,7 +181,7 @@ class MpiOnline(LeastSquaresOnline):
 
     @classmethod
     def from_state(cls, state: StateDict) -> MpiOnline:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing."""
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
         made = cls(MpiInverse.from_state(under("base_", state)), config_from(state))
         made._restore_learning(state)
         made._unknowns = np.array(field_of(state, "unknowns", "mpi"), dtype=np.float64)

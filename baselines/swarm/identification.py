@@ -1,6 +1,6 @@
-"""Identification by particle swarm, as the chapter does it: Table 2.1's search space, 1500 epochs.
+"""Identification by particle swarm, as in the chapter: the search space of Table 2.1, 1500 epochs.
 
-Kept to stand beside the better routes (``identify_bouc_wen``, ``identify_mpi``) in error and in time.
+It serves as the comparison in error and in time for ``identify_bouc_wen`` and ``identify_mpi``.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage
-from baselines.prandtl_ishlinskii.dead_zone import dead_zone
-from baselines.prandtl_ishlinskii.identify import SLOPE_FLOOR, MpiGrid
+from baselines.bounded_least_squares import SLOPE_FLOOR
+from baselines.fit_report import FitReport
+from baselines.prandtl_ishlinskii.identify import MpiGrid
 from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
-from baselines.prandtl_ishlinskii.play import play_run, play_start
+from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
 from baselines.swarm.particle_swarm import Progress, SwarmConfig, minimise, torch_module
-from baselines.validation import IdentificationReport, record
+from baselines.validation import checked_recording
 
-#: Search space of Table 2.1 in our units: m kg, b N s/m, k N/m, d µm/V (0 to 0.1 m/V), alpha, beta 1/V, gamma 1/V.
+#: Search space of Table 2.1: m kg, b N s/m, k N/m, d µm/V (0 to 0.1 m/V), alpha, beta 1/V, gamma 1/V.
 TABLE_2_1_LOWER = np.array([0.0, 1e2, 1e3, 0.0, 0.0, 0.0, 0.0])
 TABLE_2_1_UPPER = np.array([1.0, 1e6, 1e9, 1e5, 1.0, 1.0, 1.0])
-#: What stands for its zeros where a parameter has to be positive.
+#: Least values of parameters that must be positive, in place of the zeros of the table.
 _LEAST = np.array([1e-9, 1e2, 1e3, 1e-1, 0.0, 1e-9, 0.0])
-#: Parameters whose space spans decades: m, b, k, d.
-_DECADES = np.array([True, True, True, True, False, False, False])
+#: Parameters that are searched by their logarithm with ``scale="log"``: m, b, k, d.
+_LOGARITHMIC = np.array([True, True, True, True, False, False, False])
 
 
 @compiled
 def bouc_wen_costs(theta: FloatArray, u_V: FloatArray, y_um: FloatArray, dt_s: float, linear: bool) -> FloatArray:
-    """Mean squared error (2.3), µm², of each row of ``theta`` (particles, 7), with the offset that fits best.
+    """Mean squared error (2.3), µm², of each row of ``theta`` (particles, 7), with the best offset; (particles,).
 
-    Infinite where displacement would not rise with voltage, since that has no inverse.
+    Infinite where displacement would not rise with voltage, because such a model has no inverse.
     """
     costs = np.empty(theta.shape[0])
     out = np.empty((u_V.size, 3))
@@ -45,7 +46,7 @@ def bouc_wen_costs(theta: FloatArray, u_V: FloatArray, y_um: FloatArray, dt_s: f
         if not (alpha < 1.0 and 2.0 * alpha * beta < beta + gamma):
             costs[i] = np.inf
             continue
-        g = hysteresis_step(0.0, u_V[0], 0.0, alpha, beta, gamma)
+        g = hysteresis_step(0.0, u_V[0], alpha, beta, gamma)
         state[:] = 0.0
         state[0], state[1], state[2], state[4] = u_V[0], g, u_V[0] - g, u_V[0] - g
         p1, p2 = poles(b / k, m / k)
@@ -69,32 +70,32 @@ def swarm_bouc_wen(
     hold: str = "linear",
     scale: str = "linear",
     progress: Progress | None = None,
-) -> tuple[BoucWenParameters, IdentificationReport]:
-    """Bouc-Wen stage by swarm over (2.3) in Table 2.1's search space.
+) -> tuple[BoucWenParameters, FitReport]:
+    """Bouc-Wen stage by swarm over (2.3) in the search space of Table 2.1.
 
-    With ``scale="linear"`` the space is searched as the table gives it, with ``"log"`` m, b, k, d by their logarithms
-    (from 1e-9 kg and 1e-7 m/V, for the zeros of the table).
+    ``scale="linear"`` searches the space as the table gives it, ``"log"`` searches m, b, k, d by their logarithms (from
+    1e-9 kg and 1e-7 m/V in place of the zeros of the table). ``progress`` is called after each epoch.
 
-    Takes and returns what ``identify_bouc_wen`` does; the displacement's offset, which the chapter has not, is
-    solved for within the cost. The swarm is a batch in torch; its stages are simulated by a compiled loop, since
-    500 dependent samples give a tensor library nothing to do at once. Raises InputError, MissingTorchError.
+    Takes and returns what ``identify_bouc_wen`` does. The offset of the displacement, which the chapter's model lacks,
+    is solved for within the cost. The swarm is a batch in torch; a compiled loop simulates its stages, because 500
+    dependent samples give a tensor library nothing to do in parallel. Raises InputError, MissingTorchError.
     """
-    u, y, dt = record(u_V, y_um, dt_s, 20)
+    u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
     setup = config or SwarmConfig()
     torch = torch_module()
     if scale not in ("log", "linear"):
         raise InputError(f"scale: got {scale!r}, expected 'log' or 'linear'")
-    decades = _DECADES & (scale == "log")
+    logarithmic = _LOGARITHMIC & (scale == "log")
     least, most = np.maximum(TABLE_2_1_LOWER, _LEAST), TABLE_2_1_UPPER
 
     def physical(theta: FloatArray) -> FloatArray:
-        return np.where(decades, np.exp(np.where(decades, theta, 0.0)), theta)
+        return np.where(logarithmic, np.exp(np.where(logarithmic, theta, 0.0)), theta)
 
     def cost(theta: Any) -> Any:
         rows = physical(theta.cpu().numpy())
         return torch.as_tensor(bouc_wen_costs(rows, u, y, dt, hold == "linear"), device=setup.device)
 
-    low, high = (np.where(decades, np.log(np.maximum(bound, 1e-300)), bound) for bound in (least, most))
+    low, high = (np.where(logarithmic, np.log(np.maximum(bound, 1e-300)), bound) for bound in (least, most))
     found = minimise(cost, low, high, setup, progress)
     m, b, k, d, alpha, beta, gamma = (float(value) for value in physical(found.position))
     bare = BoucWenParameters(m, b, k, d, alpha, beta, gamma, hold=hold)
@@ -102,7 +103,7 @@ def swarm_bouc_wen(
     parameters = bare.with_gain(d, offset)
     model = parameters.simulate(u, dt, parameters.at_rest(float(u[0])))
     method = f"swarm of {setup.particles} over {found.history.size} epochs, Table 2.1's search space, {hold} hold"
-    return parameters, IdentificationReport.of("bouc_wen", method, y, model, dt, found.evaluations, True)
+    return parameters, FitReport.of("bouc_wen", method, y, model, dt, found.evaluations, True)
 
 
 def swarm_mpi(
@@ -114,15 +115,15 @@ def swarm_mpi(
     n: int = 12,
     m: int = 6,
     progress: Progress | None = None,
-) -> tuple[MpiParameters, IdentificationReport]:
-    """MPI model by swarm over (2.40), weights within [0, 1] as in the chapter.
+) -> tuple[MpiParameters, FitReport]:
+    """MPI model by swarm over (2.40), with weights within [0, 1] as in the chapter.
 
-    Scale constraint: the residual is measured after all weights are scaled so that the inverse saturation maps
-    the recorded stroke onto itself (the constraint of ``identify_mpi``). All zeros has no such scale and costs
-    infinitely much. The offset of x is solved for within the cost. The whole swarm is evaluated as one batch of
-    quadratic forms in torch. Raises InputError, MissingTorchError.
+    The residual is measured after all weights are scaled so that the inverse saturation maps the recorded stroke onto
+    itself, the scale constraint of ``identify_mpi``; all weights zero then cost infinitely much. The offset of x is
+    solved for within the cost. The whole swarm is evaluated in torch as one batch of quadratic forms. ``progress`` is
+    called after each epoch. Raises InputError, MissingTorchError.
     """
-    u, y, dt = record(u_V, y_um, dt_s, n + m + 4)
+    u, y, dt = checked_recording(u_V, y_um, dt_s, n + m + 4)
     setup = config or SwarmConfig()
     torch = torch_module()
     grid = MpiGrid.of(u, y, n, m)
@@ -148,4 +149,4 @@ def swarm_mpi(
     method = f"swarm of {setup.particles} over {found.history.size} epochs on (2.40), weights in [0, 1]"
     notes = ("scale: the inverse saturation maps the recorded stroke onto itself",)
     model = parameters.simulate(u, dt)
-    return parameters, IdentificationReport.of("mpi", method, y, model, dt, found.evaluations, True, notes)
+    return parameters, FitReport.of("mpi", method, y, model, dt, found.evaluations, True, notes)

@@ -1,4 +1,4 @@
-"""Particle swarm, all particles as one batch in torch; torch is imported when a swarm starts, never before."""
+"""Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from adaptive.errors import DehystError, InputError
 from adaptive.types import FloatArray
 
-#: Called after each epoch with its number (from 1) and the best cost so far; returning False stops the swarm.
+#: Called after each epoch with its number, from 1, and the best cost so far. Returning False stops the swarm.
 Progress = Callable[[int, float], bool | None]
 
 
 class MissingTorchError(DehystError, ImportError):
-    """torch is not installed; the message says how to get it."""
+    """torch is not installed; the message says how to install it."""
 
 
 def torch_module() -> Any:
@@ -27,17 +27,22 @@ def torch_module() -> Any:
     except ImportError as error:
         raise MissingTorchError(
             f"torch: {error}; identification by swarm needs it: pip install 'dehyst[torch]', or use the least-squares "
-            "route, which needs nothing more"
+            "identification, which does not need it"
         ) from error
 
 
 @dataclass(frozen=True, slots=True)
 class SwarmConfig:
-    """Swarm of ``particles`` over ``epochs``.
+    """Settings of a swarm.
 
-    The inertia falls linearly over the first three quarters of the epochs, so that the swarm first roams and then
-    settles; ``pull`` is that towards a particle's own best and towards the best of the swarm; ``step_limit`` bounds a
-    particle's step as a share of the box.
+    Attributes
+    ----------
+    particles, epochs, seed : size, duration, and seed of the random numbers.
+    inertia_first, inertia_last : the inertia falls linearly from the first to the last over three quarters of the
+        epochs, so that the swarm explores first and then settles.
+    pull : towards a particle's own best position and towards the best of the swarm.
+    step_limit : largest step of a particle as a share of the box.
+    device : device name for torch.
     """
 
     particles: int = 40
@@ -73,11 +78,11 @@ def minimise(
     config: SwarmConfig,
     progress: Progress | None = None,
 ) -> SwarmResult:
-    """Minimise ``cost`` over a box.
+    """Minimise ``cost`` over the box from ``lower`` to ``upper`` (dimensions,).
 
-    ``cost`` maps a (particles, dimensions) float64 tensor on ``config.device`` to a (particles,) tensor; a value
-    that is not finite counts as infinitely bad. Deterministic for a seed. Raises MissingTorchError, and InputError
-    when no particle ever had a finite cost.
+    ``cost`` maps a (particles, dimensions) float64 tensor on ``config.device`` to a (particles,) tensor; a value that
+    is not finite counts as infinite. The result is deterministic for a seed. Raises MissingTorchError, and InputError
+    where no particle ever has a finite cost.
     """
     torch = torch_module()
     generator = torch.Generator(device="cpu").manual_seed(config.seed)
@@ -106,7 +111,7 @@ def minimise(
             speed = torch.minimum(torch.maximum(inertia * speed + config.pull * pull, -limit), limit)
             moved = position + speed
             position = torch.minimum(torch.maximum(moved, low), high)
-            speed = torch.where(moved == position, speed, -0.5 * speed)  # a wall throws back half
+            speed = torch.where(moved == position, speed, -0.5 * speed)  # a wall reflects half of the speed
             now = finite(cost(position))
             better = now < own_cost
             own = torch.where(better[:, None], position, own)
@@ -118,5 +123,5 @@ def minimise(
         result = own[winner].cpu().numpy().astype(np.float64)
         final = float(own_cost[winner])
     if not np.isfinite(final):
-        raise InputError("lower, upper: no particle had a finite cost anywhere; widen or move the search space")
+        raise InputError("lower, upper: no particle had a finite cost; widen or move the search space")
     return SwarmResult(result, final, history[:epoch], config.particles * (epoch + 1))

@@ -19,8 +19,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray
-from baselines.bouc_wen.mechanical import MechanicalBoucWen, MechanicalReport, identify_mechanical
-from baselines.bouc_wen.periodic_record import PeriodicRecord
+from baselines.bouc_wen.mechanical import MechanicalBoucWen, MechanicalReport, PeriodicRecord, identify_mechanical
 from service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
 from sim.chapter.adaptive_loop import BlockConfig, replay
 from sim.chapter.control import learner_of

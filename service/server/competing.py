@@ -12,7 +12,7 @@ from typing import Any
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import Competition, of_models
+from baselines.competition.competition import Competition
 from baselines.competition.config import CompetitionConfig
 from service.protocol.keys import AUTO
 
@@ -126,5 +126,5 @@ def compete(
     learner = make(model)
     if not others or not isinstance(model, LssvmInverse):
         return learner
-    made = of_models(name, learner, model, dict(others), config, make)
+    made = Competition.from_models(name, learner, model, dict(others), config, make)
     return Competing(made) if len(made.names) > 1 else learner

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from adaptive.types import BoolArray, FloatArray, InverseModel
-from baselines.prandtl_ishlinskii.play import play_run, play_start
+from baselines.prandtl_ishlinskii.operators import play_run, play_start
 
 #: Time constants of the slow poles that creep is made of, s.
 SLOW_S = (1.0, 10.0)

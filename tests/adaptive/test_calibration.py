@@ -22,7 +22,7 @@ from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import of_models
+from baselines.competition.competition import Competition
 from baselines.fit import fit_linear, fit_mpi
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.signals.signals import generalisation_input, multitone, training_input
@@ -161,7 +161,7 @@ def test_what_is_served_by_default_while_learning_a_stage_that_changes(seed: int
         "linear": fit_linear(training_V, training_um, DT_S)[0],
         "mpi": fit_mpi(training_V, training_um, DT_S)[0],
     }
-    competition = of_models("lssvm_adaptive", Learner.from_model(model), model, others)
+    competition = Competition.from_models("lssvm_adaptive", Learner.from_model(model), model, others)
     u_V = excitation(seed, 12.0)
     error_V, std_V = foretold(competition, u_V, rich(seed, u_V, GAIN_STEP))
     champion = competition.snapshot()
@@ -176,7 +176,7 @@ def test_a_baseline_that_is_served_states_what_it_is_wrong_by(seed: int) -> None
     training_V = training_input(DT_S, 10.0)[1]
     mpi = fit_mpi(training_V, rich(seed, training_V), DT_S)[0]
     model = model_of(seed)
-    competition = of_models("mpi", MpiOnline(mpi), model, {})
+    competition = Competition.from_models("mpi", MpiOnline(mpi), model, {})
     u_V = excitation(seed, 12.0)
     error_V, std_V = foretold(competition, u_V, rich(seed, u_V, GAIN_STEP))
     assert competition.champion == "mpi"

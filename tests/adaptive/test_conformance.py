@@ -18,13 +18,12 @@ from adaptive.types import InverseModel, OnlineModel, Sample
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import TABLE_2_1
 from baselines.bouc_wen.online import BoucWenOnline
-from baselines.competition.competition import of_models
-from baselines.linear import LinearInverse, LinearParameters
-from baselines.linear_online import LinearOnline
+from baselines.competition.competition import Competition
+from baselines.fit_report import Domain
+from baselines.linear import LinearInverse, LinearOnline, LinearParameters
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from baselines.validation import Domain
 
 DT, N = 1e-3, 1500
 PACKAGES = ("adaptive", "baselines")
@@ -60,7 +59,7 @@ def competition(recording: Recording, model: LssvmInverse) -> Any:
         "mpi": MpiInverse(MPI, DT, SEEN, 0.01),
         "bouc_wen": BoucWenInverse(TABLE_2_1, DT, SEEN, 0.01),
     }
-    return of_models("lssvm", Learner(model), model, others)
+    return Competition.from_models("lssvm", Learner(model), model, others)
 
 
 MAKERS: dict[str, Maker] = {

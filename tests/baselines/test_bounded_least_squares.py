@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from baselines.bounded_least_squares import bounded_minimum
-from baselines.prandtl_ishlinskii.identify import bounded_least_squares
+from baselines.bounded_least_squares import bounded_least_squares, bounded_minimum
 
 
 @settings(max_examples=150, deadline=None)

@@ -18,8 +18,8 @@ import pytest
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
+from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.validation import Domain
 from service.storage.model_file import BundleMeta, write_bundle
 
 DT_S = 1e-3

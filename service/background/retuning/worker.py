@@ -53,7 +53,7 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
 def _search(wanted: bool) -> tuple[Any, str]:
     """(what finds starts, its name): torch's batch where it is wanted and installed."""
     if wanted:
-        from baselines.swarm.evidence import EvidenceSearch
+        from baselines.swarm.evidence_search import EvidenceSearch
         from baselines.swarm.particle_swarm import MissingTorchError, torch_module
 
         try:

@@ -12,8 +12,7 @@ from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen.mechanical import MechanicalBoucWen, identify_mechanical
-from baselines.bouc_wen.periodic_record import PeriodicRecord, between_samples
+from baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
 
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 MODEL = MechanicalBoucWen(2.0, 40.0, 5e4, 5e4, 0.5, -0.3, 1.3, 6e-4)

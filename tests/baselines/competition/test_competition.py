@@ -16,15 +16,15 @@ from adaptive.types import FloatArray, InverseModel, Sample
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.competition.champion import ChampionInverse
+from baselines.competition.champion_choice import BETTER, FAILED, ChampionChoice
 from baselines.competition.competition import Competition
 from baselines.competition.config import CompetitionConfig
-from baselines.competition.contestants import stating
-from baselines.competition.succession import FAILED, WINS, Succession
+from baselines.competition.contestants import with_deviation_of_at_least
+from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from baselines.validation import Domain
 from tests.online_models import PlainModel
 
 DT, GAIN, SPAN_V, RANGE_UM = 1e-3, 11.0, 7.0, 77.0
@@ -157,9 +157,9 @@ def test_a_baseline_states_what_its_answers_were_wrong_by() -> None:
 
 
 def test_before_any_answer_was_judged_nothing_is_stated() -> None:
-    assert stating(line(), 0.0).voltage_std_V == 0.1
-    assert math.isnan(stating(replace(line(), voltage_std_V=math.nan), 0.0).voltage_std_V)
-    assert stating(replace(line(), voltage_std_V=math.nan), 0.2).voltage_std_V == 0.2
+    assert with_deviation_of_at_least(line(), 0.0).voltage_std_V == 0.1
+    assert math.isnan(with_deviation_of_at_least(replace(line(), voltage_std_V=math.nan), 0.0).voltage_std_V)
+    assert with_deviation_of_at_least(replace(line(), voltage_std_V=math.nan), 0.2).voltage_std_V == 0.2
 
 
 def test_rest_does_not_count() -> None:
@@ -175,9 +175,9 @@ def test_rest_does_not_count() -> None:
     assert model.champion == "two"
 
 
-def reign(errors_V: tuple[float, ...], champion: int = 0, **config: float) -> Succession:
+def reign(errors_V: tuple[float, ...], champion: int = 0, **config: float) -> ChampionChoice:
     """One second of motion with the same errors, judged 50 times."""
-    made = Succession(CompetitionConfig(**{"patience_s": 0.5, **config}), SPAN_V, champion)  # type: ignore[arg-type]
+    made = ChampionChoice(CompetitionConfig(**{"patience_s": 0.5, **config}), SPAN_V, champion)  # type: ignore[arg-type]
     for _ in range(50):
         made.choose(errors_V, 0.02)
     return made
@@ -194,14 +194,14 @@ def test_a_challenger_needs_margin_and_floor_and_the_favourite_neither() -> None
 
 
 def test_patience_is_counted_in_motion_and_begins_anew_when_the_lead_is_lost() -> None:
-    made = Succession(CompetitionConfig(patience_s=0.5), SPAN_V)
+    made = ChampionChoice(CompetitionConfig(patience_s=0.5), SPAN_V)
     for k in range(100):
         # Ahead for 0.4 s at a time, never for half a second.
         assert made.choose((0.2, 0.1) if k % 25 < 20 else (0.1, 0.1), 0.02) == ""
     assert made.choose((0.1, 0.1), 0.02) == ""
     assert [made.choose((0.2, 0.1), 0.0) for _ in range(100)] == [""] * 100  # at rest
     told = [made.choose((0.2, 0.1), 0.125) for _ in range(4)]
-    assert told == ["", "", "", WINS]
+    assert told == ["", "", "", BETTER]
     assert made.choose((0.1, math.inf), 0.02) == FAILED
     assert (made.champion, made.changes) == (0, 2)
 
@@ -283,7 +283,7 @@ def test_one_that_raises_is_out_and_the_favourite_begins_anew() -> None:
     assert model.champion == "one"
     two.fails = True
     feed(model, 100, 7500)
-    model._models[0].fails = True  # type: ignore[attr-defined]
+    model.favourite.fails = True  # type: ignore[attr-defined]
     with pytest.raises(RuntimeError):
         feed(model, 1, 7600)
 
@@ -344,7 +344,7 @@ def test_one_that_knows_its_own_memory_is_judged_by_it() -> None:
         model.handle(Sample(k, k * DT, float(u[k]), float(y[k])))
         if k % model.config.block == 0 and k > 2000 and not learner.parts.front.holds:
             compared += 1
-            np.testing.assert_array_equal(model._judging.scores[0].memory, learner.memory())
+            np.testing.assert_array_equal(model.judge.scores[0].memory, learner.memory())
     assert compared > 20
 
 

@@ -10,30 +10,33 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from baselines.prandtl_ishlinskii import dead_zone as dead_zone_module
-from baselines.prandtl_ishlinskii import play as play_module
-from baselines.prandtl_ishlinskii.dead_zone import dead_zone, dead_zone_sum, ramps, slopes_to_weights
+from baselines.fit_report import Domain
+from baselines.prandtl_ishlinskii import operators
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import (
     MpiParameters,
     from_inverse_saturation,
     inverse_thresholds,
     inverse_weights,
-    pi_parameters,
     states_from_inverse,
     states_to_inverse,
 )
-from baselines.prandtl_ishlinskii.play import play_run, play_start
-from baselines.validation import Domain
+from baselines.prandtl_ishlinskii.operators import (
+    dead_zone,
+    dead_zone_sum,
+    play_run,
+    play_start,
+    ramps,
+    slopes_to_weights,
+)
 
 WIDE = Domain(-1e6, 1e6, 1e9)
 seeds = st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.parametrize("module", [play_module, dead_zone_module])
-def test_documented_walks(module: object) -> None:
-    result = doctest.testmod(module)  # type: ignore[arg-type]
-    assert result.attempted >= 4
+def test_documented_walks() -> None:
+    result = doctest.testmod(operators)
+    assert result.attempted >= 8
     assert result.failed == 0
 
 
@@ -55,7 +58,7 @@ def test_pi_follows_the_equations_step_by_step() -> None:
     for value in u:  # (2.4), (2.7) in their own words
         state = [max(value - r[i], min(value + r[i], state[i])) for i in range(3)]
         expected.append(sum(w[i] * state[i] for i in range(3)))
-    np.testing.assert_allclose(pi_parameters(r, w).simulate(u, 1.0), expected, rtol=1e-14)
+    np.testing.assert_allclose(MpiParameters(tuple(r), tuple(w)).simulate(u, 1.0), expected, rtol=1e-14)
 
 
 def test_dead_zones_against_the_definition() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptive.tuning.evidence import Problem, evaluate, problem
-from baselines.swarm.evidence import EvidenceSearch, EvidenceSearchConfig, _Batch
+from baselines.swarm.evidence_search import EvidenceSearch, EvidenceSearchConfig, _Batch
 from baselines.swarm.particle_swarm import MissingTorchError
 
 torch = pytest.importorskip("torch", reason="torch is not installed")

@@ -21,10 +21,10 @@ from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import TABLE_2_1
+from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
-from baselines.validation import Domain
 from lab.cli import main
 from service.answers.guard import Limits
 from service.config.config import AxisConfig

@@ -9,7 +9,7 @@ from adaptive.errors import InputError
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import TABLE_2_1
 from baselines.fit import fit_bouc_wen
-from baselines.validation import Domain
+from baselines.fit_report import Domain
 from sim.chapter.adaptive_loop import BlockConfig, replay, track_learning
 from sim.chapter.control import changing, learner_of, moving_mae, run_control
 from sim.chapter.experiments import DT_S, Score, experiments

@@ -1,10 +1,10 @@
-"""Models that learn online by least squares with forgetting, signs kept: what the line and the MPI model share.
+"""Online least squares with forgetting and lower bounds on the weights, for models that are linear in them.
 
-Both are linear in their weights. The normal matrix of all samples, each forgotten by the same factor with every
-newer one, is the exact recursive least squares in information form; unlike the covariance form it takes bounds
-on the weights, and nothing in it winds up. It starts from samples that the identified model gives over its own
-range, so that learning begins at the identified weights and moves off as real samples take their place. Samples
-are forgotten by samples that teach, not by time: a stage at rest forgets nothing.
+The normal matrix of all samples, in which each new sample scales the older ones by one factor, is the exact recursive
+least-squares problem in information form. Unlike the covariance form it admits bounds on the weights and cannot wind
+up. It starts from samples that the identified model generates over its own range, so learning begins at the
+identified weights and leaves them as real samples arrive. Only samples that teach age the older ones; a stage at rest
+forgets nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from adaptive.online.gates import LEARNT, NUMERICS, PASSED, SETTLING, UNEXCITED
 from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, StateDict
 from baselines.bounded_least_squares import bounded_minimum
-from baselines.online import OnlineBaseline, field_of
+from baselines.online_baseline import OnlineBaseline, field_of
 
 #: The velocity is a difference over this many samples on each side.
 _HALF = 2
@@ -30,11 +30,16 @@ _HALF = 2
 class LeastSquaresConfig:
     """How fast the least-squares baselines learn.
 
-    learn_every : samples between two that may teach; at least 5. solve_every : taught ones between two solutions.
-    remember : taught samples after which one counts 1/e; by default 300, for the line 100.
-    trust : samples that the identified model counts for.
+    Attributes
+    ----------
+    learn_every : samples between two that may teach; at least 5.
+    solve_every : samples that teach between two solutions.
+    remember : samples that teach after which the weight of one has fallen to 1/e.
+    trust : number of samples that the identified model counts for.
     excitation : share of the voltage range by which u must have moved for a sample to teach.
-    settle : samples after a start or gap that do not teach.
+    settle : samples after a start or a gap that do not teach.
+
+    Raises InputError on a value out of range.
     """
 
     learn_every: int = 10
@@ -55,7 +60,7 @@ class LeastSquaresConfig:
 
 @compiled
 def forget_and_add(normal: FloatArray, row: FloatArray, keep: float) -> None:
-    """normal <- keep normal + row row', in place; exactly symmetric."""
+    """normal <- keep normal + row row', (p, p) in place; the result is exactly symmetric."""
     for i in range(row.size):
         for j in range(i, row.size):
             value = keep * normal[i, j] + row[i] * row[j]
@@ -64,7 +69,15 @@ def forget_and_add(normal: FloatArray, row: FloatArray, keep: float) -> None:
 
 
 class LeastSquaresOnline(OnlineBaseline):
-    """One row [regressors, target] per taught sample; the models say how it is made and solved."""
+    """Recursive least squares with one row [regressors, target] per sample that teaches.
+
+    A model implements how a row is made, what its residual is, and how the normal matrix is solved.
+
+    Parameters
+    ----------
+    u_range_V : voltage range, which the excitation refers to, V.
+    rows : (n, p) rows of the identified model, from which learning starts.
+    """
 
     def __init__(self, dt_s: float, u_range_V: float, config: LeastSquaresConfig, rows: FloatArray) -> None:
         super().__init__(dt_s, config.settle)
@@ -105,28 +118,29 @@ class LeastSquaresOnline(OnlineBaseline):
         return LEARNT
 
     def _step_memory(self, u_V: float, first: bool) -> None:
-        """Advance what the model remembers of the voltage."""
+        """Advance the model's memory of the voltage."""
 
     def _regressors_now(self) -> FloatArray:
-        """The part of a row that depends on voltages, at this instant."""
+        """The part of a row that depends on the voltage, at this instant."""
         raise NotImplementedError
 
     def _row(self, pending: FloatArray, y_um: float, v_um_per_s: float) -> FloatArray:
+        """The row of the voltage part ``pending`` and of displacement and speed at the same instant."""
         raise NotImplementedError
 
     def _residual(self, row: FloatArray) -> float:
-        """Residual of the model as it stands, µm."""
+        """Residual of a row with the present weights, µm."""
         raise NotImplementedError
 
     def _solve(self) -> bool:
-        """New weights from the normal matrix; False, and nothing changed, where that fails."""
+        """Solve the normal matrix for new weights. Returns False, and changes nothing, where that fails."""
         raise NotImplementedError
 
     @staticmethod
     def _minimum(normal: FloatArray, lower: FloatArray) -> FloatArray:
-        """Weights (p,) of least squares above ``lower`` (p,), ``normal`` having the target as its last column.
+        """Weights (p,) not below ``lower`` (p,); the target is the last row and column of ``normal`` (p + 1, p + 1).
 
-        Raises RuntimeError where there are none.
+        Raises RuntimeError where the matrix is not positive definite.
         """
         matrix = normal[:-1, :-1] + 1e-12 * np.diag(normal).max() * np.eye(lower.size)
         return bounded_minimum(matrix, normal[:-1, -1], lower)
@@ -151,7 +165,7 @@ class LeastSquaresOnline(OnlineBaseline):
 
 
 def config_from(state: StateDict) -> LeastSquaresConfig:
-    """The configuration in a stored state; raises InputError where a field is missing."""
+    """The configuration in a stored state. Raises InputError where a field is missing."""
     values = under("config_", state)
     whole = {name: int(field_of(values, name, "online")) for name in ("learn_every", "solve_every", "settle")}
     real = {name: float(field_of(values, name, "online")) for name in ("remember", "trust", "excitation")}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from baselines.gain_filter import GainFilter
+from baselines.prandtl_ishlinskii.online import GainFilter
 
 
 def test_it_is_the_kalman_filter_of_two_random_walks() -> None:
@@ -25,7 +25,7 @@ def test_it_is_the_kalman_filter_of_two_random_walks() -> None:
         np.testing.assert_allclose([made.gain, made.offset_um], x, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(made.covariance, P, rtol=1e-6)
     assert made.gain == pytest.approx(0.94, abs=0.01)
-    assert made.undo(0.94 * 40.0 + 0.7) == pytest.approx(40.0, abs=0.3)
+    assert made.to_model(0.94 * 40.0 + 0.7) == pytest.approx(40.0, abs=0.3)
 
 
 def test_it_is_the_librarys_filter_step_by_step() -> None:

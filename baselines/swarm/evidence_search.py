@@ -1,7 +1,7 @@
 """Starts for re-tuning: the evidence of many hyper-parameters at once, as one batch in torch.
 
-All starts descend together (Adam on J2, its gradient by torch), on a GPU where there is one. It finds basins; the last
-digits are for ``adaptive.tuning.proposal``. torch is imported when a search starts, never before.
+All starts descend together (Adam on J2, with torch's gradient), on a GPU where there is one. The search finds basins;
+``adaptive.tuning.proposal`` refines the result. torch is imported only when a search starts.
 """
 
 from __future__ import annotations
@@ -17,16 +17,21 @@ from adaptive.tuning.proposal import pattern
 from adaptive.types import FloatArray
 from baselines.swarm.particle_swarm import torch_module
 
-#: J2 of a point whose kernel matrix can't be factored.
+#: J2 of a point whose kernel matrix cannot be factored.
 _REFUSED = 1e12
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSearchConfig:
-    """``starts`` descents of ``steps`` of at most ``rate`` (in logarithms) each; ``keep`` results, best first.
+    """Settings of the search.
 
-    ``apart`` : results closer than this in every logarithm count as one. device : torch's; "auto" for a GPU where there
-    is one.
+    Attributes
+    ----------
+    starts, steps : descents, and steps of each.
+    rate : largest step, in logarithms of the hyper-parameters.
+    keep : number of results, best first.
+    apart : results closer than this in every logarithm count as one.
+    device : device name for torch; "auto" is a GPU where there is one.
     """
 
     starts: int = 24
@@ -44,8 +49,10 @@ class EvidenceSearchConfig:
 
 
 class EvidenceSearch:
-    """A ``adaptive.tuning.proposal.Search``. Deterministic on one device. Raises MissingTorchError where torch is
-    missing."""
+    """Implements ``adaptive.tuning.proposal.Search``. Deterministic on one device.
+
+    Raises MissingTorchError where torch is not installed.
+    """
 
     def __init__(self, config: EvidenceSearchConfig | None = None) -> None:
         self.config = config or EvidenceSearchConfig()
@@ -55,7 +62,7 @@ class EvidenceSearch:
             self.device = "cuda" if torch.cuda.is_available() else "cpu"
 
     def __call__(self, data: Problem, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """(k, 1 + d) starts worth a descent within the box, best first; ``start`` is one of the points begun from."""
+        """(k, 1 + d) starts within the box from ``low`` to ``high``, best first; ``start`` is one of the seeds."""
         c, torch = self.config, torch_module()
         batch = _Batch(torch, data, self.device)
         floor, ceiling = (torch.as_tensor(np.asarray(x), device=self.device) for x in (low, high))
@@ -66,7 +73,7 @@ class EvidenceSearch:
             J2, gradient = batch(theta)
             better = best_J2 > J2
             best, best_J2 = torch.where(better[:, None], theta, best), torch.where(better, J2, best_J2)
-            # Adam: every start at its own pace, whatever the scale of its J2; steps shrink towards the end.
+            # Adam makes the step independent of the scale of J2; steps shrink towards the end.
             first = 0.8 * first + 0.2 * gradient
             second = 0.95 * second + 0.05 * gradient**2
             pace = c.rate * (1.0 - (step - 1) / c.steps)
@@ -88,8 +95,10 @@ class EvidenceSearch:
 
 
 class _Batch:
-    """J2 (s,) and its gradient (s, 1 + d) at (s, 1 + d) logarithms of gamma and widths; see
-    ``adaptive.tuning.evidence``."""
+    """J2 (s,) and its gradient (s, 1 + d) at logarithms (s, 1 + d) of gamma and widths.
+
+    See ``adaptive.tuning.evidence``.
+    """
 
     def __init__(self, torch: Any, data: Problem, device: str) -> None:
         self._torch = torch
@@ -111,7 +120,7 @@ class _Batch:
         R = K + torch.diag_embed(torch.exp(-theta[:, :1]) * self._noise)
         L, failed = torch.linalg.cholesky_ex(R)
         good = failed == 0
-        # A factor that is none must not spoil the others: the identity stands there, and the value is refused.
+        # The identity replaces a failed factor, so that it cannot spoil the others; its value is refused below.
         L = torch.where(good[:, None, None], L, torch.eye(n, dtype=L.dtype, device=L.device))
         columns = torch.linalg.solve_triangular(
             L, torch.cat([self._H, self._y[:, None]], dim=1).expand(len(theta), -1, -1), upper=False

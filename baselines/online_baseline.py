@@ -1,6 +1,6 @@
-"""What the online baselines share: the gates of a raw sample, the counters, the running error.
+"""What the online baselines share: admission of raw samples, outcome counters, running error.
 
-The names of the gates are those of ``adaptive.online.gates``, so that the service counts all models alike.
+Outcomes have the names of ``adaptive.online.gates``, so the service counts the samples of all models alike.
 """
 
 from __future__ import annotations
@@ -26,17 +26,22 @@ from adaptive.state_codec import prefixed
 from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
-#: Relative error of a time step beyond which a sample's clock is not believed.
+#: Relative error of a time step above which the sample is refused.
 _TIMING_TOLERANCE = 0.5
-#: Beyond these magnitudes a reading cannot be one (µm, V); keeps squares finite.
-_ABSURD = 1e9
+#: Magnitude (µm, V) from which a value is refused as not finite; keeps squares finite.
+_LARGEST = 1e9
 
 
 class OnlineBaseline:
-    """Gates and bookkeeping of one axis; the models derive from it and implement ``_advance``.
+    """Admission and bookkeeping of one axis; a model derives from it and implements ``_restart`` and ``_advance``.
 
-    Deterministic, bounded in time and memory. Not for several threads at once. The abilities of
-    :class:`adaptive.types.OnlineModel` that a baseline lacks are implemented here, trivially.
+    Deterministic, bounded in time and memory. Not thread-safe. The abilities of :class:`adaptive.types.OnlineModel`
+    that a baseline lacks are implemented here, trivially.
+
+    Parameters
+    ----------
+    dt_s : sample time, s.
+    settle : samples after a start or a gap that do not teach.
     """
 
     def __init__(self, dt_s: float, settle: int) -> None:
@@ -53,65 +58,13 @@ class OnlineBaseline:
         """Sequence number of the last sample handled, -1 before any."""
         return self._seq
 
-    # ---- abilities that only a learner has
-
-    def resync(self) -> None:
-        """Nothing: ``handle`` restarts by itself after a gap in time or numbers."""
-
-    def take_place_of(self, other: OnlineModel) -> None:
-        """Nothing, as in ``resync``: the position of a baseline is its last sample."""
-
-    def freeze(self) -> None:
-        """Nothing: a competition gives a frozen baseline no samples."""
-
-    def thaw(self) -> None:
-        """Nothing; see ``freeze``."""
-
-    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
-        """None: a baseline tracks no memory of its own."""
-        return None
-
-    def window_data(self) -> WindowData | None:
-        """None: there are no hyper-parameters to tune."""
-        return None
-
-    def adopt(self, hyper: Hyperparameters) -> str:
-        """Refused."""
-        return "it has no hyper-parameters"
-
-    @property
-    def trouble(self) -> str:
-        """Always "": a baseline does not judge the sensor."""
-        return ""
-
-    @property
-    def why(self) -> str:
-        return ""
-
-    @property
-    def distrusts(self) -> bool:
-        return False
-
-    def diagnostics(self) -> dict[str, Any]:
-        """Empty."""
-        return {}
-
-    def take_events(self) -> list[tuple[str, str]]:
-        """Empty."""
-        return []
-
-    def warm(self) -> None:
-        """Nothing: the first samples load every step."""
-
-    # ---- samples, counters and the shared state
-
     def counters(self) -> dict[str, int]:
-        """Samples by outcome; every outcome there is appears."""
+        """Number of samples by outcome, for every outcome."""
         return dict(self._counters)
 
     def handle(self, sample: Sample) -> str:
-        """Take one raw sample. Returns "learnt", "passed" (good, but none was due) or the gate that refused it."""
-        outcome = self._gate(sample)
+        """Take a raw sample. Returns "learnt", "passed" (good, but not due to teach), or the reason of a refusal."""
+        outcome = self._refusal(sample)
         if not outcome:
             missing = self._seq >= 0 and sample.seq > self._seq + 1
             first = self._seq < 0
@@ -128,8 +81,62 @@ class OnlineBaseline:
         self._counters[outcome] += 1
         return outcome
 
-    def _gate(self, sample: Sample) -> str:
-        if not (math.isfinite(sample.t_s) and abs(sample.u_V) < _ABSURD and abs(sample.y_um) < _ABSURD):
+    # ---- abilities that only a learner has
+
+    def resync(self) -> None:
+        """Do nothing: ``handle`` restarts by itself after a gap in time or numbers."""
+
+    def take_place_of(self, other: OnlineModel) -> None:
+        """Do nothing, as in ``resync``: the position of a baseline is its last sample."""
+
+    def freeze(self) -> None:
+        """Do nothing: a competition gives a frozen baseline no samples."""
+
+    def thaw(self) -> None:
+        """Do nothing; see ``freeze``."""
+
+    def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
+        """None: a baseline tracks no memory of its own."""
+        return None
+
+    def window_data(self) -> WindowData | None:
+        """None: there are no hyper-parameters to tune."""
+        return None
+
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Refuse: there are no hyper-parameters."""
+        return "it has no hyper-parameters"
+
+    @property
+    def trouble(self) -> str:
+        """Always "": a baseline does not judge the sensor."""
+        return ""
+
+    @property
+    def why(self) -> str:
+        """Always ""; see ``trouble``."""
+        return ""
+
+    @property
+    def distrusts(self) -> bool:
+        """Always False; see ``trouble``."""
+        return False
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Empty."""
+        return {}
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """Empty."""
+        return []
+
+    def warm(self) -> None:
+        """Do nothing: the first samples load every step."""
+
+    # ---- inside a sample, and the shared state
+
+    def _refusal(self, sample: Sample) -> str:
+        if not (math.isfinite(sample.t_s) and abs(sample.u_V) < _LARGEST and abs(sample.y_um) < _LARGEST):
             return NOT_FINITE
         if self._seq < 0:
             return ""
@@ -141,11 +148,11 @@ class OnlineBaseline:
         return TIMING if abs(sample.t_s - self._t_s - expected) > _TIMING_TOLERANCE * expected else ""
 
     def _restart(self, u_V: float, y_um: float, first: bool) -> None:
-        """Called at the first sample and after a gap, in place of ``_advance``'s step through time."""
+        """Begin at the first sample or after a gap, where the time since the sample before is not one step."""
         raise NotImplementedError
 
     def _advance(self, u_V: float, y_um: float, settled: bool) -> str:
-        """Take a good sample; returns the outcome. ``settled``: enough samples since start or gap."""
+        """Take a good sample one step after the last. Returns the outcome. ``settled``: it may teach."""
         raise NotImplementedError
 
     @classmethod
@@ -175,7 +182,7 @@ class OnlineBaseline:
 
 
 def field_of(state: StateDict, name: str, kind: str) -> Any:
-    """A field of a stored state; raises InputError where it is missing."""
+    """The entry ``name`` of the stored state of a ``kind`` model. Raises InputError where it is missing."""
     if name not in state:
         raise InputError(f"{name}: missing in the state of a {kind} model; start from a model file instead")
     return state[name]
