@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from lab.demo.plan import Plan
-from sim.diagnosis.report.export import OFFSET
+from sim.diagnosis.export import OFFSET
 from sim.effects import effect
 from sim.stage.config import StageConfig
 from sim.stage.file import load_stage, save_stage

@@ -9,8 +9,8 @@ from typing import Any
 from adaptive.errors import InputError
 from service.reports.diagnosis_page import Source, page, picture_name
 from service.reports.diagnosis_pictures import draw_cause, draw_residual
-from sim.diagnosis.report.export import export
-from sim.diagnosis.report.result import Diagnosis
+from sim.diagnosis.export import export_stage
+from sim.diagnosis.result import Diagnosis
 from sim.stage.file import save_stage
 
 __all__ = ["Source", "write_report"]
@@ -28,7 +28,7 @@ def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool =
             old.unlink()
         data = diagnosis.as_dict()
         (out / "report.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-        exported = export(diagnosis)
+        exported = export_stage(diagnosis)
         save_stage(exported.config, out / "stage.toml")
         draw_residual(out / "residual.png", diagnosis, f"{source.data}: {diagnosis.verdict}")
         for place, cause in enumerate(diagnosis.causes):

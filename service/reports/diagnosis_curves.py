@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.report.result import Cause
-from sim.diagnosis.search.noise_floor import standing
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.model.readings import standing
+from sim.diagnosis.result import NamedCause
 
 # --- What a picture of a cause is made of: curves as numbers, and the means and units that they share.
 #
@@ -77,12 +77,12 @@ def binned(x: FloatArray, y: FloatArray, bins: int = 60) -> tuple[FloatArray, Fl
     return 0.5 * (edges[1:] + edges[:-1])[good], mean[good]
 
 
-def unit(cause: Cause) -> tuple[float, str]:
+def unit(cause: NamedCause) -> tuple[float, str]:
     """Factor from µm and name of the unit that suits this cause's residual."""
     return (1.0, "µm") if float(np.quantile(np.abs(cause.before_um), 0.99)) > 3.0 else (1e3, "nm")
 
 
-def both(cause: Cause) -> tuple[tuple[str, FloatArray], tuple[str, FloatArray]]:
+def both(cause: NamedCause) -> tuple[tuple[str, FloatArray], tuple[str, FloatArray]]:
     scale = unit(cause)[0]
     return (WITHOUT, scale * cause.before_um), (WITH, scale * cause.after_um)
 
@@ -96,9 +96,9 @@ def slow(r_nm: FloatArray, width: int) -> FloatArray:
     return np.asarray((sums[high] - sums[low]) / (high - low))
 
 
-def period(setting: Setting) -> int:
+def period(data: FitData) -> int:
     """Samples of the drive's slowest strong period: what a mean must span to see only what is slower."""
-    u = setting.u_V - setting.u_V.mean()
+    u = data.u_V - data.u_V.mean()
     power = np.abs(np.fft.rfft(u * np.hanning(u.size))) ** 2
     strong = np.flatnonzero(power[3:] > 0.1 * power[3:].max())
     lowest = (int(strong[0]) + 3) if strong.size else 3
@@ -108,91 +108,91 @@ def period(setting: Setting) -> int:
 # --- Pictures over time: since the record began, since a step, since a reversal, stretch by stretch.
 
 
-def over_time(cause: Cause, setting: Setting) -> Picture | None:
-    curves = tuple(Curve(role, *envelope(setting.t_s, r)) for role, r in both(cause))
+def over_time(cause: NamedCause, data: FitData) -> Picture | None:
+    curves = tuple(Curve(role, *envelope(data.t_s, r)) for role, r in both(cause))
     return Picture("time / s", f"residual / {unit(cause)[1]}", curves)
 
 
-def slowly(cause: Cause, setting: Setting) -> Picture | None:
+def slowly(cause: NamedCause, data: FitData) -> Picture | None:
     """A drift: the residual's mean over a period of the drive, over time."""
-    width = period(setting)
-    cut = slice(width // 2, setting.n - width // 2)
-    curves = tuple(Curve(role, *envelope(setting.t_s[cut], slow(r, width)[cut], 1500)) for role, r in both(cause))
-    return Picture("time / s", f"mean residual over {width * setting.dt_s:.3g} s / {unit(cause)[1]}", curves)
+    width = period(data)
+    cut = slice(width // 2, data.n - width // 2)
+    curves = tuple(Curve(role, *envelope(data.t_s[cut], slow(r, width)[cut], 1500)) for role, r in both(cause))
+    return Picture("time / s", f"mean residual over {width * data.dt_s:.3g} s / {unit(cause)[1]}", curves)
 
 
-def over_log_time(cause: Cause, setting: Setting) -> Picture | None:
+def over_log_time(cause: NamedCause, data: FitData) -> Picture | None:
     """Creep: the residual after each long hold's step over the logarithm of time; without holds, since the start."""
-    still = np.abs(np.diff(setting.u_V, prepend=setting.u_V[0])) < 1e-9 * max(setting.swing_V, 1e-12)
+    still = np.abs(np.diff(data.u_V, prepend=data.u_V[0])) < 1e-9 * max(data.swing_V, 1e-12)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
     # A hold after a step shows creep; one that the record begins with shows nothing.
-    holds = [e for e in edges if e[0] > 0 and (e[1] - e[0]) * setting.dt_s > 0.5]
+    holds = [e for e in edges if e[0] > 0 and (e[1] - e[0]) * data.dt_s > 0.5]
     long = sorted(holds, key=lambda e: e[0] - e[1])[:4]
     curves: list[Curve] = []
     if not long:
-        width = period(setting)
-        where = np.unique(np.geomspace(width, setting.n - width // 2 - 1, 80).astype(int))
+        width = period(data)
+        where = np.unique(np.geomspace(width, data.n - width // 2 - 1, 80).astype(int))
         for role, r in both(cause):
             mean = slow(r, width)[where]
-            curves.append(Curve(role, where * setting.dt_s, mean - mean[-1]))
-        name = f"mean residual over {width * setting.dt_s:.3g} s, less its last / {unit(cause)[1]}"
+            curves.append(Curve(role, where * data.dt_s, mean - mean[-1]))
+        name = f"mean residual over {width * data.dt_s:.3g} s, less its last / {unit(cause)[1]}"
         return Picture("time since the record began / s", name, tuple(curves), log_x=True)
     for role, r in both(cause):
         for i, (start, stop) in enumerate(long):
-            where = np.unique(np.geomspace(max(2, round(0.02 / setting.dt_s)), stop - start - 1, 60).astype(int))
+            where = np.unique(np.geomspace(max(2, round(0.02 / data.dt_s)), stop - start - 1, 60).astype(int))
             ends = np.minimum(where + np.maximum(1, where // 8), stop - start)
             sums = np.concatenate([[0.0], np.cumsum(r[start:stop])])
             mean = (sums[ends] - sums[where]) / (ends - where)
             # Up and down alike: creep goes on in the direction of the step.
             before = max(0, int(start) - 2)
-            sign = float(np.sign(setting.u_V[start] - setting.u_V[before])) or 1.0
-            note = f"hold at {setting.u_V[start]:.3g} V"
-            curves.append(Curve(role, where * setting.dt_s, sign * (mean - mean[0]), note, dashed=i > 0))
+            sign = float(np.sign(data.u_V[start] - data.u_V[before])) or 1.0
+            note = f"hold at {data.u_V[start]:.3g} V"
+            curves.append(Curve(role, where * data.dt_s, sign * (mean - mean[0]), note, dashed=i > 0))
     name = f"residual in the step's direction since 20 ms / {unit(cause)[1]}"
     return Picture("time since the step / s", name, tuple(curves), log_x=True)
 
 
-def _by_stretch(cause: Cause, setting: Setting, of: FloatArray, least: float, scale: float, name: str) -> Picture:
+def _by_stretch(cause: NamedCause, data: FitData, of: FloatArray, least: float, scale: float, name: str) -> Picture:
     """Slope of the residual over ``of`` in forty stretches of the record."""
-    stretch = max(50, setting.n // 40)
+    stretch = max(50, data.n // 40)
     curves = []
     for role, r in ((WITHOUT, cause.before_um), (WITH, cause.after_um)):
         t, slope = [], []
-        for start in range(0, setting.n - stretch + 1, stretch):
+        for start in range(0, data.n - stretch + 1, stretch):
             x = of[start : start + stretch]
             d = x - x.mean()
             if float(d @ d) > least * stretch:
-                t.append((start + 0.5 * stretch) * setting.dt_s)
+                t.append((start + 0.5 * stretch) * data.dt_s)
                 slope.append(scale * float(d @ r[start : start + stretch]) / float(d @ d))
         curves.append(Curve(role, np.array(t), np.array(slope), points=True))
     return Picture("time / s", name, tuple(curves))
 
 
-def gain_over_time(cause: Cause, setting: Setting) -> Picture | None:
-    least = (0.02 * setting.range_um) ** 2
-    return _by_stretch(cause, setting, setting.y_um, least, 100.0, "gain beyond the model's / %")
+def gain_over_time(cause: NamedCause, data: FitData) -> Picture | None:
+    least = (0.02 * data.range_um) ** 2
+    return _by_stretch(cause, data, data.y_um, least, 100.0, "gain beyond the model's / %")
 
 
-def lag_over_time(cause: Cause, setting: Setting) -> Picture | None:
-    v = np.gradient(setting.y_um, setting.dt_s)
-    return _by_stretch(cause, setting, v, 0.01 * float(np.var(v)), -1e6, "readings late by / µs")
+def lag_over_time(cause: NamedCause, data: FitData) -> Picture | None:
+    v = np.gradient(data.y_um, data.dt_s)
+    return _by_stretch(cause, data, v, 0.01 * float(np.var(v)), -1e6, "readings late by / µs")
 
 
-def after_steps(cause: Cause, setting: Setting) -> Picture | None:
+def after_steps(cause: NamedCause, data: FitData) -> Picture | None:
     """The mean residual after the largest steps of the drive; without steps, over the speed: late is a slope."""
-    du = np.diff(setting.u_V, prepend=setting.u_V[0])
-    span = max(8, min(round(0.03 / setting.dt_s), setting.n // 20))
+    du = np.diff(data.u_V, prepend=data.u_V[0])
+    span = max(8, min(round(0.03 / data.dt_s), data.n // 20))
     order = np.argsort(-np.abs(du))[:20]
     usual = float(np.quantile(np.abs(du), 0.98))
-    steps = [k for k in order if abs(du[k]) > max(0.05 * setting.swing_V, 5.0 * usual) and 2 <= k < setting.n - span]
+    steps = [k for k in order if abs(du[k]) > max(0.05 * data.swing_V, 5.0 * usual) and 2 <= k < data.n - span]
     if len(steps) >= 2:
-        t = np.asarray((np.arange(span + 2) - 2) * setting.dt_s * 1e3, dtype=np.float64)
+        t = np.asarray((np.arange(span + 2) - 2) * data.dt_s * 1e3, dtype=np.float64)
         curves = tuple(
             Curve(role, t, _mean([r[k - 2 : k + span] * np.sign(du[k]) for k in steps]), points=True)
             for role, r in both(cause)
         )
         return Picture("time since the step / ms", f"mean residual in the step's direction / {unit(cause)[1]}", curves)
-    speed = np.gradient(setting.y_um - cause.after_um, setting.dt_s)
+    speed = np.gradient(data.y_um - cause.after_um, data.dt_s)
     curves = tuple(Curve(role, *binned(speed, r, 40)) for role, r in both(cause))
     return Picture("speed / (µm/s)", f"mean residual / {unit(cause)[1]}", curves)
 
@@ -201,50 +201,50 @@ def _mean(rows: list[FloatArray]) -> FloatArray:
     return np.asarray(np.mean(rows, axis=0), dtype=np.float64)
 
 
-def after_reversals(cause: Cause, setting: Setting) -> Picture | None:
+def after_reversals(cause: NamedCause, data: FitData) -> Picture | None:
     """Friction: the residual against the motion, over the way travelled since the last reversal."""
-    x = setting.y_um - cause.after_um
+    x = data.y_um - cause.after_um
     way = np.sign(np.diff(x, prepend=x[0]))
     turns = np.flatnonzero(way[1:] * way[:-1] < 0) + 1
     if turns.size < 2:
         return None
-    last = np.zeros(setting.n, dtype=np.intp)
+    last = np.zeros(data.n, dtype=np.intp)
     last[turns] = turns
     last = np.maximum.accumulate(last)
     travelled = np.abs(x - x[last])
-    near = (travelled > 0.0) & (travelled < 0.05 * setting.range_um) & (last > 0)
+    near = (travelled > 0.0) & (travelled < 0.05 * data.range_um) & (last > 0)
     if near.sum() < 200:
         return None
     curves = tuple(Curve(role, *binned(travelled[near], (r * way)[near])) for role, r in both(cause))
     return Picture("way since the reversal / µm", f"residual in the direction of motion / {unit(cause)[1]}", curves)
 
 
-def at_rest(cause: Cause, setting: Setting) -> Picture | None:
+def at_rest(cause: NamedCause, data: FitData) -> Picture | None:
     """Readings at rest, one by one: the grid they lie on."""
-    quiet = np.flatnonzero(standing(setting, 0.1))
+    quiet = np.flatnonzero(standing(data, 0.1))
     start = int(quiet[0]) if quiet.size else 0
-    part = slice(start, min(setting.n, start + 400))
-    y = setting.y_um[part]
+    part = slice(start, min(data.n, start + 400))
+    y = data.y_um[part]
     step = cause.parameters.get("step_um", 0.0)
     origin = float(y[0])
     name = f"reading / steps of {1e3 * step:.3g} nm" if step > 0.0 else "reading / nm"
     scale = 1.0 / step if step > 0.0 else 1e3
-    return Picture("time / s", name, (Curve(MEASURED, setting.t_s[part], scale * (y - origin), points=True),))
+    return Picture("time / s", name, (Curve(MEASURED, data.t_s[part], scale * (y - origin), points=True),))
 
 
-def picture(cause: Cause, setting: Setting) -> Picture:
+def picture(cause: NamedCause, data: FitData) -> Picture:
     """The picture in which this cause shows itself."""
     for attempt in (_PICTURES.get(cause.name, over_time), over_time):
-        made = attempt(cause, setting)
+        made = attempt(cause, data)
         if made is not None:
             return made
     raise AssertionError("a residual over time can always be drawn")  # pragma: no cover
 
 
-def _by_way(cause: Cause, setting: Setting, x: FloatArray, name: str) -> Picture | None:
+def _by_way(cause: NamedCause, data: FitData, x: FloatArray, name: str) -> Picture | None:
     """Mean residual over ``x``, on the way up and on the way down apart."""
-    rising = np.gradient(setting.u_V)
-    eps = 1e-6 * setting.swing_V
+    rising = np.gradient(data.u_V)
+    eps = 1e-6 * data.swing_V
     curves = []
     for role, r in both(cause):
         for mask, way, dashed in ((rising > eps, "rising", False), (rising < -eps, "falling", True)):
@@ -253,13 +253,13 @@ def _by_way(cause: Cause, setting: Setting, x: FloatArray, name: str) -> Picture
     return Picture(name, f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
 
 
-def _over_reading(cause: Cause, setting: Setting) -> Picture | None:
-    return _by_way(cause, setting, setting.y_um, "reading / µm")
+def _over_reading(cause: NamedCause, data: FitData) -> Picture | None:
+    return _by_way(cause, data, data.y_um, "reading / µm")
 
 
-def _over_motion(cause: Cause, setting: Setting) -> Picture | None:
+def _over_motion(cause: NamedCause, data: FitData) -> Picture | None:
     """The loop that is missing, over the displacement; across a resonance the voltage tells nothing of the way."""
-    x = setting.y_um - cause.after_um
+    x = data.y_um - cause.after_um
     speed = np.gradient(x)
     curves = []
     for role, r in both(cause):
@@ -269,14 +269,14 @@ def _over_motion(cause: Cause, setting: Setting) -> Picture | None:
     return Picture("displacement / µm", f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
 
 
-def _over_voltage(cause: Cause, setting: Setting) -> Picture | None:
-    return _by_way(cause, setting, setting.u_V, "voltage / V")
+def _over_voltage(cause: NamedCause, data: FitData) -> Picture | None:
+    return _by_way(cause, data, data.u_V, "voltage / V")
 
 
-def _over_rate(cause: Cause, setting: Setting) -> Picture | None:
+def _over_rate(cause: NamedCause, data: FitData) -> Picture | None:
     """By how much the loop is wider than the model's, over the rate of the voltage."""
-    rate, sign = setting.rate_V_per_s, np.sign(np.gradient(setting.u_V))
-    moving: BoolArray = np.asarray(rate > 1e-3 * setting.swing_V / setting.duration_s)
+    rate, sign = data.rate_V_per_s, np.sign(np.gradient(data.u_V))
+    moving: BoolArray = np.asarray(rate > 1e-3 * data.swing_V / data.duration_s)
     if moving.sum() < 200:
         return None
     curves = []
@@ -288,21 +288,21 @@ def _over_rate(cause: Cause, setting: Setting) -> Picture | None:
     )
 
 
-def _response(cause: Cause, setting: Setting) -> Picture | None:
+def _response(cause: NamedCause, data: FitData) -> Picture | None:
     """Readings over voltage in the frequency domain: measured, and as the model has it without and with the cause."""
     from scipy.signal import csd, welch
 
     # Enough pieces to average over: one alone is all speckle.
-    size = max(256, min(setting.n // 8, round(2.0 / setting.dt_s)))
-    u = setting.u_V - setting.u_V.mean()
-    rate = 1.0 / setting.dt_s
+    size = max(256, min(data.n // 8, round(2.0 / data.dt_s)))
+    u = data.u_V - data.u_V.mean()
+    rate = 1.0 / data.dt_s
     f, power = welch(u, rate, nperseg=size)
     driven = power > 1e-3 * power.max()
     driven[0] = False
     if driven.sum() < 8:
         return None
     curves = []
-    y = setting.y_um - setting.y_um.mean()
+    y = data.y_um - data.y_um.mean()
     for role, r in ((MEASURED, np.zeros_like(y)), (WITHOUT, cause.before_um), (WITH, cause.after_um)):
         _, cross = csd(u, y - r, rate, nperseg=size)
         curves.append(Curve(role, f[driven], np.abs(cross[driven]) / power[driven]))
@@ -311,19 +311,19 @@ def _response(cause: Cause, setting: Setting) -> Picture | None:
     return Picture("frequency / Hz", "gain / (µm/V)", tuple(curves), log_x=True, log_y=True, marks=marks)
 
 
-def _modes(cause: Cause) -> tuple[float, ...]:
+def _modes(cause: NamedCause) -> tuple[float, ...]:
     """Frequencies of its modes, Hz."""
     return tuple(float(v) for name, v in cause.parameters.items() if name.startswith("f0") and name.endswith("_hz"))
 
 
-def _spectrum(cause: Cause, setting: Setting) -> Picture | None:
+def _spectrum(cause: NamedCause, data: FitData) -> Picture | None:
     from scipy.signal import welch
 
     modes = _modes(cause)
-    size = max(256, min(setting.n // (8 if modes else 1), round(4.0 / setting.dt_s)))
+    size = max(256, min(data.n // (8 if modes else 1), round(4.0 / data.dt_s)))
     curves = []
     for role, r in both(cause):
-        f, power = welch(r, 1.0 / setting.dt_s, nperseg=size)
+        f, power = welch(r, 1.0 / data.dt_s, nperseg=size)
         curves.append(Curve(role, f[1:], np.sqrt(power[1:])))
     mark = cause.parameters.get("frequency_hz")
     marks = modes or ((float(mark),) if mark else ())
@@ -336,16 +336,16 @@ def _spectrum(cause: Cause, setting: Setting) -> Picture | None:
     )
 
 
-def _over_other_axis(cause: Cause, setting: Setting) -> Picture | None:
+def _over_other_axis(cause: NamedCause, data: FitData) -> Picture | None:
     if _modes(cause):
-        return _spectrum(cause, setting)
-    if setting.other_um is None:
+        return _spectrum(cause, data)
+    if data.other_um is None:
         return None
-    curves = tuple(Curve(role, *binned(setting.other_um, r)) for role, r in both(cause))
+    curves = tuple(Curve(role, *binned(data.other_um, r)) for role, r in both(cause))
     return Picture("displacement of the other axis / µm", f"mean residual / {unit(cause)[1]}", curves)
 
 
-_PICTURES: dict[str, Callable[[Cause, Setting], Picture | None]] = {
+_PICTURES: dict[str, Callable[[NamedCause, FitData], Picture | None]] = {
     "creep": over_log_time,
     "thermal_drift": slowly,
     "gain_drift": gain_over_time,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim.diagnosis.report.export import Exported
-from sim.diagnosis.report.result import TEST, Cause, Diagnosis
+from sim.diagnosis.export import ExportedStage
+from sim.diagnosis.result import TEST, Diagnosis, NamedCause
 from sim.effects import KINDS
 
 # --- How a diagnosis speaks of numbers.
@@ -57,12 +57,12 @@ class Source:
     nominal: str = "bouc_wen"
 
 
-def picture_name(place: int, cause: Cause) -> str:
+def picture_name(place: int, cause: NamedCause) -> str:
     """File of a cause's own picture."""
     return f"{place + 1}-{cause.name}.png"
 
 
-def page(diagnosis: Diagnosis, exported: Exported, source: Source, *, viewer: bool = True) -> str:
+def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewer: bool = True) -> str:
     """The whole of report.md; ``viewer``: there is a file for the viewer beside it."""
     d = diagnosis
     lines = [f"# {source.data}: what the simulation lacks", "", *_summary(d, source), ""]
@@ -88,7 +88,7 @@ def page(diagnosis: Diagnosis, exported: Exported, source: Source, *, viewer: bo
     return "\n".join(lines)
 
 
-def _file(d: Diagnosis, exported: Exported) -> str:
+def _file(d: Diagnosis, exported: ExportedStage) -> str:
     missing = (
         f"the stage library has no equal of {', '.join(plain(n) for n in exported.left_out)} in the form found here."
     )
@@ -104,7 +104,7 @@ def _file(d: Diagnosis, exported: Exported) -> str:
 
 
 def _summary(d: Diagnosis, source: Source) -> list[str]:
-    setting = d.nominal.model.setting
+    data = d.nominal.model.data
     nominal = _NOMINALS.get(source.nominal, f"the stage of `{source.nominal}`")
     verdict = {
         "adequate": f"{nominal[0].upper()}{nominal[1:]} explains this recording down to its noise.",
@@ -115,8 +115,8 @@ def _summary(d: Diagnosis, source: Source) -> list[str]:
     return [
         f"**{d.verdict}.** {verdict} {_gain(d)}",
         "",
-        f"`{source.data}`{tested}: {setting.n} samples, {setting.duration_s:.3g} s at {1.0 / setting.dt_s:.5g} Hz, "
-        f"{setting.u_low_V:.3g} to {setting.u_high_V:.3g} V, range {length(setting.range_um)}.",
+        f"`{source.data}`{tested}: {data.n} samples, {data.duration_s:.3g} s at {1.0 / data.dt_s:.5g} Hz, "
+        f"{data.u_low_V:.3g} to {data.u_high_V:.3g} V, range {length(data.range_um)}.",
     ]
 
 
@@ -180,7 +180,7 @@ def _causes(d: Diagnosis) -> list[str]:
     return lines
 
 
-def surest(cause: Cause) -> str:
+def surest(cause: NamedCause) -> str:
     """The name of the number that is known best beside its interval: the one to put into a table."""
 
     def sureness(name: str) -> float:
@@ -191,7 +191,7 @@ def surest(cause: Cause) -> str:
     return max(cause.parameters, key=sureness, default="")
 
 
-def _section(place: int, cause: Cause) -> list[str]:
+def _section(place: int, cause: NamedCause) -> list[str]:
     kind = KINDS.get(cause.name)
     lines = [f"## {place + 1}. {plain(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
     numbers = []

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, envelope, picture
 from service.reports.diagnosis_page import length
-from sim.diagnosis.report.result import Cause, Diagnosis
+from sim.diagnosis.result import Diagnosis, NamedCause
 
 BEFORE, AFTER, DRIVE, FLOOR = "#D55E00", "#0072B2", "#666666", "#BBBBBB"
 COLOURS = {MEASURED: "#222222", WITHOUT: BEFORE, WITH: AFTER}
@@ -26,12 +26,12 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, An
 
 def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
     """Voltage, and the residual of the nominal and of the extended model over time; beside them the loops."""
-    setting = diagnosis.nominal.model.setting
+    data = diagnosis.nominal.model.data
     figure, grid = _figure(3, 1, (9.0, 6.4))
     axes = grid[:, 0]
     for axis in axes[1:]:
         axis.sharex(axes[0])
-    axes[0].plot(*envelope(setting.t_s, setting.u_V), color=DRIVE, lw=0.7)
+    axes[0].plot(*envelope(data.t_s, data.u_V), color=DRIVE, lw=0.7)
     axes[0].set_ylabel("voltage / V")
     axes[0].set_title(title)
     pairs = (
@@ -43,7 +43,7 @@ def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
     for axis, (residual, colour, label) in zip(axes[1:], pairs, strict=True):
         band = 2.0 * scale * diagnosis.noise_floor_um
         axis.axhspan(-band, band, color=FLOOR, alpha=0.5, lw=0)
-        axis.plot(*envelope(setting.t_s, scale * residual), color=colour, lw=0.6, label=label)
+        axis.plot(*envelope(data.t_s, scale * residual), color=colour, lw=0.6, label=label)
         # A first moment that nothing knows must not flatten the rest; both on one scale, to be compared.
         axis.set_ylim(-1.3 * scale * max(size, 1e-6), 1.3 * scale * max(size, 1e-6))
         axis.set_ylabel(f"residual / {unit}")
@@ -52,9 +52,9 @@ def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
     figure.savefig(path)
 
 
-def draw_cause(path: Path, cause: Cause, diagnosis: Diagnosis) -> None:
+def draw_cause(path: Path, cause: NamedCause, diagnosis: Diagnosis) -> None:
     """The picture in which this cause shows itself: before (without it) and after (with it)."""
-    shown = picture(cause, diagnosis.extended.model.setting)
+    shown = picture(cause, diagnosis.extended.model.data)
     figure, grid = _figure(1, 1, (8.0, 3.6))
     axis = grid[0, 0]
     said: set[str] = set()

@@ -18,7 +18,7 @@ from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, Curve, Pic
 from service.reports.diagnosis_page import plain
 from service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
 from service.viewer.style import AMBER, FRAME, LABEL, WHITE, Colour
-from sim.diagnosis.report.result import Diagnosis
+from sim.diagnosis.result import Diagnosis
 
 APPLICATION, TIMELINE = "dehyst-diagnosis", "t_s"
 BLUE: Colour = (86, 180, 233)
@@ -42,17 +42,17 @@ class _Trace:
 def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> None:
     """Write ``path``, overwriting it. ``page`` is the report's text. Raises InputError where it cannot be written."""
     d = diagnosis
-    setting = d.nominal.model.setting
+    data = d.nominal.model.data
     scale, unit = (1e3, "nm") if float(np.quantile(np.abs(d.nominal.residual_um), 0.99)) < 1.0 else (1.0, "µm")
     traces = [
-        _Trace("voltage_V", "voltage", WHITE, setting.u_V),
-        _Trace("reading/measured_um", "measured", WHITE, setting.y_um),
-        _Trace("reading/nominal_um", "nominal stage", AMBER, setting.y_um - d.nominal.residual_um),
-        _Trace("reading/extended_um", "extended stage", BLUE, setting.y_um - d.extended.residual_um),
+        _Trace("voltage_V", "voltage", WHITE, data.u_V),
+        _Trace("reading/measured_um", "measured", WHITE, data.y_um),
+        _Trace("reading/nominal_um", "nominal stage", AMBER, data.y_um - d.nominal.residual_um),
+        _Trace("reading/extended_um", "extended stage", BLUE, data.y_um - d.extended.residual_um),
         _Trace("residual/nominal", "nominal stage", AMBER, scale * d.nominal.residual_um),
         _Trace("residual/extended", "extended stage", BLUE, scale * d.extended.residual_um),
     ]
-    pictures = {f"cause/{i + 1}_{c.name}": picture(c, setting) for i, c in enumerate(d.causes)}
+    pictures = {f"cause/{i + 1}_{c.name}": picture(c, data) for i, c in enumerate(d.causes)}
     tabs = [
         _plane_view(f"{i + 1}. {plain(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
     ]
@@ -65,7 +65,7 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
     try:
         stream.send_recording_name(title)
         for trace in traces:
-            t, y = envelope(setting.t_s, trace.values, MOST_POINTS)
+            t, y = envelope(data.t_s, trace.values, MOST_POINTS)
             lines = rr.SeriesLines(names=trace.name, colors=[trace.colour], widths=[1.0])
             stream.log(trace.path, lines, static=True)
             stream.send_columns(trace.path, [rr.TimeColumn(TIMELINE, duration=t)], rr.Scalars.columns(scalars=y))
@@ -82,11 +82,11 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
 
 def _loop(d: Diagnosis) -> Picture:
     """Reading over voltage: measured, and as both stages have it; the largest excursion's stretch of the record."""
-    setting = d.nominal.model.setting
-    middle = int(np.argmax(np.abs(setting.y_um - setting.middle_um)))
-    start = int(np.clip(middle - LOOP_POINTS // 2, 0, max(0, setting.n - LOOP_POINTS)))
+    data = d.nominal.model.data
+    middle = int(np.argmax(np.abs(data.y_um - data.middle_um)))
+    start = int(np.clip(middle - LOOP_POINTS // 2, 0, max(0, data.n - LOOP_POINTS)))
     part = slice(start, start + LOOP_POINTS)
-    u, y = setting.u_V[part], setting.y_um[part]
+    u, y = data.u_V[part], data.y_um[part]
     return Picture(
         "voltage / V",
         "reading / µm",

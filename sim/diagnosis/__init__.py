@@ -1,1 +1,33 @@
-"""What a recording holds that the simulation lacks: calibrate, detect, name, extend, measure the gain."""
+"""Diagnosis of a recording: which effects a real stage has that its simulation lacks.
+
+`prepare` checks a recording; `diagnose_prepared` calibrates a nominal stage, searches for causes and returns a
+`Diagnosis`; `export_stage` turns it into a stage file.
+
+    from sim.diagnosis import diagnose_prepared, export_stage, prepare
+    from sim.recordings import read
+
+    diagnosis = diagnose_prepared(prepare(read(path)))
+    print(diagnosis.verdict, [cause.name for cause in diagnosis.causes])
+    stage = export_stage(diagnosis).config
+"""
+
+from sim.diagnosis.diagnose import Options, diagnose, diagnose_prepared
+from sim.diagnosis.export import ExportedStage, export_stage
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.prepare import Prepared, prepare
+from sim.diagnosis.result import Diagnosis, NamedCause
+from sim.diagnosis.search.search import Thresholds
+
+__all__ = [
+    "Diagnosis",
+    "ExportedStage",
+    "FitData",
+    "NamedCause",
+    "Options",
+    "Prepared",
+    "Thresholds",
+    "diagnose",
+    "diagnose_prepared",
+    "export_stage",
+    "prepare",
+]

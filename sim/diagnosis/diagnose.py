@@ -8,19 +8,30 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
-from sim.diagnosis.experiments import Rival, next_experiment
-from sim.diagnosis.model.converter import converter_causes, grid_of, repeats
-from sim.diagnosis.model.fit import Fit, calibrate, refreshed
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.model.nominal_fit import begins_at_rest, calibrated, nominal_setting, with_other_axis
+from sim.diagnosis.causes.catalogue import NAMES
+from sim.diagnosis.model.calibration import (
+    ModelFit,
+    begins_at_rest,
+    calibrate,
+    calibrate_nominal,
+    with_new_columns,
+    with_nominal_kind,
+    with_other_axis,
+)
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.model.readings import (
+    ConverterGrid,
+    NoiseFloor,
+    RepeatedReadings,
+    converter_grid,
+    noise_floor,
+    repeated_readings,
+)
+from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.prepare import Prepared
-from sim.diagnosis.report.naming import named, not_excited, verdict_of
-from sim.diagnosis.report.result import FOLDS, TEST, Diagnosis
-from sim.diagnosis.search.evidence import split
-from sim.diagnosis.search.noise_floor import Floor, noise_floor
-from sim.diagnosis.search.search import Progress, Search, review
-from sim.diagnosis.search.second_recording import second_error
-from sim.diagnosis.search.thresholds import Rules
+from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
+from sim.diagnosis.search.held_out import HeldOut, error_on_other_recording, split
+from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
 from sim.stage.config import StageConfig
 
 
@@ -34,44 +45,44 @@ class Options:
 
     nominal: str | StageConfig = "bouc_wen"
     seed: int = 0
-    rules: Rules = field(default_factory=Rules)
+    thresholds: Thresholds = field(default_factory=Thresholds)
 
 
-def usable(setting: Setting, mask: BoolArray, nominal: str | StageConfig = "bouc_wen") -> BoolArray:
+def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_wen") -> BoolArray:
     """The mask less the first moments, in which only the unknown past of the stage shows."""
     out = mask.copy()
-    if not begins_at_rest(setting) and nominal == "bouc_wen":
+    if not begins_at_rest(data) and nominal == "bouc_wen":
         out[:1] = False  # its start is fitted, and tells the lags
         return out
-    out[: max(4, min(round(0.02 / setting.dt_s), setting.n // 20))] = False
+    out[: max(4, min(round(0.02 / data.dt_s), data.n // 20))] = False
     if int(out.sum()) < 200:
         raise InputError(f"recording: got {int(out.sum())} usable samples, expected at least 200; record longer")
     return out
 
 
-def settled(mask: BoolArray, fit: Fit, setting: Setting) -> BoolArray:
+def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
     """The mask of a recording of ``setting`` less the time in which a linear stage's mode rings down to a thousandth,
     at most a twentieth of it: what the stage did before is not known, where the recording does not begin at rest."""
-    if fit.model.nominal.name != "linear" or begins_at_rest(setting):
+    if fit.model.nominal.name != "linear" or begins_at_rest(data):
         return mask
     slowest = min(
         (2.0 * np.pi * f * (z if z < 1.0 else 0.5 / z) for f, z in fit.model.dynamics(fit.p).modes_hz), default=np.inf
     )
     out = mask.copy()
-    out[: min(int(np.log(1e3) / slowest / setting.dt_s), setting.n // 20)] = False
+    out[: min(int(np.log(1e3) / slowest / data.dt_s), data.n // 20)] = False
     return out
 
 
 def diagnose_prepared(
-    prepared: Prepared, *, seed: int = 0, rules: Rules | None = None, progress: Progress = _silent
+    prepared: Prepared, *, seed: int = 0, thresholds: Thresholds | None = None, progress: Progress = _silent
 ) -> Diagnosis:
     """The whole diagnosis of what `prepare` gave, with its nominal stage and its test recording."""
-    options = Options(prepared.nominal, seed, rules or Rules())
-    return diagnose(prepared.setting, prepared.mask, options, progress, prepared.notes, prepared.dropped, prepared.test)
+    options = Options(prepared.nominal, seed, thresholds or Thresholds())
+    return diagnose(prepared.data, prepared.mask, options, progress, prepared.notes, prepared.dropped, prepared.test)
 
 
 def diagnose(
-    setting: Setting,
+    data: FitData,
     mask: BoolArray | None = None,
     options: Options | None = None,
     progress: Progress = _silent,
@@ -87,33 +98,33 @@ def diagnose(
     be diagnosed at all.
     """
     options = options or Options()
-    mask = usable(setting, np.ones(setting.n, dtype=np.bool_) if mask is None else mask, options.nominal)
-    setting = nominal_setting(options.nominal, setting)
-    grid = grid_of(setting.y_um[mask])
-    floor = noise_floor(setting)
+    mask = usable(data, np.ones(data.n, dtype=np.bool_) if mask is None else mask, options.nominal)
+    data = with_nominal_kind(options.nominal, data)
+    grid = converter_grid(data.y_um[mask])
+    floor = noise_floor(data)
     coarse = grid.step_um > 2.0 * floor.sigma_um
-    floor = Floor(max(floor.sigma_um, grid.step_um / np.sqrt(12.0)), floor.source)
+    floor = NoiseFloor(max(floor.sigma_um, grid.step_um / np.sqrt(12.0)), floor.source)
     progress("calibrating the nominal stage", 0.02)
-    nominal = calibrated(options.nominal, setting, mask)
-    mask = settled(mask, nominal, setting)
+    nominal = calibrate_nominal(options.nominal, data, mask)
+    mask = settled(mask, nominal, data)
     nominal = with_other_axis(nominal, mask)
-    setting = nominal.model.setting
-    doubles = repeats(setting.y_um, floor.sigma_um, grid.step_um)
+    data = nominal.model.data
+    doubles = repeated_readings(data.y_um, floor.sigma_um, grid.step_um)
     doubled = doubles.count >= 5 and doubles.probability > 2e-4
     if doubled:
         mask = mask.copy()
         mask[doubles.where.astype(np.int64)] = False
         nominal = calibrate(nominal.model, nominal.p, mask, 4, 1e-4)
-    nominal = refreshed(nominal, mask)
-    search = Search(mask, split(setting), floor.sigma_um, options.rules, options.seed, progress, coarse)
+    nominal = with_new_columns(nominal, mask)
+    search = Search(mask, split(data), floor.sigma_um, options.thresholds, options.seed, progress, coarse)
     held_nominal = search.held(nominal)
     extended, held, steps = search.run(nominal)
     progress("removing each cause once more", 0.85)
-    extended, held, found = review(search, *search.redated(extended, held), {s.name: s for s in steps})
-    extended, held = search.redated(extended, held)
+    extended, held, found = review(search, *search.with_refitted_slips(extended, held), {s.name: s for s in steps})
+    extended, held = search.with_refitted_slips(extended, held)
     n = int(mask.sum())
     causes = named(search, nominal, extended, held, found)
-    causes += converter_causes(setting, grid, doubles if doubled else None, floor, extended, n, dropped)
+    causes += converter_causes(data, grid, doubles if doubled else None, floor, extended, n, dropped)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     verdict = verdict_of(causes, held_nominal, held, floor, n)
     partial: tuple[str, ...] = ()
@@ -121,7 +132,7 @@ def diagnose(
         partial, causes = tuple(c.name for c in causes), ()
     missing = not_excited(search, nominal, extended, floor)
     progress("simulating the next experiment", 0.95)
-    open_ = [Rival(f.name, r.form.name, extended, r.fit) for f in found for r in f.rivals if verdict == "effects"]
+    open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if verdict == "effects"]
     held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
     if test is not None:
         held_um = _on_test(test, options, (nominal, extended))
@@ -144,9 +155,140 @@ def diagnose(
     )
 
 
-def _on_test(test: Prepared, options: Options, fits: tuple[Fit, Fit]) -> tuple[float, float]:
+def _on_test(test: Prepared, options: Options, fits: tuple[ModelFit, ModelFit]) -> tuple[float, float]:
     """Free-run errors (rms, µm) of the nominal and of the extended stage on the test recording."""
-    mask = settled(usable(test.setting, test.mask, options.nominal), fits[0], test.setting)
-    parts = split(test.setting)
-    one, two = (second_error(fit, test.setting, mask, parts).sse_um2 / int(mask.sum()) for fit in fits)
+    mask = settled(usable(test.data, test.mask, options.nominal), fits[0], test.data)
+    parts = split(test.data)
+    one, two = (error_on_other_recording(fit, test.data, mask, parts).sse_um2 / int(mask.sum()) for fit in fits)
     return float(np.sqrt(one)), float(np.sqrt(two))
+
+
+def named(
+    search: Search, nominal: ModelFit, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]
+) -> tuple[NamedCause, ...]:
+    """The accepted causes with their numbers, and the share that each removed on top of those before it."""
+    causes = []
+    for i, one in enumerate(found):
+        values, spans = numbers(extended, i, search)
+        also = one.alternatives
+        if one.name == "resonance" and nominal.model.nominal.name != "linear":
+            # A mode that the nominal stage does not know may always have been there, or a payload moved it here.
+            also = (*also, "payload_change")
+        own = 1.0 - held.sse_um2 / one.held_without.sse_um2
+        # The last one's share is known best from removing it once more.
+        share = own if len(found) == 1 else one.step.gain
+        p = one.step.p_value
+        causes.append(
+            NamedCause(one.name, also, values, spans, float(share), p, one.without.residual_um, extended.residual_um, i)
+        )
+    return tuple(causes)
+
+
+def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Reported numbers of one cause with 95 % intervals that allow for correlated errors (sums over blocks)."""
+    parameters = fit.model.parameters
+    free = [i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high]
+    scale = np.array([parameters[i].step for i in free])
+    rows = fit.model.jacobian(fit.p, fit.signals, free) * scale[:, None] * search.mask
+    bread = np.linalg.pinv(rows @ rows.T, rcond=1e-12)
+    scores = search.parts.blocks(rows * fit.residual_um)
+    cover = bread @ (scores @ scores.T) @ bread * scale[:, None] * scale[None, :]
+    where = fit.model.where(index)
+    at = {j: row for row, j in enumerate(free)}
+    values: dict[str, float] = {}
+    spans: dict[str, tuple[float, float]] = {}
+    for name, (value, gradient) in (
+        fit.model.causes[index].physical(fit.model.part(fit.p, index), fit.model.data).items()
+    ):
+        g = np.zeros(len(free))
+        for k, slope in enumerate(gradient):
+            if where.start + k in at:
+                g[at[where.start + k]] = slope
+        half = 1.96 * float(np.sqrt(max(float(g @ cover @ g), 0.0)))
+        values[name] = value
+        spans[name] = (value - half, value + half)
+    return values, spans
+
+
+def verdict_of(causes: tuple[NamedCause, ...], nominal: HeldOut, extended: HeldOut, floor: NoiseFloor, n: int) -> str:
+    """adequate, effects or unexplained."""
+    base = n * floor.sigma_um**2
+    left, first = extended.sse_um2 - base, nominal.sse_um2 - base
+    structured = left > 0.5 * base
+    if causes and (not structured or left < 0.6 * first or any(c.index < 0 for c in causes)):
+        return "effects"
+    return "unexplained" if structured else "adequate"
+
+
+def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: NoiseFloor) -> tuple[str, ...]:
+    """Causes whose usual size would leave less than five standard errors in this record."""
+    seen = {
+        search.causes[look.index].name: True
+        for look in search.first_looks
+        if look.size_um2 > (5.0 * floor.sigma_um) ** 2
+    }
+    seen.setdefault("quantisation", True)
+    return tuple(name for name in NAMES if not seen.get(name, False))
+
+
+def converter_causes(
+    data: FitData,
+    grid: ConverterGrid,
+    doubles: RepeatedReadings | None,
+    floor: NoiseFloor,
+    extended: ModelFit,
+    n: int,
+    dropped: int,
+) -> tuple[NamedCause, ...]:
+    """Quantisation and timing, which are seen in the readings themselves rather than fitted."""
+    out: list[NamedCause] = []
+    flat = extended.residual_um
+    if grid.step_um > 0.0:
+        own = grid.step_um**2 / 12.0
+        share = own / max(extended.sse_um2 / n, own)
+        if grid.step_um > 1.2 * floor.sigma_um and share > 0.2:
+            step = grid.step_um
+            rounding = 1e-3 * step
+            out.append(
+                NamedCause(
+                    "quantisation",
+                    (),
+                    {"step_um": step},
+                    {"step_um": (step - rounding, step + rounding)},
+                    share,
+                    0.001,
+                    flat,
+                    flat,
+                )
+            )
+    if doubles is not None:
+        p = doubles.probability
+        half = 1.96 * float(np.sqrt(p * (1.0 - p) / max(1, doubles.of)))
+        out.append(
+            NamedCause(
+                "timing",
+                (),
+                {"repeat_probability": p},
+                {"repeat_probability": (max(0.0, p - half), p + half)},
+                0.0,
+                0.001,
+                flat,
+                flat,
+            )
+        )
+    elif dropped > 0:
+        share = dropped / data.n
+        out.append(
+            NamedCause(
+                "timing",
+                (),
+                {"lost_samples": float(dropped)},
+                {"lost_samples": (float(dropped), float(dropped))},
+                share,
+                0.001,
+                flat,
+                flat,
+            )
+        )
+    names = {f.name for f in extended.model.causes}
+    return tuple(c for c in out if c.name not in names)

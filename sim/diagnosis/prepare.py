@@ -8,8 +8,8 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.model.nominal_fit import NAMED
+from sim.diagnosis.model.calibration import NAMED
+from sim.diagnosis.model.fit_data import FitData
 from sim.recordings import Finding, Recording, check, repaired, require_usable
 from sim.stage.config import StageConfig
 
@@ -21,7 +21,7 @@ MOST_SAMPLES = 200_000
 class Prepared:
     """A recording ready for a diagnosis. ``mask`` is False where a sample was filled in."""
 
-    setting: Setting
+    data: FitData
     mask: BoolArray
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -82,7 +82,7 @@ def _prepared(recording: Recording, nominal: str | StageConfig) -> Prepared:
         notes.append(f"the first {MOST_SAMPLES} of {len(whole)} samples were used (--range chooses others)")
         whole = whole.part(0, MOST_SAMPLES)
     lost = sum(f.count for f in findings if f.kind in ("gap", "doubled"))
-    setting = Setting(
+    data = FitData(
         dt_s=recording.dt_s,
         u_V=np.ascontiguousarray(whole.u_V),
         y_um=np.ascontiguousarray(whole.y_um),
@@ -92,7 +92,7 @@ def _prepared(recording: Recording, nominal: str | StageConfig) -> Prepared:
         temperature_C=whole.temperature_C,
         monitor_V=_moving(whole.monitor_V),
     )
-    return Prepared(setting, fixed.valid[: len(whole)], tuple(findings), tuple(notes), lost, nominal)
+    return Prepared(data, fixed.valid[: len(whole)], tuple(findings), tuple(notes), lost, nominal)
 
 
 def _moving(values: FloatArray | None) -> FloatArray | None:

@@ -1,23 +1,20 @@
-"""The causes that a diagnosis may name, in the forms in which they are fitted."""
+"""The causes that a diagnosis may name, and the models that are fitted for them."""
 
 from __future__ import annotations
 
 from sim.diagnosis.causes.drive import AmplifierLag, Saturation, SlewLimit
-from sim.diagnosis.causes.linear import Delay, Resonance, SensorLag
-from sim.diagnosis.causes.modal import CrossModes, StructureModes
+from sim.diagnosis.causes.hysteresis import Asymmetry, HysteresisShape, RateDependence, RestoringForceLoop
+from sim.diagnosis.causes.mechanics import CrossModes, Delay, PayloadChange, Resonance, SensorLag, StructureModes
 from sim.diagnosis.causes.motion import Creep, CrossTalk, GainDrift, StickSlip, ThermalDrift
-from sim.diagnosis.causes.payload import PayloadChange
 from sim.diagnosis.causes.reading import MainsHum, SensorNonlinearity, Timing
-from sim.diagnosis.causes.restoring_force import RestoringLoop
 from sim.diagnosis.causes.slips import Slips
-from sim.diagnosis.causes.static import Asymmetry, HysteresisShape, RateDependence
-from sim.diagnosis.model.forms import Form
+from sim.diagnosis.model.stage_model import CauseModel
 
 #: Every form that is tried; forms of one name are variants of one cause.
-FORMS: tuple[Form, ...] = (
+CAUSE_MODELS: tuple[CauseModel, ...] = (
     HysteresisShape(),
     HysteresisShape(variant="restoring"),
-    RestoringLoop(),
+    RestoringForceLoop(),
     Asymmetry(),
     RateDependence(),
     RateDependence(felt_s=0.04),
@@ -47,6 +44,7 @@ FORMS: tuple[Form, ...] = (
     Timing(),
     Slips(),
 )
+
 
 #: Causes that are one set for a voltage and a sensor: beside one of them another is its form's remainder, not news.
 SETS: tuple[frozenset[str], ...] = (

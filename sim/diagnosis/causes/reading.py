@@ -1,38 +1,63 @@
-"""Causes in the reading: sensor_nonlinearity, mains_hum, timing."""
+"""Causes in the reading: sensor_nonlinearity, mains_hum, and a clock error as timing."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from sim.diagnosis.model.forms import Form, Trial, single
-from sim.diagnosis.model.loops_linear import resample
-from sim.diagnosis.model.measured import At, Setting, Slot
+from sim.diagnosis.model.fit_data import ActsOn, FitData, ModelParameter
+from sim.diagnosis.model.stage_model import CauseModel, Guess, single_guesses
+
+
+@compiled
+def resample_by(x: FloatArray, shifts: FloatArray) -> FloatArray:
+    """x at instants k + shifts[k] by cubic (Catmull-Rom) interpolation, held at the ends."""
+    n = x.shape[0]
+    out = np.empty(n)
+    for k in range(n):
+        whole = math.floor(shifts[k])
+        f = shifts[k] - whole
+        i = k + int(whole)
+        a = x[min(max(i - 1, 0), n - 1)]
+        b = x[min(max(i, 0), n - 1)]
+        c = x[min(max(i + 1, 0), n - 1)]
+        d = x[min(max(i + 2, 0), n - 1)]
+        out[k] = b + 0.5 * f * (c - a + f * (2.0 * a - 5.0 * b + 4.0 * c - d + f * (3.0 * (b - c) + d - a)))
+    return out
+
+
+@compiled
+def resample(x: FloatArray, stretch: float, shift: float) -> FloatArray:
+    """x at instants k (1 + stretch) + shift; see `resample_by`. The sum keeps the fraction's digits at large k."""
+    shifts = stretch * np.arange(x.shape[0], dtype=np.float64) + shift
+    return resample_by(x, shifts.astype(np.float64))
 
 
 @dataclass(frozen=True)
-class SensorNonlinearity(Form):
+class SensorNonlinearity(CauseModel):
     """A single-valued bend of the reading, second to fourth order, at most 0.4 % of the range."""
 
     name: str = "sensor_nonlinearity"
 
-    def plausible(self, p: FloatArray, setting: Setting) -> bool:
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
         return bool(np.max(np.abs(p)) < 0.99 * 0.008)
 
-    def slots(self, setting: Setting) -> tuple[Slot, ...]:
-        return tuple(Slot(f"order{j}", "1", 0.0, -0.008, 0.008, 5e-4, At.READING) for j in (2, 3, 4))
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return tuple(ModelParameter(f"order{j}", "1", 0.0, -0.008, 0.008, 5e-4, ActsOn.READING) for j in (2, 3, 4))
 
-    def reading(self, y_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
-        half = 0.5 * setting.range_um
-        x = (y_um - setting.centre_um) / half
+    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        half = 0.5 * data.range_um
+        x = (y_um - data.centre_um) / half
         # Orthogonal polynomials: their shares of the bend can be read one by one.
         x2 = x * x
         bend = p[0] * (x2 - 1.0) + x * (p[1] * (x2 - 1.0)) + p[2] * (x2 * x2 - x2)
         return np.asarray(y_um + half * bend)
 
-    def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
+    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         out = {}
         for i, name in enumerate(("quadratic", "cubic", "quartic")):
             row = np.zeros(p.size)
@@ -42,59 +67,61 @@ class SensorNonlinearity(Form):
 
 
 @dataclass(frozen=True)
-class MainsHum(Form):
+class MainsHum(CauseModel):
     """Lines at 50 or 60 Hz and their first harmonics, phases free. ``variant`` is the frequency."""
 
     name: str = "mains_hum"
     of_one_recording: bool = True
     variant: str = "50"
 
-    def applies(self, setting: Setting) -> str:
-        return "" if float(self.variant) < 0.48 / setting.dt_s else "a sample rate above twice the mains frequency"
+    def applies(self, data: FitData) -> str:
+        return "" if float(self.variant) < 0.48 / data.dt_s else "a sample rate above twice the mains frequency"
 
-    def orders(self, setting: Setting) -> list[int]:
-        return [k for k in (1, 2, 3) if k * float(self.variant) < 0.48 / setting.dt_s]
+    def orders(self, data: FitData) -> list[int]:
+        return [k for k in (1, 2, 3) if k * float(self.variant) < 0.48 / data.dt_s]
 
-    def slots(self, setting: Setting) -> tuple[Slot, ...]:
-        f, top = float(self.variant), 0.005 * setting.range_um
-        own: list[Slot] = [Slot("frequency_hz", "Hz", f, f - 0.6, f + 0.6, 0.05 / setting.duration_s, At.READING)]
-        for k in self.orders(setting):
-            own += [Slot(f"{w}{k}_um", "µm", 0.0, -top, top, 1e-3 * top, At.READING) for w in ("sin", "cos")]
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        f, top = float(self.variant), 0.005 * data.range_um
+        own: list[ModelParameter] = [
+            ModelParameter("frequency_hz", "Hz", f, f - 0.6, f + 0.6, 0.05 / data.duration_s, ActsOn.READING)
+        ]
+        for k in self.orders(data):
+            own += [
+                ModelParameter(f"{w}{k}_um", "µm", 0.0, -top, top, 1e-3 * top, ActsOn.READING) for w in ("sin", "cos")
+            ]
         return tuple(own)
 
-    def trials(self, setting: Setting, residual_um: FloatArray) -> list[Trial]:
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         # The line's own frequency to a small part of a bin, from the residual's spectrum beside the nominal one.
         f0 = float(self.variant)
-        grid = f0 + np.arange(-0.6, 0.6001, 0.25 / setting.duration_s)
+        grid = f0 + np.arange(-0.6, 0.6001, 0.25 / data.duration_s)
         fast = (
-            residual_um - np.convolve(residual_um, np.ones(9) / 9.0, "same")
-            if f0 * setting.dt_s > 0.02
-            else residual_um
+            residual_um - np.convolve(residual_um, np.ones(9) / 9.0, "same") if f0 * data.dt_s > 0.02 else residual_um
         )
         # Windowed, because steps and ringing leak: a line is what stays sharp.
-        fast = fast * np.hanning(setting.n)
-        start = np.exp(-2j * np.pi * grid[0] * setting.t_s)
-        turn = np.exp(-2j * np.pi * (grid[1] - grid[0]) * setting.t_s)
+        fast = fast * np.hanning(data.n)
+        start = np.exp(-2j * np.pi * grid[0] * data.t_s)
+        turn = np.exp(-2j * np.pi * (grid[1] - grid[0]) * data.t_s)
         power = np.empty(grid.size)
         carrier = fast * start
         for i in range(grid.size):
             power[i] = abs(carrier.sum())
             carrier *= turn
         f = float(grid[int(np.argmax(power))])
-        slots = self.slots(setting)
+        parameters = self.parameters(data)
         rows = []
-        for i in range(1, len(slots)):
-            row = np.array([f, *[0.0] * (len(slots) - 1)])
-            row[i] = slots[i].step
+        for i in range(1, len(parameters)):
+            row = np.array([f, *[0.0] * (len(parameters) - 1)])
+            row[i] = parameters[i].step
             rows.append(row)
         return [rows]
 
-    def reading(self, y_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
+    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if not np.any(p[1:]):
             return y_um
         out = y_um.copy()
-        phase = 2.0 * np.pi * p[0] * setting.t_s
-        for i, k in enumerate(self.orders(setting)):
+        phase = 2.0 * np.pi * p[0] * data.t_s
+        for i, k in enumerate(self.orders(data)):
             a, b = p[1 + 2 * i], p[2 + 2 * i]
             if a != 0.0:
                 out += a * np.sin(k * phase)
@@ -102,7 +129,7 @@ class MainsHum(Form):
                 out += b * np.cos(k * phase)
         return out
 
-    def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
+    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         one = np.zeros(p.size)
         one[0] = 1.0
         size = float(np.hypot(p[1], p[2]))
@@ -112,20 +139,20 @@ class MainsHum(Form):
 
 
 @dataclass(frozen=True)
-class Timing(Form):
+class Timing(CauseModel):
     """A recorder's clock that runs fast or slow against the stage's: t' = (1 + e) t."""
 
     name: str = "timing"
     of_one_recording: bool = True
 
-    def plausible(self, p: FloatArray, setting: Setting) -> bool:
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
         return 3.0 <= abs(float(p[0])) <= 1500.0
 
-    def slots(self, setting: Setting) -> tuple[Slot, ...]:
-        return (Slot("clock_ppm", "ppm", 0.0, -2000.0, 2000.0, 5.0, At.READING),)
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return (ModelParameter("clock_ppm", "ppm", 0.0, -2000.0, 2000.0, 5.0, ActsOn.READING),)
 
-    def trials(self, setting: Setting, residual_um: FloatArray) -> list[Trial]:
-        return single([-200.0, -60.0, -15.0, 15.0, 60.0, 200.0])
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        return single_guesses([-200.0, -60.0, -15.0, 15.0, 60.0, 200.0])
 
-    def reading(self, y_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
+    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         return y_um if p[0] == 0.0 else np.asarray(resample(y_um, 1e-6 * float(p[0]), 0.0))

@@ -1,127 +1,327 @@
-"""Slips: samples that one column lost or gained while the time went on, so that it runs ahead or late from there on."""
+"""Lost samples as a cause of timing: from some sample on the readings are late or early by whole samples.
+
+Functions that find and date the slips compare readings with a model's readings and need no stage model. `fit_slips`
+and `refit_slips` alternate them with calibrations.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from adaptive.compiled import compiled
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.causes.reading import Timing
-from sim.diagnosis.causes.slip_dates import MOST, MOST_SLIPS, Found, dated, moved, pruned, slips_of
-from sim.diagnosis.model.chain import Model
-from sim.diagnosis.model.fit import Fit, calibrate, evaluate
-from sim.diagnosis.model.forms import Form, Trial
-from sim.diagnosis.model.loops_linear import resample_by
-from sim.diagnosis.model.measured import At, Setting, Slot
+from sim.diagnosis.causes.reading import Timing, resample_by
+from sim.diagnosis.model.calibration import ModelFit, calibrate, evaluate
+from sim.diagnosis.model.fit_data import ActsOn, FitData, ModelParameter
+from sim.diagnosis.model.stage_model import CauseModel, Guess, StageModel
+
+#: Samples by which a column may come to run ahead or late.
+MOST = 12
+
+
+#: Slips beyond this number are no slips but another cause that looks like them.
+MOST_SLIPS = 16
+
+
+_BLOCK = 8
+
+
+#: Before this sample a slip would be the recorder's latch.
+_FIRST = 100
+
+
+#: Between two slips there are more samples than this: lost and gained at once is no slip but a model's error.
+_SHORTEST = 64
+
+
+#: First sample and number of samples lost (gained where negative), in order.
+SlipList = tuple[tuple[int, int], ...]
+
+
+IntArray = NDArray[np.int64]
+
+
+@compiled
+def _path(cost: FloatArray, price: float) -> FloatArray:
+    """The cheapest way through ``cost`` (blocks, shifts) where each step of one shift costs ``price`` (Viterbi)."""
+    n, m = cost.shape
+    back = np.zeros((n, m), dtype=np.int8)
+    total = cost[0].copy()
+    for b in range(1, n):
+        for j in range(1, m):  # a change by more steps pays for each
+            if total[j - 1] + price < total[j]:
+                total[j] = total[j - 1] + price
+                back[b, j] = back[b, j - 1] - 1
+        for j in range(m - 2, -1, -1):
+            if total[j + 1] + price < total[j]:
+                total[j] = total[j + 1] + price
+                back[b, j] = back[b, j + 1] + 1
+        for j in range(m):
+            total[j] += cost[b, j]
+    out = np.empty(n)
+    j = int(np.argmin(total))
+    for b in range(n - 1, -1, -1):
+        out[b] = j
+        j += int(back[b, j])
+    return out
+
+
+def find_slips(y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipList:
+    """Where the readings slip against the model, and by how many samples: ``((index, size), ...)``; positive is lost.
+
+    Asked of first differences, so that slow errors of the model do not matter, in blocks of eight samples. A slip has
+    to save far more than the typical error of a block.
+    """
+    n = y_um.size // _BLOCK * _BLOCK
+    best_slip_move = np.diff(y_um, prepend=y_um[:1])
+    there = np.diff(model_um, prepend=model_um[:1])
+    inside = mask & np.append(mask[:1], mask[:-1])
+    cost = np.empty((n // _BLOCK, 2 * MOST + 1))
+    for j in range(2 * MOST + 1):
+        shift = j - MOST
+        ahead = np.roll(there, -shift)
+        error = np.square(np.where(inside, best_slip_move - ahead, 0.0))
+        cost[:, j] = np.add.reduceat(error[:n], np.arange(0, n, _BLOCK))
+    least = cost.min(axis=1)
+    if not np.all(np.isfinite(least)):
+        return ()
+    cost -= least[:, None]
+    # A model that is still wrong pays for that in many blocks: the price rises until few slips are left.
+    price = 12.0 * max(float(np.quantile(least, 0.9)), 1e-18)
+    for _ in range(12):
+        path = _path(np.ascontiguousarray(cost), price)
+        at = np.flatnonzero(np.diff(path)) + 1
+        if at.size <= MOST_SLIPS:
+            return tuple((int(b * _BLOCK), int(path[b] - path[b - 1])) for b in at)
+        price *= 3.0
+    return ()
+
+
+@compiled
+def _best_cut(before_um: FloatArray, after_um: FloatArray, first: int) -> int:
+    """Sample at which the squared error of the one before it and of the other from it on is least."""
+    total, least, at = 0.0, 0.0, first
+    for k in range(before_um.shape[0]):
+        total += before_um[k] * before_um[k] - after_um[k] * after_um[k]
+        if total < least:
+            least, at = total, first + k + 1
+    return at
+
+
+def date_slips(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipList:
+    """The slips, each at the sample from which the readings agree best with the model shifted by it.
+
+    The most probable moment under white noise, given the other slips; each is looked for between its neighbours.
+    ``model_um`` (n,) is the reading without any slip. In a rest every sample is as good as another.
+    """
+    out = list(found)
+    n = y_um.size
+    index = np.arange(n)
+    for _ in range(3):
+        before = list(out)
+        shift = 0
+        for i, (_, size) in enumerate(out):
+            first = out[i - 1][0] if i > 0 else 0
+            last = out[i + 1][0] if i + 1 < len(out) else n
+            k = index[first:last]
+            error = [
+                np.where(mask[first:last], y_um[first:last] - model_um[np.clip(k + s, 0, n - 1)], 0.0)
+                for s in (shift, shift + size)
+            ]
+            out[i] = (max(int(_best_cut(error[0], error[1], first)), 1), size)
+            shift += size
+        if out == before:
+            break
+    sizes: dict[int, int] = {}
+    for at, size in out:
+        sizes[at] = sizes.get(at, 0) + size
+    return tuple((at, size) for at, size in sizes.items() if size)
+
+
+@compiled
+def _best_stretch(before_um: FloatArray, after_um: FloatArray, ends: IntArray, first: int) -> tuple[float, int, int]:
+    """(gain, begin, end): from which sample on, up to which of ``ends``, the other error is less by most (µm²)."""
+    best, begin, end = 0.0, 0, 0
+    least, at, late, total, e = 0.0, first, 0.0, 0.0, 0
+    for k in range(first, before_um.shape[0]):
+        j = k - _SHORTEST
+        if j >= first:
+            late += before_um[j] * before_um[j] - after_um[j] * after_um[j]
+            if late < least:
+                least, at = late, j + 1
+        total += before_um[k] * before_um[k] - after_um[k] * after_um[k]
+        while e < ends.shape[0] and ends[e] <= k + 1:
+            if ends[e] == k + 1 and total - least > best:
+                best, begin, end = total - least, at, k + 1
+            e += 1
+    return best, begin, end
+
+
+def best_slip_move(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> tuple[SlipList, float]:
+    """The slips with one more, or one taken in two, and what that takes off the squared error, µm².
+
+    A stretch from some sample on, up to a later slip or to the end, or from a slip on up to some sample, is shifted by
+    another few samples. Asked of the readings themselves: a slip shifts all that follows, a model's error does not.
+    """
+    n = y_um.size
+    index = np.arange(n)
+    shifts = np.zeros(n, dtype=np.int64)
+    for at, size in found:
+        shifts[at:] += size
+    ends = np.array([*(at for at, _ in found), n], dtype=np.int64)
+    # Seen from the end, where a stretch begins is where it ends.
+    begins = np.array([n - at for at, _ in reversed(found)], dtype=np.int64)
+
+    def error(extra: int) -> FloatArray:
+        return np.where(mask, y_um - model_um[np.clip(index + shifts + extra, 0, n - 1)], 0.0)
+
+    now = error(0)
+    back = np.ascontiguousarray(now[::-1])
+    best = (0.0, 0, n, 0)
+    for extra in (d for d in range(-MOST, MOST + 1) if d):
+        other = error(extra)
+        gain, begin, end = _best_stretch(now, other, ends, _FIRST)
+        best = max(best, (gain, begin, end, extra))
+        if begins.size:
+            gain, late, early = _best_stretch(back, np.ascontiguousarray(other[::-1]), begins, 0)
+            best = max(best, (gain, n - early, n - late, extra))
+    gain, begin, end, extra = best
+    sizes = dict(found)
+    for at, by in ((begin, extra), (end, -extra)):
+        if at < n:
+            sizes[at] = sizes.get(at, 0) + by
+    return tuple((at, size) for at, size in sorted(sizes.items()) if size), gain
+
+
+def merge_close_slips(found: SlipList) -> SlipList:
+    """The slips without those that a later one soon takes back (stretches too short are given to their neighbours),
+    and without one at the beginning, which is a latch."""
+    out: list[tuple[int, int]] = []
+    for at, size in found:
+        if at < _FIRST:
+            continue
+        if out and at - out[-1][0] <= _SHORTEST:
+            before, its = out.pop()
+            at, size = before, its + size
+        if size:
+            out.append((at, size))
+    return tuple(out)
+
 
 #: Least share of the squared error that a slip must take off.
 _LEAST_GAIN = 0.002
+
+
 #: Share of the squared error that the first guess may leave: more, and something else is the cause.
 _PROMISING = 0.6
 
 
 @dataclass(frozen=True)
-class Slips(Form):
+class Slips(CauseModel):
     """Samples lost (or doubled) in one column while the time went on as if nothing had happened."""
 
     name: str = "timing"
     variant: str = "slips"
     of_one_recording: bool = True
     #: Where, as first samples, and by how many samples; found anew in every residual.
-    found: Found = ()
+    found: SlipList = ()
 
-    def applies(self, setting: Setting) -> str:
+    def applies(self, data: FitData) -> str:
         return "" if self.found else "a lasting jump of the timing"
 
-    def plausible(self, p: FloatArray, setting: Setting) -> bool:
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
         """Whole samples, as a converter counts them."""
         return bool(np.all(np.abs(p - np.rint(p)) < 0.4) and np.all(np.abs(p) > 0.5))
 
-    def slots(self, setting: Setting) -> tuple[Slot, ...]:
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         return tuple(
-            Slot(f"slip{i + 1}_samples", "1", 0.0, -MOST - 1.0, MOST + 1.0, 0.2, At.READING)
+            ModelParameter(f"slip{i + 1}_samples", "1", 0.0, -MOST - 1.0, MOST + 1.0, 0.2, ActsOn.READING)
             for i in range(len(self.found))
         )
 
-    def trials(self, setting: Setting, residual_um: FloatArray) -> list[Trial]:
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return [[np.array([float(size) for _, size in self.found])]]
 
-    def reading(self, y_um: FloatArray, p: FloatArray, setting: Setting) -> FloatArray:
+    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if not np.any(p):
             return y_um
-        shifts = np.zeros(setting.n)
+        shifts = np.zeros(data.n)
         for (at, _), size in zip(self.found, p, strict=True):
             shifts[at:] += size
         return np.asarray(resample_by(y_um, shifts))
 
-    def physical(self, p: FloatArray, setting: Setting) -> dict[str, tuple[float, FloatArray]]:
+    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         one = np.ones(p.size)
         still = np.zeros(p.size)
         return {
             "slips": (float(p.size), still),
             "lost_samples": (float(p.sum()), one),
-            "first_slip_s": (self.found[0][0] * setting.dt_s, still),
+            "first_slip_s": (self.found[0][0] * data.dt_s, still),
             "clock_ppm": (0.0, still),
         }
 
 
-def without_slips(fit: Fit, index: int) -> FloatArray:
+def reading_without_slips(fit: ModelFit, index: int) -> FloatArray:
     """The reading (n,) that the model would give had ``forms[index]`` lost no sample."""
     p = fit.p.copy()
     p[fit.model.where(index)] = 0.0
-    return fit.model.simulate(p, At.READING, fit.signals).reading_um
+    return fit.model.simulate(p, ActsOn.READING, fit.signals).reading_um
 
 
-def placed(form: Slips, bare: Model, base: Fit, mask: BoolArray, known: Found = ()) -> Fit:
+def fit_slips(cause: Slips, bare: StageModel, base: ModelFit, mask: BoolArray, known: SlipList = ()) -> ModelFit:
     """Slips of whole samples beside everything else; a model that knows of some sees the others.
 
     ``known`` are those to begin with. Otherwise they are looked for beside ``base``, and beside a model that was
     fitted with a clock that runs wrong: many slips of one sign look like one, and bend the other numbers less so.
     """
-    y_um, own, index = base.model.setting.y_um, base.p.size, len(bare.forms)
+    y_um, own, index = base.model.data.y_um, base.p.size, len(bare.causes)
 
-    def fitted(p: FloatArray, found: Found, iterations: int, sizes_too: bool = False) -> Fit:
+    def fitted(p: FloatArray, found: SlipList, iterations: int, sizes_too: bool = False) -> ModelFit:
         sizes = [float(size) for _, size in found]
         only = None if sizes_too else frozenset(range(own))
-        model = bare.plus(replace(form, found=found))
+        model = bare.plus(replace(cause, found=found))
         return calibrate(model, np.concatenate([p[:own], sizes]), mask, iterations, 1e-3, only)
 
     starts = [base.p]
     if not known:
         clock = calibrate(bare.plus(Timing()), np.append(base.p, 0.0), mask, 6, 1e-2)
         starts.append(clock.p[:own])
-    fits: list[tuple[Fit, Found]] = []
+    fits: list[tuple[ModelFit, SlipList]] = []
     for p in starts:
         there = bare.simulate(p).reading_um
-        found = dated(pruned(dated(known or slips_of(y_um, there, mask), y_um, there, mask)), y_um, there, mask)
+        found = date_slips(
+            merge_close_slips(date_slips(known or find_slips(y_um, there, mask), y_um, there, mask)), y_um, there, mask
+        )
         if found:
             fits.append((fitted(p, found, 4), found))
     fit, found = min(fits, key=lambda pair: pair[0].sse_um2, default=(base, ()))
     promising = bool(known) or fit.sse_um2 < _PROMISING * base.sse_um2
     for _ in range(2 * MOST_SLIPS if promising else 0):
-        there = without_slips(fit, index) if found else fit.signals.reading_um
-        after, gain = moved(found, y_um, there, mask)
+        there = reading_without_slips(fit, index) if found else fit.signals.reading_um
+        after, gain = best_slip_move(found, y_um, there, mask)
         if gain < _LEAST_GAIN * fit.sse_um2 or len(after) > MOST_SLIPS:
             break
-        found = pruned(dated(after, y_um, there, mask))
+        found = merge_close_slips(date_slips(after, y_um, there, mask))
         fit = fitted(fit.p, found, 4)
     # That their sizes, let free, come out whole tells slips from what looks like them.
-    return fitted(fit.p, found or form.found, 8, sizes_too=not known)
+    return fitted(fit.p, found or cause.found, 8, sizes_too=not known)
 
 
-def redated(fit: Fit, mask: BoolArray) -> Fit:
+def refit_slips(fit: ModelFit, mask: BoolArray) -> ModelFit:
     """The fit with its slips looked for anew beside all its causes: an earlier model that lacked some dated them
     worse, or overlooked one. The fit as it is where it has no slips or they stay."""
-    index = next((i for i, form in enumerate(fit.model.forms) if isinstance(form, Slips)), -1)
+    index = next((i for i, cause in enumerate(fit.model.causes) if isinstance(cause, Slips)), -1)
     if index < 0:
         return fit
-    form, y_um = fit.model.forms[index], fit.model.setting.y_um
-    assert isinstance(form, Slips)
+    cause, y_um = fit.model.causes[index], fit.model.data.y_um
+    assert isinstance(cause, Slips)
     bare = fit.model.less(index)
     where = fit.model.where(index)
     # To the end of the chain, where `placed` has them.
     base = evaluate(bare, np.concatenate([fit.p[: where.start], fit.p[where.stop :]]), mask)
-    there = without_slips(fit, index)
-    tried = placed(form, bare, base, mask, dated(form.found, y_um, there, mask))
+    there = reading_without_slips(fit, index)
+    tried = fit_slips(cause, bare, base, mask, date_slips(cause.found, y_um, there, mask))
     return tried if tried.sse_um2 < (1.0 - 1e-4) * fit.sse_um2 else fit

@@ -1,4 +1,13 @@
-"""The linear part of the stage, stepped exactly: lags, one mode or two, a hold, and a delay of any fraction."""
+"""The mechanics: lags, modes, a hold and a dead time of any fraction of a sample, stepped exactly.
+
+Hysteresis may act in the restoring force of a mode, as play operators of the displacement or by the Bouc-Wen equation:
+
+    y'' + 2 z w y' + w² (y + share Z) = w² x,      Z' = y' - (beta |y'| Z + gamma y' |Z|)
+
+which is m y'' + c y' + k y + force = u with force = k share Z, in µm (Noël, Schoukens, "Hysteretic benchmark with a
+dynamic nonlinearity", 2016). Over a sub-step in which y moves one way, Z is the exact solution of (2.2) with y in
+place of the voltage. The linear part is exact for a force that changes linearly, predicted and corrected once.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +16,249 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
+from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from sim.diagnosis.model.loops_linear import modes, modes_with_plays
-from sim.diagnosis.model.restoring_force import Loop, Restoring, respond_with_loop
+from sim.diagnosis.model.hysteresis_loops import _branch
+
+
+@compiled
+def _around(w: FloatArray, i: int) -> tuple[float, float, float]:
+    """w[i-1], w[i], w[i+1] less the first value; the record goes on as it begins and ends."""
+    top = w.shape[0] - 1
+    w0 = w[0]
+    a, b, c = w[min(max(i - 1, 0), top)], w[min(max(i, 0), top)], w[min(max(i + 1, 0), top)]
+    return a - w0, b - w0, c - w0
+
+
+@compiled
+def modes(
+    w: FloatArray,
+    shift: int,
+    poles_re: FloatArray,
+    poles_im: FloatArray,
+    gains_re: FloatArray,
+    gains_im: FloatArray,
+) -> FloatArray:
+    """Sum of first-order modes x' = lambda x + r w, stepped exactly; gains (m, 3) weigh w[k-shift-1 .. k-shift+1].
+
+    The record is taken to begin in equilibrium with its first value.
+    """
+    n = w.shape[0]
+    m = poles_re.shape[0]
+    out = np.zeros(n)
+    w0 = w[0]
+    for j in range(m):
+        ar, ai = poles_re[j], poles_im[j]
+        g0r, g1r, g2r = gains_re[j, 0], gains_re[j, 1], gains_re[j, 2]
+        g0i, g1i, g2i = gains_im[j, 0], gains_im[j, 1], gains_im[j, 2]
+        # Deviations from the first value: the equilibrium needs no arithmetic of its own.
+        xr = 0.0
+        xi = 0.0
+        # Within the record nothing has to be asked, and what the input adds is summed apart from the recursion.
+        first = min(max(shift + 1, 0), n - 1)
+        last = max(min(n - 1 + shift, n - 1), first)
+        for k in range(first):
+            i = k - shift
+            a, b, c = _around(w, i)
+            nr = ar * xr - ai * xi + (g0r * a + g1r * b + g2r * c)
+            xi = ar * xi + ai * xr + (g0i * a + g1i * b + g2i * c)
+            xr = nr
+            out[k + 1] += xr
+        if ai == 0.0 and xi == 0.0 and g0i == 0.0 and g1i == 0.0 and g2i == 0.0:
+            for k in range(first, last):
+                i = k - shift
+                xr = ar * xr + (g0r * (w[i - 1] - w0) + g1r * (w[i] - w0) + g2r * (w[i + 1] - w0))
+                out[k + 1] += xr
+        else:
+            for k in range(first, last):
+                i = k - shift
+                a, b, c = w[i - 1] - w0, w[i] - w0, w[i + 1] - w0
+                nr = ar * xr - ai * xi + (g0r * a + g1r * b + g2r * c)
+                xi = ar * xi + ai * xr + (g0i * a + g1i * b + g2i * c)
+                xr = nr
+                out[k + 1] += xr
+        for k in range(last, n - 1):
+            i = k - shift
+            a, b, c = _around(w, i)
+            nr = ar * xr - ai * xi + (g0r * a + g1r * b + g2r * c)
+            xi = ar * xi + ai * xr + (g0i * a + g1i * b + g2i * c)
+            xr = nr
+            out[k + 1] += xr
+    for k in range(n):
+        out[k] += w0
+    return out
+
+
+@compiled
+def modes_with_plays(
+    w: FloatArray,
+    shift: int,
+    poles_re: FloatArray,
+    poles_im: FloatArray,
+    gains_re: FloatArray,
+    gains_im: FloatArray,
+    back_re: FloatArray,
+    back_im: FloatArray,
+    radii_um: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """`modes` with hysteresis in the restoring force: weighted plays of the output itself are taken off its input.
+
+    ``back`` (m,) weighs the force at sample k in the step to k + 1. A motion that leaves all bounds is cut short.
+    """
+    n = w.shape[0]
+    m = poles_re.shape[0]
+    r = radii_um.shape[0]
+    out = np.zeros(n)
+    xr, xi = np.zeros(m), np.zeros(m)
+    play = np.zeros(r)
+    w0 = w[0]
+    y = 0.0
+    for k in range(n):
+        out[k] = y + w0
+        force = 0.0
+        for j in range(r):
+            play[j] = min(max(play[j], y - radii_um[j]), y + radii_um[j])
+            force += weights[j] * (y - play[j])
+        i = k - shift
+        a, b, c = _around(w, i)
+        y = 0.0
+        for j in range(m):
+            nr = poles_re[j] * xr[j] - poles_im[j] * xi[j]
+            ni = poles_re[j] * xi[j] + poles_im[j] * xr[j]
+            xr[j] = nr + gains_re[j, 0] * a + gains_re[j, 1] * b + gains_re[j, 2] * c - back_re[j] * force
+            xi[j] = ni + gains_im[j, 0] * a + gains_im[j, 1] * b + gains_im[j, 2] * c - back_im[j] * force
+            y += xr[j]
+        if not abs(y) < 1e12:
+            break
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class ForceStops:
+    """Weighted stops (y less a play of y) of these radii, µm."""
+
+    radii_um: FloatArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ForceLoop:
+    """Z of the module's equation: its stiffness as a share of the spring's, beta + gamma and beta - gamma (1/µm)."""
+
+    share: float
+    rise_per_um: float
+    fall_per_um: float
+    substeps: int = 4
+
+
+RestoringForce = ForceStops | ForceLoop
+
+
+def between_samples(w: FloatArray, substeps: int, delay_samples: float, hold: str) -> FloatArray:
+    """``w`` (n,) at the sub-steps, ``delay_samples`` late, ((n - 1) substeps + 1,).
+
+    ``hold`` "zero": held; "first": a continuous drive, so a cubic spline goes through its samples, not straight lines.
+    """
+    at = np.arange((w.size - 1) * substeps + 1) / substeps - delay_samples
+    if hold == "zero":
+        return np.ascontiguousarray(w[np.clip(np.floor(at + 1e-9).astype(np.int64), 0, w.size - 1)])
+    spline = CubicSpline(np.arange(w.size, dtype=np.float64), w)
+    return np.ascontiguousarray(spline(np.clip(at, 0.0, w.size - 1.0)))
+
+
+@compiled
+def modes_with_loop(
+    w: FloatArray,
+    every: int,
+    held: bool,
+    poles_re: FloatArray,
+    poles_im: FloatArray,
+    starts_re: FloatArray,
+    starts_im: FloatArray,
+    ends_re: FloatArray,
+    ends_im: FloatArray,
+    share: float,
+    rise: float,
+    fall: float,
+) -> FloatArray:
+    """Output at every ``every``-th sub-step; the input of the modes is ``w`` less ``share`` Z of their own output.
+
+    ``starts`` and ``ends`` (m,) weigh the input at both ends of a sub-step; ``held``: w keeps its value over it.
+    A motion that leaves all bounds is cut short.
+    """
+    steps = w.shape[0] - 1
+    m = poles_re.shape[0]
+    out = np.zeros(steps // every + 1)
+    xr, xi = np.zeros(m), np.zeros(m)
+    end = 0.0
+    for j in range(m):
+        end += ends_re[j]
+    w0 = w[0]
+    y = z = before = 0.0
+    out[0] = w0
+    for k in range(steps):
+        a = w[k] - w0 - share * z
+        guess = 2.0 * z - before
+        b = (w[k] if held else w[k + 1]) - w0 - share * guess
+        there = 0.0
+        for j in range(m):
+            nr = poles_re[j] * xr[j] - poles_im[j] * xi[j] + starts_re[j] * a + ends_re[j] * b
+            xi[j] = poles_re[j] * xi[j] + poles_im[j] * xr[j] + starts_im[j] * a + ends_im[j] * b
+            xr[j] = nr
+            there += nr
+        way = there - y
+        after = _branch(z, way, 1.0, rise, fall) if way >= 0.0 else -_branch(-z, -way, 1.0, rise, fall)
+        late = share * (guess - after)
+        for j in range(m):
+            xr[j] += ends_re[j] * late
+            xi[j] += ends_im[j] * late
+        there += end * late
+        way = there - y
+        before = z
+        z = _branch(z, way, 1.0, rise, fall) if way >= 0.0 else -_branch(-z, -way, 1.0, rise, fall)
+        y = there
+        if not abs(y) < 1e12:
+            break
+        if (k + 1) % every == 0:
+            out[(k + 1) // every] = y + w0
+    return out
+
+
+def linear_weights(poles: list[complex], residues: list[complex], step_s: float) -> list[FloatArray]:
+    """Of each pole: its step, and the weights of the input at the start and at the end of it; real and imaginary."""
+    rows = []
+    for pole, residue in zip(poles, residues, strict=True):
+        x = pole * step_s
+        grown = np.exp(x)
+        whole = (grown - 1.0) / pole if abs(x) > 1e-6 else complex(step_s)
+        # Integral of exp(pole (h - s)) s/h over s in [0, h].
+        end = (grown - 1.0 - x) / (pole * x) if abs(x) > 1e-4 else step_s * (0.5 + x / 6.0)
+        rows.append((grown, residue * (whole - end), residue * end))
+    table = np.array(rows)
+    return [np.ascontiguousarray(c) for column in table.T for c in (column.real, column.imag)]
+
+
+def respond_with_loop(
+    w: FloatArray,
+    poles: list[complex],
+    residues: list[complex],
+    delay_s: float,
+    hold: str,
+    dt_s: float,
+    loop: ForceLoop,
+) -> FloatArray:
+    """Response (n,) of poles and residues (of a conjugate pair the upper one, doubled) with ``loop`` in the force."""
+    fine = between_samples(w, loop.substeps, delay_s / dt_s, hold)
+    steps_re, steps_im, starts_re, starts_im, ends_re, ends_im = linear_weights(poles, residues, dt_s / loop.substeps)
+    return np.asarray(
+        modes_with_loop(
+            fine, loop.substeps, hold == "zero", steps_re, steps_im, starts_re, starts_im, ends_re, ends_im,
+            loop.share, loop.rise_per_um, loop.fall_per_um,
+        )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +307,7 @@ def _gains(pole: complex, residue: complex, dt_s: float, fraction: float, hold: 
     return residue * (early - up_early), residue * (up_early + late - up_late), residue * up_late
 
 
-def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: Restoring | None = None) -> FloatArray:
+def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: RestoringForce | None = None) -> FloatArray:
     """Response at the sampling instants to the static part's output ``w`` (n,), which begins in equilibrium."""
     poles = _poles(system)
     shift = math.floor(system.delay_s / dt_s)
@@ -93,7 +341,7 @@ def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: Restoring |
     w = np.ascontiguousarray(w)
     if restoring is None:
         return np.asarray(modes(w, shift, poles_re, poles_im, re, im))
-    if isinstance(restoring, Loop):
+    if isinstance(restoring, ForceLoop):
         kept = [(poles[i], residues[i] * (2.0 if poles[i].imag > 0.0 else 1.0)) for i in keep]
         upper, weighed = [pole for pole, _ in kept], [residue for _, residue in kept]
         return respond_with_loop(w, upper, weighed, system.delay_s, system.hold, dt_s, restoring)

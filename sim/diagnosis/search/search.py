@@ -1,4 +1,9 @@
-"""The search: add the cause that explains most held-out error, join, remove, substitute, stop at the noise floor."""
+"""The search for causes: add the one that reduces the held-out error most, then review each accepted cause.
+
+Each round screens all cause models by a linearised fit, fits the most promising ones jointly with everything accepted
+so far, and accepts the best if it passes the `Thresholds`. The review removes each accepted cause once more, drops or
+replaces those that are not needed, and collects rivals that explain the recording as well.
+"""
 
 from __future__ import annotations
 
@@ -8,36 +13,105 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.causes.catalogue import FORMS, same_set
-from sim.diagnosis.causes.modal import Modes
-from sim.diagnosis.causes.narrow_lines import line_is_there
-from sim.diagnosis.causes.refined_forms import finer
-from sim.diagnosis.causes.restoring_force import RestoringLoop
-from sim.diagnosis.causes.slip_dates import slips_of
-from sim.diagnosis.causes.slips import Slips, redated
-from sim.diagnosis.model.fit import Fit, calibrate, refreshed
-from sim.diagnosis.model.forms import Form
-from sim.diagnosis.search.evidence import HeldOut, Screen, Screened, Split, held_out, p_value, worse_by
-from sim.diagnosis.search.first_fits import first_fits
-from sim.diagnosis.search.monitor import monitor_misfit
-from sim.diagnosis.search.parallel import side_by_side
-from sim.diagnosis.search.thresholds import Rules
+from sim.diagnosis.causes.catalogue import CAUSE_MODELS, same_set
+from sim.diagnosis.causes.hysteresis import RestoringForceLoop, refined_model
+from sim.diagnosis.causes.mechanics import Modes
+from sim.diagnosis.causes.slips import Slips, find_slips, fit_slips, refit_slips
+from sim.diagnosis.model.calibration import ModelFit, calibrate, clipped_to_bounds, evaluate, with_new_columns
+from sim.diagnosis.model.readings import has_spectral_line
+from sim.diagnosis.model.stage_model import CauseModel, StageModel
+from sim.diagnosis.parallel import side_by_side
+from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
+from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What is asked of a cause before it is named. The values are those with which `docs/diagnosis.md` was scored."""
+
+    #: Chance level of the null distribution, after correction for the number of candidates.
+    level: float = 0.01
+    #: Least share of the held-out squared error that a cause must remove.
+    least_gain: float = 0.02
+    #: The same, as a share of the noise floor's square: less is a quarter of the noise and no matter.
+    least_of_floor: float = 0.08
+    #: Least share of what stands above the noise floor that the first, and a further, cause must remove.
+    least_excess_first: float = 0.1
+    least_excess_next: float = 0.25
+    #: A further cause that removes so much of it is accepted whatever the forms before it may have left behind.
+    nearly_all: float = 0.85
+    #: Cost of a number, as a share of the squared error: of two causes that do as well, the simpler.
+    cost_per_number: float = 0.002
+    #: How many of the linearised guesses are fitted in full.
+    refits: int = 6
+    most_causes: int = 5
+    #: A substitute within this share of the gain, or within this many standard errors, is an alternative.
+    close_share: float = 0.02
+    close_sigmas: float = 2.5
+
+
+def first_fits(
+    cause: CauseModel, guess: FloatArray, base: ModelFit, mask: BoolArray
+) -> tuple[CauseModel, list[ModelFit]]:
+    """A few steps of the joint fit of ``base`` and ``form``, with each hold that suits; the form as it was fitted.
+
+    ``guess`` holds the form's numbers as the linearised look at the residual found them.
+    """
+    other = replace(base.model, nominal=base.model.nominal.with_other_hold())
+    if isinstance(cause, Slips):
+        fits = [fit_slips(cause, model, base, mask) for model in (base.model, other)]
+        # Half a slip is the hold's doing: whole ones go first.
+        whole = [f for f in fits if f.model.causes[-1].plausible(f.p[base.p.size :], f.model.data)]
+        best = min(whole or fits, key=lambda f: f.sse_um2)
+        return best.model.causes[-1], [best]
+    if isinstance(cause, RestoringForceLoop):
+        return cause, [_giving_way(cause, base, guess, mask)]
+    fits = [_quick(base.model.plus(cause), base, guess, mask)]
+    if cause.fast:
+        fits.append(_quick(other.plus(cause), base, guess, mask))
+    return cause, fits
+
+
+def _quick(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
+    """From a linearised guess, or from beside neutral where that overshot."""
+    start = np.concatenate([base.p, guess])
+    if evaluate(model, clipped_to_bounds(model, start), mask).sse_um2 > base.sse_um2:
+        parameters = model.causes[-1].parameters(model.data)
+        linear = np.array([s.linear for s in parameters])
+        neutral = np.array([s.neutral for s in parameters])
+        start[base.p.size :] = np.where(linear, neutral, guess)
+    return calibrate(model, start, mask, 8, 2e-3, known=base.columns())
+
+
+def _giving_way(cause: RestoringForceLoop, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
+    """From the best of a grid in which the nominal stage's mode gives way to the loop."""
+    model = base.model.plus(cause)
+    names = tuple(parameter.name for parameter in model.parameters[: model.n_nominal])
+    between = base.p[model.n_nominal :]
+    starts = [np.concatenate([base.p, guess])]
+    for p in cause.together(base.p[: model.n_nominal], names, model.data):
+        own = p.size - guess.size
+        starts.append(np.concatenate([p[:own], between, p[own:]]))
+    tried = [(evaluate(model, clipped_to_bounds(model, p), mask).sse_um2, i) for i, p in enumerate(starts)]
+    order = [i for sse, i in sorted(tried) if np.isfinite(sse)][:2]
+    return min((calibrate(model, starts[i], mask, 12, 2e-3) for i in order), key=lambda f: f.sse_um2)
+
 
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CauseCandidate:
     """A cause fitted jointly with everything else."""
 
-    form: Form
-    fit: Fit
+    cause: CauseModel
+    fit: ModelFit
     held: HeldOut
     cost: float
 
 
 @dataclass(frozen=True)
-class Step:
+class AcceptedCause:
     """One accepted cause at the time of its acceptance."""
 
     name: str
@@ -53,92 +127,92 @@ class Search:
     mask: BoolArray
     parts: Split
     sigma_um: float
-    rules: Rules
+    thresholds: Thresholds
     seed: int
     progress: Progress
     #: The readings' grid is coarser than their noise.
     coarse: bool = False
-    forms: tuple[Form, ...] = FORMS
-    first_looks: list[Screened] = field(default_factory=list)
+    causes: tuple[CauseModel, ...] = CAUSE_MODELS
+    first_looks: list[ScreenedCause] = field(default_factory=list)
     #: Numbers of the nominal stage calibrated alone.
     nominal_p: FloatArray | None = None
 
-    def cost(self, fit: Fit, held: HeldOut, base: Fit) -> float:
+    def cost(self, fit: ModelFit, held: HeldOut, base: ModelFit) -> float:
         """Held-out error, with the price of the numbers that a model has more than ``base``."""
         extra = len(fit.free) - len(base.free)
-        seen = monitor_misfit(fit, self.mask) * self.sigma_um**2 if fit.model.setting.monitor_V is not None else 0.0
-        return seen + held.sse_um2 * (1.0 + self.rules.cost_per_number * max(extra, 0))
+        seen = monitor_misfit(fit, self.mask) * self.sigma_um**2 if fit.model.data.monitor_V is not None else 0.0
+        return seen + held.sse_um2 * (1.0 + self.thresholds.cost_per_number * max(extra, 0))
 
-    def held(self, fit: Fit) -> HeldOut:
+    def held(self, fit: ModelFit) -> HeldOut:
         return held_out(fit, self.mask, self.parts)
 
-    def looks(self, fit: Fit, skip: set[str]) -> tuple[list[Screened], list[Form]]:
+    def looks(self, fit: ModelFit, skip: set[str]) -> tuple[list[ScreenedCause], list[CauseModel]]:
         """The best linearised guess of every form that could show, largest gain first."""
-        screen = Screen(fit, self.mask, self.parts)
+        screen = ResidualScreen(fit, self.mask, self.parts)
         self._refresh(fit)
-        shown = [i for i, f in enumerate(self.forms) if f.name not in skip and not f.applies(fit.model.setting)]
-        seen = side_by_side(lambda i: screen.look(i, fit.model.plus(self.forms[i])), shown)
+        shown = [i for i, f in enumerate(self.causes) if f.name not in skip and not f.applies(fit.model.data)]
+        seen = side_by_side(lambda i: screen.look(i, fit.model.plus(self.causes[i])), shown)
         found = sorted((look for look in seen if look is not None), key=lambda s: -s.gain_um2)
-        return found, [self.forms[s.index] for s in found]
+        return found, [self.causes[s.index] for s in found]
 
-    def _refresh(self, fit: Fit) -> None:
+    def _refresh(self, fit: ModelFit) -> None:
         """Slips have no place, and modes no frequency, until a model says what it leaves."""
-        self.forms = tuple(f.sought(fit) if isinstance(f, Modes) else f for f in self.forms)
-        if any(form.name == "timing" for form in fit.model.forms):
+        self.causes = tuple(f.sought(fit) if isinstance(f, Modes) else f for f in self.causes)
+        if any(cause.name == "timing" for cause in fit.model.causes):
             return
-        found = slips_of(fit.model.setting.y_um, fit.signals.reading_um, self.mask)
-        self.forms = tuple(replace(f, found=found) if isinstance(f, Slips) else f for f in self.forms)
+        found = find_slips(fit.model.data.y_um, fit.signals.reading_um, self.mask)
+        self.causes = tuple(replace(f, found=found) if isinstance(f, Slips) else f for f in self.causes)
 
-    def refit(self, base: Fit, looks: list[Screened], count: int, least_um2: float) -> list[Candidate]:
+    def refit(self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float) -> list[CauseCandidate]:
         """The most promising guesses fitted jointly, the cheapest in held-out error first."""
         if not looks:
             return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
-        timing = bool(chosen) and self.forms[chosen[0].index].name == "timing"
+        timing = bool(chosen) and self.causes[chosen[0].index].name == "timing"
         for look in looks:
-            form = self.forms[look.index]
+            cause = self.causes[look.index]
             # A line at the mains is small but has its own mark; a loop in the force shows once the mode gives way;
             # slips show to a model that knows of the others, and until then a clock stands for them.
-            line = form.name == "mains_hum" and self.is_line(look, base)
-            own = line or isinstance(form, RestoringLoop) or (timing and isinstance(form, Slips))
+            line = cause.name == "mains_hum" and self.is_line(look, base)
+            own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
             if own and all(look is not c for c in chosen):
                 chosen.append(look)
 
-        def fitted(look: Screened) -> Candidate:
-            form, fits = first_fits(self.forms[look.index], look.start, base, self.mask)
+        def fitted(look: ScreenedCause) -> CauseCandidate:
+            cause, fits = first_fits(self.causes[look.index], look.start, base, self.mask)
             quick = min(fits, key=lambda f: f.sse_um2)
             held = self.held(quick)
-            return Candidate(form, quick.slim(), held, self.cost(quick, held, base))
+            return CauseCandidate(cause, quick.without_signals(), held, self.cost(quick, held, base))
 
         return sorted(side_by_side(fitted, chosen), key=lambda c: c.cost)
 
-    def is_line(self, look: Screened, base: Fit) -> bool:
-        return line_is_there(base.residual_um, base.model.setting, float(look.start[0]))
+    def is_line(self, look: ScreenedCause, base: ModelFit) -> bool:
+        return has_spectral_line(base.residual_um, base.model.data, float(look.start[0]))
 
-    def polish(self, candidate: Candidate, base: Fit) -> Candidate:
+    def polish(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The same cause fitted to the end."""
-        more = 40 if candidate.form.variant.startswith("restoring") else 12
+        more = 40 if candidate.cause.variant.startswith("restoring") else 12
         fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, more, 1e-5)
-        fit = refreshed(fit, self.mask)
+        fit = with_new_columns(fit, self.mask)
         held = self.held(fit)
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
-    def plausible(self, candidate: Candidate) -> bool:
+    def plausible(self, candidate: CauseCandidate) -> bool:
         """Whether its numbers are of a size and sign that the cause has."""
         model = candidate.fit.model
-        return candidate.form.plausible(model.part(candidate.fit.p, len(model.forms) - 1), model.setting)
+        return candidate.cause.plausible(model.part(candidate.fit.p, len(model.causes) - 1), model.data)
 
-    def acceptable(self, best: Candidate, held: HeldOut, left_um2: FloatArray, p: float, base: Fit) -> bool:
+    def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
         """Whether the gain of a cause is more than chance, more than the form's own error, and physical."""
-        rules = self.rules
+        thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
-        if p > rules.level or gain <= 0.0:
+        if p > thresholds.level or gain <= 0.0:
             return False
-        slots = best.form.slots(best.fit.model.setting)
-        q = best.fit.model.part(best.fit.p, len(best.fit.model.forms) - 1)
-        if best.form.name == "mains_hum":
-            return gain > 30.0 * self.sigma_um**2 and line_is_there(base.residual_um, base.model.setting, float(q[0]))
-        if len(slots) == 1 and (q[0] <= slots[0].low or q[0] >= slots[0].high):
+        parameters = best.cause.parameters(best.fit.model.data)
+        q = best.fit.model.part(best.fit.p, len(best.fit.model.causes) - 1)
+        if best.cause.name == "mains_hum":
+            return gain > 30.0 * self.sigma_um**2 and has_spectral_line(base.residual_um, base.model.data, float(q[0]))
+        if len(parameters) == 1 and (q[0] <= parameters[0].low or q[0] >= parameters[0].high):
             return False
         if not self.plausible(best):
             return False
@@ -150,29 +224,32 @@ class Search:
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
-        need = rules.least_excess_first if first else rules.least_excess_next
+        need = thresholds.least_excess_first if first else thresholds.least_excess_next
         # Rounding to a coarse grid errs alike wherever the stage stands still, so that it passes for a cause.
         least = max(
-            rules.least_gain * float(now.sum()), (0.5 if self.coarse else rules.least_of_floor) * float(floor.sum())
+            thresholds.least_gain * float(now.sum()),
+            (0.5 if self.coarse else thresholds.least_of_floor) * float(floor.sum()),
         )
         # What a form leaves behind is no other cause to the last: what explains nearly all of it, and much, is there.
-        if not first and whole > rules.nearly_all and float(now.sum()) > 2.0 * float(floor.sum()):
+        if not first and whole > thresholds.nearly_all and float(now.sum()) > 2.0 * float(floor.sum()):
             return True
         return gain > least and gain > need * excess and whole > 0.5 * need
 
-    def run(self, nominal: Fit) -> tuple[Fit, HeldOut, list[Step]]:
+    def run(self, nominal: ModelFit) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Greedy addition from a calibrated nominal model, with substitution after each step."""
         current, held = nominal, self.held(nominal)
         self.nominal_p = nominal.p
         left_um2 = np.zeros_like(held.per_block_um2)
-        steps: list[Step] = []
-        for round_ in range(self.rules.most_causes):
-            self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.rules.most_causes)
-            looks, _ = self.looks(current, same_set({f.name for f in current.model.forms}))
+        steps: list[AcceptedCause] = []
+        for round_ in range(self.thresholds.most_causes):
+            self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.thresholds.most_causes)
+            looks, _ = self.looks(current, same_set({f.name for f in current.model.causes}))
             if round_ == 0:
                 self.first_looks = looks
-            ranked = self.refit(current, looks, self.rules.refits, 0.3 * self.rules.least_gain * current.sse_um2)
-            accepted: Candidate | None = None
+            ranked = self.refit(
+                current, looks, self.thresholds.refits, 0.3 * self.thresholds.least_gain * current.sse_um2
+            )
+            accepted: CauseCandidate | None = None
             p = 1.0
             fitting = [c for c in ranked if self.plausible(c)]
             for candidate in fitting[:3]:
@@ -185,15 +262,15 @@ class Search:
                     break
             if accepted is None:
                 break
-            accepted = self._other_hold(self._finer(accepted, current), current)
+            accepted = self._other_hold(self._with_refined_model(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
-            left_um2 = left_um2 + accepted.form.form_error**2 * gone
+            left_um2 = left_um2 + accepted.cause.model_error**2 * gone
             current, held = accepted.fit, accepted.held
-            steps.append(Step(accepted.form.name, p, share))
+            steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
 
-    def _other_hold(self, accepted: Candidate, base: Fit) -> Candidate:
+    def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The hold between two samples once more: a large cause may have hidden which one suits."""
         fit = accepted.fit
         model = replace(fit.model, nominal=fit.model.nominal.with_other_hold())
@@ -201,39 +278,39 @@ class Search:
         other = calibrate(model, fit.p, self.mask, 4, 2e-3, known=fit.columns())
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
             return accepted
-        other = refreshed(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
+        other = with_new_columns(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
         held = self.held(other)
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 
-    def _finer(self, accepted: Candidate, base: Fit) -> Candidate:
+    def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The same cause in a form with more numbers, where it has one and that does better."""
         left = np.sqrt(accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
         own = accepted.fit.p[len(base.p) :]
-        found = finer(accepted.form, own, float(left), base.model.setting)
+        found = refined_model(accepted.cause, own, float(left), base.model.data)
         if found is None:
             return accepted
-        form, starts = found
-        model = base.model.plus(form)
+        cause, starts = found
+        model = base.model.plus(cause)
         beside = accepted.fit.p[: len(base.p)]
         fits = [calibrate(model, np.concatenate([beside, start]), self.mask, 10, 1e-3) for start in starts]
-        fit = refreshed(min(fits, key=lambda f: f.sse_um2), self.mask)
+        fit = with_new_columns(min(fits, key=lambda f: f.sse_um2), self.mask)
         held = self.held(fit)
         cost = self.cost(fit, held, base)
-        return Candidate(form, fit, held, cost) if cost < accepted.cost else accepted
+        return CauseCandidate(cause, fit, held, cost) if cost < accepted.cost else accepted
 
-    def redated(self, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
+    def with_refitted_slips(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
         """The fit with its slips, if it has any, dated beside everything that was found since."""
-        better = redated(fit, self.mask)
+        better = refit_slips(fit, self.mask)
         if better is fit:
             return fit, held
-        better = refreshed(better, self.mask)
+        better = with_new_columns(better, self.mask)
         return better, self.held(better)
 
-    def without(self, fit: Fit, index: int) -> Fit:
+    def without(self, fit: ModelFit, index: int) -> ModelFit:
         """The model less one cause, calibrated anew."""
         where = fit.model.where(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
-        if isinstance(fit.model.forms[index], RestoringLoop) and self.nominal_p is not None:
+        if isinstance(fit.model.causes[index], RestoringForceLoop) and self.nominal_p is not None:
             # The mode had given way to the loop: from there no calibration finds back to a linear stage.
             start[: fit.model.n_nominal] = self.nominal_p
             return calibrate(fit.model.less(index), start, self.mask, 12, 1e-4)
@@ -244,13 +321,13 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Found:
+class ReviewedCause:
     """An accepted cause while alternatives are still sought."""
 
-    step: Step
-    without: Fit
+    step: AcceptedCause
+    without: ModelFit
     held_without: HeldOut
-    rivals: tuple[Candidate, ...] = ()
+    rivals: tuple[CauseCandidate, ...] = ()
 
     @property
     def name(self) -> str:
@@ -258,56 +335,58 @@ class Found:
 
     @property
     def alternatives(self) -> tuple[str, ...]:
-        return tuple(r.form.name for r in self.rivals)
+        return tuple(r.cause.name for r in self.rivals)
 
 
-def review(search: Search, fit: Fit, held: HeldOut, steps: dict[str, Step]) -> tuple[Fit, HeldOut, list[Found]]:
+def review(
+    search: Search, fit: ModelFit, held: HeldOut, steps: dict[str, AcceptedCause]
+) -> tuple[ModelFit, HeldOut, list[ReviewedCause]]:
     """Remove each cause once more: drop what has become idle, swap what another explains better, name rivals."""
-    rules = search.rules
-    found: list[Found] = []
+    thresholds = search.thresholds
+    found: list[ReviewedCause] = []
     index = swaps = 0
-    while index < len(fit.model.forms):
-        form = fit.model.forms[index]
+    while index < len(fit.model.causes):
+        cause = fit.model.causes[index]
         less = search.without(fit, index)
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
-        keep = rules.least_gain if form.name != "mains_hum" else 0.0
+        keep = thresholds.least_gain if cause.name != "mains_hum" else 0.0
         if gain <= keep * held_less.sse_um2:
             fit, held = less, held_less
             found, index = [], 0
             continue
-        looks, _ = search.looks(less, {f.name for f in less.model.forms} | {form.name})
+        looks, _ = search.looks(less, {f.name for f in less.model.causes} | {cause.name})
         rivals = search.refit(less, looks, 4, 0.5 * gain)
         cost = search.cost(fit, held, less)
         polished = (search.polish(c, less) for c in rivals[:2])
         swap = next((c for c in polished if c.cost < 0.9 * cost), None)
-        if swap is not None and swaps < 2 and swap.form.name not in steps and search.plausible(swap):
+        if swap is not None and swaps < 2 and swap.cause.name not in steps and search.plausible(swap):
             swaps += 1
-            before = steps[form.name]
-            steps[swap.form.name] = Step(swap.form.name, before.p_value, before.gain)
+            before = steps[cause.name]
+            steps[swap.cause.name] = AcceptedCause(swap.cause.name, before.p_value, before.gain)
             fit, held = swap.fit, swap.held
             found, index = [], 0
             continue
         # Where the voltage was monitored, a rival must agree with that as well.
         rivals = [r for r in rivals if r.cost - r.held.sse_um2 <= 1.2 * (cost - held.sse_um2) + 0.05 * gain]
         names = _rivals(search, rivals, held, gain, held_less)
-        found.append(Found(steps[form.name], less.slim(), held_less, names))
+        found.append(ReviewedCause(steps[cause.name], less.without_signals(), held_less, names))
         index += 1
     return fit, held, found
 
 
 def _rivals(
-    search: Search, rivals: list[Candidate], held: HeldOut, gain: float, held_less: HeldOut
-) -> tuple[Candidate, ...]:
+    search: Search, rivals: list[CauseCandidate], held: HeldOut, gain: float, held_less: HeldOut
+) -> tuple[CauseCandidate, ...]:
     """Those that do as well within what the record can tell, one of each name."""
-    out: list[Candidate] = []
-    rules = search.rules
+    out: list[CauseCandidate] = []
+    thresholds = search.thresholds
     for rival in rivals:
         lost, sigmas = worse_by(rival.held, held)
-        close = lost < rules.close_share * gain or (sigmas < rules.close_sigmas and lost < 0.25 * gain)
+        close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
         # A narrow line that never stops is like nothing else.
-        if rival.form.name == "mains_hum":
+        if rival.cause.name == "mains_hum":
             continue
-        if close and search.plausible(rival) and all(rival.form.name != other.form.name for other in out):
+        if close and search.plausible(rival) and all(rival.cause.name != other.cause.name for other in out):
             out.append(rival)
     return tuple(out)

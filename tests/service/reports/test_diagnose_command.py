@@ -21,8 +21,8 @@ from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, envelope, 
 from service.reports.diagnosis_page import Source, length, plain, surest, with_unit
 from sim.diagnosis.causes.catalogue import NAMES
 from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.report.result import Cause
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.result import NamedCause
 from sim.effects import Chain, effect, simulate
 from sim.stage.file import load_stage, save_stage
 from sim.stage.stage import Stage
@@ -199,8 +199,8 @@ def test_what_cannot_be_diagnosed_is_refused_with_the_reason(tmp_path: Path) -> 
 def test_the_page_of_a_record_without_a_named_cause(tmp_path: Path) -> None:
     u_V = drive(5)[:5000]
     chain = Chain((effect("linear_actuator", gain_um_per_V=10.0), effect("sensor_noise", rms_um=0.005)))
-    setting = Setting(DT_S, u_V, simulate(chain, u_V, DT_S, seed=5))
-    adequate = diagnose(setting, None, Options(nominal="linear"))
+    data = FitData(DT_S, u_V, simulate(chain, u_V, DT_S, seed=5))
+    adequate = diagnose(data, None, Options(nominal="linear"))
     assert adequate.verdict == "adequate"
     write_report(tmp_path, adequate, Source("healthy", nominal="linear"), rrd=False)
     assert "explains this recording down to its noise" in (tmp_path / "report.md").read_text()
@@ -216,7 +216,7 @@ def test_the_page_of_a_record_without_a_named_cause(tmp_path: Path) -> None:
 # ---- curves and words, without a diagnosis
 
 
-def settings() -> dict[str, Setting]:
+def settings() -> dict[str, FitData]:
     """A record with steps and holds, one of a sine alone, and one of a noisy drive."""
     rng = np.random.default_rng(3)
     steps, t = drive(1), np.arange(6000) * DT_S
@@ -224,7 +224,7 @@ def settings() -> dict[str, Setting]:
     made = {}
     for name, u in (("steps", steps), ("sine", sine), ("noise", noise)):
         other = np.roll(u, 700)
-        made[name] = Setting(
+        made[name] = FitData(
             DT_S, u, 10.0 * u + 0.01 * rng.normal(size=u.size), other_um=other, other_um_per_s=np.gradient(other)
         )
     return made
@@ -233,11 +233,11 @@ def settings() -> dict[str, Setting]:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["steps", "sine", "noise"])
 def test_every_cause_has_a_picture_on_every_record(name: str, kind: str) -> None:
-    setting = settings()[kind]
+    data = settings()[kind]
     rng = np.random.default_rng(4)
-    before = 0.05 * np.sin(2 * np.pi * 3.0 * setting.t_s) + 0.01 * rng.normal(size=setting.n)
-    cause = Cause(name, (), {"f0_hz": 120.0}, {"f0_hz": (119.0, 121.0)}, 0.5, 0.001, before, 0.1 * before)
-    shown = picture(cause, setting)
+    before = 0.05 * np.sin(2 * np.pi * 3.0 * data.t_s) + 0.01 * rng.normal(size=data.n)
+    cause = NamedCause(name, (), {"f0_hz": 120.0}, {"f0_hz": (119.0, 121.0)}, 0.5, 0.001, before, 0.1 * before)
+    shown = picture(cause, data)
     assert shown.curves
     for curve in shown.curves:
         assert curve.x.shape == curve.y.shape
@@ -251,10 +251,10 @@ def test_every_cause_has_a_picture_on_every_record(name: str, kind: str) -> None
 
 def test_creep_is_a_straight_line_over_the_logarithm_of_time() -> None:
     u = drive(1)
-    setting = Setting(DT_S, u, 10.0 * u)
+    data = FitData(DT_S, u, 10.0 * u)
     since = np.maximum(np.arange(u.size) - 1000, 0) * DT_S
     before = np.where(u == 3.0, 0.3 * np.log10(np.maximum(since, 1e-3) / 0.01), 0.0)
-    shown = picture(Cause("creep", (), {}, {}, 0.5, 0.001, before, 0.0 * before), setting)
+    shown = picture(NamedCause("creep", (), {}, {}, 0.5, 0.001, before, 0.0 * before), data)
     assert shown.log_x
     without = next(c for c in shown.curves if c.role == WITHOUT and "3 V" in c.note)
     slope, _ = np.polyfit(np.log10(without.x), without.y, 1)
@@ -262,9 +262,9 @@ def test_creep_is_a_straight_line_over_the_logarithm_of_time() -> None:
 
 
 def test_a_gain_that_drifts_is_seen_over_time() -> None:
-    setting = settings()["sine"]
-    before = setting.y_um * 0.01 * setting.t_s / setting.t_s[-1]
-    shown = picture(Cause("gain_drift", (), {}, {}, 0.5, 0.001, before, 0.0 * before), setting)
+    data = settings()["sine"]
+    before = data.y_um * 0.01 * data.t_s / data.t_s[-1]
+    shown = picture(NamedCause("gain_drift", (), {}, {}, 0.5, 0.001, before, 0.0 * before), data)
     curve = next(c for c in shown.curves if c.role == WITHOUT)
     assert curve.y[-1] - curve.y[0] == pytest.approx(1.0, abs=0.3)
 
@@ -285,5 +285,5 @@ def test_numbers_are_said_with_their_units() -> None:
     assert with_unit("gain_per_decade", 0.01) == "0.01"
     assert plain("gain_drift") == "gain drift"
     none = np.zeros(3)
-    wide = Cause("a", (), {"x": 1.0, "z": 1.0}, {"x": (-9.0, 11.0), "z": (0.9, 1.1)}, 0.1, 0.1, none, none)
+    wide = NamedCause("a", (), {"x": 1.0, "z": 1.0}, {"x": (-9.0, 11.0), "z": (0.9, 1.1)}, 0.1, 0.1, none, none)
     assert surest(wide) == "z"

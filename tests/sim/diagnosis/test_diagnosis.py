@@ -10,9 +10,9 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.report.export import export
-from sim.diagnosis.report.result import Diagnosis
+from sim.diagnosis.export import export_stage
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.result import Diagnosis
 from sim.effects import Chain, Effect, effect, simulate
 from sim.stage.file import from_dict, to_dict
 
@@ -31,13 +31,13 @@ def drive() -> tuple[FloatArray, FloatArray]:
     return u, other
 
 
-def stage(*effects: Effect, seed: int = 0, quiet: float = 0.005) -> Setting:
+def stage(*effects: Effect, seed: int = 0, quiet: float = 0.005) -> FitData:
     """A recording of the chapter's stage with these effects."""
     u, u2 = drive()
     base: list[Effect] = [effect("bouc_wen", d_um_per_V=11.0, alpha=0.45), effect("mechanics")]
     other = simulate(Chain(tuple(base)), u2, DT)
     chain = Chain((*base, effect("sensor_noise", rms_um=quiet), *effects))
-    return Setting(DT, u, simulate(chain, u, DT, other_um=other, seed=seed) + 1.7, u2_V=u2)
+    return FitData(DT, u, simulate(chain, u, DT, other_um=other, seed=seed) + 1.7, u2_V=u2)
 
 
 def found(diagnosis: Diagnosis) -> dict[str, tuple[str, ...]]:
@@ -84,16 +84,16 @@ def test_one_hidden_effect_is_named_and_measured(hidden: Effect, number: str, va
 
 def test_two_hidden_effects_are_both_named_and_run_as_a_stage() -> None:
     pair = (effect("creep", gain_per_decade=0.012), effect("cross_talk", static=0.008))
-    setting = stage(*pair, seed=5)
-    diagnosis = diagnose(setting)
+    data = stage(*pair, seed=5)
+    diagnosis = diagnose(data)
     assert set(found(diagnosis)) == {"creep", "cross_talk"}
     gains = [c.heldout_gain for c in diagnosis.causes]
     assert gains == sorted(gains, reverse=True)
-    exported = export(diagnosis)
+    exported = export_stage(diagnosis)
     assert exported.rms_um < 0.05
     again = from_dict(to_dict(exported.config))
-    free_run = simulate(again.effects, setting.u_V, DT, other_um=diagnosis.extended.model.setting.other_um)
-    assert np.sqrt(np.mean(np.square(free_run - setting.y_um))) < 0.05
+    free_run = simulate(again.effects, data.u_V, DT, other_um=diagnosis.extended.model.data.other_um)
+    assert np.sqrt(np.mean(np.square(free_run - data.y_um))) < 0.05
 
 
 def test_a_butterfly_is_unexplained() -> None:
@@ -107,15 +107,15 @@ def test_a_butterfly_is_unexplained() -> None:
         p += abs(rise) * 1.1 * (target - p)
         polarisation[k] = p
     y = 40.0 * polarisation**2 + 0.6 * u * polarisation + 0.005 * np.random.default_rng(0).standard_normal(u.size)
-    diagnosis = diagnose(Setting(DT, u, y))
+    diagnosis = diagnose(FitData(DT, u, y))
     assert diagnosis.verdict == "unexplained"
     assert diagnosis.causes == ()
 
 
 def test_the_same_recording_gives_the_same_report() -> None:
-    setting = stage(effect("cross_talk", static=0.004), seed=6)
-    one = diagnose(setting, options=Options(seed=3)).as_dict()
-    two = diagnose(setting, options=Options(seed=3)).as_dict()
+    data = stage(effect("cross_talk", static=0.004), seed=6)
+    one = diagnose(data, options=Options(seed=3)).as_dict()
+    two = diagnose(data, options=Options(seed=3)).as_dict()
     assert one == two
     assert set(one) == {
         "schema", "verdict", "nominal", "extended", "noise_floor_um", "effects", "not_excited", "next_experiment"
@@ -123,8 +123,8 @@ def test_the_same_recording_gives_the_same_report() -> None:
 
 
 def test_without_the_other_axis_cross_talk_is_not_excited_and_the_next_experiment_drives_it() -> None:
-    setting = stage(seed=7)
-    diagnosis = diagnose(Setting(DT, setting.u_V, setting.y_um))
+    data = stage(seed=7)
+    diagnosis = diagnose(FitData(DT, data.u_V, data.y_um))
     assert diagnosis.verdict == "adequate"
     assert "cross_talk" in diagnosis.not_excited
     assert diagnosis.next_experiment is not None

@@ -11,18 +11,23 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
-from sim.diagnosis.causes.narrow_lines import line_is_there
-from sim.diagnosis.model.chain import Model
-from sim.diagnosis.model.converter import grid_of, repeats
+from sim.diagnosis.causes.motion import friction
+from sim.diagnosis.causes.reading import resample
+from sim.diagnosis.model.calibration import calibrate
 from sim.diagnosis.model.dynamics import Dynamics, respond
-from sim.diagnosis.model.fit import calibrate
-from sim.diagnosis.model.loops import bouc_wen_loop, bouc_wen_paced
-from sim.diagnosis.model.loops_linear import friction, resample
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.model.nominal import BoucWen
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.model.hysteresis_loops import bouc_wen_loop, bouc_wen_paced
+from sim.diagnosis.model.nominal import BoucWenStage
+from sim.diagnosis.model.readings import (
+    converter_grid,
+    has_spectral_line,
+    noise_floor,
+    repeated_period,
+    repeated_readings,
+)
+from sim.diagnosis.model.stage_model import StageModel
 from sim.diagnosis.prepare import prepare
-from sim.diagnosis.search.evidence import split
-from sim.diagnosis.search.noise_floor import noise_floor, repeated_period
+from sim.diagnosis.search.held_out import split
 from sim.effects import effect, simulate
 from sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
@@ -118,13 +123,13 @@ def test_calibration_finds_the_librarys_bouc_wen_stage() -> None:
     )
     y = 3.0 + simulate(chain, u, DT)
     fit = calibrate(
-        model := Model(Setting(DT, u, y), BoucWen()),
-        model.nominal.starts(model.setting)[0],
+        model := StageModel(FitData(DT, u, y), BoucWenStage()),
+        model.nominal.starts(model.data)[0],
         np.ones(u.size, bool),
         40,
         1e-9,
     )
-    got = dict(zip([s.name for s in model.slots], fit.p, strict=True))
+    got = dict(zip([s.name for s in model.parameters], fit.p, strict=True))
     assert np.sqrt(fit.sse_um2 / u.size) < 2e-3
     assert got["d_um_per_V"] == pytest.approx(10.2, rel=1e-3)
     assert got["rise_per_V"] == pytest.approx(1.9, rel=1e-2)
@@ -136,7 +141,7 @@ def test_noise_floor_sees_noise_and_not_creep() -> None:
     rng = np.random.default_rng(1)
     u = np.repeat([0.0, 5.0, 0.0, 3.0], 4000).astype(np.float64)
     y = 10.0 * u + 0.2 * np.log10(1.0 + np.arange(u.size) * DT) + 0.005 * rng.standard_normal(u.size)
-    floor = noise_floor(Setting(DT, u, y))
+    floor = noise_floor(FitData(DT, u, y))
     assert floor.source == "rests"
     assert floor.sigma_um == pytest.approx(0.005, rel=0.05)
 
@@ -146,20 +151,20 @@ def test_noise_floor_of_repeated_periods() -> None:
     u = np.tile(rng.standard_normal(1500), 4)
     y = np.convolve(np.tile(u, 2), [0.2, 0.5, 0.3])[u.size : 2 * u.size] + 0.01 * rng.standard_normal(u.size)
     assert repeated_period(u) == 1500
-    assert noise_floor(Setting(DT, u, y)).sigma_um == pytest.approx(0.01, rel=0.05)
+    assert noise_floor(FitData(DT, u, y)).sigma_um == pytest.approx(0.01, rel=0.05)
     assert repeated_period(np.sin(np.arange(3000.0) ** 1.3 * 0.01)) == 0
 
 
 def test_grid_and_repeats() -> None:
     rng = np.random.default_rng(3)
     y = 5.0 * np.sin(np.arange(20_000) * 0.01) + 0.02 * rng.standard_normal(20_000)
-    assert grid_of(np.round(y / 0.05) * 0.05).step_um == pytest.approx(0.05, rel=1e-3)
-    assert grid_of(y).step_um == 0.0
+    assert converter_grid(np.round(y / 0.05) * 0.05).step_um == pytest.approx(0.05, rel=1e-3)
+    assert converter_grid(y).step_um == 0.0
     fast = 40.0 * np.sin(np.arange(20_000) * 0.03) + 0.005 * rng.standard_normal(20_000)
-    assert repeats(fast, 0.005, 0.0).count == 0
+    assert repeated_readings(fast, 0.005, 0.0).count == 0
     doubled = fast.copy()
     doubled[500::997] = doubled[499::997][: doubled[500::997].size]
-    assert repeats(doubled, 0.005, 0.0).count >= 15
+    assert repeated_readings(doubled, 0.005, 0.0).count >= 15
 
 
 def test_a_line_is_told_from_ringing() -> None:
@@ -167,18 +172,18 @@ def test_a_line_is_told_from_ringing() -> None:
     u = np.zeros(n)
     u[::4000] = 1.0
     t = np.arange(n) * DT
-    setting = Setting(DT, u, np.zeros(n))
+    data = FitData(DT, u, np.zeros(n))
     rng = np.random.default_rng(4)
     noise = 0.005 * rng.standard_normal(n)
-    assert line_is_there(noise + 0.002 * np.sin(2 * np.pi * 50.0 * t), setting, 50.0)
-    assert not line_is_there(noise, setting, 50.0)
+    assert has_spectral_line(noise + 0.002 * np.sin(2 * np.pi * 50.0 * t), data, 50.0)
+    assert not has_spectral_line(noise, data, 50.0)
     since = np.mod(np.arange(n), 4000) * DT
-    assert not line_is_there(noise + 0.2 * np.exp(-since / 0.02) * np.sin(2 * np.pi * 53.0 * since), setting, 50.0)
+    assert not has_spectral_line(noise + 0.2 * np.exp(-since / 0.02) * np.sin(2 * np.pi * 53.0 * since), data, 50.0)
 
 
 def test_folds_leave_out_whole_stretches() -> None:
     u = _steps()
-    parts = split(Setting(DT, u, u))
+    parts = split(FitData(DT, u, u))
     assert parts.edges[0] == 0
     assert parts.edges[-1] == u.size
     assert sum(int(parts.samples(f).sum()) for f in range(parts.n_folds)) == u.size

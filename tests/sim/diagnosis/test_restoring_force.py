@@ -8,11 +8,10 @@ import pytest
 from adaptive.types import FloatArray
 from baselines.bouc_wen.mechanical import MechanicalBoucWen
 from sim.diagnosis.diagnose import diagnose_prepared
-from sim.diagnosis.model.dynamics import Dynamics, respond
-from sim.diagnosis.model.loops import plays_nested
-from sim.diagnosis.model.restoring_force import Loop
+from sim.diagnosis.export import export_stage
+from sim.diagnosis.model.dynamics import Dynamics, ForceLoop, respond
+from sim.diagnosis.model.hysteresis_loops import plays_nested
 from sim.diagnosis.prepare import prepare
-from sim.diagnosis.report.export import export
 from sim.effects import effect, simulate
 from sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
@@ -55,7 +54,7 @@ def test_hysteresis_in_the_force_is_named_alone_and_measured() -> None:
     assert numbers["gamma_per_um"] == pytest.approx(gamma, rel=0.05)
     # What it explains is measured against the linear stage as it is without it.
     assert float(np.std(diagnosis.causes[0].before_um)) < 1.5 * diagnosis.nominal_rmse_um
-    exported = export(diagnosis)
+    exported = export_stage(diagnosis)
     assert exported.left_out == ()
     assert "mechanical_hysteresis" in [e.name for e in exported.config.effects]
     assert exported.rms_um < 2.0 * diagnosis.noise_floor_um
@@ -73,7 +72,7 @@ def test_the_effect_and_the_fitted_model_are_one_equation() -> None:
         gamma_per_um=-0.3,
     )
     stage = simulate(effect("linear_actuator", gain_um_per_V=5.0) + mode, u, DT)
-    fitted = respond(5.0 * u, Dynamics((), ((20.0, 0.05),)), DT, Loop(0.8, 0.3, 0.9, substeps=8))
+    fitted = respond(5.0 * u, Dynamics((), ((20.0, 0.05),)), DT, ForceLoop(0.8, 0.3, 0.9, substeps=8))
     np.testing.assert_allclose(stage, fitted, atol=1e-6 * float(np.ptp(fitted)))
     without = respond(5.0 * u, Dynamics((), ((20.0, 0.05),)), DT)
     assert float(np.std(fitted - without)) > 0.1 * float(np.std(without))
@@ -82,7 +81,7 @@ def test_the_effect_and_the_fitted_model_are_one_equation() -> None:
 def test_finer_steps_change_little() -> None:
     u = 5.0 * multisine(2048, 5)
     system = Dynamics((), ((25.0, 0.02),), 0.3 * DT, "first")
-    coarse, fine = (respond(u, system, DT, Loop(1.0, 0.05, 0.4, substeps=k)) for k in (4, 32))
+    coarse, fine = (respond(u, system, DT, ForceLoop(1.0, 0.05, 0.4, substeps=k)) for k in (4, 32))
     assert float(np.std(coarse - fine)) < 2e-3 * float(np.std(fine))
 
 

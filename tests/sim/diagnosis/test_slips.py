@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.slip_dates import Found, dated, moved, pruned, slips_of
+from sim.diagnosis.causes.slips import SlipList, best_slip_move, date_slips, find_slips, merge_close_slips
 
 N = 6000
 NOISE_UM = 0.005
@@ -18,7 +18,7 @@ def motion() -> FloatArray:
     return np.asarray(30.0 * np.sin(2 * np.pi * 5.0 * t_s) + 8.0 * np.sin(2 * np.pi * 31.0 * t_s + 0.4))
 
 
-def slipped(found: Found, rng: np.random.Generator) -> FloatArray:
+def slipped(found: SlipList, rng: np.random.Generator) -> FloatArray:
     """Readings (N,) of `motion` that slip so."""
     shifts = np.zeros(N, dtype=np.int64)
     for at, size in found:
@@ -29,44 +29,44 @@ def slipped(found: Found, rng: np.random.Generator) -> FloatArray:
 @pytest.mark.parametrize(
     "truth", [((1234, 1),), ((900, 1), (2500, 1), (2700, 2)), ((700, 2), (3000, -1), (4100, -1), (5000, 3))]
 )
-def test_slips_are_dated_to_the_sample(truth: Found) -> None:
+def test_slips_are_dated_to_the_sample(truth: SlipList) -> None:
     y_um = slipped(truth, np.random.default_rng(1))
     there = np.ones(N, dtype=np.bool_)
     model = motion()[:N]
     rough = tuple((at + 7 * (-1) ** i, size) for i, (at, size) in enumerate(truth))
-    assert dated(rough, y_um, model, there) == truth
+    assert date_slips(rough, y_um, model, there) == truth
 
 
 def test_from_nothing_one_move_after_the_other_finds_them_all() -> None:
-    truth: Found = ((900, 1), (2500, 1), (4100, -2))
+    truth: SlipList = ((900, 1), (2500, 1), (4100, -2))
     y_um, there, model = slipped(truth, np.random.default_rng(2)), np.ones(N, dtype=np.bool_), motion()[:N]
-    found: Found = ()
+    found: SlipList = ()
     for _ in range(8):
-        after, gain_um2 = moved(found, y_um, model, there)
+        after, gain_um2 = best_slip_move(found, y_um, model, there)
         if gain_um2 < 40.0 * NOISE_UM**2:
             break
-        found = dated(after, y_um, model, there)
+        found = date_slips(after, y_um, model, there)
     assert found == truth
 
 
 def test_two_that_were_taken_for_one_come_apart() -> None:
-    truth: Found = ((900, 1), (2500, 1), (4100, 1))
+    truth: SlipList = ((900, 1), (2500, 1), (4100, 1))
     y_um, there, model = slipped(truth, np.random.default_rng(6)), np.ones(N, dtype=np.bool_), motion()[:N]
-    after, _ = moved(((900, 1), (2500, 2)), y_um, model, there)
-    assert dated(after, y_um, model, there) == truth
+    after, _ = best_slip_move(((900, 1), (2500, 2)), y_um, model, there)
+    assert date_slips(after, y_um, model, there) == truth
 
 
 def test_a_gain_is_the_squared_error_that_a_move_takes_off() -> None:
-    truth: Found = ((1500, 1), (3000, 1))
+    truth: SlipList = ((1500, 1), (3000, 1))
     y_um, there, model = slipped(truth, np.random.default_rng(3)), np.ones(N, dtype=np.bool_), motion()[:N]
 
-    def sse_um2(found: Found) -> float:
+    def sse_um2(found: SlipList) -> float:
         shifts = np.zeros(N, dtype=np.int64)
         for at, size in found:
             shifts[at:] += size
         return float(np.sum((y_um - model[np.clip(np.arange(N) + shifts, 0, N - 1)]) ** 2))
 
-    after, gain_um2 = moved(((1500, 1),), y_um, model, there)
+    after, gain_um2 = best_slip_move(((1500, 1),), y_um, model, there)
     assert sse_um2(((1500, 1),)) - sse_um2(after) == pytest.approx(gain_um2, rel=1e-9)
 
 
@@ -75,17 +75,17 @@ def test_samples_that_do_not_count_date_nothing() -> None:
     y_um[2100:2110] += 50.0
     there = np.ones(N, dtype=np.bool_)
     there[2100:2110] = False
-    assert dated(((1990, 1),), y_um, motion()[:N], there) == ((2000, 1),)
+    assert date_slips(((1990, 1),), y_um, motion()[:N], there) == ((2000, 1),)
 
 
 def test_what_is_soon_taken_back_is_no_slip() -> None:
-    assert pruned(((100, 3), (101, -3), (2000, 1))) == ((2000, 1),)
-    assert pruned(((100, 4), (105, -3), (2000, 1))) == ((100, 1), (2000, 1))
-    assert pruned(((100, 1), (400, 1))) == ((100, 1), (400, 1))
-    assert pruned(()) == ()
+    assert merge_close_slips(((100, 3), (101, -3), (2000, 1))) == ((2000, 1),)
+    assert merge_close_slips(((100, 4), (105, -3), (2000, 1))) == ((100, 1), (2000, 1))
+    assert merge_close_slips(((100, 1), (400, 1))) == ((100, 1), (400, 1))
+    assert merge_close_slips(()) == ()
 
 
 def test_healthy_readings_do_not_slip() -> None:
     y_um, there, model = slipped((), np.random.default_rng(5)), np.ones(N, dtype=np.bool_), motion()[:N]
-    assert slips_of(y_um, model, there) == ()
-    assert moved((), y_um, model, there)[1] < 40.0 * NOISE_UM**2
+    assert find_slips(y_um, model, there) == ()
+    assert best_slip_move((), y_um, model, there)[1] < 40.0 * NOISE_UM**2

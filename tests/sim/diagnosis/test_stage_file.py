@@ -10,11 +10,11 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.slip_dates import slips_of
+from sim.diagnosis.causes.mechanics import peaks
+from sim.diagnosis.causes.slips import find_slips
 from sim.diagnosis.diagnose import diagnose_prepared
-from sim.diagnosis.model.modal import peaks
 from sim.diagnosis.prepare import prepare
-from sim.diagnosis.report.result import TEST, Diagnosis
+from sim.diagnosis.result import TEST, Diagnosis
 from sim.effects import Chain, effect
 from sim.recordings import Recording, read
 from sim.stage.config import StageConfig
@@ -105,10 +105,10 @@ def test_lost_rows_are_found_where_motion_shows_them() -> None:
     model = 20.0 * np.sin(2.0 * np.pi * 6.0 * t) * np.sin(2.0 * np.pi * 0.31 * t)
     y = model + 0.005 * rng.standard_normal(t.size)
     whole = np.ones(t.size, dtype=np.bool_)
-    assert slips_of(y, model, whole) == ()
+    assert find_slips(y, model, whole) == ()
     lost = np.delete(y, [3000, 8000])
     lost = np.append(lost, lost[-2:])
-    found = slips_of(lost, model, whole)
+    found = find_slips(lost, model, whole)
     assert [size for _, size in found] == [1, 1]
     assert [at for at, _ in found] == [pytest.approx(3000, abs=60), pytest.approx(8000, abs=60)]
 

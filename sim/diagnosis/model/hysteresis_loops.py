@@ -1,4 +1,4 @@
-"""The compiled loops under the diagnosis: one pass over the samples each, nothing allocated inside."""
+"""Compiled hysteresis operators of the diagnosis, one pass over the samples each, without allocation inside."""
 
 from __future__ import annotations
 

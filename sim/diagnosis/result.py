@@ -6,14 +6,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adaptive.types import FloatArray
-from sim.diagnosis.model.fit import Fit
+from sim.diagnosis.model.calibration import ModelFit
 
 SCHEMA = 1
+
+
 FOLDS, TEST = "folds of the recording", "test recording"
 
 
 @dataclass(frozen=True)
-class Cause:
+class NamedCause:
     """One named cause.
 
     Attributes
@@ -23,7 +25,7 @@ class Cause:
     heldout_gain : share of the held-out squared error that it removes on top of those named before it.
     p_value : how often chance gains as much, corrected for the number of candidates.
     before_um, after_um : residual without it (all else refitted) and with it, (n,), for its picture.
-    form : index of its form in the extended model, -1 where it is none (quantisation, repeats).
+    index : index of its model in ``extended.model.causes``; -1 if it has none (quantisation, repeated readings).
     """
 
     name: str
@@ -34,7 +36,7 @@ class Cause:
     p_value: float
     before_um: FloatArray = field(repr=False)
     after_um: FloatArray = field(repr=False)
-    form: int = -1
+    index: int = -1
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,11 @@ class Diagnosis:
     extended_heldout_um: float
     noise_floor_um: float
     floor_source: str
-    causes: tuple[Cause, ...]
+    causes: tuple[NamedCause, ...]
     not_excited: tuple[str, ...]
     next_experiment: str | None
-    nominal: Fit = field(repr=False)
-    extended: Fit = field(repr=False)
+    nominal: ModelFit = field(repr=False)
+    extended: ModelFit = field(repr=False)
     notes: tuple[str, ...] = ()
     #: Causes that the search found before it had to admit that they do not explain the record.
     partial: tuple[str, ...] = ()

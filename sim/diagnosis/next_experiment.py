@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.catalogue import FORMS
-from sim.diagnosis.model.chain import Model
-from sim.diagnosis.model.fit import Fit
-from sim.diagnosis.model.measured import Setting
-from sim.diagnosis.search.monitor import drive_at_samples
+from sim.diagnosis.causes.catalogue import CAUSE_MODELS
+from sim.diagnosis.model.calibration import ModelFit
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.model.stage_model import StageModel
 
 #: What a voltage monitor resolves, relative to the swing.
 MONITOR_NOISE = 2e-4
@@ -32,14 +31,14 @@ class Rival:
 
     name: str
     other: str
-    mine: Fit
-    theirs: Fit
+    mine: ModelFit
+    theirs: ModelFit
 
 
-def experiments(setting: Setting) -> list[Experiment]:
+def experiments(data: FitData) -> list[Experiment]:
     """Drives between the record's lowest and highest voltage, as many samples as it has."""
-    n, dt, low, swing = setting.n, setting.dt_s, setting.u_low_V, setting.swing_V
-    t, total, zero = setting.t_s, setting.duration_s, np.zeros(setting.n)
+    n, dt, low, swing = data.n, data.dt_s, data.u_low_V, data.swing_V
+    t, total, zero = data.t_s, data.duration_s, np.zeros(data.n)
     x = t / total
     triangle = 1.0 - np.abs(2.0 * np.mod(x * 3.0, 1.0) - 1.0)
     fast = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.minimum(20.0, 0.02 / dt) * t)
@@ -59,38 +58,37 @@ def experiments(setting: Setting) -> list[Experiment]:
         (f"a small chirp of 5 % of the range up to {top:.3g} Hz", 0.5 + 0.025 * sweep),
     ]
     out = [Experiment(words, np.ascontiguousarray(low + swing * s), zero) for words, s in shapes]
-    out.append(Experiment("the same record once more after a minute at zero input", setting.u_V, zero))
+    out.append(Experiment("the same record once more after a minute at zero input", data.u_V, zero))
     out.append(Experiment("the other axis driven alone over its range, this one at zero", zero, low + swing * medium))
     return out
 
 
-def _at(model: Model, p: FloatArray, experiment: Experiment) -> FloatArray:
-    home = model.setting
-    setting = replace(home, u_V=experiment.u_V, u2_V=experiment.u2_V)
+def _at(model: StageModel, p: FloatArray, experiment: Experiment) -> FloatArray:
+    home = model.data
+    data = replace(home, u_V=experiment.u_V, u2_V=experiment.u2_V, scales_from=home.scales)
     if np.any(experiment.u2_V):
         other = home.gain_um_per_V * (experiment.u2_V - experiment.u2_V[0])
-        setting = replace(setting, other_um=other, other_um_per_s=np.gradient(other, setting.dt_s))
-    setting = setting.scaled_as(home)
-    return Model(setting, model.nominal, model.forms).simulate(p).reading_um
+        data = replace(data, other_um=other, other_um_per_s=np.gradient(other, data.dt_s))
+    return StageModel(data, model.nominal, model.causes).simulate(p).reading_um
 
 
-def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: Fit, sigma_um: float) -> str | None:
+def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
     """What to record next, in a sentence with the simulated separation, or None where nothing is open."""
-    setting = fit.model.setting
+    data = fit.model.data
     if rivals:
         rival = rivals[0]
         here = _apart(rival.mine.signals.reading_um, rival.theirs.signals.reading_um)
         best, size = "", 0.0
-        for experiment in experiments(setting):
+        for experiment in experiments(data):
             both = [_at(f.model, f.p, experiment) for f in (rival.mine, rival.theirs)]
             apart = _apart(both[0], both[1])
             if np.isfinite(apart) and apart > size:
                 best, size = experiment.words, apart
-        drive = _apart(drive_at_samples(rival.mine), drive_at_samples(rival.theirs)) / max(setting.swing_V, 1e-12)
+        drive = _apart(rival.mine.drive_at_samples(), rival.theirs.drive_at_samples()) / max(data.swing_V, 1e-12)
         if drive / MONITOR_NOISE > size / sigma_um:
             return (
                 f"the same record with a voltage monitor at the actuator (monitor_V): simulated, {rival.name} and "
-                f"{rival.other} then differ there by {drive * setting.swing_V * 1e3:.3g} mV rms"
+                f"{rival.other} then differ there by {drive * data.swing_V * 1e3:.3g} mV rms"
             )
         if size < 2.0 * max(here, 0.2 * sigma_um):
             return (
@@ -110,23 +108,23 @@ def _apart(a: FloatArray, b: FloatArray) -> float:
     return float(np.std(d))
 
 
-def _excite(missing: tuple[str, ...], fit: Fit, sigma_um: float) -> str | None:
+def _excite(missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
     """The drive in which most of the causes that this record does not excite would show."""
-    wanted = [f for f in FORMS if f.name in missing and f.name != "payload_change"]
+    wanted = [f for f in CAUSE_MODELS if f.name in missing and f.name != "payload_change"]
     best: tuple[str, list[str]] = ("", [])
-    for experiment in experiments(fit.model.setting):
+    for experiment in experiments(fit.model.data):
         base = _at(fit.model, fit.p, experiment)
         names: list[str] = []
-        for form in wanted:
-            setting = fit.model.setting
-            crossing = form.name == "cross_talk" and bool(np.any(experiment.u2_V))
-            if form.applies(setting) and not crossing:
+        for cause in wanted:
+            data = fit.model.data
+            crossing = cause.name == "cross_talk" and bool(np.any(experiment.u2_V))
+            if cause.applies(data) and not crossing:
                 continue
-            model = fit.model.plus(form)
-            for trial in form.trials(setting, fit.residual_um)[:3]:
+            model = fit.model.plus(cause)
+            for trial in cause.guesses(data, fit.residual_um)[:3]:
                 moved = _at(model, np.concatenate([fit.p, trial[0]]), experiment)
-                if np.all(np.isfinite(moved)) and np.std(moved - base) * np.sqrt(setting.n) > 30.0 * sigma_um:
-                    names.append(form.name)
+                if np.all(np.isfinite(moved)) and np.std(moved - base) * np.sqrt(data.n) > 30.0 * sigma_um:
+                    names.append(cause.name)
                     break
         if len(set(names)) > len(set(best[1])):
             best = (experiment.words, sorted(set(names)))

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.restoring_force import RestoringLoop
-from sim.diagnosis.model.chain import Model
-from sim.diagnosis.model.fit import Fit
-from sim.diagnosis.model.forms import Form
-from sim.diagnosis.model.measured import At, Setting
-from sim.diagnosis.model.nominal import Linear, loop_numbers
-from sim.diagnosis.model.nominal_stage import StageNominal
-from sim.diagnosis.report.result import Diagnosis
+from sim.diagnosis.causes.hysteresis import RestoringForceLoop
+from sim.diagnosis.model.calibration import DampingRule, ModelFit, damped_step
+from sim.diagnosis.model.fit_data import ActsOn, FitData
+from sim.diagnosis.model.nominal import BoucWenStage, FileStage, LinearStage, loop_numbers
+from sim.diagnosis.model.stage_model import CauseModel, StageModel
+from sim.diagnosis.result import Diagnosis
 from sim.effects import KINDS, Chain, Effect, effect, simulate
 from sim.stage.config import StageConfig
 
@@ -35,14 +33,14 @@ def make(name: str, label: str = "", **values: float) -> Effect:
     return effect(name, label=label, **_clip(name, **values))
 
 
-def nominal_effects(fit: Fit) -> list[Effect]:
+def nominal_effects(fit: ModelFit) -> list[Effect]:
     """The calibrated nominal stage in the library's effects. The recorder's latch is no part of the stage."""
     p = fit.model.part(fit.p, -1)
     nominal = fit.model.nominal
     # After the mechanics: an offset before them would be travelled to, lag and all, from a start at zero.
     drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
     offset = make("thermal_drift", OFFSET, offset_um=nominal.offset_um(p), **drift)
-    if isinstance(nominal, StageNominal):
+    if isinstance(nominal, FileStage):
         return [*nominal.effects(p), offset]
     if nominal.name == "linear":
         f, z = float(np.exp(p[1])), float(np.exp(p[2]))
@@ -61,13 +59,13 @@ def nominal_effects(fit: Fit) -> list[Effect]:
     ]
 
 
-def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Effect], bool]:
+def cause_effects(cause: CauseModel, p: FloatArray, data: FitData) -> tuple[list[Effect], bool]:
     """One fitted cause in the library's effects, and whether their numbers still want fitting."""
-    v = {name: value for name, (value, _) in form.physical(p, setting).items()}
-    swing, duration = setting.swing_V, setting.duration_s
-    match form.name:
+    v = {name: value for name, (value, _) in cause.physical(p, data).items()}
+    swing, duration = data.swing_V, data.duration_s
+    match cause.name:
         case "amplifier_lag" | "sensor_lag":
-            return [make(form.name, tau_s=v["tau_s"])], False
+            return [make(cause.name, tau_s=v["tau_s"])], False
         case "slew_limit":
             return [make("slew_limit", rate_V_per_s=v["slew_V_per_s"])], False
         case "saturation":
@@ -81,7 +79,7 @@ def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Eff
         case "creep":
             return [make("creep", gain_per_decade=v["gain_per_decade"])], True
         case "cross_talk":
-            if form.variant == "modes":
+            if cause.variant == "modes":
                 return [], False
             return [make("cross_talk", static=v["static"], rate_s=v["rate_s"])], False
         case "mains_hum":
@@ -100,20 +98,18 @@ def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Eff
         case "stick_slip":
             return [make("stick_slip", width_um=v["width_um"], sliding_share=v["sliding_share"])], False
         case "thermal_drift":
-            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
+            ramp = 60.0 * float(p[-1]) / duration if cause.variant != "temperature" else 0.0
             tau = 0.3 * duration
             return [make("thermal_drift", amplitude_um=1e-3, tau_s=tau, ramp_um_per_min=ramp)], True
         case "gain_drift":
-            ramp = 60.0 * float(p[-1]) / duration if form.variant != "temperature" else 0.0
+            ramp = 60.0 * float(p[-1]) / duration if cause.variant != "temperature" else 0.0
             tau = 0.3 * duration
             return [make("gain_drift", ramp_per_min=ramp, amplitude=1e-4, tau_s=tau)], True
         case "sensor_nonlinearity":
-            return [
-                make("sensor_nonlinearity", square=v["quadratic"], cubic=v["cubic"], range_um=setting.range_um)
-            ], True
+            return [make("sensor_nonlinearity", square=v["quadratic"], cubic=v["cubic"], range_um=data.range_um)], True
         case "asymmetry":
-            slope = v["bend"] * setting.range_um / swing
-            where = setting.u_low_V
+            slope = v["bend"] * data.range_um / swing
+            where = data.u_low_V
             return [
                 make(
                     "asymmetry",
@@ -136,12 +132,12 @@ def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Eff
                     "rate_dependence",
                     growth_per_decade=0.1,
                     corner_V_per_s=v["corner_V_per_s"],
-                    width_um=0.1 * setting.range_um,
+                    width_um=0.1 * data.range_um,
                     largest_V=0.35 * swing,
                 )
             ], True
         case "hysteresis_shape":
-            width = 0.05 * setting.range_um
+            width = 0.05 * data.range_um
             return [
                 make("hysteresis_shape", "hysteresis_shape", width_um=width, largest_V=0.5 * swing, fading=1.0),
                 make(
@@ -151,17 +147,22 @@ def cause_effects(form: Form, p: FloatArray, setting: Setting) -> tuple[list[Eff
     return [], False
 
 
-def in_force(e: Effect, form: RestoringLoop, p: FloatArray, setting: Setting) -> Effect:
+def in_force(e: Effect, cause: RestoringForceLoop, p: FloatArray, data: FitData) -> Effect:
     """A mode of the nominal stage with the loop in its restoring force; any other effect as it is."""
     if e.name != "resonance":
         return e
-    v = {name: value for name, (value, _) in form.physical(p, setting).items()}
+    v = {name: value for name, (value, _) in cause.physical(p, data).items()}
     mode = {name: e.values[name] for name in ("frequency_Hz", "damping_ratio")}
     return make("mechanical_hysteresis", e.label, **mode, **v)
 
 
+#: A chain, its free run (n,), and the error of that run without the samples that settle.
+_Run = tuple[Chain, FloatArray, FloatArray]
+_RULE = DampingRule(least=1e-8, least_after_failure=0.0, rcond=1e-12)
+
+
 @dataclass(frozen=True)
-class Exported:
+class ExportedStage:
     """A stage configuration and how far (rms, µm) its free run is from the extended model that was fitted.
 
     ``left_out``: causes that the library's chain has no equal of, such as hysteresis in the restoring force.
@@ -173,58 +174,58 @@ class Exported:
     left_out: tuple[str, ...] = ()
 
 
-def export(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> Exported:
+def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> ExportedStage:
     """The extended stage as a configuration. Where a cause's form and the library's differ, the library's numbers
     are fitted by simulating the library's own chain against the extended model, latch and noise left out.
     """
     fit = diagnosis.extended
-    setting = fit.model.setting
+    data = fit.model.data
     own, loose = nominal_effects(fit), {"bouc_wen", "linear_actuator", OFFSET}
     effects, named, missing = list(own), list[str](), list[str]()
-    for i, form in enumerate(fit.model.forms):
-        if not any(c.form == i for c in diagnosis.causes):
+    for i, cause in enumerate(fit.model.causes):
+        if not any(c.index == i for c in diagnosis.causes):
             continue
-        if isinstance(form, RestoringLoop):
-            effects = [in_force(e, form, fit.model.part(fit.p, i), setting) for e in effects]
-            named.append(form.name)
+        if isinstance(cause, RestoringForceLoop):
+            effects = [in_force(e, cause, fit.model.part(fit.p, i), data) for e in effects]
+            named.append(cause.name)
             continue
-        mine, wants = cause_effects(form, fit.model.part(fit.p, i), setting)
+        mine, wants = cause_effects(cause, fit.model.part(fit.p, i), data)
         if not mine:
-            missing.append(form.name)
+            missing.append(cause.name)
         mine = [_apart(e, effects) for e in mine]
         effects += mine
-        named.append(form.name)
+        named.append(cause.name)
         if wants:
             loose |= {e.label for e in mine}
     step = next((c.parameters["step_um"] for c in diagnosis.causes if c.name == "quantisation"), 0.0)
     clean = Chain(tuple(effects))
     target, skip = _target(fit), _settling(fit)
-    before = _rms((_free_run(clean, setting) - target)[skip:])
+    before = _rms((_free_run(clean, data) - target)[skip:])
     fitted, after = clean, before
     if not loose <= {"bouc_wen", "linear_actuator", OFFSET}:
-        fitted, after = _fit(clean, loose, setting, target, skip)
+        fitted, after = _fit(clean, loose, data, target, skip)
     left_out = tuple(missing)
     plain = Chain(tuple(own))
-    if named and not after < _rms((_free_run(plain, setting) - target)[skip:]):
+    if named and not after < _rms((_free_run(plain, data) - target)[skip:]):
         # The library puts it elsewhere in the chain: such an extension would be further off than none.
         fitted, left_out = plain, tuple(dict.fromkeys(named))
-        after = _rms((_free_run(plain, setting) - target)[skip:])
+        after = _rms((_free_run(plain, data) - target)[skip:])
     extras: list[Effect] = [make("sensor_noise", rms_um=_noise(diagnosis, step))]
     if step > 0.0:
         extras.append(make("quantisation", step_um=step))
     repeat = next((c.parameters.get("repeat_probability", 0.0) for c in diagnosis.causes if c.name == "timing"), 0.0)
     if repeat > 0.0 and "timing" not in fitted:
         extras.append(make("timing", repeat_probability=repeat))
-    margin = 0.05 * setting.swing_V
+    margin = 0.05 * data.swing_V
     config = StageConfig(
         name,
         Chain((*fitted, *extras)),
-        dt_s=setting.dt_s,
+        dt_s=data.dt_s,
         seed=seed,
-        u_min_V=min(0.0, setting.u_low_V - margin),
-        u_max_V=max(0.0, setting.u_high_V + margin),
+        u_min_V=min(0.0, data.u_low_V - margin),
+        u_max_V=max(0.0, data.u_high_V + margin),
     )
-    return Exported(config, after, before, left_out)
+    return ExportedStage(config, after, before, left_out)
 
 
 def _apart(e: Effect, others: list[Effect]) -> Effect:
@@ -236,13 +237,13 @@ def _apart(e: Effect, others: list[Effect]) -> Effect:
     return effect(e.name, label=f"{e.label}_{number}", **e.values)
 
 
-def _settling(fit: Fit) -> int:
+def _settling(fit: ModelFit) -> int:
     """Samples in which a stage that was at rest at 0 V before, as a simulated one is, forgets that it was."""
-    u = fit.model.setting.u_V
-    at_rest = abs(float(u[0])) < 1e-3 * fit.model.setting.swing_V and not getattr(
-        fit.model.nominal, "free_memory", False
-    )
-    return 0 if at_rest else fit.model.setting.n // 5
+    u = fit.model.data.u_V
+    nominal = fit.model.nominal
+    free_memory = isinstance(nominal, BoucWenStage) and nominal.free_memory
+    at_rest = abs(float(u[0])) < 1e-3 * fit.model.data.swing_V and not free_memory
+    return 0 if at_rest else fit.model.data.n // 5
 
 
 def _noise(diagnosis: Diagnosis, step_um: float) -> float:
@@ -253,24 +254,24 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _target(fit: Fit) -> FloatArray:
+def _target(fit: ModelFit) -> FloatArray:
     """The extended model's reading without the recorder's own latch and, of a linear stage, hold."""
-    model: Model = fit.model
-    if isinstance(model.nominal, Linear):
+    model: StageModel = fit.model
+    if isinstance(model.nominal, LinearStage):
         # A stage is driven by a converter that holds.
-        model = Model(model.setting, replace(model.nominal, hold="zero"), model.forms)
+        model = StageModel(model.data, replace(model.nominal, hold="zero"), model.causes)
     p = fit.p.copy()
-    for i, slot in enumerate(model.slots[: model.n_nominal]):
-        if slot.name == "latch_samples":
+    for i, parameter in enumerate(model.parameters[: model.n_nominal]):
+        if parameter.name == "latch_samples":
             p[i] = 0.0
-    return model.simulate(p, At.DRIVE).reading_um
+    return model.simulate(p, ActsOn.DRIVE).reading_um
 
 
-def _free_run(chain: Chain, setting: Setting) -> FloatArray:
-    return simulate(chain, setting.u_V, setting.dt_s, other_um=setting.other_um)
+def _free_run(chain: Chain, data: FitData) -> FloatArray:
+    return simulate(chain, data.u_V, data.dt_s, other_um=data.other_um)
 
 
-def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray, skip: int = 0) -> tuple[Chain, float]:
+def _fit(chain: Chain, loose: set[str], data: FitData, target: FloatArray, skip: int = 0) -> tuple[Chain, float]:
     """Levenberg-Marquardt on the loose effects' numbers, each on its own natural scale, but for ``skip`` samples."""
     paths: list[str] = []
     for e in chain:
@@ -281,38 +282,38 @@ def _fit(chain: Chain, loose: set[str], setting: Setting, target: FloatArray, sk
     spec: dict[str, Any] = {
         path: chain[path.rpartition(".")[0]].kind.parameter(path.rpartition(".")[2]) for path in paths
     }
-    now = chain.parameters
-    run = _free_run(chain, setting)
+    run = _free_run(chain, data)
     error = (target - run)[skip:]
     best = float(error @ error)
     damping = 1e-3
     for _ in range(12):
+        now = chain.parameters
         scale = np.array([max(abs(now[path]), 0.02 * abs(spec[path].default), 1e-6) for path in paths])
-        rows = np.empty((len(paths), setting.n - skip))
+        rows = np.empty((len(paths), data.n - skip))
         for i, path in enumerate(paths):
             h = 1e-3 * scale[i] * (1.0 if now[path] + 1e-3 * scale[i] <= spec[path].high else -1.0)
-            moved = _free_run(chain.replace({path: now[path] + h}), setting)
+            moved = _free_run(chain.replace({path: now[path] + h}), data)
             rows[i] = (moved - run)[skip:] / h * scale[i]
         gram, slope = rows @ rows.T, rows @ error
         size = np.maximum(np.diag(gram), 1e-9 * float(np.max(np.diag(gram))))
-        improved = False
-        for _ in range(5):
-            move = np.linalg.lstsq(gram + np.diag(damping * size), slope, rcond=1e-12)[0] * scale
+
+        def trial(move: FloatArray, chain: Chain = chain, scale: FloatArray = scale) -> tuple[float, _Run]:
+            now, step = chain.parameters, move * scale
             values = {
-                path: float(np.clip(now[path] + move[i], spec[path].low, spec[path].high))
+                path: float(np.clip(now[path] + step[i], spec[path].low, spec[path].high))
                 for i, path in enumerate(paths)
             }
-            trial = chain.replace(values)
-            there = _free_run(trial, setting)
-            left = (target - there)[skip:]
-            sse = float(left @ left)
-            if np.isfinite(sse) and sse < best:
-                gained = 1.0 - sse / best
-                chain, run, error, best, now = trial, there, left, sse, trial.parameters
-                damping = max(0.2 * damping, 1e-8)
-                improved = gained > 1e-3
-                break
-            damping *= 10.0
-        if not improved:
+            moved = chain.replace(values)
+            reading = _free_run(moved, data)
+            left = (target - reading)[skip:]
+            return float(left @ left), (moved, reading, left)
+
+        better, damping = damped_step(gram, slope, size, damping, _RULE, 5, best, trial)
+        if better is None:
             break
-    return chain, float(np.sqrt(best / (setting.n - skip)))
+        chain, run, error = better
+        sse = float(error @ error)
+        gained, best = 1.0 - sse / best, sse
+        if gained <= 1e-3:
+            break
+    return chain, float(np.sqrt(best / (data.n - skip)))

@@ -1,0 +1,181 @@
+"""What the readings alone tell, before a model is fitted: noise floor, converter grid, repeats, spectral lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adaptive.types import BoolArray, FloatArray
+from sim.diagnosis.model.fit_data import FitData
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Standard deviation of the noise (µm) and where it was seen: ``rests``, ``holds`` or ``differences``."""
+
+    sigma_um: float
+    source: str
+
+
+def standing(data: FitData, settle_s: float = 0.3) -> BoolArray:
+    """Samples at which the drive (and that of the other axis) has stood still for ``settle_s``."""
+    still = data.rate_V_per_s <= 1e-9 * max(data.swing_V, 1e-30) / data.dt_s
+    if data.u2_V is not None:
+        still &= np.abs(np.diff(data.u2_V, prepend=data.u2_V[0])) == 0.0
+    moves = np.flatnonzero(~still)
+    last = np.full(data.n, 0)
+    last[moves] = moves
+    last = np.maximum.accumulate(last)
+    return np.asarray(still & (np.arange(data.n) - last >= settle_s / data.dt_s))
+
+
+def repeated_period(u_V: FloatArray) -> int:
+    """Samples after which the whole drive repeats itself exactly, at least twice; 0 where it does not."""
+    n = u_V.size
+    x = u_V - u_V.mean()
+    if n < 64 or not np.any(x):
+        return 0
+    size = 1 << (2 * n - 1).bit_length()
+    likeness = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: n // 2 + 1] / np.arange(n, n - n // 2 - 1, -1)
+    # Behind the first fall of the autocorrelation: a smooth drive is like itself at small lags, too.
+    fall = int(np.argmax(likeness < 0.5 * likeness[0]))
+    if fall == 0:
+        return 0
+    # The first of the highest peaks: twice the period is one, too.
+    lag = fall + int(np.argmax(likeness[fall:] > (1.0 - 1e-6) * np.max(likeness[fall:])))
+    same = np.max(np.abs(u_V[lag:] - u_V[:-lag])) <= 1e-3 * np.ptp(u_V)
+    return lag if same else 0
+
+
+def noise_floor(data: FitData) -> NoiseFloor:
+    """Median over short windows at rest of the readings' spread about a line; without rests, from differences."""
+    period = repeated_period(data.u_V)
+    others = [u for u in (data.u2_V, data.u3_V) if u is not None]
+    if period and all(repeated_period(u) == period for u in others):
+        # The first period is still settling where there are more than two.
+        y = data.y_um[period:] if data.n >= 3 * period else data.y_um
+        # By blocks, and their median: where the first period came from rest, its beginning differs by more than noise.
+        d = y[period:] - y[:-period]
+        block = max(8, d.size // 100)
+        return NoiseFloor(float(np.median(_spread(d, block)) / np.sqrt(2.0)), "repeated periods")
+    window = max(16, round(0.1 / data.dt_s))
+    quiet = standing(data)
+    starts = np.arange(0, data.n - window, window)
+    whole = [int(s) for s in starts if quiet[s : s + window].all()]
+    if len(whole) >= 4:
+        t = np.linspace(-1.0, 1.0, window)
+        pieces = np.array([data.y_um[s : s + window] for s in whole])
+        pieces = pieces - pieces.mean(axis=1, keepdims=True)
+        pieces -= (pieces @ t)[:, None] * t / (t @ t)
+        variance = np.sum(pieces**2, axis=1) / (window - 2)
+        return NoiseFloor(float(np.sqrt(np.median(variance))), "rests")
+    # The smoothest parts of the record: sixth differences leave nothing of the motion there.
+    d = np.diff(data.y_um, n=4) / np.sqrt(70.0)
+    return NoiseFloor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")
+
+
+def _spread(d: FloatArray, block: int) -> FloatArray:
+    """Standard deviation in each whole block."""
+    n = d.size // block * block
+    return np.asarray(np.std(d[:n].reshape(-1, block), axis=1))
+
+
+def monitor_noise_V(data: FitData) -> float:
+    """Noise of the monitor: its spread while the drive stands still, at least what a 16-bit converter rounds."""
+    assert data.monitor_V is not None
+    still = standing(data, 0.1)
+    d = np.diff(data.monitor_V)[still[1:]]
+    least = float(np.ptp(data.monitor_V)) / 65536.0
+    return max(float(np.std(d)) / np.sqrt(2.0) if d.size > 20 else 0.0, least)
+
+
+@dataclass(frozen=True)
+class ConverterGrid:
+    """Step of the readings' grid (µm, 0 where there is none that shows) and how many levels were used."""
+
+    step_um: float
+    levels: int
+
+
+def converter_grid(y_um: FloatArray) -> ConverterGrid:
+    """The grid that all readings lie on, or none.
+
+    The smallest distance between levels is refined to the step that every reading is a multiple of; a record whose
+    levels are nearly as many as its readings has no grid that could matter.
+    """
+    levels = np.unique(y_um)
+    if levels.size < 3 or levels.size > 0.9 * y_um.size:
+        return ConverterGrid(0.0, int(levels.size))
+    gaps = np.diff(levels)
+    # Differences of doubles carry rounding; a step is far larger than that.
+    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), 1e-12)]
+    if gaps.size < 2:
+        return ConverterGrid(0.0, int(levels.size))
+    step = float(np.min(gaps))
+    for _ in range(3):
+        counts = np.rint(gaps / step)
+        step = float(gaps.sum() / counts.sum())
+    counts = np.rint(gaps / step)
+    off = np.abs(gaps - counts * step) / step
+    return ConverterGrid(step if float(np.quantile(off, 0.99)) < 0.05 else 0.0, int(levels.size))
+
+
+@dataclass(frozen=True)
+class RepeatedReadings:
+    """Readings that repeat the one before although the motion had moved on: how many, of how many that could show."""
+
+    count: int
+    of: int
+    where: FloatArray
+
+    @property
+    def probability(self) -> float:
+        return self.count / self.of if self.of else 0.0
+
+
+def repeated_readings(y_um: FloatArray, sigma_um: float, step_um: float) -> RepeatedReadings:
+    """Count exact repeats between two samples that both moved by far more than the noise and the grid.
+
+    Asked of the readings alone: where a clamp or friction holds the stage, they do not move before and after.
+    """
+    moved = np.diff(y_um)
+    least = 8.0 * max(sigma_um, 1e-12) + 1.5 * step_um
+    # Both the same way: at the top of a fast sine a step of zero is no repeat.
+    candidate = (np.minimum(moved[:-2], moved[2:]) > least) | (np.maximum(moved[:-2], moved[2:]) < -least)
+    where = np.flatnonzero(candidate & (moved[1:-1] == 0.0)) + 2
+    return RepeatedReadings(int(where.size), int(candidate.sum()), where.astype(np.float64))
+
+
+def _amplitude(residual: FloatArray, t_s: FloatArray, f_hz: float) -> tuple[float, float]:
+    """Amplitude of a line and its standard error, about a slow parabola."""
+    x = t_s - t_s.mean()
+    span = max(float(np.ptp(x)), 1e-12)
+    z = 2.0 * np.pi * f_hz * t_s
+    columns = np.stack([np.sin(z), np.cos(z), np.ones_like(x), x / span, (x / span) ** 2])
+    solved = np.linalg.lstsq(columns.T, residual, rcond=None)[0]
+    left = residual - solved @ columns
+    error = float(np.std(left)) * np.sqrt(2.0 / max(1, residual.size - 5))
+    return float(np.hypot(solved[0], solved[1])), error
+
+
+def has_spectral_line(
+    residual_um: FloatArray, data: FitData, f_hz: float, sigmas: float = 5.5, ratio: float = 3.0
+) -> bool:
+    """True where a line at ``f_hz`` stands out of the fast residual at rest and beside its neighbours.
+
+    Steps and ringing have broad spectra that pass through the mains frequency; hum is narrow and does not stop.
+    """
+    quiet: BoolArray = standing(data, 0.1)
+    width = max(3, round(0.04 / data.dt_s))
+    fast = residual_um - np.convolve(residual_um, np.ones(width) / width, "same")
+    where = quiet
+    if int(quiet.sum()) * data.dt_s < 1.0:
+        # Under drive everything that repeats has lines: only one that towers over its neighbours is hum.
+        where, sigmas, ratio = np.ones(data.n, dtype=np.bool_), 3.0 * sigmas, 3.0 * ratio
+    t, r = data.t_s[where], fast[where]
+    size, error = _amplitude(r, t, f_hz)
+    if size < sigmas * error:
+        return False
+    beside = [_amplitude(r, t, f_hz + d)[0] for d in (-4.3, -3.1, -2.2, 2.2, 3.1, 4.3)]
+    return size > ratio * float(np.median(beside))
