@@ -41,7 +41,7 @@ def _silent(stage: str, share: float) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """How to diagnose. ``nominal``: ``bouc_wen`` (the chapter's stage), ``linear``, or the stage of a stage file."""
+    """How to diagnose. ``nominal``: "bouc_wen" (the chapter's stage), "linear", or the stage of a stage file."""
 
     nominal: str | StageConfig = "bouc_wen"
     seed: int = 0
@@ -49,10 +49,13 @@ class Options:
 
 
 def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_wen") -> BoolArray:
-    """The mask less the first moments, in which only the unknown past of the stage shows."""
+    """The mask without the first samples, which depend on what the stage did before the recording.
+
+    Raises InputError if fewer than 200 samples remain.
+    """
     out = mask.copy()
     if not begins_at_rest(data) and nominal == "bouc_wen":
-        out[:1] = False  # its start is fitted, and tells the lags
+        out[:1] = False  # The start is fitted here, and it determines the lags.
         return out
     out[: max(4, min(round(0.02 / data.dt_s), data.n // 20))] = False
     if int(out.sum()) < 200:
@@ -61,8 +64,10 @@ def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_we
 
 
 def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
-    """The mask of a recording of ``setting`` less the time in which a linear stage's mode rings down to a thousandth,
-    at most a twentieth of it: what the stage did before is not known, where the recording does not begin at rest."""
+    """The mask without the time in which a linear stage's mode rings down to 0.1 %, at most 5 % of the recording.
+
+    It only applies where the recording does not begin at rest: then the initial state of the mode is unknown.
+    """
     if fit.model.nominal.name != "linear" or begins_at_rest(data):
         return mask
     slowest = min(
@@ -76,7 +81,7 @@ def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
 def diagnose_prepared(
     prepared: Prepared, *, seed: int = 0, thresholds: Thresholds | None = None, progress: Progress = _silent
 ) -> Diagnosis:
-    """The whole diagnosis of what `prepare` gave, with its nominal stage and its test recording."""
+    """Diagnose what `prepare` returned, with its nominal stage and its test recording."""
     options = Options(prepared.nominal, seed, thresholds or Thresholds())
     return diagnose(prepared.data, prepared.mask, options, progress, prepared.notes, prepared.dropped, prepared.test)
 
@@ -90,12 +95,12 @@ def diagnose(
     dropped: int = 0,
     test: Prepared | None = None,
 ) -> Diagnosis:
-    """Calibrate, search, remove once more, and say what is there, what is not, and what cannot be told.
+    """Calibrate the nominal stage, search for causes, review them, and derive the verdict.
 
-    ``mask`` (n,) is False where a sample was filled in; ``dropped`` is how many were missing or doubled in the
-    recorder's own time base, which is a finding about timing whatever else there is. ``test``: another recording, on
-    which the held-out errors are taken in place of the folds of this one. Raises InputError where the record cannot
-    be diagnosed at all.
+    ``mask`` (n,) is False where a sample was filled in. ``dropped`` is the number of samples that are missing or
+    doubled in the recorder's own time base; any is reported as a cause "timing". ``test``: another recording of the
+    stage; held-out errors are then measured on it and not by folds. Raises InputError if the recording cannot be
+    diagnosed.
     """
     options = options or Options()
     mask = usable(data, np.ones(data.n, dtype=np.bool_) if mask is None else mask, options.nominal)
@@ -156,7 +161,7 @@ def diagnose(
 
 
 def _on_test(test: Prepared, options: Options, fits: tuple[ModelFit, ModelFit]) -> tuple[float, float]:
-    """Free-run errors (rms, µm) of the nominal and of the extended stage on the test recording."""
+    """Free-run errors (RMS, µm) of the nominal and of the extended stage on the test recording."""
     mask = settled(usable(test.data, test.mask, options.nominal), fits[0], test.data)
     parts = split(test.data)
     one, two = (error_on_other_recording(fit, test.data, mask, parts).sse_um2 / int(mask.sum()) for fit in fits)
@@ -166,16 +171,16 @@ def _on_test(test: Prepared, options: Options, fits: tuple[ModelFit, ModelFit]) 
 def named(
     search: Search, nominal: ModelFit, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]
 ) -> tuple[NamedCause, ...]:
-    """The accepted causes with their numbers, and the share that each removed on top of those before it."""
+    """The accepted causes with their numbers, and the share of the error that each removed when it was added."""
     causes = []
     for i, one in enumerate(found):
         values, spans = numbers(extended, i, search)
         also = one.alternatives
         if one.name == "resonance" and nominal.model.nominal.name != "linear":
-            # A mode that the nominal stage does not know may always have been there, or a payload moved it here.
+            # The nominal stage has no such mode: it may be the stage's own, or a known one moved by a payload.
             also = (*also, "payload_change")
         own = 1.0 - held.sse_um2 / one.held_without.sse_um2
-        # The last one's share is known best from removing it once more.
+        # A single cause's share is measured best by removing it from the final model.
         share = own if len(found) == 1 else one.step.gain
         p = one.step.p_value
         causes.append(
@@ -185,7 +190,10 @@ def named(
 
 
 def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Reported numbers of one cause with 95 % intervals that allow for correlated errors (sums over blocks)."""
+    """The reported numbers of one cause with 95 % intervals.
+
+    The covariance is estimated from sums over blocks, so correlated errors are allowed for.
+    """
     parameters = fit.model.parameters
     free = [i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high]
     scale = np.array([parameters[i].step for i in free])
@@ -193,12 +201,12 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
     bread = np.linalg.pinv(rows @ rows.T, rcond=1e-12)
     scores = search.parts.blocks(rows * fit.residual_um)
     cover = bread @ (scores @ scores.T) @ bread * scale[:, None] * scale[None, :]
-    where = fit.model.where(index)
+    where = fit.model.slice_of(index)
     at = {j: row for row, j in enumerate(free)}
     values: dict[str, float] = {}
     spans: dict[str, tuple[float, float]] = {}
     for name, (value, gradient) in (
-        fit.model.causes[index].physical(fit.model.part(fit.p, index), fit.model.data).items()
+        fit.model.causes[index].reported(fit.model.parameters_of(fit.p, index), fit.model.data).items()
     ):
         g = np.zeros(len(free))
         for k, slope in enumerate(gradient):
@@ -211,7 +219,7 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
 
 
 def verdict_of(causes: tuple[NamedCause, ...], nominal: HeldOut, extended: HeldOut, floor: NoiseFloor, n: int) -> str:
-    """adequate, effects or unexplained."""
+    """The verdict: "adequate", "effects" or "unexplained"."""
     base = n * floor.sigma_um**2
     left, first = extended.sse_um2 - base, nominal.sse_um2 - base
     structured = left > 0.5 * base
@@ -221,7 +229,7 @@ def verdict_of(causes: tuple[NamedCause, ...], nominal: HeldOut, extended: HeldO
 
 
 def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: NoiseFloor) -> tuple[str, ...]:
-    """Causes whose usual size would leave less than five standard errors in this record."""
+    """Names of the causes that, at their usual size, would change this recording by less than five standard errors."""
     seen = {
         search.causes[look.index].name: True
         for look in search.first_looks
@@ -240,7 +248,7 @@ def converter_causes(
     n: int,
     dropped: int,
 ) -> tuple[NamedCause, ...]:
-    """Quantisation and timing, which are seen in the readings themselves rather than fitted."""
+    """Quantisation and timing, as far as they are seen in the readings themselves and not fitted."""
     out: list[NamedCause] = []
     flat = extended.residual_um
     if grid.step_um > 0.0:
@@ -249,46 +257,16 @@ def converter_causes(
         if grid.step_um > 1.2 * floor.sigma_um and share > 0.2:
             step = grid.step_um
             rounding = 1e-3 * step
-            out.append(
-                NamedCause(
-                    "quantisation",
-                    (),
-                    {"step_um": step},
-                    {"step_um": (step - rounding, step + rounding)},
-                    share,
-                    0.001,
-                    flat,
-                    flat,
-                )
-            )
+            values, spans = {"step_um": step}, {"step_um": (step - rounding, step + rounding)}
+            out.append(NamedCause("quantisation", (), values, spans, share, 0.001, flat, flat))
     if doubles is not None:
         p = doubles.probability
         half = 1.96 * float(np.sqrt(p * (1.0 - p) / max(1, doubles.of)))
-        out.append(
-            NamedCause(
-                "timing",
-                (),
-                {"repeat_probability": p},
-                {"repeat_probability": (max(0.0, p - half), p + half)},
-                0.0,
-                0.001,
-                flat,
-                flat,
-            )
-        )
+        values, spans = {"repeat_probability": p}, {"repeat_probability": (max(0.0, p - half), p + half)}
+        out.append(NamedCause("timing", (), values, spans, 0.0, 0.001, flat, flat))
     elif dropped > 0:
         share = dropped / data.n
-        out.append(
-            NamedCause(
-                "timing",
-                (),
-                {"lost_samples": float(dropped)},
-                {"lost_samples": (float(dropped), float(dropped))},
-                share,
-                0.001,
-                flat,
-                flat,
-            )
-        )
+        values, spans = {"lost_samples": float(dropped)}, {"lost_samples": (float(dropped), float(dropped))}
+        out.append(NamedCause("timing", (), values, spans, share, 0.001, flat, flat))
     names = {f.name for f in extended.model.causes}
     return tuple(c for c in out if c.name not in names)

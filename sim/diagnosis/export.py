@@ -1,4 +1,7 @@
-"""The extended stage in the effects library's own terms: a stage file that `dehyst stage` runs."""
+"""Export of a diagnosed stage: its nominal stage and causes as effects of the library, for a stage file.
+
+Where a cause model and the effect of the library differ, the effect is fitted to the cause model.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,6 @@ from sim.diagnosis.result import Diagnosis
 from sim.effects import KINDS, Chain, Effect, effect, simulate
 from sim.stage.config import StageConfig
 
-# --- The calibrated nominal stage and each fitted cause in the effects library's own terms.
-
-
 #: Label of the effect that carries the sensor's offset.
 OFFSET = "sensor_offset"
 
@@ -34,10 +34,10 @@ def make(name: str, label: str = "", **values: float) -> Effect:
 
 
 def nominal_effects(fit: ModelFit) -> list[Effect]:
-    """The calibrated nominal stage in the library's effects. The recorder's latch is no part of the stage."""
-    p = fit.model.part(fit.p, -1)
+    """The calibrated nominal stage as effects of the library, without the recorder's latch."""
+    p = fit.model.parameters_of(fit.p, -1)
     nominal = fit.model.nominal
-    # After the mechanics: an offset before them would be travelled to, lag and all, from a start at zero.
+    # The offset comes after the mechanics: before them it would cause a transient from zero.
     drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
     offset = make("thermal_drift", OFFSET, offset_um=nominal.offset_um(p), **drift)
     if isinstance(nominal, FileStage):
@@ -60,8 +60,8 @@ def nominal_effects(fit: ModelFit) -> list[Effect]:
 
 
 def cause_effects(cause: CauseModel, p: FloatArray, data: FitData) -> tuple[list[Effect], bool]:
-    """One fitted cause in the library's effects, and whether their numbers still want fitting."""
-    v = {name: value for name, (value, _) in cause.physical(p, data).items()}
+    """One fitted cause as effects of the library, and whether their numbers must still be fitted."""
+    v = {name: value for name, (value, _) in cause.reported(p, data).items()}
     swing, duration = data.swing_V, data.duration_s
     match cause.name:
         case "amplifier_lag" | "sensor_lag":
@@ -148,10 +148,10 @@ def cause_effects(cause: CauseModel, p: FloatArray, data: FitData) -> tuple[list
 
 
 def in_force(e: Effect, cause: RestoringForceLoop, p: FloatArray, data: FitData) -> Effect:
-    """A mode of the nominal stage with the loop in its restoring force; any other effect as it is."""
+    """A mode of the nominal stage with ``cause`` in its restoring force; any other effect unchanged."""
     if e.name != "resonance":
         return e
-    v = {name: value for name, (value, _) in cause.physical(p, data).items()}
+    v = {name: value for name, (value, _) in cause.reported(p, data).items()}
     mode = {name: e.values[name] for name in ("frequency_Hz", "damping_ratio")}
     return make("mechanical_hysteresis", e.label, **mode, **v)
 
@@ -163,9 +163,9 @@ _RULE = DampingRule(least=1e-8, least_after_failure=0.0, rcond=1e-12)
 
 @dataclass(frozen=True)
 class ExportedStage:
-    """A stage configuration and how far (rms, µm) its free run is from the extended model that was fitted.
+    """A stage configuration and the RMS difference (µm) of its free run from the extended model.
 
-    ``left_out``: causes that the library's chain has no equal of, such as hysteresis in the restoring force.
+    ``left_out``: causes that the effects library cannot express. ``rms_before_um``: the difference before the fit.
     """
 
     config: StageConfig
@@ -175,8 +175,10 @@ class ExportedStage:
 
 
 def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -> ExportedStage:
-    """The extended stage as a configuration. Where a cause's form and the library's differ, the library's numbers
-    are fitted by simulating the library's own chain against the extended model, latch and noise left out.
+    """The extended stage as a stage configuration.
+
+    Effects that differ from their cause models are fitted by simulating the library's chain against the extended
+    model, without the recorder's latch and noise.
     """
     fit = diagnosis.extended
     data = fit.model.data
@@ -186,10 +188,10 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
         if not any(c.index == i for c in diagnosis.causes):
             continue
         if isinstance(cause, RestoringForceLoop):
-            effects = [in_force(e, cause, fit.model.part(fit.p, i), data) for e in effects]
+            effects = [in_force(e, cause, fit.model.parameters_of(fit.p, i), data) for e in effects]
             named.append(cause.name)
             continue
-        mine, wants = cause_effects(cause, fit.model.part(fit.p, i), data)
+        mine, wants = cause_effects(cause, fit.model.parameters_of(fit.p, i), data)
         if not mine:
             missing.append(cause.name)
         mine = [_apart(e, effects) for e in mine]
@@ -207,7 +209,7 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
     left_out = tuple(missing)
     plain = Chain(tuple(own))
     if named and not after < _rms((_free_run(plain, data) - target)[skip:]):
-        # The library puts it elsewhere in the chain: such an extension would be further off than none.
+        # The library has the effect at another place of the chain, so the export is worse with it than without.
         fitted, left_out = plain, tuple(dict.fromkeys(named))
         after = _rms((_free_run(plain, data) - target)[skip:])
     extras: list[Effect] = [make("sensor_noise", rms_um=_noise(diagnosis, step))]
@@ -229,7 +231,7 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
 
 
 def _apart(e: Effect, others: list[Effect]) -> Effect:
-    """The effect under a label that none of ``others`` has: a stage file may hold one of its kind already."""
+    """The effect with a label that none of ``others`` has: a stage file may hold one of its kind already."""
     taken = {other.label for other in others}
     if e.label not in taken:
         return e
@@ -238,7 +240,7 @@ def _apart(e: Effect, others: list[Effect]) -> Effect:
 
 
 def _settling(fit: ModelFit) -> int:
-    """Samples in which a stage that was at rest at 0 V before, as a simulated one is, forgets that it was."""
+    """Number of first samples to leave out, because a simulated stage starts at rest at 0 V and this one did not."""
     u = fit.model.data.u_V
     nominal = fit.model.nominal
     free_memory = isinstance(nominal, BoucWenStage) and nominal.free_memory
@@ -255,10 +257,10 @@ def _rms(values: FloatArray) -> float:
 
 
 def _target(fit: ModelFit) -> FloatArray:
-    """The extended model's reading without the recorder's own latch and, of a linear stage, hold."""
+    """(n,) reading of the extended model without the recorder's latch and, for a linear stage, with a held drive."""
     model: StageModel = fit.model
     if isinstance(model.nominal, LinearStage):
-        # A stage is driven by a converter that holds.
+        # A simulated stage is driven by a D/A converter that holds.
         model = StageModel(model.data, replace(model.nominal, hold="zero"), model.causes)
     p = fit.p.copy()
     for i, parameter in enumerate(model.parameters[: model.n_nominal]):
@@ -272,7 +274,7 @@ def _free_run(chain: Chain, data: FitData) -> FloatArray:
 
 
 def _fit(chain: Chain, loose: set[str], data: FitData, target: FloatArray, skip: int = 0) -> tuple[Chain, float]:
-    """Levenberg-Marquardt on the loose effects' numbers, each on its own natural scale, but for ``skip`` samples."""
+    """Fit the numbers of the effects ``loose`` (labels) by Levenberg-Marquardt, without the first ``skip`` samples."""
     paths: list[str] = []
     for e in chain:
         if e.label in loose:

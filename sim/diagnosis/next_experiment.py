@@ -1,4 +1,4 @@
-"""The next experiment: of a few that anybody can run, the one whose simulation separates what is still open."""
+"""The next experiment: of a few simple drives, the one that separates rival causes best in a simulation."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from sim.diagnosis.model.calibration import ModelFit
 from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.stage_model import StageModel
 
-#: What a voltage monitor resolves, relative to the swing.
+#: Resolution of a voltage monitor relative to the swing.
 MONITOR_NOISE = 2e-4
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A drive of the same length and swing as the record, in words and as voltages."""
+    """A drive of the length and swing of the recording: a description and its voltages (n,)."""
 
     words: str
     u_V: FloatArray
@@ -27,7 +27,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Rival:
-    """Two fitted explanations of one record."""
+    """Two fitted causes that explain one recording equally well."""
 
     name: str
     other: str
@@ -36,7 +36,7 @@ class Rival:
 
 
 def experiments(data: FitData) -> list[Experiment]:
-    """Drives between the record's lowest and highest voltage, as many samples as it has."""
+    """Drives between the lowest and highest voltage of the recording, with as many samples."""
     n, dt, low, swing = data.n, data.dt_s, data.u_low_V, data.swing_V
     t, total, zero = data.t_s, data.duration_s, np.zeros(data.n)
     x = t / total
@@ -73,7 +73,7 @@ def _at(model: StageModel, p: FloatArray, experiment: Experiment) -> FloatArray:
 
 
 def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
-    """What to record next, in a sentence with the simulated separation, or None where nothing is open."""
+    """What to record next, as a sentence with the simulated difference; None if nothing is open."""
     data = fit.model.data
     if rivals:
         rival = rivals[0]
@@ -103,13 +103,13 @@ def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit
 
 
 def _apart(a: FloatArray, b: FloatArray) -> float:
-    """Rms difference, a common offset left out."""
+    """RMS difference without a common offset."""
     d = a - b
     return float(np.std(d))
 
 
 def _excite(missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
-    """The drive in which most of the causes that this record does not excite would show."""
+    """The drive that shows most of the causes that this recording does not excite, as a sentence."""
     wanted = [f for f in CAUSE_MODELS if f.name in missing and f.name != "payload_change"]
     best: tuple[str, list[str]] = ("", [])
     for experiment in experiments(fit.model.data):
@@ -118,9 +118,9 @@ def _excite(missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | N
         for cause in wanted:
             data = fit.model.data
             crossing = cause.name == "cross_talk" and bool(np.any(experiment.u2_V))
-            if cause.applies(data) and not crossing:
+            if cause.missing(data) and not crossing:
                 continue
-            model = fit.model.plus(cause)
+            model = fit.model.with_cause(cause)
             for trial in cause.guesses(data, fit.residual_um)[:3]:
                 moved = _at(model, np.concatenate([fit.p, trial[0]]), experiment)
                 if np.all(np.isfinite(moved)) and np.std(moved - base) * np.sqrt(data.n) > 30.0 * sigma_um:

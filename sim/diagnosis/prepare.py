@@ -1,4 +1,4 @@
-"""From a recording to the setting of a diagnosis: checked, on its own time grid, holes marked."""
+"""From a recording to the data of a diagnosis: checked, repaired onto its time grid, filled samples marked."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from sim.diagnosis.model.fit_data import FitData
 from sim.recordings import Finding, Recording, check, repaired, require_usable
 from sim.stage.config import StageConfig
 
-#: Longer records are diagnosed on their longest head of this many samples: memory stays below 1 GB.
+#: A longer recording is cut to its first samples, so that memory stays below 1 GB.
 MOST_SAMPLES = 200_000
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A recording ready for a diagnosis. ``mask`` is False where a sample was filled in."""
+    """A recording ready for a diagnosis. ``mask`` (n,) is False where a sample was filled in."""
 
     data: FitData
     mask: BoolArray
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
-    #: Samples that the recorder lost or doubled, by its own time base.
+    #: Number of samples that the recorder lost or doubled according to its time base.
     dropped: int
-    #: What the recording is compared with: ``bouc_wen``, ``linear``, or a stage file's stage.
+    #: Nominal stage: "bouc_wen", "linear", or the stage of a stage file.
     nominal: str | StageConfig = "bouc_wen"
-    #: Another recording of the same stage, on which errors are measured and nothing is fitted.
+    #: Another recording of the same stage, for held-out errors.
     test: Prepared | None = None
 
 
 def prepare(
     recording: Recording, *, nominal: str | StageConfig = "bouc_wen", test: Recording | None = None
 ) -> Prepared:
-    """Check, repair and cut.
+    """Check, repair and cut a recording.
 
     ``nominal``: ``"bouc_wen"`` (the chapter's stage), ``"linear"`` (one mode), or a stage
     (`sim.stage.file.load_stage`).
     ``test``: another recording of the same stage with the same sample time, on which the held-out errors are taken.
-    Raises InputError where nothing can be diagnosed, with what to do about it.
+    Raises InputError, with advice, if the recording cannot be diagnosed.
     """
     if not isinstance(nominal, StageConfig) and nominal not in NAMED:
         raise InputError(f"nominal: got {nominal!r}, expected one of {', '.join(NAMED)}, or a stage of a stage file")
@@ -96,7 +96,7 @@ def _prepared(recording: Recording, nominal: str | StageConfig) -> Prepared:
 
 
 def _moving(values: FloatArray | None) -> FloatArray | None:
-    """A column that says something, or None."""
+    """The column, or None if it is constant or not finite."""
     if values is None or not np.all(np.isfinite(values)) or float(np.ptp(values)) == 0.0:
         return None
     return np.ascontiguousarray(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a diagnosis says: the fixed form of report.json, and what the pictures are drawn from."""
+"""The result of a diagnosis: the content of report.json, and the residuals for its pictures."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from adaptive.types import FloatArray
 from sim.diagnosis.model.calibration import ModelFit
 
 SCHEMA = 1
-
-
 FOLDS, TEST = "folds of the recording", "test recording"
 
 
 @dataclass(frozen=True)
 class NamedCause:
-    """One named cause.
+    """One cause that the diagnosis names.
 
     Attributes
     ----------
@@ -56,13 +54,13 @@ class Diagnosis:
     nominal: ModelFit = field(repr=False)
     extended: ModelFit = field(repr=False)
     notes: tuple[str, ...] = ()
-    #: Causes that the search found before it had to admit that they do not explain the record.
+    #: Causes that the search accepted although together they do not explain the recording (verdict "unexplained").
     partial: tuple[str, ...] = ()
-    #: Where the held-out errors come from.
+    #: Source of the held-out errors: `FOLDS` or `TEST`.
     heldout_source: str = FOLDS
 
     def as_dict(self) -> dict[str, Any]:
-        """The form of report.json, schema 1."""
+        """The content of report.json, schema 1."""
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,

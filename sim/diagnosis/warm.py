@@ -1,4 +1,4 @@
-"""Compile the diagnosis' loops once, on a record of nothing much."""
+"""Compile the loops of the diagnosis once, on a short record."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim.diagnosis.model.hysteresis_loops import (
     asymmetric,
     bouc_wen_loop,
     bouc_wen_paced,
-    felt_rate,
+    filtered_rate,
     grown_plays,
     plays_nested,
 )
@@ -25,7 +25,7 @@ def warm() -> None:
     two = np.array([0.1, 0.2])
     bouc_wen_loop(u, 1.0, 0.9, 0.9, 0.0)
     bouc_wen_paced(u, 1.0, 0.9, 0.9, 0.0, u, 0.1)
-    felt_rate(u, 0.5, 1.0)
+    filtered_rate(u, 0.5, 1.0)
     grown_plays(u, two, two, u, u)
     asymmetric(u, u, u, np.zeros(6), two, two, two, np.ones(3), 1.0)
     plays_nested(u, two, two)

@@ -102,7 +102,7 @@ def run_case(kind: str, seed: int) -> Outcome:
     columns = record(truth, *excitation(np.random.default_rng(seed)))
     start, cpu = time.perf_counter(), time.process_time()
     prepared = prepare(Recording(**columns, dt_s=1.0 / FS_HZ, source=f"{kind}/{seed}"))
-    said = diagnose(prepared.setting, prepared.mask, notes=prepared.notes, dropped=prepared.dropped)
+    said = diagnose(prepared.data, prepared.mask, notes=prepared.notes, dropped=prepared.dropped)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     named = tuple((cause.name, *cause.alternatives) for cause in said.causes)
     judgement = judge(kind, truth, said.verdict, named)

@@ -10,17 +10,17 @@ from sim.diagnosis.causes.reading import MainsHum, SensorNonlinearity, Timing
 from sim.diagnosis.causes.slips import Slips
 from sim.diagnosis.model.stage_model import CauseModel
 
-#: Every form that is tried; forms of one name are variants of one cause.
+#: Every model that is tried. Models of one name are variants of one cause.
 CAUSE_MODELS: tuple[CauseModel, ...] = (
     HysteresisShape(),
     HysteresisShape(variant="restoring"),
     RestoringForceLoop(),
     Asymmetry(),
     RateDependence(),
-    RateDependence(felt_s=0.04),
+    RateDependence(rate_lag_s=0.04),
     RateDependence(variant="thresholds"),
     RateDependence(variant="added"),
-    RateDependence(variant="added", felt_s=0.04),
+    RateDependence(variant="added", rate_lag_s=0.04),
     Creep(),
     ThermalDrift(),
     ThermalDrift(variant="temperature", of_one_recording=False),
@@ -44,9 +44,7 @@ CAUSE_MODELS: tuple[CauseModel, ...] = (
     Timing(),
     Slips(),
 )
-
-
-#: Causes that are one set for a voltage and a sensor: beside one of them another is its form's remainder, not news.
+#: Causes that one voltage and one sensor cannot tell apart: beside one of them the other is not added.
 SETS: tuple[frozenset[str], ...] = (
     frozenset({"asymmetry", "sensor_nonlinearity"}),
     frozenset({"amplifier_lag", "sensor_lag"}),
@@ -54,11 +52,11 @@ SETS: tuple[frozenset[str], ...] = (
 
 
 def same_set(names: set[str]) -> set[str]:
-    """The names with those that are inseparable from one of them."""
+    """The names, with those that cannot be told from one of them."""
     return names.union(*(s for s in SETS if s & names))
 
 
-#: The names of the catalogue; quantisation is found by means of its own.
+#: The names of the catalogue. Quantisation has no model; it is found in the readings.
 NAMES: tuple[str, ...] = (
     "hysteresis_shape",
     "asymmetry",

@@ -15,9 +15,9 @@ from sim.diagnosis.model.stage_model import CauseModel, Guess, single_guesses
 
 @compiled
 def lag_ends(u: FloatArray, ratio: float, straight: bool) -> FloatArray:
-    """First-order lag at the beginning of each sample. ratio = time constant / sample.
+    """(n,) output of a first-order lag at the beginning of each sample. ``ratio`` = time constant / sample time.
 
-    The input is held over a sample or, ``straight``, runs in a line to the next one.
+    The input is held over a sample or, with ``straight``, runs linearly to the next one.
     """
     n = u.shape[0]
     out = np.empty(n)
@@ -35,7 +35,7 @@ def lag_ends(u: FloatArray, ratio: float, straight: bool) -> FloatArray:
 
 @compiled
 def slew_ends(u: FloatArray, step: float, straight: bool) -> FloatArray:
-    """Rate clamp of ``step`` volts a sample, at the beginning of each sample; the input as in `lag_ends`."""
+    """(n,) output of a rate limit of ``step`` volts per sample at the beginning of each sample; see `lag_ends`."""
     n = u.shape[0]
     out = np.empty(n)
     s = u[0]
@@ -69,7 +69,7 @@ class AmplifierLag(CauseModel):
 
 @dataclass(frozen=True)
 class SlewLimit(CauseModel):
-    """Rate clamp of the voltage (V/s at the command)."""
+    """Rate limit of the voltage, V/s at the command."""
 
     name: str = "slew_limit"
     fast: bool = True
@@ -81,7 +81,7 @@ class SlewLimit(CauseModel):
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         top = self._fastest(data)
-        # Slower than a full swing in 0.2 s is no amplifier.
+        # An amplifier takes less than 0.2 s for the full swing.
         low = min(5.0 * data.swing_V, 0.5 * top)
         return (
             ModelParameter("slew_V_per_s", "V/s", 2.0 * top, low, 2.0 * top, 0.05 * data.swing_V / 1e-3, ActsOn.DRIVE),
@@ -99,12 +99,12 @@ class SlewLimit(CauseModel):
 
 @dataclass(frozen=True)
 class Saturation(CauseModel):
-    """Clamp of the voltage at an upper and a lower rail."""
+    """Saturation of the voltage at an upper and a lower limit."""
 
     name: str = "saturation"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        """Flat tops: beyond the rail the readings no longer go with the command."""
+        """Beyond the limit the readings hardly follow the command."""
         beyond = (data.u_V > p[0]) | (data.u_V < p[1])
         if int(beyond.sum()) < 20:
             return False

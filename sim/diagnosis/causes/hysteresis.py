@@ -10,20 +10,18 @@ import numpy as np
 from adaptive.types import FloatArray
 from sim.diagnosis.model.dynamics import ForceLoop, ForceStops, RestoringForce
 from sim.diagnosis.model.fit_data import ActsOn, FitData, ModelParameter
-from sim.diagnosis.model.hysteresis_loops import asymmetric, bouc_wen_paced, felt_rate, grown_plays, plays_nested
+from sim.diagnosis.model.hysteresis_loops import asymmetric, bouc_wen_paced, filtered_rate, grown_plays, plays_nested
 from sim.diagnosis.model.nominal import loop_numbers
 from sim.diagnosis.model.stage_model import CauseModel, Guess
 
-#: Knees of the dead zones: of the displacement, and of a wide play, over half the stroke from its middle.
+#: Knees of the dead zones of the displacement and of a wide play: distance from the middle over half the stroke.
 _NEAR = np.array([-0.6, -0.2, 0.2, 0.6])
-
-
 _WIDE = np.array([-0.4, 0.0, 0.4])
 
 
 @dataclass(frozen=True)
 class HysteresisShape(CauseModel):
-    """A sum of plays (2.7) beside the nominal loop: any loop shape with nonlocal memory and minor loops.
+    """A sum of plays (2.7) beside the nominal hysteresis: any loop shape with nonlocal memory and minor loops.
 
     ``variant`` "restoring", for a nominal stage that is linear: stops of the displacement in the restoring force.
     Thresholds lie twice as dense as the chapter's (2.38) up to half the swing, beyond which only the first rise
@@ -39,8 +37,8 @@ class HysteresisShape(CauseModel):
             steps = np.concatenate([[0.5], np.arange(1.0, 13.1, 0.5), np.arange(15, 26, 2)])
         return np.asarray(steps / 26.0 * top)
 
-    def applies(self, data: FitData) -> str:
-        # Beside a loop at the input, one more in the force of the mechanics would be no other cause.
+    def missing(self, data: FitData) -> str:
+        # A nominal stage with hysteresis explains a loop already: one in the mechanics would be the same cause.
         return "" if self.variant != "restoring" or data.input_is_linear else "a nominal stage without hysteresis"
 
     def restoring(self, p: FloatArray, data: FitData) -> RestoringForce | None:
@@ -49,7 +47,7 @@ class HysteresisShape(CauseModel):
         return ForceStops(self.radii_um(data), np.ascontiguousarray(p))
 
     def radii_um(self, data: FitData) -> FloatArray:
-        """Radii of the plays of the displacement itself, of the variant ``restoring``."""
+        """Radii (µm) of the plays of the displacement, for the variant "restoring"."""
         return np.asarray(np.array([0.01, 0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.45]) * data.range_um)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -71,8 +69,8 @@ class HysteresisShape(CauseModel):
             return None
         return np.asarray(plays_nested(u_V, self.radii_V(data), np.ascontiguousarray(p)))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """Height of the additional loop over the full swing, and the sum of the plays' weights."""
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """Height of the additional loop over the full swing, and the sum of the play weights."""
         if self.variant == "restoring":
             stops = self.radii_um(data) / data.range_um
             return {"force_share": (float(stops @ p), stops), "stiffness_share": (float(p.sum()), np.ones(p.size))}
@@ -92,7 +90,7 @@ class Asymmetry(CauseModel):
     model_error: float = 0.12
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return 1e-5 <= abs(self.physical(p, data)["bend"][0]) + 0.02 * float(np.max(np.abs(p[7:]))) <= 0.1
+        return 1e-5 <= abs(self.reported(p, data)["bend"][0]) + 0.02 * float(np.max(np.abs(p[7:]))) <= 0.1
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         near = tuple(
@@ -116,8 +114,8 @@ class Asymmetry(CauseModel):
         q = np.ascontiguousarray(p)
         return np.asarray(asymmetric(u_V, h_um, w_um, q, _NEAR, _WIDE, x_scale, z_scale, max(loop, 1e-12)))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """The bend over the whole stroke, and the two products."""
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """The bend over the whole stroke and the weights of both products."""
         row = np.zeros(p.size)
         row[:4] = 0.5 * (1.0 - _NEAR) / 2.0
         row[4:7] = 0.5 * (1.0 - _WIDE) / 2.0
@@ -137,12 +135,12 @@ class RateDependence(CauseModel):
     name: str = "rate_dependence"
     model_error: float = 0.3
     variant: str = "width"
-    #: Time over which the rate is felt, s; ``felt_free``: only where its fit begins.
-    felt_s: float = 0.004
-    felt_free: bool = False
+    #: Time constant of the lag that filters the rate, s; with ``free_rate_lag`` the start value of its fit.
+    rate_lag_s: float = 0.004
+    free_rate_lag: bool = False
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return 0.003 <= self.physical(p, data)["growth_per_decade"][0] <= 0.6
+        return 0.003 <= self.reported(p, data)["growth_per_decade"][0] <= 0.6
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         v = data.swing_V
@@ -161,15 +159,15 @@ class RateDependence(CauseModel):
             pace,
         )
         felt = ModelParameter(
-            "log_felt_s", "1", float(np.log(self.felt_s)), float(np.log(2e-4)), 0.0, 0.2, ActsOn.STATIC
+            "log_felt_s", "1", float(np.log(self.rate_lag_s)), float(np.log(2e-4)), 0.0, 0.2, ActsOn.STATIC
         )
-        return (*own, felt) if self.felt_free else own
+        return (*own, felt) if self.free_rate_lag else own
 
     def _paced(self, p: FloatArray) -> tuple[float, float]:
-        """Rate above which the loop grows (V/s), and the time over which it is felt (s)."""
-        if self.felt_free:
+        """Rate above which the loop grows (V/s), and the time constant of the rate filter (s)."""
+        if self.free_rate_lag:
             return float(np.exp(p[-2])), float(np.exp(p[-1]))
-        return float(np.exp(p[-1])), self.felt_s
+        return float(np.exp(p[-1])), self.rate_lag_s
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         parameters = self.parameters(data)
@@ -185,7 +183,7 @@ class RateDependence(CauseModel):
         return out
 
     def _growth(self, data: FitData) -> tuple[FloatArray, float, float]:
-        """Thresholds at rest (V), their growth per decade as a factor and in V."""
+        """Thresholds at rest (V), and their growth per decade as a factor and in V."""
         if self.variant == "added":
             return np.array([0.0, 0.1, 0.3]) * data.swing_V, 0.0, 0.01 * data.swing_V
         return np.array([0.06, 0.18, 0.36]) * data.swing_V, 0.05, 0.0
@@ -195,8 +193,8 @@ class RateDependence(CauseModel):
     ) -> FloatArray | None:
         if not np.any(p[: 2 if self.variant == "width" else 3]):
             return None
-        corner_V_per_s, felt_s = self._paced(p)
-        rate = felt_rate(u_V, float(np.exp(-data.dt_s / felt_s)) if felt_s > 0.0 else 0.0, data.dt_s)
+        corner_V_per_s, rate_lag_s = self._paced(p)
+        rate = filtered_rate(u_V, float(np.exp(-data.dt_s / rate_lag_s)) if rate_lag_s > 0.0 else 0.0, data.dt_s)
         pace = np.log10(1.0 + rate / corner_V_per_s)
         if self.variant != "width":
             radii, factor, added = self._growth(data)
@@ -204,17 +202,17 @@ class RateDependence(CauseModel):
         out = -p[0] * h_um * pace
         if p[1] != 0.0 and data.nominal_kind == "bouc_wen":
             slope, beta, gamma = loop_numbers(nominal)
-            # The driving term must not change its sign, or the loop would run away.
+            # The loop diverges if the driving term changes its sign.
             pace = np.maximum(pace, -0.9 / p[1]) if p[1] > 0.0 else np.minimum(pace, -0.9 / p[1])
             out -= bouc_wen_paced(u_V, slope, beta, gamma, float(h_um[0]), pace, float(p[1])) - h_um
         return np.asarray(out)
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         v0, _ = self._paced(p)
         row, corner = np.zeros(p.size), np.zeros(p.size)
-        corner[-2 if self.felt_free else -1] = v0
+        corner[-2 if self.free_rate_lag else -1] = v0
         if self.variant != "width":
-            # Growth of the loop's height, relative to the stroke.
+            # Growth of the loop height relative to the stroke.
             radii, factor, added = self._growth(data)
             row[:3] = 2.0 * (factor * radii + added) / data.range_um
         else:
@@ -224,19 +222,19 @@ class RateDependence(CauseModel):
 
 @dataclass(frozen=True)
 class RestoringForceLoop(CauseModel):
-    """(2.2) with the displacement for the voltage, as a force beside the spring of the nominal stage's mode.
+    """(2.2) with the displacement in place of the voltage, as a force parallel to the spring of the nominal mode.
 
-    Only beside a stage without a loop of its own: a second one in the mechanics would be no other cause.
+    It only applies to a nominal stage without hysteresis.
     """
 
     name: str = "hysteresis_shape"
     variant: str = "restoring_loop"
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if data.input_is_linear else "a nominal stage without hysteresis"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        # A loop that levels off nowhere, or at once, is a spring or a friction.
+        # A loop that never saturates is a spring; one that saturates at once is friction.
         return float(p[0]) > 0.02 and 0.1 < math.exp(float(p[1])) * data.range_um < 250.0
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -252,15 +250,15 @@ class RestoringForceLoop(CauseModel):
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return [[np.array([0.1, math.log(reach / data.range_um), 0.0])] for reach in (1.0, 4.0, 16.0, 60.0)]
 
-    def together(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        """The loop takes over a part of the spring: what a linear calibration found is the stiffness of both."""
+    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
+        """Joint start values: a linear calibration found the stiffness of spring and loop together."""
         if "log_f0" not in names:
             return []
         gain, f0 = names.index("gain_um_per_V"), names.index("log_f0")
         out = []
         for share in (0.3, 1.0, 3.0):
             for reach in (1.0, 4.0, 16.0, 60.0):
-                # The wider the motion, the less of the loop is felt as stiffness.
+                # The wider the motion, the smaller the stiffness of the loop.
                 felt = 1.0 + share * (0.9 if reach < 2.0 else 0.6)
                 p = nominal.copy()
                 p[gain] *= felt
@@ -274,8 +272,8 @@ class RestoringForceLoop(CauseModel):
         beta = math.exp(float(p[1]))
         return ForceLoop(float(p[0]), beta * (1.0 + float(p[2])), beta * (1.0 - float(p[2])))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """Stiffness beside the spring's, and both rates of the loop; gamma with the sign of (2.2)."""
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """Stiffness relative to the spring, and both rates of the loop; gamma with the sign of (2.2)."""
         beta = math.exp(float(p[1]))
         share, own, gamma = np.zeros(3), np.zeros(3), np.zeros(3)
         share[0] = 1.0
@@ -288,25 +286,25 @@ class RestoringForceLoop(CauseModel):
         }
 
 
-#: Error left, in noise floors, above which a finer form is worth its time.
+#: Remaining error, in noise floors, above which a finer model is fitted.
 _LEFT = {"hysteresis_shape": 1.5, "rate_dependence": 1.2}
 
 
 def refined_model(
     cause: CauseModel, p: FloatArray, left_floors: float, data: FitData
 ) -> tuple[CauseModel, list[FloatArray]] | None:
-    """A finer form of the same cause and the starts of its fit, or None where it has none or needs none.
+    """A model of the same cause with more parameters and its start values; None if there is none or none is needed.
 
-    ``p`` are the fitted numbers of ``form``; ``left_floors`` is the error left beside it, in noise floors.
+    An error that a coarse model leaves must not be taken for another cause. ``p`` are the fitted parameters of
+    ``cause``; ``left_floors`` is the remaining error in noise floors.
     """
     if left_floors <= _LEFT.get(cause.name, np.inf):
         return None
     if isinstance(cause, HysteresisShape) and not cause.variant:
         fine = replace(cause, variant="fine")
         return fine, [np.zeros(len(fine.parameters(data)))]
-    if isinstance(cause, RateDependence) and not cause.felt_free:
-        # Over what time the rate is felt is no constant of nature.
-        free = replace(cause, variant="width", felt_free=True)
+    if isinstance(cause, RateDependence) and not cause.free_rate_lag:
+        free = replace(cause, variant="width", free_rate_lag=True)
         width, slope, pace = p if cause.variant == "width" else (0.02, 0.0, float(np.log(2.0 * data.swing_V)))
-        return free, [np.array([width, slope, pace, np.log(felt_s)]) for felt_s in (0.004, 0.02)]
+        return free, [np.array([width, slope, pace, np.log(rate_lag_s)]) for rate_lag_s in (0.004, 0.02)]
     return None

@@ -22,7 +22,7 @@ from sim.diagnosis.model.stage_model import CauseModel, Guess, single_guesses
 
 @dataclass(frozen=True)
 class Resonance(CauseModel):
-    """A missing second-order mode of unit gain after the loop."""
+    """A second-order mode of unit gain after the hysteresis that the nominal stage lacks."""
 
     name: str = "resonance"
     fast: bool = True
@@ -70,14 +70,14 @@ class Resonance(CauseModel):
         mode = (float(np.exp(p[0])), float(np.exp(p[1])))
         return replace(system, modes_hz=(*system.modes_hz, mode))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         f, z = float(np.exp(p[0])), float(np.exp(p[1]))
         return {"f0_hz": (f, np.array([f, 0.0])), "damping": (z, np.array([0.0, z]))}
 
 
 @dataclass(frozen=True)
 class SensorLag(CauseModel):
-    """A low-pass in the sensor's electronics."""
+    """A first-order low-pass in the sensor's electronics."""
 
     name: str = "sensor_lag"
     fast: bool = True
@@ -94,7 +94,7 @@ class SensorLag(CauseModel):
 
 @dataclass(frozen=True)
 class Delay(CauseModel):
-    """A dead time of more than the one sample that is the recorder's own."""
+    """A dead time of more than the one sample of the recorder."""
 
     name: str = "delay"
     fast: bool = True
@@ -112,7 +112,7 @@ class Delay(CauseModel):
 
 
 def loaded(system: Dynamics, ratio: float) -> Dynamics:
-    """The system whose lightly damped mode of the nominal stage carries ``ratio`` of its own mass more.
+    """The system with ``ratio`` of its moving mass added to the first lightly damped mode.
 
     Spring and dashpot stay: f0 and damping ratio both fall by sqrt(1 + ratio), the DC gain does not change.
     """
@@ -128,7 +128,7 @@ def loaded(system: Dynamics, ratio: float) -> Dynamics:
 
 @dataclass(frozen=True)
 class PayloadChange(CauseModel):
-    """A payload: the known mode lies at f0 sqrt(m/(m+M)). Negative where a payload was taken off.
+    """A payload M: the known mode lies at f0 sqrt(m/(m+M)). Negative if a payload was removed.
 
     ``variant`` "": throughout the recording, against a frequency that a stage file states; "midway": from a moment in
     the recording on, which the nominal stage's own mode cannot imitate.
@@ -137,7 +137,7 @@ class PayloadChange(CauseModel):
     name: str = "payload_change"
     fast: bool = True
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         if self.variant == "midway":
             return "" if data.has_mode else "a nominal stage with a mode"
         return "" if data.known_modes_hz else "a nominal stage whose mode is known beforehand"
@@ -164,7 +164,7 @@ class PayloadChange(CauseModel):
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system if self.variant == "midway" else loaded(system, float(p[0]))
 
-    def later(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
+    def changed_dynamics(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
         if self.variant != "midway" or p[0] == 0.0:
             return None
         other = loaded(system, float(p[0]))
@@ -174,14 +174,12 @@ class PayloadChange(CauseModel):
 
 #: Least share of the residual's power that a mode explains.
 LEAST = 0.004
-
-
 ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One mode: frequency (Hz), damping ratio, and the shares of its displacement and (over omega) its velocity."""
+    """One mode: frequency (Hz), damping ratio, and the weights of its displacement and of its velocity / omega."""
 
     f_hz: float
     damping: float
@@ -190,7 +188,7 @@ class Mode:
 
 
 def modal_response(x: FloatArray, p: FloatArray, data: FitData, system: Dynamics) -> FloatArray:
-    """Sum of modes driven by ``x`` (n,); ``p`` holds log f, log damping, share and rate of each."""
+    """(n,) sum of modes driven by ``x`` (n,); ``p`` holds log f, log damping, share and rate of each."""
     poles: list[complex] = []
     residues: list[complex] = []
     for log_f, log_z, share, rate in p.reshape(-1, 4):
@@ -204,7 +202,7 @@ def modal_response(x: FloatArray, p: FloatArray, data: FitData, system: Dynamics
 
 
 def modal_parameters(data: FitData, count: int, size: float, at: ActsOn) -> tuple[ModelParameter, ...]:
-    """Four numbers a mode. ``size`` is the natural scale of a share."""
+    """Four parameters per mode. ``size`` is the natural scale of a share."""
     top = 0.49 / data.dt_s
     out: list[ModelParameter] = []
     for i in range(1, count + 1):
@@ -218,7 +216,7 @@ def modal_parameters(data: FitData, count: int, size: float, at: ActsOn) -> tupl
 
 
 def peaks(x: FloatArray, residual_um: FloatArray, dt_s: float, most: int) -> list[Mode]:
-    """Modes by which ``x`` would explain the residual, strongest first, in the frequency domain.
+    """Modes by which ``x`` (n,) explains the residual (n,), strongest first, found in the frequency domain.
 
     One mode after the other is taken from where it gains most, its frequency and damping on a grid and its shares by
     least squares; after each all shares are solved for again. Stops where a mode explains less than `LEAST`.
@@ -279,7 +277,7 @@ MOST = 10
 
 @dataclass(frozen=True)
 class Modes(CauseModel):
-    """Modes beside the nominal stage, found in the residual's spectrum anew each time.
+    """Modes parallel to the nominal stage, found again in the spectrum of each residual.
 
     Only beside a nominal stage without a loop: what a loop leaves is no structure's answer to the voltage.
     """
@@ -287,7 +285,7 @@ class Modes(CauseModel):
     variant: str = "modes"
     found: tuple[Mode, ...] = ()
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if self.found and data.input_is_linear else "modes that stand out of a linear stage's residual"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
@@ -310,23 +308,23 @@ class Modes(CauseModel):
         return [[p]]
 
     def driving(self, fit: ModelFit) -> FloatArray | None:
-        """What drives these modes, (n,), or None where it was not recorded."""
+        """(n,) signal that drives these modes, or None if it was not recorded."""
         return fit.signals.static_um[:: fit.model.substeps]
 
-    def sought(self, fit: ModelFit) -> Modes:
-        """The same cause with the modes that this residual shows."""
+    def with_modes_of(self, fit: ModelFit) -> Modes:
+        """The same cause with the modes in the residual of ``fit``."""
         data = fit.model.data
         x = self.driving(fit)
         if x is None or not data.input_is_linear:
             return replace(self, found=())
         return replace(self, found=tuple(peaks(x, fit.residual_um, data.dt_s, MOST)))
 
-    def beside(
+    def added_motion(
         self, drive_V: FloatArray, static_um: FloatArray, p: FloatArray, data: FitData, system: Dynamics
     ) -> FloatArray | None:
         return modal_response(static_um, p, data, system)
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         """Frequency and damping of the strongest mode, then of the others by frequency."""
         rows = p.reshape(-1, 4)
         f, z = np.exp(rows[:, 0]), np.exp(rows[:, 1])
@@ -345,7 +343,7 @@ class Modes(CauseModel):
 
 @dataclass(frozen=True)
 class StructureModes(Modes):
-    """Resonances of a structure, driven by what the actuator does."""
+    """Resonances of a structure, driven by the actuator's displacement."""
 
     name: str = "resonance"
     fast: bool = True
@@ -353,11 +351,11 @@ class StructureModes(Modes):
 
 @dataclass(frozen=True)
 class CrossModes(Modes):
-    """The other axes' drives, heard through modes of their own."""
+    """Cross-talk from the voltages of other axes, through modes of its own."""
 
     name: str = "cross_talk"
-    #: By mode: which of the other drives it answers.
-    heard: tuple[int, ...] = ()
+    #: For each mode the index of the voltage that drives it.
+    driven_by: tuple[int, ...] = ()
 
     def at(self) -> ActsOn:
         return ActsOn.MOTION
@@ -366,19 +364,19 @@ class CrossModes(Modes):
         swings = [float(np.ptp(u)) for u in _others(data)]
         return 0.2 * data.range_um / max(*swings, 1e-9) if swings else 1.0
 
-    def sought(self, fit: ModelFit) -> Modes:
+    def with_modes_of(self, fit: ModelFit) -> Modes:
         data = fit.model.data
         if not data.input_is_linear:
-            return replace(self, found=(), heard=())
+            return replace(self, found=(), driven_by=())
         found: list[Mode] = []
-        heard: list[int] = []
+        driven_by: list[int] = []
         for which, u in enumerate(_others(data)):
             more = peaks(u, fit.residual_um, data.dt_s, MOST)
             found += more
-            heard += [which] * len(more)
-        return replace(self, found=tuple(found), heard=tuple(heard))
+            driven_by += [which] * len(more)
+        return replace(self, found=tuple(found), driven_by=tuple(driven_by))
 
-    def beside(
+    def added_motion(
         self, drive_V: FloatArray, static_um: FloatArray, p: FloatArray, data: FitData, system: Dynamics
     ) -> FloatArray | None:
         return None
@@ -386,18 +384,18 @@ class CrossModes(Modes):
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         out, rows = x_um, p.reshape(-1, 4)
         for which, u in enumerate(_others(data)):
-            mine = np.flatnonzero(np.array(self.heard) == which)
+            mine = np.flatnonzero(np.array(self.driven_by) == which)
             if mine.size:
                 out = out + modal_response(u, np.ascontiguousarray(rows[mine]), data, Dynamics())
         return out
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """Static share as a part of this axis' own gain, then the modes."""
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """Static cross-talk relative to this axis' gain, then the modes."""
         row = np.zeros(p.size)
-        row[2::4] = np.where(np.array(self.heard) == 0, 1.0 / data.gain_um_per_V, 0.0)
-        return {"static": (float(row @ p), row)} | super().physical(p, data)
+        row[2::4] = np.where(np.array(self.driven_by) == 0, 1.0 / data.gain_um_per_V, 0.0)
+        return {"static": (float(row @ p), row)} | super().reported(p, data)
 
 
 def _others(data: FitData) -> list[FloatArray]:
-    """Voltages of the other axes, as far as they were recorded."""
+    """Recorded voltages of the other axes."""
     return [u for u in (data.u2_V, data.u3_V) if u is not None]

@@ -16,7 +16,7 @@ from sim.diagnosis.model.stage_model import CauseModel, Guess
 
 @compiled
 def slow_poles(x: FloatArray, rates: FloatArray) -> FloatArray:
-    """First-order lags of x - x[0] with rates dt/tau, exact for a held x, (m, n)."""
+    """(m, n) first-order lags of x - x[0] with rates dt/tau (m,), exact for an x that is held over each sample."""
     m = rates.shape[0]
     n = x.shape[0]
     out = np.empty((m, n))
@@ -32,9 +32,9 @@ def slow_poles(x: FloatArray, rates: FloatArray) -> FloatArray:
 
 @compiled
 def friction(x: FloatArray, width: float, share: float) -> FloatArray:
-    """Stuck after each reversal until the drive is ``width`` away, then sliding ``share * width`` behind it.
+    """Friction: the output sticks after each reversal until x is ``width`` away, then follows ``share * width`` behind.
 
-    share = 1 is a play of radius ``width``; below, letting go is a jump.
+    share = 1 is a play of radius ``width``; below 1, the output jumps when it breaks free.
     """
     n = x.shape[0]
     out = np.empty(n)
@@ -64,7 +64,7 @@ _POLES = LastResultCache()
 
 @dataclass(frozen=True)
 class Creep(CauseModel):
-    """Slow poles half a decade apart, 0.03 s to beyond the record: equal weights are log t."""
+    """A sum of slow first-order lags, 0.05 s to beyond the record, 0.6 decades apart. Equal weights give log t."""
 
     name: str = "creep"
     model_error: float = 0.04
@@ -75,11 +75,11 @@ class Creep(CauseModel):
         count = max(2, int(np.floor(np.log10(top / 0.05) / self.spacing)) + 1)
         return np.asarray(0.05 * 10.0 ** (self.spacing * np.arange(count)), dtype=np.float64)
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if data.duration_s > 1.0 else "a record longer than a second"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return 5e-4 <= self.physical(p, data)["gain_per_decade"][0] <= 0.08
+        return 5e-4 <= self.reported(p, data)["gain_per_decade"][0] <= 0.08
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         r = data.range_um
@@ -87,7 +87,7 @@ class Creep(CauseModel):
             ModelParameter(f"weight{j + 1}", "1", 0.0, 0.0, 0.1, 0.005, ActsOn.MOTION, True)
             for j in range(self.taus_s(data).size)
         ]
-        # A step before the record began is still creeping.
+        # Creep goes on from a step before the recording.
         return (*weights, ModelParameter("start_um", "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION))
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
@@ -104,8 +104,8 @@ class Creep(CauseModel):
             out += p[-1] * (p[:-1] @ _steps(data, taus))
         return np.asarray(out)
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        # Slope of the step response over log10 t, from the first pole's time to half of the record.
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        # Slope of the step response over log10 t, from 0.1 s to half the record.
         taus = self.taus_s(data)
         t = np.logspace(-1.0, np.log10(max(data.slowest_s / 6.0, 0.3)), 60)
         rise = 1.0 - np.exp(-t[None, :] / taus[:, None])
@@ -121,7 +121,7 @@ class CrossTalk(CauseModel):
 
     name: str = "cross_talk"
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if data.other_um is not None else "the other axis driven and recorded (u2_V or y2_um)"
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -138,12 +138,12 @@ class CrossTalk(CauseModel):
 
 @dataclass(frozen=True)
 class ThermalDrift(CauseModel):
-    """A slow additive drift: piecewise linear in time, or following the temperature that was recorded."""
+    """A slow additive drift: a spline in time or, as ``variant`` "temperature", proportional to the temperature."""
 
     name: str = "thermal_drift"
     of_one_recording: bool = True
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         if self.variant == "temperature" and data.warmth_K is None:
             return "a temperature that was recorded and moved"
         return "" if data.duration_s > 1.0 else "a record longer than a second"
@@ -165,9 +165,9 @@ class ThermalDrift(CauseModel):
             return x_um if data.warmth_K is None else x_um + p[0] * data.warmth_K
         return x_um + _spline(p, data)
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         if self.variant == "temperature":
-            return super().physical(p, data)
+            return super().reported(p, data)
         rate = np.zeros(p.size)
         rate[-1] = 1.0 / data.duration_s
         return {"rate_um_per_s": (float(rate @ p), rate)}
@@ -175,12 +175,12 @@ class ThermalDrift(CauseModel):
 
 @dataclass(frozen=True)
 class GainDrift(CauseModel):
-    """A gain that changes over time, or with the recorded temperature."""
+    """A gain that changes with time (a spline) or, as ``variant`` "temperature", with the recorded temperature."""
 
     name: str = "gain_drift"
     of_one_recording: bool = True
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         if self.variant == "temperature" and data.warmth_K is None:
             return "a temperature that was recorded and moved"
         return "" if data.duration_s > 1.0 else "a record longer than a second"
@@ -198,9 +198,9 @@ class GainDrift(CauseModel):
             return x_um if data.warmth_K is None else x_um * (1.0 + p[0] * data.warmth_K)
         return x_um * (1.0 + _spline(p, data))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         if self.variant == "temperature":
-            return super().physical(p, data)
+            return super().reported(p, data)
         last = np.zeros(p.size)
         last[-1] = 1.0
         return {
@@ -210,12 +210,12 @@ class GainDrift(CauseModel):
 
 
 def _steps(data: FitData, taus_s: FloatArray) -> FloatArray:
-    """What a unit step at the start becomes in each pole, (m, n)."""
+    """(m, n) response of each slow lag to a unit step at the first sample."""
     return data.derived(("step responses", taus_s.size), lambda: 1.0 - np.exp(-data.t_s[None, :] / taus_s[:, None]))
 
 
 def _spline(p: FloatArray, data: FitData) -> FloatArray:
-    """A cubic spline in time through 0 at the start and ``p`` at equal spans."""
+    """(n,) cubic spline in time through 0 at the start and the values ``p`` at equal spans."""
 
     def basis() -> FloatArray:
         knots = np.arange(p.size + 1) * (data.duration_s / p.size)
@@ -226,7 +226,7 @@ def _spline(p: FloatArray, data: FitData) -> FloatArray:
 
 @dataclass(frozen=True)
 class StickSlip(CauseModel):
-    """Friction: stuck after each reversal, then sliding behind by a share of the width."""
+    """Friction, see `friction`: the stage sticks after each reversal, then slides behind by a share of the width."""
 
     name: str = "stick_slip"
 

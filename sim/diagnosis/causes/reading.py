@@ -15,7 +15,7 @@ from sim.diagnosis.model.stage_model import CauseModel, Guess, single_guesses
 
 @compiled
 def resample_by(x: FloatArray, shifts: FloatArray) -> FloatArray:
-    """x at instants k + shifts[k] by cubic (Catmull-Rom) interpolation, held at the ends."""
+    """(n,) x at the instants k + shifts[k] by cubic (Catmull-Rom) interpolation, constant beyond the ends."""
     n = x.shape[0]
     out = np.empty(n)
     for k in range(n):
@@ -32,14 +32,14 @@ def resample_by(x: FloatArray, shifts: FloatArray) -> FloatArray:
 
 @compiled
 def resample(x: FloatArray, stretch: float, shift: float) -> FloatArray:
-    """x at instants k (1 + stretch) + shift; see `resample_by`. The sum keeps the fraction's digits at large k."""
+    """(n,) x at the instants k (1 + stretch) + shift, see `resample_by`."""
     shifts = stretch * np.arange(x.shape[0], dtype=np.float64) + shift
     return resample_by(x, shifts.astype(np.float64))
 
 
 @dataclass(frozen=True)
 class SensorNonlinearity(CauseModel):
-    """A single-valued bend of the reading, second to fourth order, at most 0.4 % of the range."""
+    """A static curve of the sensor: a polynomial of second to fourth order, at most 0.4 % of the range."""
 
     name: str = "sensor_nonlinearity"
 
@@ -52,12 +52,12 @@ class SensorNonlinearity(CauseModel):
     def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         half = 0.5 * data.range_um
         x = (y_um - data.centre_um) / half
-        # Orthogonal polynomials: their shares of the bend can be read one by one.
+        # Near-orthogonal polynomials: the share of each order can be read on its own.
         x2 = x * x
         bend = p[0] * (x2 - 1.0) + x * (p[1] * (x2 - 1.0)) + p[2] * (x2 * x2 - x2)
         return np.asarray(y_um + half * bend)
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         out = {}
         for i, name in enumerate(("quadratic", "cubic", "quartic")):
             row = np.zeros(p.size)
@@ -68,13 +68,13 @@ class SensorNonlinearity(CauseModel):
 
 @dataclass(frozen=True)
 class MainsHum(CauseModel):
-    """Lines at 50 or 60 Hz and their first harmonics, phases free. ``variant`` is the frequency."""
+    """Spectral lines at 50 or 60 Hz and the first harmonics, with free phases. ``variant`` is the frequency."""
 
     name: str = "mains_hum"
     of_one_recording: bool = True
     variant: str = "50"
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if float(self.variant) < 0.48 / data.dt_s else "a sample rate above twice the mains frequency"
 
     def orders(self, data: FitData) -> list[int]:
@@ -92,13 +92,13 @@ class MainsHum(CauseModel):
         return tuple(own)
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        # The line's own frequency to a small part of a bin, from the residual's spectrum beside the nominal one.
+        # Search the residual's spectrum around the nominal frequency in steps of a quarter of a bin.
         f0 = float(self.variant)
         grid = f0 + np.arange(-0.6, 0.6001, 0.25 / data.duration_s)
         fast = (
             residual_um - np.convolve(residual_um, np.ones(9) / 9.0, "same") if f0 * data.dt_s > 0.02 else residual_um
         )
-        # Windowed, because steps and ringing leak: a line is what stays sharp.
+        # The window suppresses the leakage of steps and ringing; a line stays sharp.
         fast = fast * np.hanning(data.n)
         start = np.exp(-2j * np.pi * grid[0] * data.t_s)
         turn = np.exp(-2j * np.pi * (grid[1] - grid[0]) * data.t_s)
@@ -129,7 +129,7 @@ class MainsHum(CauseModel):
                 out += b * np.cos(k * phase)
         return out
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         one = np.zeros(p.size)
         one[0] = 1.0
         size = float(np.hypot(p[1], p[2]))

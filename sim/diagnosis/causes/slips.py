@@ -18,40 +18,28 @@ from sim.diagnosis.model.calibration import ModelFit, calibrate, evaluate
 from sim.diagnosis.model.fit_data import ActsOn, FitData, ModelParameter
 from sim.diagnosis.model.stage_model import CauseModel, Guess, StageModel
 
-#: Samples by which a column may come to run ahead or late.
+#: Largest total shift of a column, samples.
 MOST = 12
-
-
-#: Slips beyond this number are no slips but another cause that looks like them.
+#: More slips than this are taken for another cause.
 MOST_SLIPS = 16
-
-
 _BLOCK = 8
-
-
-#: Before this sample a slip would be the recorder's latch.
+#: A slip before this sample cannot be told from the recorder's latch.
 _FIRST = 100
-
-
-#: Between two slips there are more samples than this: lost and gained at once is no slip but a model's error.
+#: Least distance of two slips, samples: a shift that is soon taken back is a model error.
 _SHORTEST = 64
-
-
-#: First sample and number of samples lost (gained where negative), in order.
+#: Slips in order: first sample, and number of samples lost (negative: gained).
 SlipList = tuple[tuple[int, int], ...]
-
-
 IntArray = NDArray[np.int64]
 
 
 @compiled
 def _path(cost: FloatArray, price: float) -> FloatArray:
-    """The cheapest way through ``cost`` (blocks, shifts) where each step of one shift costs ``price`` (Viterbi)."""
+    """(blocks,) cheapest path through ``cost`` (blocks, shifts) if a change by one shift costs ``price`` (Viterbi)."""
     n, m = cost.shape
     back = np.zeros((n, m), dtype=np.int8)
     total = cost[0].copy()
     for b in range(1, n):
-        for j in range(1, m):  # a change by more steps pays for each
+        for j in range(1, m):  # A change by several shifts pays for each.
             if total[j - 1] + price < total[j]:
                 total[j] = total[j - 1] + price
                 back[b, j] = back[b, j - 1] - 1
@@ -70,7 +58,7 @@ def _path(cost: FloatArray, price: float) -> FloatArray:
 
 
 def find_slips(y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipList:
-    """Where the readings slip against the model, and by how many samples: ``((index, size), ...)``; positive is lost.
+    """The slips of the readings ``y_um`` (n,) against the model ``model_um`` (n,), by a coarse search.
 
     Asked of first differences, so that slow errors of the model do not matter, in blocks of eight samples. A slip has
     to save far more than the typical error of a block.
@@ -89,7 +77,7 @@ def find_slips(y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipL
     if not np.all(np.isfinite(least)):
         return ()
     cost -= least[:, None]
-    # A model that is still wrong pays for that in many blocks: the price rises until few slips are left.
+    # A wrong model makes many blocks expensive: raise the price until few slips remain.
     price = 12.0 * max(float(np.quantile(least, 0.9)), 1e-18)
     for _ in range(12):
         path = _path(np.ascontiguousarray(cost), price)
@@ -102,7 +90,7 @@ def find_slips(y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipL
 
 @compiled
 def _best_cut(before_um: FloatArray, after_um: FloatArray, first: int) -> int:
-    """Sample at which the squared error of the one before it and of the other from it on is least."""
+    """The sample k that minimises the squared error of ``before_um`` up to k and of ``after_um`` from k on."""
     total, least, at = 0.0, 0.0, first
     for k in range(before_um.shape[0]):
         total += before_um[k] * before_um[k] - after_um[k] * after_um[k]
@@ -112,10 +100,9 @@ def _best_cut(before_um: FloatArray, after_um: FloatArray, first: int) -> int:
 
 
 def date_slips(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> SlipList:
-    """The slips, each at the sample from which the readings agree best with the model shifted by it.
+    """The slips with their first samples fitted, each between its neighbours, by least squares.
 
-    The most probable moment under white noise, given the other slips; each is looked for between its neighbours.
-    ``model_um`` (n,) is the reading without any slip. In a rest every sample is as good as another.
+    ``model_um`` (n,) is the reading without any slip. While the stage rests, a slip cannot be dated.
     """
     out = list(found)
     n = y_um.size
@@ -143,7 +130,7 @@ def date_slips(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask: Bo
 
 @compiled
 def _best_stretch(before_um: FloatArray, after_um: FloatArray, ends: IntArray, first: int) -> tuple[float, int, int]:
-    """(gain, begin, end): from which sample on, up to which of ``ends``, the other error is less by most (µm²)."""
+    """(gain, begin, end): the stretch up to one of ``ends`` over which ``after_um`` has the largest gain (µm²)."""
     best, begin, end = 0.0, 0, 0
     least, at, late, total, e = 0.0, first, 0.0, 0.0, 0
     for k in range(first, before_um.shape[0]):
@@ -161,10 +148,10 @@ def _best_stretch(before_um: FloatArray, after_um: FloatArray, ends: IntArray, f
 
 
 def best_slip_move(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask: BoolArray) -> tuple[SlipList, float]:
-    """The slips with one more, or one taken in two, and what that takes off the squared error, µm².
+    """The slips after the best single change, and by how much it reduces the squared error, µm².
 
-    A stretch from some sample on, up to a later slip or to the end, or from a slip on up to some sample, is shifted by
-    another few samples. Asked of the readings themselves: a slip shifts all that follows, a model's error does not.
+    A change shifts one stretch by some samples. The stretch ends at a slip or at the last sample, or begins at a slip;
+    so a slip is added or split in two.
     """
     n = y_um.size
     index = np.arange(n)
@@ -172,7 +159,7 @@ def best_slip_move(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask
     for at, size in found:
         shifts[at:] += size
     ends = np.array([*(at for at, _ in found), n], dtype=np.int64)
-    # Seen from the end, where a stretch begins is where it ends.
+    # In reversed time the begin of a stretch is its end.
     begins = np.array([n - at for at, _ in reversed(found)], dtype=np.int64)
 
     def error(extra: int) -> FloatArray:
@@ -197,8 +184,7 @@ def best_slip_move(found: SlipList, y_um: FloatArray, model_um: FloatArray, mask
 
 
 def merge_close_slips(found: SlipList) -> SlipList:
-    """The slips without those that a later one soon takes back (stretches too short are given to their neighbours),
-    and without one at the beginning, which is a latch."""
+    """The slips without those at the beginning, and with slips that are too close together merged into one."""
     out: list[tuple[int, int]] = []
     for at, size in found:
         if at < _FIRST:
@@ -211,29 +197,27 @@ def merge_close_slips(found: SlipList) -> SlipList:
     return tuple(out)
 
 
-#: Least share of the squared error that a slip must take off.
+#: Least share of the squared error that a further slip must remove.
 _LEAST_GAIN = 0.002
-
-
-#: Share of the squared error that the first guess may leave: more, and something else is the cause.
+#: Largest share of the squared error that the first fit may leave for the search to go on.
 _PROMISING = 0.6
 
 
 @dataclass(frozen=True)
 class Slips(CauseModel):
-    """Samples lost (or doubled) in one column while the time went on as if nothing had happened."""
+    """Samples lost or doubled in one column, while the time column continues without a gap."""
 
     name: str = "timing"
     variant: str = "slips"
     of_one_recording: bool = True
-    #: Where, as first samples, and by how many samples; found anew in every residual.
+    #: The slips, found again in every residual.
     found: SlipList = ()
 
-    def applies(self, data: FitData) -> str:
+    def missing(self, data: FitData) -> str:
         return "" if self.found else "a lasting jump of the timing"
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        """Whole samples, as a converter counts them."""
+        """True if every slip is a whole number of samples."""
         return bool(np.all(np.abs(p - np.rint(p)) < 0.4) and np.all(np.abs(p) > 0.5))
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -253,7 +237,7 @@ class Slips(CauseModel):
             shifts[at:] += size
         return np.asarray(resample_by(y_um, shifts))
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         one = np.ones(p.size)
         still = np.zeros(p.size)
         return {
@@ -265,29 +249,29 @@ class Slips(CauseModel):
 
 
 def reading_without_slips(fit: ModelFit, index: int) -> FloatArray:
-    """The reading (n,) that the model would give had ``forms[index]`` lost no sample."""
+    """(n,) the model's reading without the slips of ``causes[index]``."""
     p = fit.p.copy()
-    p[fit.model.where(index)] = 0.0
+    p[fit.model.slice_of(index)] = 0.0
     return fit.model.simulate(p, ActsOn.READING, fit.signals).reading_um
 
 
 def fit_slips(cause: Slips, bare: StageModel, base: ModelFit, mask: BoolArray, known: SlipList = ()) -> ModelFit:
-    """Slips of whole samples beside everything else; a model that knows of some sees the others.
+    """Fit slips of whole samples together with the model ``base``; slips found first make others visible.
 
-    ``known`` are those to begin with. Otherwise they are looked for beside ``base``, and beside a model that was
-    fitted with a clock that runs wrong: many slips of one sign look like one, and bend the other numbers less so.
+    ``known`` slips are the start. Without them the search starts beside ``base`` and beside a fit with a clock error:
+    many slips of one sign resemble a clock error, which then distorts the other parameters less.
     """
     y_um, own, index = base.model.data.y_um, base.p.size, len(bare.causes)
 
     def fitted(p: FloatArray, found: SlipList, iterations: int, sizes_too: bool = False) -> ModelFit:
         sizes = [float(size) for _, size in found]
         only = None if sizes_too else frozenset(range(own))
-        model = bare.plus(replace(cause, found=found))
+        model = bare.with_cause(replace(cause, found=found))
         return calibrate(model, np.concatenate([p[:own], sizes]), mask, iterations, 1e-3, only)
 
     starts = [base.p]
     if not known:
-        clock = calibrate(bare.plus(Timing()), np.append(base.p, 0.0), mask, 6, 1e-2)
+        clock = calibrate(bare.with_cause(Timing()), np.append(base.p, 0.0), mask, 6, 1e-2)
         starts.append(clock.p[:own])
     fits: list[tuple[ModelFit, SlipList]] = []
     for p in starts:
@@ -306,21 +290,23 @@ def fit_slips(cause: Slips, bare: StageModel, base: ModelFit, mask: BoolArray, k
             break
         found = merge_close_slips(date_slips(after, y_um, there, mask))
         fit = fitted(fit.p, found, 4)
-    # That their sizes, let free, come out whole tells slips from what looks like them.
+    # The sizes are free in the last fit: whole numbers then confirm that these are slips.
     return fitted(fit.p, found or cause.found, 8, sizes_too=not known)
 
 
 def refit_slips(fit: ModelFit, mask: BoolArray) -> ModelFit:
-    """The fit with its slips looked for anew beside all its causes: an earlier model that lacked some dated them
-    worse, or overlooked one. The fit as it is where it has no slips or they stay."""
+    """The fit with its slips searched again beside all its causes, if that is better; else ``fit`` itself.
+
+    An earlier model that lacked some causes may have dated slips wrongly or missed one.
+    """
     index = next((i for i, cause in enumerate(fit.model.causes) if isinstance(cause, Slips)), -1)
     if index < 0:
         return fit
     cause, y_um = fit.model.causes[index], fit.model.data.y_um
     assert isinstance(cause, Slips)
-    bare = fit.model.less(index)
-    where = fit.model.where(index)
-    # To the end of the chain, where `placed` has them.
+    bare = fit.model.without_cause(index)
+    where = fit.model.slice_of(index)
+    # `fit_slips` appends the slips at the end of the causes.
     base = evaluate(bare, np.concatenate([fit.p[: where.start], fit.p[where.stop :]]), mask)
     there = reading_without_slips(fit, index)
     tried = fit_slips(cause, bare, base, mask, date_slips(cause.found, y_um, there, mask))

@@ -300,7 +300,7 @@ def with_other_axis(fit: ModelFit, mask: BoolArray, *, refit: bool = True) -> Mo
     data = fit.model.data
     modelled = None
     if data.u2_V is not None and float(np.ptp(data.u2_V)) > 1e-9:
-        mine = fit.model.part(fit.p, -1)
+        mine = fit.model.parameters_of(fit.p, -1)
         _, w = fit.model.nominal.static(data.u2_V, mine, data)
         modelled = respond(w, fit.model.dynamics(fit.p), data.dt_s)
     measured = data.y2_um
@@ -330,7 +330,7 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
     """
     home = fit.model
     _, static_um = home.nominal.static(
-        fit.signals.drive_V, home.part(fit.p, -1), home.data.subdivided(home.substeps, home.nominal.hold)
+        fit.signals.drive_V, home.parameters_of(fit.p, -1), home.data.subdivided(home.substeps, home.nominal.hold)
     )
     there = replace(
         data,
@@ -353,7 +353,7 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
     for i, cause in enumerate(model.causes):
         # The number of parameters of such a cause may depend on the length of the recording.
         fresh = np.array([parameter.neutral for parameter in cause.parameters(there)])
-        start = np.concatenate([start, fresh if cause.of_one_recording else home.part(fit.p, i)])
+        start = np.concatenate([start, fresh if cause.of_one_recording else home.parameters_of(fit.p, i)])
         first = start.size - fresh.size
         for k, parameter in enumerate(cause.parameters(there)):
             if cause.of_one_recording or parameter.name in OF_ONE_RECORDING:

@@ -20,12 +20,12 @@ from scipy.interpolate import CubicSpline
 
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from sim.diagnosis.model.hysteresis_loops import _branch
+from sim.diagnosis.model.hysteresis_loops import rising_step
 
 
 @compiled
 def _around(w: FloatArray, i: int) -> tuple[float, float, float]:
-    """w[i-1], w[i], w[i+1] less the first value; the record goes on as it begins and ends."""
+    """w[i-1], w[i], w[i+1] less the first value. Beyond its ends the record is constant."""
     top = w.shape[0] - 1
     w0 = w[0]
     a, b, c = w[min(max(i - 1, 0), top)], w[min(max(i, 0), top)], w[min(max(i + 1, 0), top)]
@@ -41,9 +41,9 @@ def modes(
     gains_re: FloatArray,
     gains_im: FloatArray,
 ) -> FloatArray:
-    """Sum of first-order modes x' = lambda x + r w, stepped exactly; gains (m, 3) weigh w[k-shift-1 .. k-shift+1].
+    """(n,) sum of first-order modes x' = lambda x + r w, stepped exactly. Gains (m, 3) weigh w[k-shift-1 .. k-shift+1].
 
-    The record is taken to begin in equilibrium with its first value.
+    The modes begin in equilibrium with the first value.
     """
     n = w.shape[0]
     m = poles_re.shape[0]
@@ -53,10 +53,10 @@ def modes(
         ar, ai = poles_re[j], poles_im[j]
         g0r, g1r, g2r = gains_re[j, 0], gains_re[j, 1], gains_re[j, 2]
         g0i, g1i, g2i = gains_im[j, 0], gains_im[j, 1], gains_im[j, 2]
-        # Deviations from the first value: the equilibrium needs no arithmetic of its own.
+        # The states are deviations from the equilibrium with the first value.
         xr = 0.0
         xi = 0.0
-        # Within the record nothing has to be asked, and what the input adds is summed apart from the recursion.
+        # Inside the record no index must be clipped, and the input terms are independent of the recursion.
         first = min(max(shift + 1, 0), n - 1)
         last = max(min(n - 1 + shift, n - 1), first)
         for k in range(first):
@@ -104,9 +104,9 @@ def modes_with_plays(
     radii_um: FloatArray,
     weights: FloatArray,
 ) -> FloatArray:
-    """`modes` with hysteresis in the restoring force: weighted plays of the output itself are taken off its input.
+    """`modes` with hysteresis in the restoring force: weighted stops of the output are subtracted from the input.
 
-    ``back`` (m,) weighs the force at sample k in the step to k + 1. A motion that leaves all bounds is cut short.
+    ``back`` (m,) weighs the force at sample k in the step to k + 1. The simulation stops when it diverges.
     """
     n = w.shape[0]
     m = poles_re.shape[0]
@@ -138,7 +138,7 @@ def modes_with_plays(
 
 @dataclass(frozen=True, slots=True)
 class ForceStops:
-    """Weighted stops (y less a play of y) of these radii, µm."""
+    """Weighted stop operators of the displacement y (y less a play of y) with these radii, µm."""
 
     radii_um: FloatArray
     weights: FloatArray
@@ -146,7 +146,7 @@ class ForceStops:
 
 @dataclass(frozen=True, slots=True)
 class ForceLoop:
-    """Z of the module's equation: its stiffness as a share of the spring's, beta + gamma and beta - gamma (1/µm)."""
+    """Bouc-Wen force Z: its stiffness as a share of the spring's, beta + gamma and beta - gamma (1/µm)."""
 
     share: float
     rise_per_um: float
@@ -158,9 +158,9 @@ RestoringForce = ForceStops | ForceLoop
 
 
 def between_samples(w: FloatArray, substeps: int, delay_samples: float, hold: str) -> FloatArray:
-    """``w`` (n,) at the sub-steps, ``delay_samples`` late, ((n - 1) substeps + 1,).
+    """((n - 1) substeps + 1,) values of ``w`` (n,) at the sub-steps, ``delay_samples`` late.
 
-    ``hold`` "zero": held; "first": a continuous drive, so a cubic spline goes through its samples, not straight lines.
+    ``hold`` "zero": held. "first": the drive is continuous, so a cubic spline interpolates its samples.
     """
     at = np.arange((w.size - 1) * substeps + 1) / substeps - delay_samples
     if hold == "zero":
@@ -184,10 +184,10 @@ def modes_with_loop(
     rise: float,
     fall: float,
 ) -> FloatArray:
-    """Output at every ``every``-th sub-step; the input of the modes is ``w`` less ``share`` Z of their own output.
+    """Output at every ``every``-th sub-step of modes whose input is ``w`` less ``share`` Z of their own output.
 
-    ``starts`` and ``ends`` (m,) weigh the input at both ends of a sub-step; ``held``: w keeps its value over it.
-    A motion that leaves all bounds is cut short.
+    ``starts`` and ``ends`` (m,) weigh the input at both ends of a sub-step; ``held``: w is constant over it. The
+    simulation stops when it diverges.
     """
     steps = w.shape[0] - 1
     m = poles_re.shape[0]
@@ -210,7 +210,7 @@ def modes_with_loop(
             xr[j] = nr
             there += nr
         way = there - y
-        after = _branch(z, way, 1.0, rise, fall) if way >= 0.0 else -_branch(-z, -way, 1.0, rise, fall)
+        after = rising_step(z, way, 1.0, rise, fall) if way >= 0.0 else -rising_step(-z, -way, 1.0, rise, fall)
         late = share * (guess - after)
         for j in range(m):
             xr[j] += ends_re[j] * late
@@ -218,7 +218,7 @@ def modes_with_loop(
         there += end * late
         way = there - y
         before = z
-        z = _branch(z, way, 1.0, rise, fall) if way >= 0.0 else -_branch(-z, -way, 1.0, rise, fall)
+        z = rising_step(z, way, 1.0, rise, fall) if way >= 0.0 else -rising_step(-z, -way, 1.0, rise, fall)
         y = there
         if not abs(y) < 1e12:
             break
@@ -228,7 +228,7 @@ def modes_with_loop(
 
 
 def linear_weights(poles: list[complex], residues: list[complex], step_s: float) -> list[FloatArray]:
-    """Of each pole: its step, and the weights of the input at the start and at the end of it; real and imaginary."""
+    """For each pole its step factor and the weights of the input at both ends; real and imaginary parts."""
     rows = []
     for pole, residue in zip(poles, residues, strict=True):
         x = pole * step_s
@@ -250,7 +250,7 @@ def respond_with_loop(
     dt_s: float,
     loop: ForceLoop,
 ) -> FloatArray:
-    """Response (n,) of poles and residues (of a conjugate pair the upper one, doubled) with ``loop`` in the force."""
+    """(n,) response of poles and residues (of a conjugate pair the upper pole, doubled) with ``loop`` in the force."""
     fine = between_samples(w, loop.substeps, delay_s / dt_s, hold)
     steps_re, steps_im, starts_re, starts_im, ends_re, ends_im = linear_weights(poles, residues, dt_s / loop.substeps)
     return np.asarray(
@@ -265,8 +265,8 @@ def respond_with_loop(
 class Dynamics:
     """A unit-gain linear system: lags 1/(1 + s tau), modes w²/(s² + 2 z w s + w²), and a dead time.
 
-    ``hold`` is how the static part's output runs between two samples: ``"zero"`` (a D/A that holds) or
-    ``"first"`` (a continuous drive that the recorder sampled).
+    ``hold`` says how the input runs between two samples: "zero" (a D/A converter holds it) or "first" (a continuous
+    drive that the recorder sampled).
     """
 
     lags_s: tuple[float, ...] = ()
@@ -281,7 +281,7 @@ def _poles(system: Dynamics) -> list[complex]:
         w = 2.0 * math.pi * f_hz
         root = cmath.sqrt(complex(damping * damping - 1.0))
         poles += [w * (-damping + root), w * (-damping - root)]
-    # Partial fractions want distinct poles: equal ones are moved apart by a part in 1e5, far below any data.
+    # Partial fractions need distinct poles: equal ones are moved apart by 3e-5, which no data resolve.
     for i in range(len(poles)):
         while any(abs(poles[i] - poles[j]) < 1e-5 * abs(poles[i]) for j in range(i)):
             poles[i] *= 1.0 + 3e-5
@@ -308,7 +308,7 @@ def _gains(pole: complex, residue: complex, dt_s: float, fraction: float, hold: 
 
 
 def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: RestoringForce | None = None) -> FloatArray:
-    """Response at the sampling instants to the static part's output ``w`` (n,), which begins in equilibrium."""
+    """(n,) response at the sampling instants to ``w`` (n,), from equilibrium with its first value."""
     poles = _poles(system)
     shift = math.floor(system.delay_s / dt_s)
     fraction = system.delay_s / dt_s - shift
@@ -330,7 +330,7 @@ def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: RestoringFo
         gains[i, :3] = _gains(pole, residue, dt_s, fraction, system.hold)
         gains[i, 3] = _gains(pole, residue, dt_s, 0.0, "zero")[1]
         steps[i] = cmath.exp(pole * dt_s)
-        # Of a conjugate pair the real part of one, doubled, says all.
+        # A conjugate pair is twice the real part of its upper pole.
         if pole.imag > 0.0:
             gains[i] *= 2.0
         if pole.imag >= 0.0:
@@ -354,9 +354,10 @@ def respond(w: FloatArray, system: Dynamics, dt_s: float, restoring: RestoringFo
 def respond_partial(
     w: FloatArray, poles: list[complex], residues: list[complex], delay_s: float, hold: str, dt_s: float
 ) -> FloatArray:
-    """Response of a sum of complex pole pairs, given by the pole of positive imaginary part and its residue.
+    """(n,) response of complex pole pairs, each given by its upper pole and residue, to ``w`` (n,).
 
-    From equilibrium with the first value of ``w`` (n,), whose own share is left out: the answer begins at zero.
+    The response starts in equilibrium with the first value of ``w``, and that equilibrium is subtracted: it begins
+    at zero.
     """
     shift = math.floor(delay_s / dt_s)
     fraction = delay_s / dt_s - shift
@@ -371,10 +372,10 @@ def respond_partial(
 def changed_midway(
     w: FloatArray, before: FloatArray, system: Dynamics, change: tuple[float, Dynamics], dt_s: float
 ) -> FloatArray:
-    """Response (n,) of a system whose mode becomes another at a moment: position and velocity go on from there.
+    """(n,) response of a system whose mode changes at one moment; position and velocity are continuous there.
 
-    ``before`` (n,) is the response of ``system`` throughout; ``change`` the moment (s) and the system from then on. The
-    mode comes last, so that what stands before it is the same for both, and the difference rings out freely.
+    ``before`` (n,) is the response of ``system`` throughout; ``change`` is the moment (s) and the system after it. The
+    mode is the last block, so the blocks before it are the same for both, and the difference decays freely.
     """
     at_s, later = change
     after = respond(w, later, dt_s)
@@ -387,7 +388,7 @@ def changed_midway(
     own, other = _state(w, system, at_s, k, dt_s), _state(w, later, at_s, k, dt_s)
     f_hz, damping = next(
         mode for mode, old in zip(later.modes_hz, system.modes_hz, strict=True) if mode != old
-    )  # the one that the payload moved
+    )  # The mode that the payload changes.
     omega = 2.0 * math.pi * f_hz
     damped = omega * math.sqrt(max(1.0 - damping * damping, 1e-12))
     x0, v0 = own[0] - other[0], own[1] - other[1]
@@ -399,7 +400,7 @@ def changed_midway(
 
 
 def _state(w: FloatArray, system: Dynamics, at_s: float, k: int, dt_s: float) -> tuple[float, float]:
-    """Position and velocity of the output at ``at_s``, from the stretch before it: delays of any size are exact."""
+    """Position (µm) and velocity (µm/s) of the output at ``at_s``, from the second before it."""
     first = max(0, k - round(1.0 / dt_s))
     stretch = np.ascontiguousarray(w[first : k + 1])
     late = k * dt_s - at_s

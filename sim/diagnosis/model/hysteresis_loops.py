@@ -11,8 +11,8 @@ from adaptive.types import FloatArray
 
 
 @compiled
-def _branch(g: float, length: float, push: float, rate_up: float, rate_down: float) -> float:
-    """h of (2.2) with n = 1 after the voltage has risen by ``length``, from ``g``; exact.
+def rising_step(g: float, length: float, push: float, rate_up: float, rate_down: float) -> float:
+    """h of (2.2) with n = 1 after a rise of the voltage by ``length``, from h = ``g``; exact.
 
     ``push`` = alpha d in µm/V; the rates are beta + gamma where h > 0 and beta - gamma where h < 0. On either side of
     zero the equation is linear in u, so the solution is one exponential; a sign change splits the step once.
@@ -38,18 +38,18 @@ def _branch(g: float, length: float, push: float, rate_up: float, rate_down: flo
 
 
 @compiled
-def _followed(h: float, du: float, push: float, beta: float, gamma: float) -> float:
-    """h after a step du of the voltage, V. By the symmetry of (2.2) a falling step of h is a rising one of -h."""
+def exact_step(h: float, du: float, push: float, beta: float, gamma: float) -> float:
+    """h after a step ``du`` (V) of the voltage. By the symmetry of (2.2) a falling step of h is a rising one of -h."""
     if du > 0.0:
-        return _branch(h, du, push, beta + gamma, beta - gamma)
+        return rising_step(h, du, push, beta + gamma, beta - gamma)
     if du < 0.0:
-        return -_branch(-h, -du, push, beta + gamma, beta - gamma)
+        return -rising_step(-h, -du, push, beta + gamma, beta - gamma)
     return h
 
 
 @compiled
 def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: float) -> FloatArray:
-    """h of (2.2) with n = 1, exactly, for a voltage that is monotone between two samples.
+    """(n,) h of (2.2) with n = 1, exact for a voltage that is monotone between two samples.
 
     ``slope`` = alpha d in µm/V; beta, gamma in 1/V; h in µm.
     """
@@ -59,7 +59,7 @@ def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: 
     out[0] = h
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
-        h = _followed(h, du, slope, beta, gamma)
+        h = exact_step(h, du, slope, beta, gamma)
         out[k] = h
     return out
 
@@ -68,7 +68,7 @@ def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: 
 def bouc_wen_paced(
     u_V: FloatArray, slope: float, beta: float, gamma: float, h0: float, pace: FloatArray, gain: float
 ) -> FloatArray:
-    """(2.2) whose driving term grows with the rate: slope (1 + gain pace_k) on the step that ends at sample k."""
+    """(n,) h of (2.2) with a rate-dependent driving term: slope (1 + gain pace_k) on the step that ends at sample k."""
     n = u_V.shape[0]
     out = np.empty(n)
     h = h0
@@ -76,14 +76,14 @@ def bouc_wen_paced(
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
         push = max(slope * (1.0 + gain * pace[k]), 1e-12)
-        h = _followed(h, du, push, beta, gamma)
+        h = exact_step(h, du, push, beta, gamma)
         out[k] = h
     return out
 
 
 @compiled
-def felt_rate(u_V: FloatArray, keep: float, dt_s: float) -> FloatArray:
-    """Size of du/dt through a first-order lag whose pole is ``keep``."""
+def filtered_rate(u_V: FloatArray, keep: float, dt_s: float) -> FloatArray:
+    """(n,) |du/dt| through a first-order lag with the pole ``keep``."""
     n = u_V.shape[0]
     out = np.empty(n)
     s = 0.0
@@ -98,7 +98,7 @@ def felt_rate(u_V: FloatArray, keep: float, dt_s: float) -> FloatArray:
 def grown_plays(
     u_V: FloatArray, radii_V: FloatArray, weights: FloatArray, grown: FloatArray, added_V: FloatArray
 ) -> FloatArray:
-    """Weighted plays whose thresholds grow by a factor ``grown`` and by ``added_V`` (n,), less the same at rest."""
+    """(n,) weighted plays with thresholds r grown + added_V, less the same plays with thresholds r."""
     n = u_V.shape[0]
     m = radii_V.shape[0]
     still = np.zeros(m)
@@ -129,7 +129,7 @@ def asymmetric(
     z_scale: FloatArray,
     loop_um: float,
 ) -> FloatArray:
-    """Dead zones (2.8) on the static displacement and on a wide play, and products of loop and displacement, µm.
+    """(n,) µm: dead zones (2.8) on the static displacement and on a wide play, and products of loop and displacement.
 
     ``p``: weights at the knees ``near`` of x, at the knees ``wide`` of z, of h x and of h². x = (w - low)/half - 1 with
     ``x_scale`` (low, half) in µm; z the same of a play of the voltage with ``z_scale`` (radius, low, half) in V.
@@ -159,11 +159,10 @@ def asymmetric(
 
 @compiled
 def plays_nested(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> FloatArray:
-    """Sum of weighted plays (2.4), (2.7) that start relaxed at zero volts, with radii in rising order.
-    A few operations a sample, however many plays there are.
+    """(n,) sum of weighted plays (2.4), (2.7), relaxed at 0 V at the start, with radii in rising order.
 
-    Plays that start relaxed stay nested: those that an input drags along are always the narrowest so many. Only a
-    reversal touches the others, and the held part of the sum is taken anew there, so that no error builds up.
+    The cost per sample does not depend on the number of plays: relaxed plays stay nested, so the input always drags
+    the narrowest ones. The held part of the sum is computed again at each reversal, so that no error accumulates.
     """
     n = u_V.shape[0]
     m = radii_V.shape[0]

@@ -19,7 +19,7 @@ from sim.stage.config import StageConfig
 
 
 class NominalStage(Protocol):
-    """A stage with parameters of its own, which are calibrated before anything is called missing."""
+    """A stage that a recording is compared with. Its parameters are calibrated before causes are searched."""
 
     @property
     def name(self) -> str: ...
@@ -27,7 +27,7 @@ class NominalStage(Protocol):
     def hold(self) -> str: ...
     @property
     def substeps(self) -> int:
-        """Sub-steps of a sample at which drive and loop are simulated."""
+        """Sub-steps per sample at which drive and hysteresis are simulated."""
         ...
 
     def with_other_hold(self) -> NominalStage: ...
@@ -39,17 +39,17 @@ class NominalStage(Protocol):
 
     def dynamics(self, p: FloatArray, data: FitData) -> Dynamics: ...
     def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
-        """What the stage itself makes of the displacement behind the mechanics, before the reading."""
+        """(n,) displacement behind the mechanics after what the stage itself adds there."""
         ...
 
     def offset_um(self, p: FloatArray) -> float: ...
     def start_um(self, p: FloatArray) -> float:
-        """How far from equilibrium with its first voltage the stage was at rest when the record began."""
+        """Distance (µm) of the first sample from equilibrium with the first voltage."""
         ...
 
 
 def common_parameters(data: FitData) -> tuple[ModelParameter, ModelParameter]:
-    """A free sensor offset, and a latch up to one sample early or late: recorders differ in both."""
+    """The sensor's offset, and a latch of up to one sample early or late: recorders differ in both."""
     span = 4.0 * data.range_um + abs(data.middle_um)
     return (
         ModelParameter("offset_um", "µm", 0.0, -span, span, 0.1 * data.range_um, ActsOn.READING),
@@ -60,7 +60,7 @@ def common_parameters(data: FitData) -> tuple[ModelParameter, ModelParameter]:
 def loop_numbers(p: FloatArray) -> tuple[float, float, float]:
     """Slope alpha d (µm/V), beta and gamma (1/V) of a Bouc-Wen stage's parameters.
 
-    beta - gamma is kept above -(beta + gamma): beyond, h runs away from any bounded voltage.
+    beta - gamma is kept above -(beta + gamma): below it h diverges for a bounded voltage.
     """
     fall = max(float(p[3]), -0.95 * float(p[2]))
     return float(p[1] * p[0]), 0.5 * (float(p[2]) + fall), 0.5 * (float(p[2]) - fall)
@@ -68,7 +68,7 @@ def loop_numbers(p: FloatArray) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class BoucWenStage:
-    """(2.1), (2.2) with n = 1. Only ratios show in (u, y): alpha, beta, gamma, d, b/k; m/k as in Table 2.1.
+    """The chapter's stage, (2.1) and (2.2) with n = 1. A recording (u, y) determines alpha, beta, gamma, d and b/k.
 
     With sqrt(k/m) = 3.55e4 rad/s the mass of Table 2.1 adds a pole 0.3 µs from the origin, which no recording
     shows; the stage is a lag of b/k = 2.5 ms after the loop. A mode below 10 kHz is therefore not a parameter of
@@ -77,7 +77,7 @@ class BoucWenStage:
 
     hold: str = "zero"
     name: str = "bouc_wen"
-    #: The loop's memory at the first sample is free where the recording does not begin at rest at zero volts.
+    #: The hysteresis at the first sample is a parameter, because the recording does not begin at rest at 0 V.
     free_memory: bool = False
 
     def with_other_hold(self) -> BoucWenStage:
@@ -85,7 +85,7 @@ class BoucWenStage:
 
     @property
     def substeps(self) -> int:
-        # Along a straight way between two samples h bends; under a held voltage it jumps, and needs no more steps.
+        # h is curved while the voltage runs linearly between samples; under a held voltage one exact step suffices.
         return 4 if self.hold == "first" else 1
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -138,7 +138,7 @@ class BoucWenStage:
 
 @dataclass(frozen=True)
 class LinearStage:
-    """y = gain u through one mode or, overdamped, two lags: what a linear identification would have given."""
+    """A linear stage: gain and one mode, or two lags if overdamped."""
 
     hold: str = "zero"
     name: str = "linear"
@@ -151,7 +151,7 @@ class LinearStage:
         return 1
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        # Across a resonance the slope of the readings over the voltage says little about the gain.
+        # Near a resonance the regression slope is no estimate of the gain.
         g = max(abs(data.gain_um_per_V), data.range_um / max(data.swing_V, 1e-12), 1e-9)
         offset, latch = common_parameters(data)
         return (
@@ -171,7 +171,7 @@ class LinearStage:
         )
 
     def starts(self, data: FitData) -> list[FloatArray]:
-        """The best of a grid of modes, each with the gain and offset that suit it best."""
+        """The three best modes of a grid, each with its least-squares gain and offset."""
         neutral = np.array([s.neutral for s in self.parameters(data)])
         n = min(data.n, 20_000)
         u, y = np.ascontiguousarray(data.u_V[:n]), data.y_um[:n]
@@ -208,27 +208,25 @@ class LinearStage:
         return 0.0
 
 
-#: Modes of one type of stage differ by about this much from piece to piece; more is a payload.
+#: Relative spread of the mode frequencies of one type of stage; a larger difference is a payload.
 MODE_SPREAD = 0.015
-
-
-#: Calibration may scale the other numbers of the actuator by as much either way.
+#: Calibration scales the other numbers of the actuator by at most this factor, up or down.
 SCALE = 2.0
 
 
 @dataclass(frozen=True)
 class FileStage:
-    """What a stage file says, in the stretches of a model: before the mechanics, its modes, and behind them.
+    """The stage of a stage file, in three blocks: effects before the mechanics, modes, and effects behind them.
 
     Numbers of the actuator that are not zero are calibrated as factors of the file's, between 1/2 and 2; the
-    frequency of a lightly damped mode within `MODE_SPREAD`. What stands behind the mechanics is taken as it is; noise
-    is left out, and so is what the file changes during a run.
+    frequency of a lightly damped mode within `MODE_SPREAD`. Effects behind the mechanics are taken as they are; noise
+    and changes during a run are left out.
     """
 
     before: Chain
     modes_hz: tuple[tuple[float, float], ...]
     behind: Chain
-    calibrate_nominal: tuple[str, ...]
+    calibrated: tuple[str, ...]
     hold: str = "zero"
     name: str = "stage"
     _unit: Chain = field(init=False, repr=False)
@@ -245,12 +243,12 @@ class FileStage:
 
     @property
     def has_loop(self) -> bool:
-        """Whether the actuator has hysteresis of its own."""
+        """Whether the actuator has hysteresis."""
         return any(e.name not in ("linear_actuator", "dac", "creep", "amplifier_lag") for e in self.before)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         span = 1.0 / SCALE
-        own = [ModelParameter(path, "1", 1.0, span, SCALE, 0.05, ActsOn.STATIC) for path in self.calibrate_nominal]
+        own = [ModelParameter(path, "1", 1.0, span, SCALE, 0.05, ActsOn.STATIC) for path in self.calibrated]
         modes: list[ModelParameter] = []
         for i, (_, damping) in enumerate(self.modes_hz):
             spread = math.log1p(MODE_SPREAD) if damping < 1.0 else math.log(3.0)
@@ -265,7 +263,7 @@ class FileStage:
         return [p]
 
     def effects(self, p: FloatArray) -> list[Effect]:
-        """The file's effects with the calibrated numbers, modes as ``resonance``; the latch is no part of a stage."""
+        """The file's effects with the calibrated numbers, modes as ``resonance``. The latch belongs to the recorder."""
         modes = self.modes(p)
         mine = [
             effect("resonance", label=f"nominal_mode_{i + 1}", frequency_Hz=f, damping_ratio=min(max(z, 1e-3), 100.0))
@@ -274,12 +272,12 @@ class FileStage:
         return [*self.actuator(p), *mine, *self.behind]
 
     def actuator(self, p: FloatArray) -> Chain:
-        """What stands before the mechanics, with the calibrated numbers."""
+        """The effects before the mechanics, with the calibrated numbers."""
         values = self.before.parameters
         return self.before.replace(
             {
                 path: float(np.clip(values[path] * p[i], *_range(self.before, path)))
-                for i, path in enumerate(self.calibrate_nominal)
+                for i, path in enumerate(self.calibrated)
             }
         )
 
@@ -295,7 +293,7 @@ class FileStage:
 
     def modes(self, p: FloatArray) -> tuple[tuple[float, float], ...]:
         """Frequency (Hz) and damping ratio of each mode, calibrated."""
-        at, modes = len(self.calibrate_nominal), []
+        at, modes = len(self.calibrated), []
         for f_hz, damping in self.modes_hz:
             f = f_hz * math.exp(float(p[at]))
             light = damping < 1.0
@@ -304,7 +302,7 @@ class FileStage:
         return tuple(modes)
 
     def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
-        """What the file puts behind the mechanics: creep has been before, drift, cross-talk and sensor are here."""
+        """(n,) displacement after the file's effects behind the mechanics: drift, cross-talk and sensor."""
         if not len(self.behind):
             return x_um
         later = np.append(x_um[1:], x_um[-1])
@@ -335,7 +333,7 @@ def _mode(e: Effect, payload: float) -> tuple[float, float]:
 
 
 def file_stage(config: StageConfig) -> FileStage:
-    """The first axis of a stage file as a nominal stage. Raises InputError where it has no actuator."""
+    """The first axis of a stage file as a nominal stage. Raises InputError if it has no actuator."""
     chain = config.effects
     before, behind, modes, loose = [], [], [], []
     payload = sum(e.values["payload_ratio"] for e in chain if e.name == "payload_change")

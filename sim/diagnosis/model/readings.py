@@ -12,14 +12,14 @@ from sim.diagnosis.model.fit_data import FitData
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Standard deviation of the noise (µm) and where it was seen: ``rests``, ``holds`` or ``differences``."""
+    """Standard deviation of the noise (µm) and its source: "repeated periods", "rests" or "differences"."""
 
     sigma_um: float
     source: str
 
 
 def standing(data: FitData, settle_s: float = 0.3) -> BoolArray:
-    """Samples at which the drive (and that of the other axis) has stood still for ``settle_s``."""
+    """(n,) True where the voltages of both axes have been constant for ``settle_s``."""
     still = data.rate_V_per_s <= 1e-9 * max(data.swing_V, 1e-30) / data.dt_s
     if data.u2_V is not None:
         still &= np.abs(np.diff(data.u2_V, prepend=data.u2_V[0])) == 0.0
@@ -31,31 +31,31 @@ def standing(data: FitData, settle_s: float = 0.3) -> BoolArray:
 
 
 def repeated_period(u_V: FloatArray) -> int:
-    """Samples after which the whole drive repeats itself exactly, at least twice; 0 where it does not."""
+    """Period of the drive in samples, if the whole drive repeats exactly at least twice; else 0."""
     n = u_V.size
     x = u_V - u_V.mean()
     if n < 64 or not np.any(x):
         return 0
     size = 1 << (2 * n - 1).bit_length()
     likeness = np.fft.irfft(np.abs(np.fft.rfft(x, size)) ** 2, size)[: n // 2 + 1] / np.arange(n, n - n // 2 - 1, -1)
-    # Behind the first fall of the autocorrelation: a smooth drive is like itself at small lags, too.
+    # Skip small lags, where a smooth drive is similar to itself.
     fall = int(np.argmax(likeness < 0.5 * likeness[0]))
     if fall == 0:
         return 0
-    # The first of the highest peaks: twice the period is one, too.
+    # Take the first of the highest peaks: multiples of the period are peaks as well.
     lag = fall + int(np.argmax(likeness[fall:] > (1.0 - 1e-6) * np.max(likeness[fall:])))
     same = np.max(np.abs(u_V[lag:] - u_V[:-lag])) <= 1e-3 * np.ptp(u_V)
     return lag if same else 0
 
 
 def noise_floor(data: FitData) -> NoiseFloor:
-    """Median over short windows at rest of the readings' spread about a line; without rests, from differences."""
+    """The noise floor from repeated periods, else from windows at rest (spread about a line), else from differences."""
     period = repeated_period(data.u_V)
     others = [u for u in (data.u2_V, data.u3_V) if u is not None]
     if period and all(repeated_period(u) == period for u in others):
-        # The first period is still settling where there are more than two.
+        # With more than two periods, leave out the first one: the stage still settles.
         y = data.y_um[period:] if data.n >= 3 * period else data.y_um
-        # By blocks, and their median: where the first period came from rest, its beginning differs by more than noise.
+        # Median over blocks: the beginning of a first period from rest differs by more than noise.
         d = y[period:] - y[:-period]
         block = max(8, d.size // 100)
         return NoiseFloor(float(np.median(_spread(d, block)) / np.sqrt(2.0)), "repeated periods")
@@ -70,7 +70,7 @@ def noise_floor(data: FitData) -> NoiseFloor:
         pieces -= (pieces @ t)[:, None] * t / (t @ t)
         variance = np.sum(pieces**2, axis=1) / (window - 2)
         return NoiseFloor(float(np.sqrt(np.median(variance))), "rests")
-    # The smoothest parts of the record: sixth differences leave nothing of the motion there.
+    # Fourth differences remove the motion in the smoothest quarter of the record.
     d = np.diff(data.y_um, n=4) / np.sqrt(70.0)
     return NoiseFloor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")
 
@@ -82,7 +82,7 @@ def _spread(d: FloatArray, block: int) -> FloatArray:
 
 
 def monitor_noise_V(data: FitData) -> float:
-    """Noise of the monitor: its spread while the drive stands still, at least what a 16-bit converter rounds."""
+    """Noise (V) of the voltage monitor while the drive is constant, at least the step of a 16-bit converter."""
     assert data.monitor_V is not None
     still = standing(data, 0.1)
     d = np.diff(data.monitor_V)[still[1:]]
@@ -92,23 +92,23 @@ def monitor_noise_V(data: FitData) -> float:
 
 @dataclass(frozen=True)
 class ConverterGrid:
-    """Step of the readings' grid (µm, 0 where there is none that shows) and how many levels were used."""
+    """Step of the converter grid (µm, 0 if no grid is visible) and the number of levels in use."""
 
     step_um: float
     levels: int
 
 
 def converter_grid(y_um: FloatArray) -> ConverterGrid:
-    """The grid that all readings lie on, or none.
+    """The grid that all readings lie on, if there is one.
 
-    The smallest distance between levels is refined to the step that every reading is a multiple of; a record whose
-    levels are nearly as many as its readings has no grid that could matter.
+    The smallest distance between levels is refined to the step that fits all distances. A record with nearly as many
+    levels as readings has no grid that matters.
     """
     levels = np.unique(y_um)
     if levels.size < 3 or levels.size > 0.9 * y_um.size:
         return ConverterGrid(0.0, int(levels.size))
     gaps = np.diff(levels)
-    # Differences of doubles carry rounding; a step is far larger than that.
+    # Leave out distances that are rounding errors of doubles.
     gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), 1e-12)]
     if gaps.size < 2:
         return ConverterGrid(0.0, int(levels.size))
@@ -123,7 +123,7 @@ def converter_grid(y_um: FloatArray) -> ConverterGrid:
 
 @dataclass(frozen=True)
 class RepeatedReadings:
-    """Readings that repeat the one before although the motion had moved on: how many, of how many that could show."""
+    """Readings that repeat the one before during motion: ``count`` of ``of`` readings where it could be seen."""
 
     count: int
     of: int
@@ -135,20 +135,20 @@ class RepeatedReadings:
 
 
 def repeated_readings(y_um: FloatArray, sigma_um: float, step_um: float) -> RepeatedReadings:
-    """Count exact repeats between two samples that both moved by far more than the noise and the grid.
+    """Exact repeats between two steps of the readings that are far larger than the noise and the grid.
 
-    Asked of the readings alone: where a clamp or friction holds the stage, they do not move before and after.
+    A clamp or friction that holds the stage is not counted: the readings are constant before or after it.
     """
     moved = np.diff(y_um)
     least = 8.0 * max(sigma_um, 1e-12) + 1.5 * step_um
-    # Both the same way: at the top of a fast sine a step of zero is no repeat.
+    # Both steps in one direction: at the top of a fast sine a step of zero is no repeat.
     candidate = (np.minimum(moved[:-2], moved[2:]) > least) | (np.maximum(moved[:-2], moved[2:]) < -least)
     where = np.flatnonzero(candidate & (moved[1:-1] == 0.0)) + 2
     return RepeatedReadings(int(where.size), int(candidate.sum()), where.astype(np.float64))
 
 
 def _amplitude(residual: FloatArray, t_s: FloatArray, f_hz: float) -> tuple[float, float]:
-    """Amplitude of a line and its standard error, about a slow parabola."""
+    """Amplitude of a spectral line and its standard error, about a slow parabola."""
     x = t_s - t_s.mean()
     span = max(float(np.ptp(x)), 1e-12)
     z = 2.0 * np.pi * f_hz * t_s
@@ -162,16 +162,16 @@ def _amplitude(residual: FloatArray, t_s: FloatArray, f_hz: float) -> tuple[floa
 def has_spectral_line(
     residual_um: FloatArray, data: FitData, f_hz: float, sigmas: float = 5.5, ratio: float = 3.0
 ) -> bool:
-    """True where a line at ``f_hz`` stands out of the fast residual at rest and beside its neighbours.
+    """True if a line at ``f_hz`` exceeds the noise of the fast residual at rest, and its neighbours in frequency.
 
-    Steps and ringing have broad spectra that pass through the mains frequency; hum is narrow and does not stop.
+    The spectra of steps and ringing are broad and contain the mains frequency too; hum is narrow and permanent.
     """
     quiet: BoolArray = standing(data, 0.1)
     width = max(3, round(0.04 / data.dt_s))
     fast = residual_um - np.convolve(residual_um, np.ones(width) / width, "same")
     where = quiet
     if int(quiet.sum()) * data.dt_s < 1.0:
-        # Under drive everything that repeats has lines: only one that towers over its neighbours is hum.
+        # Without rests: a periodic drive has lines as well, so require three times the ratio.
         where, sigmas, ratio = np.ones(data.n, dtype=np.bool_), 3.0 * sigmas, 3.0 * ratio
     t, r = data.t_s[where], fast[where]
     size, error = _amplitude(r, t, f_hz)

@@ -18,32 +18,32 @@ Guess = list[FloatArray]
 
 @dataclass(frozen=True)
 class CauseModel:
-    """A cause, neutral in every hook that it does not override. ``variant`` tells forms of one name apart."""
+    """Model of one cause. Each hook is neutral unless overridden. ``variant`` tells models of one cause apart."""
 
     name: str = ""
     variant: str = ""
-    #: Slots of the nominal stage that would mean the same number twice, and stand still while this form is in.
+    #: Parameters of the nominal stage that this cause replaces; they stay at their neutral values.
     pins: tuple[str, ...] = ()
-    #: Sub-steps of a sample at which drive and loop are simulated while this form is in.
+    #: Sub-steps per sample at which drive and hysteresis must be simulated.
     substeps: int = 1
-    #: What it makes of the drive has no jumps: from one sub-step to the next it runs in a straight line.
+    #: The drive behind it has no jumps and runs linearly between sub-steps.
     continuous: bool = False
-    #: Acts within a few samples of a step, where the hold between two samples would have been chosen to imitate it.
+    #: It acts within a few samples of a step, so the choice of the hold may have imitated it: fit it with both.
     fast: bool = False
-    #: Its numbers belong to one recording and say nothing of another (a drift over time, a hum's phase).
+    #: Its parameters belong to one recording (drift over time, phase of a hum).
     of_one_recording: bool = False
-    #: Share (rms) of what it removes that its fitted form may leave behind in a real stage: no form is exact.
+    #: Model error: share (RMS) of the removed residual that the model may leave behind in a real stage.
     model_error: float = 0.025
 
-    def applies(self, data: FitData) -> str:
-        """Empty where the recording could show this cause at all, else what is missing."""
+    def missing(self, data: FitData) -> str:
+        """What the data lack to show this cause; empty if nothing."""
         return ""
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         raise NotImplementedError
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        """Guesses. The default for a linear form: one trial with a unit of every number."""
+        """Start values for screening. Default for a linear cause: one guess with a unit step of every parameter."""
         parameters = self.parameters(data)
         neutral = np.array([s.neutral for s in parameters])
         rows = []
@@ -54,7 +54,7 @@ class CauseModel:
         return [rows]
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        """Whether the fitted numbers are of a size and a sign that this cause has."""
+        """Whether the fitted parameters have a plausible size and sign."""
         return True
 
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
@@ -63,20 +63,20 @@ class CauseModel:
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
     ) -> FloatArray | None:
-        """What is added to the static displacement, (n,), or None."""
+        """(n,) µm added to the static displacement, or None."""
         return None
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system
 
-    def later(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
-        """A moment (s) from which the linear part is another, and that other one; None where it stays."""
+    def changed_dynamics(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
+        """Time (s) of a change of the mechanics and the mechanics after it, or None."""
         return None
 
-    def beside(
+    def added_motion(
         self, drive_V: FloatArray, static_um: FloatArray, p: FloatArray, data: FitData, system: Dynamics
     ) -> FloatArray | None:
-        """What moves beside the nominal mechanics, (n,), driven by the voltage or by the static displacement."""
+        """(n,) motion parallel to the nominal mechanics, or None."""
         return None
 
     def restoring(self, p: FloatArray, data: FitData) -> RestoringForce | None:
@@ -89,8 +89,8 @@ class CauseModel:
     def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         return y_um
 
-    def physical(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """Reported numbers by name: value and its gradient by ``p`` (for the interval)."""
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """Reported numbers by name: the value and its gradient with respect to ``p``."""
         out = {}
         for i, parameter in enumerate(self.parameters(data)):
             gradient = np.zeros(p.size)
@@ -100,17 +100,17 @@ class CauseModel:
 
 
 def single_guesses(values: list[float]) -> list[Guess]:
-    """Trials of a form of one number."""
+    """Guesses of a cause with one parameter."""
     return [[np.array([v])] for v in values]
 
 
 @dataclass
 class Signals:
-    """Signals between the stretches of one simulation, kept so that a later one may start half way."""
+    """Signals between the blocks of one simulation, kept so that a later one may start at any block."""
 
     drive_V: FloatArray
     h_um: FloatArray
-    #: The nominal stage's own static displacement, and the parameters that it is of.
+    #: Static displacement of the nominal stage alone, and its parameters as bytes.
     w_um: FloatArray
     nominal_p: bytes
     static_um: FloatArray
@@ -121,10 +121,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class StageModel:
-    """Nominal stage + causes, in a setting. Parameters are one flat vector: the nominal's, then each cause's.
-
-    ``frozen`` causes (of a stage file) stand among ``forms`` like any other; only their parameters are tighter.
-    """
+    """A nominal stage and causes on one recording. The parameter vector begins with the nominal stage."""
 
     data: FitData
     nominal: NominalStage
@@ -146,39 +143,39 @@ class StageModel:
     def n_nominal(self) -> int:
         return self._cuts[1]
 
-    def part(self, p: FloatArray, index: int) -> FloatArray:
-        """The parameters of the cause ``forms[index]``; -1 is the nominal stage."""
+    def parameters_of(self, p: FloatArray, index: int) -> FloatArray:
+        """The parameters of ``causes[index]``; -1 is the nominal stage."""
         return p[self._cuts[index + 1] : self._cuts[index + 2]]
 
-    def where(self, index: int) -> slice:
-        """Place of the parameters of ``forms[index]`` in the flat vector."""
+    def slice_of(self, index: int) -> slice:
+        """Place of the parameters of ``causes[index]`` in the vector."""
         return slice(self._cuts[index + 1], self._cuts[index + 2])
 
     @property
     def substeps(self) -> int:
-        """Sub-steps of a sample at which drive and loop are simulated."""
+        """Sub-steps per sample at which drive and hysteresis are simulated."""
         return max(self.nominal.substeps, *(cause.substeps for cause in self.causes), 1)
 
     @property
     def continuous(self) -> bool:
-        """Whether a cause smooths the drive, so that nothing behind it jumps."""
+        """Whether a cause removes the jumps of the drive."""
         return any(cause.continuous for cause in self.causes)
 
-    def plus(self, cause: CauseModel) -> StageModel:
+    def with_cause(self, cause: CauseModel) -> StageModel:
         """The model with one cause more, at the end."""
         return StageModel(self.data, self.nominal, (*self.causes, cause))
 
-    def less(self, index: int) -> StageModel:
-        """The model without the cause ``forms[index]``."""
+    def without_cause(self, index: int) -> StageModel:
+        """The model without ``causes[index]``."""
         return StageModel(self.data, self.nominal, self.causes[:index] + self.causes[index + 1 :])
 
     def simulate(self, p: FloatArray, start: ActsOn = ActsOn.DRIVE, kept: Signals | None = None) -> Signals:
-        """All signals with parameters ``p``; the stretches before ``start`` are taken from ``kept``."""
+        """All signals with the parameters ``p``; those of blocks before ``start`` are taken from ``kept``."""
         s = self.data
         substeps = self.substeps
         inner = s.subdivided(substeps, self.nominal.hold)
-        parts = [self.part(p, i) for i in range(len(self.causes))]
-        mine = self.part(p, -1)
+        parts = [self.parameters_of(p, i) for i in range(len(self.causes))]
+        mine = self.parameters_of(p, -1)
         pairs = list(zip(self.causes, parts, strict=True))
         if kept is None:
             start = ActsOn.DRIVE
@@ -191,7 +188,7 @@ class StageModel:
         if start <= ActsOn.STATIC or kept is None:
             own = mine.tobytes()
             if kept is not None and start == ActsOn.STATIC and kept.nominal_p == own:
-                # A number of a cause: the nominal loop, which costs most, is as it was.
+                # Only a cause has changed: the nominal hysteresis, which costs most time, is the same.
                 h, w = kept.h_um, kept.w_um
             else:
                 h, w = self.nominal.static(drive, mine, inner)
@@ -208,12 +205,12 @@ class StageModel:
             system = self.dynamics(p)
             moved = respond(static, system, inner.dt_s, back)
             for cause, q in pairs:
-                # Beside a loop in the force a mode does not go on by superposition.
-                change = cause.later(system, q) if back is None else None
+                # With hysteresis in the force superposition does not hold.
+                change = cause.changed_dynamics(system, q) if back is None else None
                 if change is not None:
                     moved = changed_midway(static, moved, system, change, inner.dt_s)
             for cause, q in pairs:
-                more = cause.beside(drive, static, q, inner, system)
+                more = cause.added_motion(drive, static, q, inner, system)
                 if more is not None:
                     moved = moved + more
             if substeps > 1:
@@ -234,16 +231,16 @@ class StageModel:
         return Signals(drive, h, w, own, static, moved, motion, reading)
 
     def dynamics(self, p: FloatArray) -> Dynamics:
-        """The linear part: the nominal's and what the causes add to it."""
-        system = self.nominal.dynamics(self.part(p, -1), self.data)
+        """The mechanics: those of the nominal stage and what the causes add."""
+        system = self.nominal.dynamics(self.parameters_of(p, -1), self.data)
         if self.continuous:
             system = replace(system, hold="first")
         for i, cause in enumerate(self.causes):
-            system = cause.dynamics(system, self.part(p, i))
+            system = cause.dynamics(system, self.parameters_of(p, i))
         return system
 
     def jacobian(self, p: FloatArray, base: Signals, which: list[int] | None = None) -> FloatArray:
-        """Derivatives of the reading by the parameters ``which`` (all by default), (m, n), one row a parameter."""
+        """(m, n) derivatives of the reading with respect to the parameters ``which`` (default: all)."""
         chosen = range(len(self.parameters)) if which is None else which
         rows = np.empty((len(chosen), self.data.n))
 

@@ -39,10 +39,10 @@ class Split:
 
 
 def split(data: FitData, block_s: float = 0.5, n_folds: int = 4) -> Split:
-    """Blocks, and folds that each leave out stretches of another waveform and rate.
+    """Blocks, and folds that each leave out whole stretches of one waveform and rate.
 
-    Neighbouring blocks whose drive is alike (the same rate within a factor of two, the same share of standing
-    still) make one stretch; stretches longer than an eighth of the record are cut. Stretches go to the folds in turn.
+    Neighbouring blocks with a similar drive (rate within a factor of two, similar share of rest) form one stretch, of
+    at most an eighth of the record. Stretches are assigned to the folds in turn.
     """
     block = max(8, min(round(block_s / data.dt_s), data.n // 40))
     count = max(1, data.n // block)
@@ -62,22 +62,22 @@ def split(data: FitData, block_s: float = 0.5, n_folds: int = 4) -> Split:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Squared error (µm²) of a calibrated model on data that its numbers have not seen, per block and in sum."""
+    """Squared error (µm²) of a calibrated model on data that were not used to fit it, per block and in total."""
 
     per_block_um2: FloatArray
     sse_um2: float
 
 
-#: What happened before the record is known from its first moments alone, and cannot be held out with them.
-PAST = ("start_um", "h0")
+#: Parameters of the initial state: only the first samples determine them, so they cannot be held out.
+INITIAL_STATE = ("start_um", "h0")
 
 
 def unit_columns(fit: ModelFit, mask: BoolArray, past: bool = True) -> FloatArray:
-    """Columns (as rows) of the numbers that can still move, masked and scaled to unit norm."""
+    """(m, n) Jacobian columns, one per row, of the parameters away from their bounds, masked and of unit norm."""
     if fit.rows is not None:
         if not past:
             names = [fit.model.parameters[i].name for i in fit.row_indices]
-            fit = replace(fit, rows=fit.rows[[i for i, name in enumerate(names) if name not in PAST]])
+            fit = replace(fit, rows=fit.rows[[i for i, name in enumerate(names) if name not in INITIAL_STATE]])
         assert fit.rows is not None
         norms = np.sqrt(np.einsum("ij,ij->i", fit.rows, fit.rows))
         good = norms > 0.0
@@ -85,7 +85,7 @@ def unit_columns(fit: ModelFit, mask: BoolArray, past: bool = True) -> FloatArra
     parameters = fit.model.parameters
     slope_free = [i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high]
     if not past:
-        slope_free = [i for i in slope_free if parameters[i].name not in PAST]
+        slope_free = [i for i in slope_free if parameters[i].name not in INITIAL_STATE]
     rows = fit.model.jacobian(fit.p, fit.signals, slope_free) * mask
     norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
     good = norms > 1e-9 * max(float(norms.max(initial=0.0)), 1e-300)
@@ -93,7 +93,7 @@ def unit_columns(fit: ModelFit, mask: BoolArray, past: bool = True) -> FloatArra
 
 
 def held_out(fit: ModelFit, mask: BoolArray, parts: Split) -> HeldOut:
-    """Leave-one-fold-out error of the model linearised at its calibration: exact where the model is linear."""
+    """Leave-one-fold-out error of the model linearised at its calibration; exact for a linear model."""
     rows = unit_columns(fit, mask, past=False)
     residual = fit.residual_um * mask
     per_block = parts.blocks(np.square(residual))
@@ -104,11 +104,11 @@ def held_out(fit: ModelFit, mask: BoolArray, parts: Split) -> HeldOut:
         grams.append(part @ part.T)
         slopes.append(part @ residual[inside])
     whole, slope = sum(grams), sum(slopes)
-    # What only one stretch of the record determines (the first rise from rest, say) cannot be held out with it:
-    # such directions stay where the whole record puts them.
+    # The ridge keeps directions that only one stretch determines (such as the first rise from rest) at the value from
+    # the whole record.
     ridge = 1e-4 * np.eye(rows.shape[0])
-    # A calibration stops a little short of its optimum. That step is the same with and without a fold: only what
-    # leaving the fold out changes is evidence.
+    # A calibration stops slightly before its optimum. The remaining step is the same with and without the fold, so it
+    # is subtracted.
     short = np.linalg.lstsq(whole + 1e-9 * np.eye(rows.shape[0]), slope, rcond=1e-12)[0]
     out = np.zeros_like(per_block)
     for f in range(parts.n_folds):
@@ -122,7 +122,7 @@ def held_out(fit: ModelFit, mask: BoolArray, parts: Split) -> HeldOut:
 
 
 def worse_by(one: HeldOut, other: HeldOut) -> tuple[float, float]:
-    """By how much ``one`` errs more than ``other`` (µm²), and that difference in its own standard errors.
+    """By how much the error of ``one`` exceeds that of ``other`` (µm²), and the same in standard errors.
 
     Vuong's comparison of non-nested models, over blocks.
     """
@@ -133,7 +133,7 @@ def worse_by(one: HeldOut, other: HeldOut) -> tuple[float, float]:
 
 
 def error_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray, parts: Split) -> HeldOut:
-    """Squared error of the fitted model on another recording, by blocks and in sum."""
+    """Squared error of the fitted model on another recording, per block and in total."""
     there = fit_on_other_recording(fit, data, mask)
     residual: FloatArray = np.where(mask, there.residual_um, 0.0)
     per_block = parts.blocks(np.square(residual))

@@ -15,19 +15,19 @@ from sim.diagnosis.search.held_out import Split, unit_columns
 
 @dataclass(frozen=True)
 class ScreenedCause:
-    """One linearised guess: which form, from which start, and what it could remove of the squared error."""
+    """The best linearised guess of one cause: its start values and how much squared error it could remove."""
 
     index: int
     start: FloatArray
     gain_um2: float
     slopes: FloatArray  # (columns, blocks): inner products with the residual, block by block
     gram: FloatArray
-    #: Largest squared norm of any guess: what the cause would leave in this record at its usual size.
+    #: Largest squared norm of any guess: the effect of the cause at its usual size on this recording.
     size_um2: float = 0.0
 
 
 class ResidualScreen:
-    """The residual of a calibrated model, seen beside what its own numbers could still explain."""
+    """The residual of a calibrated model without what its own parameters could still explain."""
 
     def __init__(self, fit: ModelFit, mask: BoolArray, parts: Split) -> None:
         self.fit, self.mask, self.parts = fit, mask, parts
@@ -38,17 +38,17 @@ class ResidualScreen:
         self.residual = residual - (residual @ q) @ q.T
 
     def project(self, rows: FloatArray) -> FloatArray:
-        """Rows less what the model's own numbers explain of them."""
+        """``rows`` (m, n) without the part that the model's own parameters can explain."""
         rows = rows * self.mask
         return np.asarray(rows - (rows @ self.tangent.T) @ self.tangent)
 
     def differences(self, model: StageModel, trial: list[FloatArray]) -> FloatArray:
-        """Simulated differences of a trial from the present model, (columns, n). ``model`` has one form more."""
+        """(m, n) simulated differences of a guess from the present model. ``model`` has one cause more."""
         base = self.fit.signals
         parameters = model.nominal.parameters(model.data)
         own = model.causes[-1]
         start = min(s.acts_on for s in own.parameters(model.data))
-        # Signals kept at other sub-steps cannot be gone on from.
+        # Kept signals can only be used with the same sub-steps.
         if model.substeps != self.fit.model.substeps or model.continuous != self.fit.model.continuous:
             start = ActsOn.DRIVE
         p = self.fit.p.copy()
@@ -58,8 +58,8 @@ class ResidualScreen:
         rows = [model.simulate(np.concatenate([p, q]), start, base).reading_um - base.reading_um for q in trial]
         return np.array(rows)
 
-    def look(self, index: int, model: StageModel) -> ScreenedCause | None:
-        """The best trial of the last form of ``model``, or None where none shows at all."""
+    def best_guess(self, index: int, model: StageModel) -> ScreenedCause | None:
+        """The best guess of the last cause of ``model``, or None if no guess changes the reading."""
         cause, data = model.causes[-1], model.data
         parameters = cause.parameters(data)
         neutral = np.array([s.neutral for s in parameters])
@@ -81,13 +81,13 @@ class ResidualScreen:
             system = gram * scale[:, None] * scale[None, :] + 1e-8 * np.eye(size.size)
             weights = scale * np.linalg.solve(system, scale * slope)
             if len(trial) == 1:
-                # One guess of a number that does not simply scale: near its own size it is to be believed.
+                # A single guess is nonlinear in its parameter: allow only a factor of 0 to 2.
                 weights = np.clip(weights, 0.0, 2.0)
                 start = trial[0]
             else:
                 start = trial[0].copy()
                 moves = np.array([q - neutral for q in trial])
-                # A number that only one of the guesses moves scales; one that all of them share stands.
+                # Parameters that only one vector moves scale linearly; shared ones keep their value.
                 linear = np.count_nonzero(moves, axis=0) <= 1
                 start[linear] = (neutral + weights @ moves)[linear]
             gain = float(2.0 * weights @ slope - weights @ gram @ weights)
@@ -97,11 +97,10 @@ class ResidualScreen:
 
 
 def p_value(looks: list[ScreenedCause], gain_um2: float, seed: int, draws: int = 999) -> float:
-    """How often chance alone would gain as much with the best of all these guesses.
+    """Probability that chance alone gains ``gain_um2`` with the best of all these guesses.
 
-    The blocks of the residual get random signs (a wild block bootstrap): what repeats with the drive loses its
-    phase, while colour and uneven size of the noise stay. The largest gain of all candidates counts, which
-    corrects for their number.
+    A wild block bootstrap gives the blocks of the residual random signs. This destroys the relation to the drive and
+    keeps colour and varying size of the noise. The maximum over all candidates corrects for their number.
     """
     if not looks:
         return 1.0

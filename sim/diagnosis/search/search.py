@@ -27,25 +27,25 @@ from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_valu
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What is asked of a cause before it is named. The values are those with which `docs/diagnosis.md` was scored."""
+    """What a cause must fulfil to be named. The scores in `docs/diagnosis.md` were measured with these values."""
 
-    #: Chance level of the null distribution, after correction for the number of candidates.
+    #: Largest p-value, corrected for the number of candidates.
     level: float = 0.01
     #: Least share of the held-out squared error that a cause must remove.
     least_gain: float = 0.02
-    #: The same, as a share of the noise floor's square: less is a quarter of the noise and no matter.
+    #: Least gain as a share of the squared noise floor.
     least_of_floor: float = 0.08
-    #: Least share of what stands above the noise floor that the first, and a further, cause must remove.
+    #: Least share of the squared error above the noise floor that the first cause, and a further one, must remove.
     least_excess_first: float = 0.1
     least_excess_next: float = 0.25
-    #: A further cause that removes so much of it is accepted whatever the forms before it may have left behind.
+    #: A further cause that removes this share is accepted even if the model errors of earlier causes could explain it.
     nearly_all: float = 0.85
-    #: Cost of a number, as a share of the squared error: of two causes that do as well, the simpler.
+    #: Cost of one parameter, as a share of the squared error: of two equal causes the simpler one is preferred.
     cost_per_number: float = 0.002
-    #: How many of the linearised guesses are fitted in full.
+    #: Number of linearised guesses that are fitted in full.
     refits: int = 6
     most_causes: int = 5
-    #: A substitute within this share of the gain, or within this many standard errors, is an alternative.
+    #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative.
     close_share: float = 0.02
     close_sigmas: float = 2.5
 
@@ -53,9 +53,9 @@ class Thresholds:
 def first_fits(
     cause: CauseModel, guess: FloatArray, base: ModelFit, mask: BoolArray
 ) -> tuple[CauseModel, list[ModelFit]]:
-    """A few steps of the joint fit of ``base`` and ``form``, with each hold that suits; the form as it was fitted.
+    """A few steps of the joint fit of ``base`` and ``cause``, with each suitable hold; and the cause as fitted.
 
-    ``guess`` holds the form's numbers as the linearised look at the residual found them.
+    ``guess`` holds the parameters of the cause that screening found.
     """
     other = replace(base.model, nominal=base.model.nominal.with_other_hold())
     if isinstance(cause, Slips):
@@ -65,14 +65,14 @@ def first_fits(
         best = min(whole or fits, key=lambda f: f.sse_um2)
         return best.model.causes[-1], [best]
     if isinstance(cause, RestoringForceLoop):
-        return cause, [_giving_way(cause, base, guess, mask)]
-    fits = [_quick(base.model.plus(cause), base, guess, mask)]
+        return cause, [_first_fit_of_force_loop(cause, base, guess, mask)]
+    fits = [_first_fit(base.model.with_cause(cause), base, guess, mask)]
     if cause.fast:
-        fits.append(_quick(other.plus(cause), base, guess, mask))
+        fits.append(_first_fit(other.with_cause(cause), base, guess, mask))
     return cause, fits
 
 
-def _quick(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
+def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
     """From a linearised guess, or from beside neutral where that overshot."""
     start = np.concatenate([base.p, guess])
     if evaluate(model, clipped_to_bounds(model, start), mask).sse_um2 > base.sse_um2:
@@ -83,13 +83,13 @@ def _quick(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray
     return calibrate(model, start, mask, 8, 2e-3, known=base.columns())
 
 
-def _giving_way(cause: RestoringForceLoop, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
+def _first_fit_of_force_loop(cause: RestoringForceLoop, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
     """From the best of a grid in which the nominal stage's mode gives way to the loop."""
-    model = base.model.plus(cause)
+    model = base.model.with_cause(cause)
     names = tuple(parameter.name for parameter in model.parameters[: model.n_nominal])
     between = base.p[model.n_nominal :]
     starts = [np.concatenate([base.p, guess])]
-    for p in cause.together(base.p[: model.n_nominal], names, model.data):
+    for p in cause.joint_starts(base.p[: model.n_nominal], names, model.data):
         own = p.size - guess.size
         starts.append(np.concatenate([p[:own], between, p[own:]]))
     tried = [(evaluate(model, clipped_to_bounds(model, p), mask).sse_um2, i) for i, p in enumerate(starts)]
@@ -102,7 +102,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class CauseCandidate:
-    """A cause fitted jointly with everything else."""
+    """A cause fitted jointly with everything accepted so far. ``cost`` is the held-out error with its penalties."""
 
     cause: CauseModel
     fit: ModelFit
@@ -116,13 +116,13 @@ class AcceptedCause:
 
     name: str
     p_value: float
-    #: Share of the held-out squared error, as it then was, that it removed.
+    #: Share of the held-out squared error that it removed at that time.
     gain: float
 
 
 @dataclass
 class Search:
-    """Everything that the greedy search works on; `run` gives the accepted model."""
+    """The greedy search. `run` returns the accepted model."""
 
     mask: BoolArray
     parts: Split
@@ -130,15 +130,15 @@ class Search:
     thresholds: Thresholds
     seed: int
     progress: Progress
-    #: The readings' grid is coarser than their noise.
+    #: The converter grid of the readings is coarser than their noise.
     coarse: bool = False
     causes: tuple[CauseModel, ...] = CAUSE_MODELS
     first_looks: list[ScreenedCause] = field(default_factory=list)
-    #: Numbers of the nominal stage calibrated alone.
+    #: Parameters of the nominal stage calibrated without causes.
     nominal_p: FloatArray | None = None
 
     def cost(self, fit: ModelFit, held: HeldOut, base: ModelFit) -> float:
-        """Held-out error, with the price of the numbers that a model has more than ``base``."""
+        """Held-out squared error with the cost of the parameters that ``base`` lacks, and the monitor's error (µm²)."""
         extra = len(fit.free) - len(base.free)
         seen = monitor_misfit(fit, self.mask) * self.sigma_um**2 if fit.model.data.monitor_V is not None else 0.0
         return seen + held.sse_um2 * (1.0 + self.thresholds.cost_per_number * max(extra, 0))
@@ -147,32 +147,33 @@ class Search:
         return held_out(fit, self.mask, self.parts)
 
     def looks(self, fit: ModelFit, skip: set[str]) -> tuple[list[ScreenedCause], list[CauseModel]]:
-        """The best linearised guess of every form that could show, largest gain first."""
+        """The best linearised guess of every applicable cause, largest gain first."""
         screen = ResidualScreen(fit, self.mask, self.parts)
         self._refresh(fit)
-        shown = [i for i, f in enumerate(self.causes) if f.name not in skip and not f.applies(fit.model.data)]
-        seen = side_by_side(lambda i: screen.look(i, fit.model.plus(self.causes[i])), shown)
+        shown = [i for i, f in enumerate(self.causes) if f.name not in skip and not f.missing(fit.model.data)]
+        seen = side_by_side(lambda i: screen.best_guess(i, fit.model.with_cause(self.causes[i])), shown)
         found = sorted((look for look in seen if look is not None), key=lambda s: -s.gain_um2)
         return found, [self.causes[s.index] for s in found]
 
     def _refresh(self, fit: ModelFit) -> None:
-        """Slips have no place, and modes no frequency, until a model says what it leaves."""
-        self.causes = tuple(f.sought(fit) if isinstance(f, Modes) else f for f in self.causes)
+        """Find the places of slips and the frequencies of modes in the residual of ``fit``."""
+        self.causes = tuple(f.with_modes_of(fit) if isinstance(f, Modes) else f for f in self.causes)
         if any(cause.name == "timing" for cause in fit.model.causes):
             return
         found = find_slips(fit.model.data.y_um, fit.signals.reading_um, self.mask)
         self.causes = tuple(replace(f, found=found) if isinstance(f, Slips) else f for f in self.causes)
 
     def refit(self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float) -> list[CauseCandidate]:
-        """The most promising guesses fitted jointly, the cheapest in held-out error first."""
+        """The most promising guesses fitted jointly, the lowest cost first."""
         if not looks:
             return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
         timing = bool(chosen) and self.causes[chosen[0].index].name == "timing"
         for look in looks:
             cause = self.causes[look.index]
-            # A line at the mains is small but has its own mark; a loop in the force shows once the mode gives way;
-            # slips show to a model that knows of the others, and until then a clock stands for them.
+            # These are fitted even with a small linearised gain: mains hum, because a spectral line is specific; a loop
+            # in the restoring force, because it shows only when the mode is fitted with it; slips beside a timing
+            # guess, because several of them look like a clock error at first.
             line = cause.name == "mains_hum" and self.is_line(look, base)
             own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
             if own and all(look is not c for c in chosen):
@@ -190,7 +191,7 @@ class Search:
         return has_spectral_line(base.residual_um, base.model.data, float(look.start[0]))
 
     def polish(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The same cause fitted to the end."""
+        """The same cause fitted to convergence."""
         more = 40 if candidate.cause.variant.startswith("restoring") else 12
         fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, more, 1e-5)
         fit = with_new_columns(fit, self.mask)
@@ -198,18 +199,18 @@ class Search:
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
     def plausible(self, candidate: CauseCandidate) -> bool:
-        """Whether its numbers are of a size and sign that the cause has."""
+        """Whether the fitted parameters have a plausible size and sign."""
         model = candidate.fit.model
-        return candidate.cause.plausible(model.part(candidate.fit.p, len(model.causes) - 1), model.data)
+        return candidate.cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
 
     def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
-        """Whether the gain of a cause is more than chance, more than the form's own error, and physical."""
+        """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
         thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
         if p > thresholds.level or gain <= 0.0:
             return False
         parameters = best.cause.parameters(best.fit.model.data)
-        q = best.fit.model.part(best.fit.p, len(best.fit.model.causes) - 1)
+        q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
         if best.cause.name == "mains_hum":
             return gain > 30.0 * self.sigma_um**2 and has_spectral_line(base.residual_um, base.model.data, float(q[0]))
         if len(parameters) == 1 and (q[0] <= parameters[0].low or q[0] >= parameters[0].high):
@@ -219,24 +220,24 @@ class Search:
         floor = self.parts.blocks(self.mask.astype(np.float64) * self.sigma_um**2)
         now, after = held.per_block_um2, best.held.per_block_um2
         first = not np.any(left_um2)
-        # Blocks that hold hardly more than what the forms of earlier causes leave behind tell nothing of a further one.
+        # Blocks whose error is mostly the model error of earlier causes are not evidence for a further one.
         clean = now > 2.0 * left_um2
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
         need = thresholds.least_excess_first if first else thresholds.least_excess_next
-        # Rounding to a coarse grid errs alike wherever the stage stands still, so that it passes for a cause.
+        # With a coarse grid, rounding errors repeat wherever the stage rests and could look like a cause.
         least = max(
             thresholds.least_gain * float(now.sum()),
             (0.5 if self.coarse else thresholds.least_of_floor) * float(floor.sum()),
         )
-        # What a form leaves behind is no other cause to the last: what explains nearly all of it, and much, is there.
+        # A model error of earlier causes is never explained almost completely by another cause.
         if not first and whole > thresholds.nearly_all and float(now.sum()) > 2.0 * float(floor.sum()):
             return True
         return gain > least and gain > need * excess and whole > 0.5 * need
 
     def run(self, nominal: ModelFit) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
-        """Greedy addition from a calibrated nominal model, with substitution after each step."""
+        """Add causes to the calibrated nominal stage, one per round, until none is acceptable."""
         current, held = nominal, self.held(nominal)
         self.nominal_p = nominal.p
         left_um2 = np.zeros_like(held.per_block_um2)
@@ -255,7 +256,6 @@ class Search:
             for candidate in fitting[:3]:
                 best = self.polish(candidate, current)
                 gain = held.sse_um2 - best.held.sse_um2
-                # The linearised gain is what the null distribution knows; a full fit may only be judged by as much.
                 p = p_value(looks, gain, self.seed + round_)
                 if self.acceptable(best, held, left_um2, p, current):
                     accepted = best
@@ -271,7 +271,7 @@ class Search:
         return current, held, steps
 
     def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The hold between two samples once more: a large cause may have hidden which one suits."""
+        """The candidate with the other hold between samples, if that fits better: a large cause can hide it."""
         fit = accepted.fit
         model = replace(fit.model, nominal=fit.model.nominal.with_other_hold())
         dearer = model.nominal.substeps > fit.model.nominal.substeps
@@ -283,14 +283,14 @@ class Search:
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The same cause in a form with more numbers, where it has one and that does better."""
+        """The candidate with a finer model of the same cause, if there is one and it costs less."""
         left = np.sqrt(accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
         own = accepted.fit.p[len(base.p) :]
         found = refined_model(accepted.cause, own, float(left), base.model.data)
         if found is None:
             return accepted
         cause, starts = found
-        model = base.model.plus(cause)
+        model = base.model.with_cause(cause)
         beside = accepted.fit.p[: len(base.p)]
         fits = [calibrate(model, np.concatenate([beside, start]), self.mask, 10, 1e-3) for start in starts]
         fit = with_new_columns(min(fits, key=lambda f: f.sse_um2), self.mask)
@@ -299,7 +299,7 @@ class Search:
         return CauseCandidate(cause, fit, held, cost) if cost < accepted.cost else accepted
 
     def with_refitted_slips(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
-        """The fit with its slips, if it has any, dated beside everything that was found since."""
+        """The fit with its slips, if any, dated again beside all causes found since."""
         better = refit_slips(fit, self.mask)
         if better is fit:
             return fit, held
@@ -307,22 +307,22 @@ class Search:
         return better, self.held(better)
 
     def without(self, fit: ModelFit, index: int) -> ModelFit:
-        """The model less one cause, calibrated anew."""
-        where = fit.model.where(index)
+        """The model without one cause, calibrated again."""
+        where = fit.model.slice_of(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
         if isinstance(fit.model.causes[index], RestoringForceLoop) and self.nominal_p is not None:
-            # The mode had given way to the loop: from there no calibration finds back to a linear stage.
+            # The loop changed the nominal mode too much: start from the nominal stage calibrated alone.
             start[: fit.model.n_nominal] = self.nominal_p
-            return calibrate(fit.model.less(index), start, self.mask, 12, 1e-4)
-        return calibrate(fit.model.less(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
+            return calibrate(fit.model.without_cause(index), start, self.mask, 12, 1e-4)
+        return calibrate(fit.model.without_cause(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
 
 
-# --- The review: each accepted cause is removed once more, and has to be worth its place last.
+# The review: each accepted cause is removed once more and must be worth its place.
 
 
 @dataclass(frozen=True)
 class ReviewedCause:
-    """An accepted cause while alternatives are still sought."""
+    """An accepted cause after its review: the model without it, and its rivals."""
 
     step: AcceptedCause
     without: ModelFit
@@ -341,7 +341,7 @@ class ReviewedCause:
 def review(
     search: Search, fit: ModelFit, held: HeldOut, steps: dict[str, AcceptedCause]
 ) -> tuple[ModelFit, HeldOut, list[ReviewedCause]]:
-    """Remove each cause once more: drop what has become idle, swap what another explains better, name rivals."""
+    """Remove each cause once more: drop it if idle, replace it if another explains more, collect its rivals."""
     thresholds = search.thresholds
     found: list[ReviewedCause] = []
     index = swaps = 0
@@ -367,7 +367,7 @@ def review(
             fit, held = swap.fit, swap.held
             found, index = [], 0
             continue
-        # Where the voltage was monitored, a rival must agree with that as well.
+        # With a voltage monitor, a rival must agree with the monitor as well.
         rivals = [r for r in rivals if r.cost - r.held.sse_um2 <= 1.2 * (cost - held.sse_um2) + 0.05 * gain]
         names = _rivals(search, rivals, held, gain, held_less)
         found.append(ReviewedCause(steps[cause.name], less.without_signals(), held_less, names))
@@ -378,13 +378,13 @@ def review(
 def _rivals(
     search: Search, rivals: list[CauseCandidate], held: HeldOut, gain: float, held_less: HeldOut
 ) -> tuple[CauseCandidate, ...]:
-    """Those that do as well within what the record can tell, one of each name."""
+    """The rivals that the recording cannot tell from the accepted cause, one of each name."""
     out: list[CauseCandidate] = []
     thresholds = search.thresholds
     for rival in rivals:
         lost, sigmas = worse_by(rival.held, held)
         close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
-        # A narrow line that never stops is like nothing else.
+        # A permanent narrow line cannot be confused with another cause.
         if rival.cause.name == "mains_hum":
             continue
         if close and search.plausible(rival) and all(rival.cause.name != other.cause.name for other in out):
