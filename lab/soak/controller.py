@@ -28,16 +28,16 @@ from service.runtime.delivery import SURELY
 from service.runtime.stopping import StopSignal
 from service.stage_node.node import status_key
 
-#: Time-out of a query, s: a controller that has 60 ms ahead does not wait for a second.
+#: Timeout of a query, s. The controller asks 60 ms ahead, so it does not wait longer.
 TIMEOUT_S = 0.1
 REPORT_S = 1.0
-#: An answer that comes less than so many ticks before its block is due may not reach the stage in time: it is not sent,
-#: since a block that arrives half over would make the stage jump.
+#: An answer that comes less than this many ticks before its block is due is not sent: it might reach the stage in the
+#: middle of the block, and the voltage would jump.
 MARGIN = 10
 
 
 class StageClock:
-    """The stage's newest number, and the first one of its present life; filled by the wire's thread."""
+    """The stage's newest sample number and the first one since its start; filled by zenoh's thread."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.newest = -1
@@ -53,7 +53,7 @@ class StageClock:
         try:
             batch = wire.decode_samples(sample.payload.to_bytes())
         except InputError:
-            # Anybody may publish; the stage's own samples go on.
+            # Another client sent this. The stage's own samples follow.
             return
         with self._moved:
             last = int(batch.seq[-1])
@@ -62,33 +62,32 @@ class StageClock:
                 self._moved.notify_all()
 
     def _status(self, sample: zenoh.Sample) -> None:
-        told = json.loads(sample.payload.to_bytes())
+
+        status = json.loads(sample.payload.to_bytes())
         with self._moved:
-            # A stage that waits for commands has a new life; one that runs is followed from where it is.
-            if told["state"] == "waiting" and told["first"] != self.first:
-                self.first, self.newest = told["first"], told["first"] - 1
-                self._moved.notify_all()
-            elif self.first != told["first"]:
-                self.first, self.newest = told["first"], told["tick"]
+            # A restarted stage waits for commands; a stage that runs is followed from its present tick.
+            if self.first != status["first"]:
+                self.first = status["first"]
+                self.newest = self.first - 1 if status["state"] == "waiting" else status["tick"]
                 self._moved.notify_all()
 
     def wait(self, first: int, seq: int, timeout_s: float) -> bool:
-        """Until sample ``seq`` of the life that began with ``first`` has come, or another life has begun."""
+        """Wait until sample ``seq`` of the stage that began at ``first`` has come, or the stage has restarted."""
         with self._moved:
             return self._moved.wait_for(lambda: self.first != first or self.newest >= seq, timeout_s)
 
     def before(self, seq: int) -> bool:
-        """Whether what is sent now reaches the stage before it takes sample ``seq``."""
+        """Whether a command sent now reaches the stage before sample ``seq``."""
         return self.newest < max(seq - MARGIN, self.first)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 class Controller:
-    """One run; `run` returns when stopped."""
+    """Asks for blocks and sends them; `run` returns when stopped. ``counts`` is printed every second."""
 
     def __init__(self, control: ControlTask, client: Client, session: zenoh.Session) -> None:
         self.control = control
@@ -103,30 +102,31 @@ class Controller:
         self._error = ""
 
     def _rest(self, sample: zenoh.Sample) -> None:
-        told = json.loads(sample.payload.to_bytes())
-        self.reference.dwells = [*self.reference.dwells[-8:], (int(told["first"]), int(told["ticks"]))]
+
+        dwell = json.loads(sample.payload.to_bytes())
+        self.reference.dwells = [*self.reference.dwells[-8:], (int(dwell["first"]), int(dwell["ticks"]))]
 
     def run(self, stop: StopSignal) -> None:
         """Follow the stage's clock until stopped."""
         clock = StageClock(self._session)
         first, begin = -1, 0
         answer: Trajectory | None = None
-        told_s = time.monotonic()
+        reported_s = time.monotonic()
         size, lead = self.control.block, self.control.lead
         try:
             while not stop.reason:
-                if time.monotonic() - told_s >= REPORT_S:
-                    told_s = time.monotonic()
+                if time.monotonic() - reported_s >= REPORT_S:
+                    reported_s = time.monotonic()
                     print(json.dumps({**self.counts, "error": self._error}), flush=True)
                 if clock.first != first:
                     first, answer, self._last_V = clock.first, None, math.nan
-                    # A stage that waits is given its first commands; one that runs, those of a little later.
+                    # Command a waiting stage from its first sample on, a running one from a little later on.
                     ahead = 0 if clock.newest < first else clock.newest + lead - first
                     begin = first + -(-ahead // size) * size
                 if first < 0 or not clock.wait(first, begin - lead, 0.2) or clock.first != first:
                     continue
                 if clock.newest - begin > lead:
-                    # Too far behind to catch up block by block: go on where the stage will be.
+                    # Too far behind to catch up block by block: continue ahead of the stage.
                     begin += -(-(clock.newest - begin) // size) * size + lead
                     answer = None
                 answer = self._block(first, begin, answer, clock)
@@ -137,7 +137,7 @@ class Controller:
             self._commands.undeclare()  # type: ignore[no-untyped-call]
 
     def _block(self, first: int, begin: int, after: Trajectory | None, clock: StageClock) -> Trajectory | None:
-        """Ask for a block and send it; None where it was given up because it is due."""
+        """Ask for a block and send it. None if no answer came before it was due."""
         size = self.control.block
         motion = self.reference.rows(begin - first, size)
         self.counts["blocks"] += 1
@@ -166,7 +166,8 @@ class Controller:
         return None
 
     def _safe(self, answer: Trajectory) -> bool:
-        """Whether an answer keeps what the service promises: finite, within limits, within slew from where it was."""
+        """Whether an answer keeps the promise of the service: finite, within limits, within slew from the last
+        voltage."""
         c, u_V = self.control, answer.u_V
         steps = np.abs(np.diff(u_V, prepend=self._last_V if math.isfinite(self._last_V) else u_V[0]))
         within = bool(np.isfinite(u_V).all()) and c.u_min_V <= u_V.min() and u_V.max() <= c.u_max_V
@@ -176,7 +177,7 @@ class Controller:
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
     stop = StopSignal()
-    # The wire's threads must not wait 5 ms for the interpreter.
+    # zenoh's threads must not wait 5 ms for the interpreter lock.
     sys.setswitchinterval(5e-5)
     control = ControlTask(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
     from service.runtime.session import open_client

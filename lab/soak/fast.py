@@ -1,4 +1,4 @@
-"""A soak in one process: stage, axis and controller in turns, with the faults that samples and references can have."""
+"""A soak in one process: stage, axis and controller in turns, with the faults of samples, stage and reference."""
 
 from __future__ import annotations
 
@@ -34,37 +34,37 @@ def run_fast(
     out: Path, stage: StageConfig, control: ControlTask, plan: SoakPlan, observed: Observations, interim: InterimJudge,
     stopped: Callable[[], bool], say: Callable[[str], None],
 ) -> dict[str, int]:  # fmt: skip
-    """Run the plan and fill the ledger; returns the counts of samples. Times are those of the stage."""
+    """Run the plan and record it in ``observed``; returns the counts of samples. Times are those of the stage."""
     limits = Limits(control.u_min_V, control.u_max_V, control.slew_V_per_s)
     config = AxisConfig(AXIS, out / "model.npz", limits, served=SERVED, snapshot_every=control.block)
     turn = _Turns(Stage(stage), load_axis(STAGE, config), control)
     observed.seconds = turn.track.seconds
     waiting = list(plan.faults)
     under_way: list[tuple[float, FaultRecord]] = []
-    begin, told_s = time.monotonic(), 0.0
+    begin, reported_s = time.monotonic(), 0.0
     while turn.now_s < plan.duration_s and not stopped():
         while waiting and waiting[0].at_s <= turn.now_s:
             fault = waiting.pop(0)
-            happened = FaultRecord(fault.kind, turn.now_s, value=fault.value)
-            turn.suffer(fault)
-            observed.faults.append(happened)
-            under_way.append((fault.end_s, happened))
-        for end_s, happened in list(under_way):
+            record = FaultRecord(fault.kind, turn.now_s, value=fault.value)
+            turn.begin_fault(fault)
+            observed.faults.append(record)
+            under_way.append((fault.end_s, record))
+        for end_s, record in list(under_way):
             if end_s <= turn.now_s:
-                happened.end_s = turn.now_s
-                under_way.remove((end_s, happened))
+                record.end_s = turn.now_s
+                under_way.remove((end_s, record))
         turn.step()
         if turn.second_is_over():
             observed.counters.append((turn.now_s, "service", Counters(flatten_status(turn.status()))))
-            # Nobody else takes them.
+            # In a service the axis loop publishes them.
             observed.events += [{"t_s": turn.now_s, **event} for event in turn.axis.take_events()]
             interim.due(turn.now_s, lambda: _samples(turn))
-        if time.monotonic() - told_s >= _PROGRESS_S:
-            told_s = time.monotonic()
+        if time.monotonic() - reported_s >= _PROGRESS_S:
+            reported_s = time.monotonic()
             done = turn.now_s / plan.duration_s
             mae = [s.mae_um for s in turn.track.seconds[-2:-1]]
             error = f"error {100.0 * mae[0] / control.range_um:.3f} % of range, " if mae else ""
-            speed = turn.now_s / max(told_s - begin, 1e-3)
+            speed = turn.now_s / max(reported_s - begin, 1e-3)
             say(
                 f"  [{'#' * round(20 * min(1.0, done)):<20}] {turn.now_s:6.0f} of {plan.duration_s:g} s  {error}"
                 f"{len(observed.faults)} of {len(plan.faults)} faults, {speed:.1f} times as fast as real time"
@@ -83,7 +83,7 @@ def _samples(turn: _Turns) -> dict[str, int]:
 
 
 class _Turns:
-    """Stage, axis and controller, a block of ticks at a time; the controller asks ``lead`` ticks ahead."""
+    """Stage, axis and controller, one block of samples at a time; the controller asks ``lead`` samples ahead."""
 
     def __init__(self, stage: Stage, axis: Axis, control: ControlTask) -> None:
         self.axis = axis
@@ -97,7 +97,7 @@ class _Turns:
         self._asked = 0
         self._commanded = PendingCommands()
         self._last_V = math.nan
-        self._told = 0
+        self._second = 0
 
     @property
     def now_s(self) -> float:
@@ -105,14 +105,14 @@ class _Turns:
         return self.k * self._control.dt_s
 
     def second_is_over(self) -> bool:
-        """True once in every second."""
-        if int(self.now_s) == self._told:
+        """True once per second."""
+        if int(self.now_s) == self._second:
             return False
-        self._told = int(self.now_s)
+        self._second = int(self.now_s)
         return True
 
-    def suffer(self, fault: PlannedFault) -> None:
-        """Let a fault begin."""
+    def begin_fault(self, fault: PlannedFault) -> None:
+        """Begin a fault."""
         c = self._control
         changes = {"gain": "gain_drift.gain", "payload": "resonance.payload_ratio"}
         if fault.kind in changes:
@@ -125,7 +125,7 @@ class _Turns:
             self.injector.add(Fault(kind, max(fault.duration_s, c.dt_s), value))
 
     def step(self) -> None:
-        """One block of ticks."""
+        """Run one block of samples."""
         size = self._control.block
         while self._asked <= self.k + self._control.lead:
             self._ask()
@@ -144,7 +144,7 @@ class _Turns:
                 self.track.take(batch)
 
     def status(self) -> dict[str, Any]:
-        """The part of the service's status that is judged."""
+        """The part of the service's status that the invariants use."""
         axis = self.axis
         counters = {} if axis.learner is None else axis.learner.counters()
         samples = {**axis.sequence.counters(), "dropped": 0, "gates": axis.gates}

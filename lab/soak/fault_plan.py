@@ -11,9 +11,9 @@ import numpy as np
 
 from adaptive.errors import InputError
 
-# --- The kinds
+# --- Kinds of faults
 
-#: Where a fault happens: to a process, to the stage's samples, to the reference, to the machine.
+#: What a fault acts on: a process, the stage's samples, the reference, or the machine.
 PROCESS, STAGE, REFERENCE, MACHINE = "process", "stage", "reference", "machine"
 
 
@@ -23,12 +23,12 @@ class FaultKind:
 
     Attributes
     ----------
-    what : for people. where : see above.
-    duration_s : how long it lasts, drawn between the two, s.
-    recover_s : within this time after its end everything is as before: queries answered, tracking good.
-    answered : whether queries are to be answered in time while it lasts. silent_s : for how long they may fail.
-    ends_service : whether it ends a serving process; such come early, so that memory can be watched afterwards.
-    fast : whether a run in one process can suffer it.
+    what : description for reports. where : what it acts on.
+    duration_s : range of its length, s; the length is drawn from it.
+    recover_s : within this time after its end, s, queries must be answered and tracking must be good again.
+    silent_s : longest time without an answer that it may cause, s.
+    ends_service : whether it ends a service. Such faults come early, so that memory can be measured after them.
+    fast : whether it can be applied in a run in one process.
     """
 
     what: str
@@ -70,18 +70,18 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
 
 # --- The plan
 
-#: Calm before the first fault and at the end, s; between the end of one's recovery and the next at least and at most.
+#: Time without faults before the first one and at the end, s, and range of the time between two, s.
 WARM_S, TAIL_S = 6.0, 3.0
 CALM_S = (1.0, 8.0)
-#: The calm between two faults, as a share of the run.
+#: Time between two faults as a share of the run.
 _CALM_SHARE = 1.0 / 180.0
-#: Share of the run after which nothing ends a serving process any more, so that its memory can be watched.
+#: Share of the run after which no fault ends a service, so that its memory can be measured.
 KILLING_SHARE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFault:
-    """One fault of the plan: ``at_s`` after the start, for ``duration_s``; ``value`` as the kind has it."""
+    """One fault of the plan: begins ``at_s`` after the start and lasts ``duration_s``; the kind defines ``value``."""
 
     kind: str
     at_s: float
@@ -90,18 +90,18 @@ class PlannedFault:
 
     @property
     def end_s(self) -> float:
-        """When it is over."""
+        """When it ends, s."""
         return self.at_s + self.duration_s
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """From its beginning until everything has to be well again."""
+        """From its beginning to the end of its recovery time, s."""
         return self.at_s, self.end_s + FAULT_KINDS[self.kind].recover_s
 
 
 @dataclass(frozen=True, slots=True)
 class SoakPlan:
-    """``faults`` in order of time, and the kinds for which there was no time."""
+    """``faults`` in order of time, and in ``left_out`` the kinds that did not fit into the run."""
 
     duration_s: float
     seed: int
@@ -110,7 +110,7 @@ class SoakPlan:
 
 
 def select_kinds(names: list[str]) -> tuple[str, ...]:
-    """The kinds named, or all of them where none is; none of them for ``none``. Raises InputError on an unknown one."""
+    """The kinds named, or all if ``names`` is empty; none for ``["none"]``. Raises InputError on an unknown kind."""
     if names == ["none"]:
         return ()
     for name in names:
@@ -120,9 +120,9 @@ def select_kinds(names: list[str]) -> tuple[str, ...]:
 
 
 def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
-    """Faults one after the other, each with its time to recover, as many rounds of all kinds as there is time for.
+    """Draw faults one after the other, each with its time to recover: as many rounds of all kinds as fit into the run.
 
-    The same arguments give the same plan. Kinds that end a serving process come in the first rounds only.
+    The same arguments give the same plan. Kinds that end a service come in the first rounds only.
     """
     rng = np.random.default_rng(seed)
     faults: list[PlannedFault] = []
@@ -154,7 +154,7 @@ def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
 
 
 def _value(name: str, rng: np.random.Generator, turn: int) -> float:
-    """The number that goes with a fault: of a change, what the parameter becomes, there and back from turn to turn."""
+    """The value of a fault. For a change: the new parameter value, which alternates from round to round."""
     if name == "gain":
         return round(float(rng.uniform(-0.06, -0.03)), 4) if turn % 2 == 0 else 0.0
     if name == "payload":
@@ -162,18 +162,18 @@ def _value(name: str, rng: np.random.Generator, turn: int) -> float:
     return {"spike": 30.0, "stage_clock": -3600.0, "clock_back": -3600.0}.get(name, 0.0)
 
 
-# --- Which fault of a plan is next, and when it really comes.
+# --- The schedule
 
 
-#: The calm between two faults has room for so much, s.
+#: A delay up to this, s, is absorbed by the time between two faults.
 LATE_S: Final = 0.5
 
 
 class Schedule:
-    """The faults of ``plan`` one after the other, each with its time to recover, whatever those before it took.
+    """The faults of ``plan`` one after the other, each with its time to recover, whatever delays occurred before.
 
-    One that takes a process to begin begins when the machine has made that process; one that may not happen yet, as
-    ``possible`` says, waits; those behind it come as much later. What then has no time left to recover is left out.
+    A fault that starts a process begins when that process is ready, and a fault that is not ``possible`` yet waits;
+    all later faults are delayed by as much. A fault that has no time left to recover is left out.
     """
 
     def __init__(self, plan: SoakPlan, possible: Callable[[PlannedFault], bool]) -> None:
@@ -183,7 +183,7 @@ class Schedule:
         self._notes: list[str] = []
 
     def due(self, now_s: float) -> tuple[int, PlannedFault] | None:
-        """The fault that is to begin at ``now_s``, and its number in the plan; None where there is none."""
+        """The fault that begins at ``now_s``, with its number in the plan; None if there is none."""
         while self._waiting:
             index, fault = self._waiting[0]
             if now_s < fault.at_s + self._delay_s:
@@ -200,14 +200,14 @@ class Schedule:
         return None
 
     def over(self, index: int, end_s: float) -> None:
-        """The fault of that number has ended at ``end_s``."""
+        """Report that fault number ``index`` has ended at ``end_s``."""
         late_s = end_s - (self._plan.faults[index].end_s + self._delay_s)
         if late_s > LATE_S:
             self._delay_s += late_s
 
     def left_out(self) -> list[str]:
-        """At the end of a run: which faults did not happen, and why."""
-        # Such as one that waited to the end for the standby to be synced, and those behind it.
+        """After the run: one line for each fault that did not happen, with the reason."""
+        # Also a fault that waited for the standby until the end, and those after it.
         return self._notes + [_note(fault, "it did not come to it") for _, fault in self._waiting]
 
 

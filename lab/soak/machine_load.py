@@ -16,65 +16,62 @@ from typing import Final
 
 import psutil
 
-#: Threads that a query wakes on its way.
+#: Threads that a query wakes, one after the other.
 HANDOVERS: Final = 8
-#: The soak itself wants about half of two cores: who is left less than that waits, though others have not all.
-#: A second in which the bare loop was later than this, s, or others had more than this share of all cores, is none
-#: that a time can be judged by.
+#: In a second in which the bare loop was later than this, s, or other processes had more than this share of all cores,
+#: no time is judged. The soak itself needs about half of two cores.
 STALLED_S: Final = 0.1
 TAKEN_SHARE: Final = 0.45
-#: Later than this, s, or more than this share for others, and commands that are asked for 60 ms ahead need not come in
-#: time.
+#: Above this delay, s, or this share of other processes, commands that are asked for 60 ms ahead may come late.
 BUSY_S: Final = 0.0075
 BUSY_SHARE: Final = 0.25
 
-#: By second: its end, s, and what was measured.
+#: One row per second: its end, s, and the value measured.
 Rows = Sequence[tuple[float, float]]
 
 
 class MachineLoad:
-    """``bare``: the most that the bare loop was late, s; ``others``: their share of all cores, 0 to 1.
+    """``bare``: largest delay of the bare loop, s; ``others``: share of all cores that other processes had, 0 to 1.
 
-    Where nothing was measured it is a machine that is free.
+    Without any rows the machine counts as idle.
     """
 
     def __init__(self, bare: Rows, others: Rows = ()) -> None:
         self._rows = [([row[0] for row in rows], [row[1] for row in rows]) for rows in (bare, others)]
 
     def _within(self, which: int, begin_s: float, end_s: float) -> list[float]:
-        """Of the seconds that overlap with the time from ``begin_s`` to ``end_s``."""
+        """The values of the seconds that overlap with the time from ``begin_s`` to ``end_s``."""
         t_s, values = self._rows[which]
         return values[bisect_left(t_s, begin_s) : bisect_left(t_s, end_s + 1.0)]
 
     def stalled(self, begin_s: float, end_s: float) -> bool:
-        """Whether the machine stood still, or was taken by others, in that time."""
+        """Whether the machine stalled, or other processes occupied it, in that time."""
         late_s, others = (max(self._within(which, begin_s, end_s), default=0.0) for which in (0, 1))
         return late_s > STALLED_S or others > TAKEN_SHARE
 
     def taken(self, begin_s: float, end_s: float) -> bool:
-        """Whether others had so much of it that what computes may have had to wait."""
+        """Whether other processes had so much that a computation may have had to wait."""
         return max(self._within(1, begin_s, end_s), default=0.0) > BUSY_SHARE
 
     def allowed_s(self, begin_s: float, end_s: float) -> float:
-        """What a query may take longer than on a machine that is free, s."""
+        """How much longer a query may take than on an idle machine, s."""
         return HANDOVERS * max(self._within(0, begin_s, end_s), default=0.0)
 
     def busy_s(self, begin_s: float, end_s: float) -> float:
-        """How much of that time the machine was too busy for a voltage to come in time, s."""
+        """How many seconds of that time the machine was too busy for voltages to come in time."""
         late = sum(late_s > BUSY_S for late_s in self._within(0, begin_s, end_s))
         taken = sum(share > BUSY_SHARE for share in self._within(1, begin_s, end_s))
         return float(max(late, taken))
 
 
-# --- How much of the machine's processor others take than a soak's own processes.
+# --- Load by other processes
 
-
-#: A shorter time between two looks says nothing, s.
+#: A shorter time between two calls gives no result, s.
 _LEAST_S = 0.2
 
 
 class OtherLoad:
-    """Asked now and then with the processor time of one's own processes so far."""
+    """Processor time that other processes take, from one call of `share` to the next."""
 
     def __init__(self) -> None:
         self._cores = psutil.cpu_count() or 1
@@ -82,10 +79,11 @@ class OtherLoad:
         self._own: dict[int, float] = {}
 
     def share(self, own_s: Mapping[int, float]) -> float | None:
-        """Share of all cores that others had since the last call, 0 to 1; None where that was a moment ago.
+        """Share of all cores that other processes had since the last call, 0 to 1; None if that was less than 0.2 s
+        ago.
 
-        ``own_s``: by number of the process, its seconds of processor time so far (:func:`taken_s`); one that was not
-        there before counts from its beginning.
+        ``own_s``: by process id, the processor time so far of the soak's own processes, s (`processor_times_s`). A
+        process that was not in the last call counts from its start.
         """
         now_s, busy_s = time.monotonic(), _busy_s()
         passed_s = now_s - self._at_s
@@ -95,15 +93,15 @@ class OtherLoad:
         others_s = busy_s - self._busy_s - own
         first = not self._own
         self._at_s, self._busy_s, self._own = now_s, busy_s, dict(own_s)
-        # What the processes had before the first look is not known.
+        # Their time before the first call is unknown.
         return None if first else min(1.0, max(0.0, others_s / (passed_s * self._cores)))
 
 
 def processor_times_s(roots: Iterable[int]) -> dict[int, float]:
-    """By number of the process, seconds of processor time so far of each root that lives and of all that it has begun.
+    """By process id, the processor time so far, s, of each root that lives, with all its descendants.
 
-    Of a tree each process counts, and those that it has outlived, so that it only grows; a root within the tree of
-    another counts for itself only. Of one's own process those that it has outlived are not counted: they were roots.
+    Includes descendants that have ended, so that the value only grows. A root below another root counts for itself
+    only. For the calling process, children that have ended are not counted: they were roots.
     """
     parent, taken = {}, {}
     for process in psutil.process_iter(["ppid", "cpu_times"]):

@@ -37,18 +37,18 @@ from service.runtime.stopping import StopSignal
 Asks = TypeVar("Asks")
 Gets = TypeVar("Gets")
 
-#: Most questions without an answer at a time.
+#: Most queries under way at a time.
 MOST: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
 class QueryOutcome(Generic[Asks, Gets]):
-    """What became of a question.
+    """The result of a query.
 
     Attributes
     ----------
-    asked : the question. answer : None where there was none, for the reason in ``error``. took_us : round trip, µs.
-    at_s : when it was over, s of the monotonic clock.
+    asked : the query. answer : None if there was none, for the reason in ``error``. took_us : round trip, µs.
+    at_s : when it ended, s of the monotonic clock.
     """
 
     asked: Asks
@@ -59,13 +59,16 @@ class QueryOutcome(Generic[Asks, Gets]):
 
 
 class OverlappingQueries(Generic[Asks, Gets]):
-    """Asks in threads of its own; use as a context manager.
+    """Sends queries in threads ``soak-ask`` and sends another one when an answer is late, without giving up the first.
+
+    An answer that takes 0.12 s is an answer. A client that gave it up after 0.1 s would get no answer at all on a
+    machine where each one takes so long, and would report a slow service as silent. Use as a context manager.
 
     Parameters
     ----------
-    ways : functions that ask and wait for the answer, one for each question that may be under way at a time: none is
-        called while its last call lasts. They raise DehystError where there is no answer, after at most a second or so.
-    again_s : how long :meth:`ask` waits for an answer, s.
+    ways : functions that send a query and return the answer, one for each query that may be under way at a time; none
+    is called while its last call runs. They raise DehystError if there is no answer, after at most about a second.
+    again_s : how long `ask` waits for an answer, s.
     """
 
     def __init__(self, ways: Sequence[Callable[[Asks], Gets]], again_s: float) -> None:
@@ -83,9 +86,10 @@ class OverlappingQueries(Generic[Asks, Gets]):
         self._pool.shutdown()
 
     def ask(self, question: Asks) -> list[QueryOutcome[Asks, Gets]]:
-        """Ask, wait until this or an earlier question is over, and return all that are, in that order.
+        """Send a query, wait until this or an earlier one has ended, and return all that have, in the order of their
+        ends.
 
-        Empty where none was over in ``again_s``; what is under way is then left so, and another call asks beside it.
+        Empty if none ended within ``again_s``: the next call then sends another one beside it.
         """
         if self._idle:
             way = self._idle.pop()
@@ -108,17 +112,17 @@ def _asked(way: Callable[[Asks], Gets], question: Asks) -> QueryOutcome[Asks, Ge
 
 # --- The prober
 
-#: Pause between two rounds of one query and one echo; how long an answer is waited for before another is asked for
-#: beside it; and the time-out of both, s.
+#: Pause between two rounds of one query and one echo, s; time until another query is sent beside a late one, s;
+#: timeout of both, s.
 PAUSE_S, AGAIN_S, TIMEOUT_S = 0.01, 0.1, 1.0
 
-Told = QueryOutcome[Point | None, Point]
+PointOutcome = QueryOutcome[Point | None, Point]
 
 
 class Prober:
-    """What is counted in a second, and the questions.
+    """The queries, and what is counted in the present second.
 
-    ``points`` asks for a point after another one; ``echoes`` sends so many bytes there and back.
+    ``points`` asks for a point that continues another one; ``echoes`` sends so many bytes there and back.
     """
 
     def __init__(
@@ -138,23 +142,23 @@ class Prober:
         }  # fmt: skip
 
     def ask(self) -> None:
-        """One point; what is wrong with the answer is counted, as with one that comes late."""
+        """Ask for a point; count what is wrong with the answers that have come."""
         for outcome in self._points.ask(self._last):
             self._take(outcome)
 
-    def _take(self, outcome: Told) -> None:
-        told = self.counts
+    def _take(self, outcome: PointOutcome) -> None:
+        counts = self.counts
         if outcome.answer is None:
-            # What could be read, but not as an answer, is worse than none.
-            told["unsafe" if isinstance(outcome.error, InputError) else "failed"] += 1
-            told["error"] = str(outcome.error)
-            # A memory that no longer fits is asked for anew.
+            # An answer that cannot be decoded is worse than none.
+            counts["unsafe" if isinstance(outcome.error, InputError) else "failed"] += 1
+            counts["error"] = str(outcome.error)
+            # The model may have changed: ask without a memory.
             self._last = None
             return
-        told["service_us"].append(round(outcome.took_us, 1))
-        told["silent_s"] = max(told["silent_s"], outcome.at_s - self._answered_s)
+        counts["service_us"].append(round(outcome.took_us, 1))
+        counts["silent_s"] = max(counts["silent_s"], outcome.at_s - self._answered_s)
         self._answered_s = max(self._answered_s, outcome.at_s)
-        told["unsafe"] += not self._safe(outcome.asked, outcome.answer)
+        counts["unsafe"] += not self._safe(outcome.asked, outcome.answer)
         self._last = outcome.answer
 
     def _safe(self, before: Point | None, point: Point) -> bool:
@@ -165,16 +169,16 @@ class Prober:
         return safe and abs(point.u_V - before.u_V) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
 
     def echo(self, payload: bytes) -> None:
-        """The bare round trip of as many bytes there and back."""
+        """Measure the bare round trip of as many bytes."""
         self.counts["echo_us"] += [round(o.took_us, 1) for o in self._echoes.ask(payload) if o.answer is not None]
 
     def look(self, age_s: float) -> None:
-        """At the age of the followed model, s."""
+        """Record the age of the followed model, s."""
         self.counts["ages_s"].append(round(age_s, 4))
 
     def report(self) -> str:
-        """The second's line, and a new second."""
-        # A silence that has not ended is told too.
+        """The JSON line of the second; begins a new second."""
+        # Includes a silence that has not ended.
         self.counts["silent_s"] = round(max(self.counts["silent_s"], time.monotonic() - self._answered_s), 4)
         line = json.dumps({"t_s": round(time.monotonic(), 3), **self.counts})
         self._clear()
@@ -206,7 +210,7 @@ def main(argv: list[str]) -> int:
             nothing = Answer(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model)
             key = f"{ECHO_KEY}/{len(encode_reply(nothing))}"
             with open_client(argv[1], 10.0) as session, ExitStack() as stack:
-                # A client is not for several threads at once.
+                # A client must not be used by several threads at once.
                 clients = [
                     stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)
                 ]

@@ -1,4 +1,4 @@
-"""One soak from beginning to end: identify, run, judge, draw, and leave the files behind."""
+"""One soak: identify the stage, run the plan, judge the observations, draw, and write the files."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from lab.soak.live import Say, run_live, withheld
 from lab.soak.rig import identify, stage_config
 from lab.soak.verdict.interim import InterimJudge
 from lab.soak.verdict.invariants import TRACKING_PCT, judge, recorded
-from lab.soak.verdict.observations import FAST, OTHER_LIFE, REAL_TIME, Intervals, Observations, assess_recovery
+from lab.soak.verdict.observations import FAST, REAL_TIME, RESTART_GAP, Intervals, Observations, assess_recovery
 from lab.soak.verdict.outcome import SECONDS, report, soak_summary, write_seconds, write_summary
 from service.storage.output_folder import clear_output
 
-#: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
+#: Files and folders of a run. Those of an older run are removed first; other files stay.
 OURS = ("soak.json", "report.md", "plan.json", SECONDS, "error.png", "latency.png", "memory.png",
         "soak.rrd", "model.npz", "a", "b", "logs")  # fmt: skip
-#: With a stage of one's own nobody knows how good its model can be: so much worse than before the first fault.
+#: Limit of the error for a stage from a file, as a multiple of the error before the first fault.
 OWN_STAGE_RATIO = 2.0
-#: What waits to be written when the disk is full, or to be passed on when the router dies, is lost too, s; and a second
-#: is told by its beginning.
+#: Records that wait to be written when the disk is full, or to be sent when the router dies, are lost too, s. Seconds
+#: are identified by their beginning.
 WAITING_S = 1.0
-#: No second without a sample is longer than this, s.
+#: Longest gap between two seconds with samples, s.
 _BEFORE_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """A finished soak: the content of ``soak.json``, and whether it was ended early."""
+    """A finished soak: the content of ``soak.json``, and whether the run was ended early."""
 
     found: dict[str, Any]
     interrupted: bool
@@ -41,9 +41,9 @@ class Done:
 def run(
     out: Path, plan: SoakPlan, *, fast: bool, stage_file: Path | None, stopped: Callable[[], bool], say: Say
 ) -> Done:
-    """Run the plan and write the results into ``out``.
+    """Run the plan and write the results into ``out``. ``stage_file``: a stage in place of the default one.
 
-    Raises InputError on a folder or a stage that cannot be used, ServiceError where a process does not come up.
+    Raises InputError on a folder or a stage that cannot be used, ServiceError if a process does not start.
     """
     clear_output(out, OURS)
     (out / "logs").mkdir()
@@ -56,7 +56,7 @@ def run(
         say(f"      no time for: {', '.join(plan.left_out)}")
     observed = Observations(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
     observed.planned = len(plan.faults)
-    # With a stage of one's own the limit is known when the first fault begins; the end judges it.
+    # For a stage from a file the limit is known only when the first fault begins; it is judged at the end.
     interim = InterimJudge(observed, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
     missing: int | None = None
     if fast:
@@ -96,14 +96,14 @@ def _tracking_limit(observed: Observations, stage_file: Path | None) -> dict[str
     calm = [s for s in observed.seconds if s.judged and 2.0 <= s.t_s < first]
     if not calm:
         return {}
-    # A second in which the stage had to hold a voltage tells of the machine.
+    # A second in which the stage held a voltage says something about the machine, not about the model.
     calm = [s for s in calm if not s.held] or calm
     mae_um = sum(s.error_sum_um for s in calm) / sum(s.judged for s in calm)
     return {"tracking_pct": OWN_STAGE_RATIO * 100.0 * mae_um / observed.range_um}
 
 
 def _machine(observed: Observations) -> list[str]:
-    """How busy the machine was with other things, in words."""
+    """A sentence on how busy the machine was."""
     if not observed.loop_delays or not observed.other_load:
         return []
     late_ms = [1e3 * late_s for _, late_s in observed.loop_delays]
@@ -121,14 +121,14 @@ def _median_and_tenth(values: list[float]) -> tuple[float, float]:
 
 
 def _kept(out: Path, observed: Observations, seen: Intervals, received: int) -> tuple[int, dict[str, int]]:
-    """How many samples that came are in no recording though they could be, and the counts of samples."""
-    # One that stands by records too, in a folder of its own.
+    """Number of samples that the monitor saw and no service recorded though it could, and all counts of samples."""
+    # A standby records too, in a folder of its own.
     folders = [out / name / folder for name in ("a", "b") for folder in ("recording", "recording-standby")]
     found, rows = recorded(folders)
     nowhere = Intervals()
     for start, stop in seen.minus(found):
         nowhere.add(start, stop)
-    missing = sum(stop - start for start, stop in nowhere.minus(_excused(observed)))
+    missing = sum(stop - start for start, stop in nowhere.minus(unrecordable(observed)))
     return missing, {
         "seen": len(seen),
         "received_by_monitor": received,
@@ -139,23 +139,20 @@ def _kept(out: Path, observed: Observations, seen: Intervals, received: int) -> 
     }
 
 
-def _excused(observed: Observations) -> Intervals:
-    """Samples of which the services could not keep what the monitor saw.
-
-    While no file may grow nothing can be kept, and behind a router that is gone nothing arrives: the services count
-    both, and what the monitor saw then proves nothing.
-    """
+def unrecordable(observed: Observations) -> Intervals:
+    """Samples that the services could not record though the monitor saw them: while no file may grow, and while the
+    router is gone. The services count both cases themselves."""
     excused = Intervals()
     for fault in observed.faults:
         begin, end = fault.window_s
         if fault.kind not in ("disk_full", "restart_router"):
             continue
-        # From some time before: whose last second is that which the first of them follows.
+        # Begin earlier: the samples of a second begin where the second before ended.
         around = observed.seconds_between(begin - _BEFORE_S, end)
         for last, second in itertools.pairwise(around):
             if begin - WAITING_S - 1.0 <= second.t_s <= end and second.samples:
-                # From where the second before ended: of its numbers some may have been lost, and not at its beginning.
-                follows = 0 < second.seq - last.seq < OTHER_LIFE
+                # Some sample numbers may be missing, also at the beginning of a second.
+                follows = 0 < second.seq - last.seq < RESTART_GAP
                 excused.add(last.seq + 1 if follows else second.seq - second.samples + 1, second.seq + 1)
     return excused
 

@@ -1,4 +1,4 @@
-"""The task of the soak's controller: names on the wire, limits, and the reference."""
+"""The task of the soak's controller: keys, limits, and the reference."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class ControlTask:
     Attributes
     ----------
     dt_s : sample time, s. low_um, high_um : range of the reference, µm. seed : of the reference.
-    block, lead : ticks a query, and ticks that it is asked ahead.
-    u_min_V, u_max_V, slew_V_per_s : the limits that every voltage is checked against.
+    block, lead : samples per query, and samples that it is asked ahead.
+    u_min_V, u_max_V, slew_V_per_s : limits that every voltage is checked against.
     """
 
     dt_s: float
@@ -45,18 +45,18 @@ class ControlTask:
 
     @property
     def range_um(self) -> float:
-        """Commanded range, to which all percentages refer."""
+        """Commanded range, µm, to which all percentages refer."""
         return self.high_um - self.low_um
 
     def write(self, path: Path) -> None:
-        """For the controller's process."""
+        """Write the task for the processes of controller and prober."""
         path.write_text(json.dumps(asdict(self)), encoding="utf-8")
 
 
 # --- The reference
 
 PERIOD_S = 120.0
-#: Time over which motion fades into rest, and rest into motion, s.
+#: Time of the transition between motion and rest, s.
 FADE_S = 0.6
 
 #: A weight and its two derivatives, (n,) each.
@@ -64,7 +64,7 @@ Weight = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def fade(q: FloatArray) -> Weight:
-    """Seventh-order step from 0 to 1 over ``q`` in [0, 1] and its two derivatives with respect to ``q``."""
+    """Seventh-order step from 0 to 1 over ``q`` in [0, 1], and its two derivatives with respect to ``q``."""
     q = np.clip(q, 0.0, 1.0)
     s0 = q**4 * (35.0 - 84.0 * q + 70.0 * q**2 - 20.0 * q**3)
     s1 = 140.0 * q**3 * (1.0 - q) ** 3
@@ -73,7 +73,7 @@ def fade(q: FloatArray) -> Weight:
 
 
 def _towards(motion: FloatArray, level_um: float, weight: Weight, dt_s: float) -> FloatArray:
-    """(3, n) motion about a level, scaled by a weight with its derivatives per tick; by the product rule."""
+    """(3, n) motion about a level, scaled by a weight with its derivatives per tick (product rule)."""
     w0, w1, w2 = weight[0], weight[1] / dt_s, weight[2] / dt_s**2
     y, v, a = motion[0] - level_um, motion[1], motion[2]
     return np.stack((level_um + w0 * y, w0 * v + w1 * y, w0 * a + 2.0 * w1 * v + w2 * y))
@@ -81,7 +81,7 @@ def _towards(motion: FloatArray, level_um: float, weight: Weight, dt_s: float) -
 
 @dataclass
 class SoakReference:
-    """Rows (y µm, v µm/s, a µm/s²) by tick, over and over; each turn begins and ends at rest at ``low_um``.
+    """A periodic reference: rows y µm, v µm/s, a µm/s² by tick. Each period begins and ends at rest at ``low_um``.
 
     ``dwells`` are pairs (first tick, ticks) during which the reference rests at mid-range.
     """
@@ -110,17 +110,18 @@ class SoakReference:
         return motion
 
     def _rest(self, k: NDArray[np.int64], start: int, stop: int) -> Weight:
-        """Weight of the motion where it rests from ``start`` to ``stop``; both fades lie inside, and never meet."""
+        """Weight of the motion with a rest from ``start`` to ``stop``; both transitions lie inside."""
         return self._chosen(k, 0.5 * (start + stop), start, -1.0, stop, 1.0)
 
     def _turn(self, k: NDArray[np.int64], stop: int) -> Weight:
-        """Weight of the motion where it rests at tick 0 and at ``stop``."""
+        """Weight of the motion with a rest at tick 0 and at ``stop``."""
         return self._chosen(k, 0.5 * stop, 0, 1.0, stop, -1.0)
 
     def _chosen(
         self, k: NDArray[np.int64], middle: float, first: int, sign: float, second: int, other_sign: float
     ) -> Weight:
-        """Before ``middle`` a fade that begins at ``first``, after it one that ends at ``second``; signs: in or out."""
+        """Before ``middle`` a transition that begins at ``first``, after it one that ends at ``second``. Signs: in (1)
+        or out (-1)."""
         width = FADE_S / self.dt_s
         early = _faded((k - first) / width, sign, width)
         late = _faded((k - second) / width + 1.0, other_sign, width)
@@ -128,6 +129,6 @@ class SoakReference:
 
 
 def _faded(q: FloatArray, sign: float, width: float) -> Weight:
-    """A fade in (sign 1) or out (-1) over q from 0 to 1, ``width`` ticks long, derivatives per tick."""
+    """A transition in (sign 1) or out (-1) over q from 0 to 1, ``width`` ticks long, with derivatives per tick."""
     s0, s1, s2 = fade(q)
     return (s0 if sign > 0.0 else 1.0 - s0), sign * s1 / width, sign * s2 / width**2

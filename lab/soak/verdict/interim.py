@@ -1,8 +1,7 @@
-"""Judges a soak while it runs, a stretch at a time, so that one that dies on its third day leaves what it had seen.
+"""Judges a soak while it runs, once a minute, so that a run that dies on its third day leaves a verdict up to then.
 
-What a look has judged is not looked at again: each costs as much as the minute that it looks at, not as the days before
-it, and copies no more. Faults are settled once their time is over; what can only be told of a whole run waits for its
-end.
+Each look judges only what is new: its cost depends on the minute, not on the days before it, and it copies no more. A
+fault is assessed when its recovery time is over. What only a whole run can show is judged at its end.
 """
 
 from __future__ import annotations
@@ -40,27 +39,27 @@ from lab.soak.verdict.outcome import of_kinds, soak_summary, write_summary
 
 T = TypeVar("T")
 
-#: Distance of two looks, s of the run.
+#: Period of the looks, s of the run.
 EVERY_S: Final = 60.0
-#: What was seen less than this ago need not all have come yet, s.
+#: Observations that are younger than this may not be complete yet, s.
 _LAG_S: Final = 4.0
-#: So long after everything had to be well again a fault is settled, s: on a busy machine more is looked at.
+#: A fault is assessed this long after the end of its recovery time, s: on a busy machine later seconds count too.
 _OVER_S: Final = 16.0
-#: Statuses of so long before a fault are compared with those after it, s; and of faults so long ago nothing is left.
+#: A fault is compared with the statuses of this time before it, s. Faults older than the second number have no effect.
 _BEFORE_S, _PAST_S = 35.0, 120.0
-#: Of these the number grows from stretch to stretch.
+#: Invariants that count something, so that stretches are added.
 _COUNTED: Final = ("voltages_finite", "answers_safe", "faults_told")
-#: Seconds of looks before one look in a hundred says anything: in fewer, the half second of a start is as much.
+#: Seconds with ages before their 99 % is judged: in fewer, the first half second of a run has too much weight.
 _AGES_OF_S: Final = 60
-_AT_THE_END: Final = "told at the end"
+_AT_THE_END: Final = "known only at the end"
 
 
 class InterimJudge:
-    """Looks at a ledger that fills; see `due`.
+    """Judges observations while they are collected; see `due`.
 
     Parameters
     ----------
-    path : of ``soak.json``. tracking_pct : limit of the mean error; None where it is known at the end only.
+    path : of ``soak.json``. tracking_pct : limit of the mean error; None if it is known only at the end.
     """
 
     def __init__(
@@ -68,7 +67,7 @@ class InterimJudge:
     ) -> None:
         self._ledger, self._path, self._say, self._tracking_pct = observed, path, say, tracking_pct
         self._next_s = EVERY_S
-        #: Until when the seconds have been judged, s; of the faults so many, as they ended.
+        #: Until when the seconds have been judged, s; and the faults that have been assessed.
         self._until_s = 0.0
         self._settled: list[FaultRecord] = []
         self._found: dict[str, Invariant] = {}
@@ -78,7 +77,8 @@ class InterimJudge:
         self._broken: set[str] = set()
 
     def due(self, now_s: float, samples: Callable[[], Mapping[str, int]]) -> None:
-        """Judge, tell of what is broken, and write ``soak.json``, once a minute; ``samples``: its counts of samples."""
+        """Once a minute: judge, report what is broken, and write ``soak.json``. ``samples`` returns its counts of
+        samples."""
         if now_s < self._next_s:
             return
         self._next_s = now_s + EVERY_S
@@ -89,9 +89,9 @@ class InterimJudge:
             self._say(f"  soak.json of the run so far: {error}")
 
     def look(self, now_s: float, samples: Mapping[str, int]) -> dict[str, Any]:
-        """The content of ``soak.json`` as far as it can be told at ``now_s``."""
+        """The content of ``soak.json`` as far as it is known at ``now_s``."""
         observed, until_s = self._ledger, max(now_s - _LAG_S, self._until_s)
-        # The statuses and seconds just before tell what those that follow have to be compared with.
+        # The statuses and seconds just before are needed for comparison.
         fresh = _part(observed, self._until_s, until_s, now_s)
         context = _part(observed, self._until_s - 3.0, until_s, now_s)
         self._seconds(fresh, context)
@@ -103,11 +103,12 @@ class InterimJudge:
         found = self._invariants()
         for name in [name for name, one in found.items() if one.held is False and name not in self._broken]:
             self._broken.add(name)
-            told = f"{name}: first seen broken at {now_s:.0f} s"
-            self._say(f"  (!) {told}: {_value(found[name])}, {found[name].text}")
-            observed.notes.append(told)
+
+            note = f"{name}: first seen broken at {now_s:.0f} s"
+            self._say(f"  (!) {note}: {_value(found[name])}, {found[name].text}")
+            observed.notes.append(note)
         counts = dict(samples) | {"without_their_voltage_in_time": self._held}
-        # Latencies are those of this stretch: those of all days would have to be sorted anew each time.
+        # Latencies are those of this stretch: those of the whole run would have to be sorted at every look.
         stretch = soak_summary(replace(fresh, counters=[]), found, counts, over=False)
         return stretch | {"duration_s": round(now_s, 1), "faults": of_kinds(self._settled)}
 
@@ -118,7 +119,7 @@ class InterimJudge:
             self._found[name] = one if before is None else merge(before, one)
 
     def _seconds(self, fresh: Observations, context: Observations) -> None:
-        """Voltages, samples and the error of the seconds since the last look."""
+        """Judge voltages, samples and the error of the seconds since the last look."""
         self._add(safe_voltages(fresh) | {"answers_safe": answers_safe(fresh)})
         self._add({"samples_accounted": samples_accounted(context)})
         if fresh.mode != FAST:
@@ -130,12 +131,12 @@ class InterimJudge:
                     self._error[i] += value
 
     def _times(self, fresh: Observations, machine: MachineLoad) -> None:
-        """How long nobody answered, and how old the followed snapshot was, outside fault windows."""
+        """Judge times without an answer and the age of the followed snapshot, outside fault windows."""
         self._add({"queries_answered": queries_answered(fresh, machine)})
         self._ages.add(fresh, machine)
 
     def _faults(self, now_s: float) -> None:
-        """Settle copies of the faults that are over by now: the end settles them all."""
+        """Assess copies of the faults that are over by now; the end of the run assesses all faults again."""
         faults = self._ledger.faults
         first = last = len(self._settled)
         while last < len(faults) and faults[last].ended and faults[last].window_s[1] + _OVER_S <= now_s:
@@ -143,7 +144,7 @@ class InterimJudge:
         if first == last:
             return
         part = _part(self._ledger, faults[first].begin_s - _BEFORE_S, now_s, now_s)
-        # With the one that follows, from which on a silence is its own.
+        # With the next fault: from its beginning on, a silence belongs to it.
         part.faults = [replace(fault) for fault in faults[first : last + 1]]
         assess_recovery(part, last - first)
         part.faults = part.faults[: last - first]
@@ -155,7 +156,7 @@ class InterimJudge:
     def _invariants(self) -> dict[str, Invariant]:
         observed = self._ledger
         found = dict(self._found)
-        # What the controller counts it counts from its beginning.
+        # The controller counts from the beginning of the run.
         found["answers_safe"] = sum_of(found["answers_safe"], answers_safe(replace(observed, query_seconds=[])))
         found["processes_alive"] = processes_alive(observed)
         found["faults_happened"] = unjudged(0, "runs", _AT_THE_END)
@@ -174,7 +175,7 @@ class InterimJudge:
 
 
 def _part(observed: Observations, begin_s: float, end_s: float, now_s: float) -> Observations:
-    """What happened from ``begin_s`` on and before ``end_s``; a fault that is not over lasts until ``now_s``."""
+    """The observations from ``begin_s`` until before ``end_s``. A fault that has not ended lasts until ``now_s``."""
 
     def cut(rows: Sequence[T], time_of: Callable[[T], float]) -> list[T]:
         return list(rows[bisect_left(rows, begin_s, key=time_of) : bisect_left(rows, end_s, key=time_of)])

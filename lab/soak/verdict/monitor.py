@@ -1,4 +1,4 @@
-"""Watches a soak from outside: the samples of the stage, what was wanted and sent, what the services say of it."""
+"""Observes a soak from outside the service: samples, references, commands, events and statuses."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from service.runtime.delivery import SURELY
 from service.runtime.session import open_client
 from service.stage_node.node import status_key
 
-#: So many events are kept: those of months, or of some days in which everybody complains.
+#: Events are kept up to this number, which lasts for months.
 _MAX_EVENTS = 500_000
 
 
 class Monitor:
-    """Subscribes through the router, and asks all instances for their status; times are s from ``start_s``."""
+    """Subscribes through the router, and asks all services for their status. Times are s from ``start_s``."""
 
     def __init__(self, endpoint: str, control: ControlTask, start_s: float) -> None:
         self.start_s = start_s
         self.track = SampleTracker(control, self.now)
         self.events: list[dict[str, Any]] = []
-        #: By instance the newest status, and when it came.
+        #: By instance, when its newest status came, and the status.
         self.statuses: dict[str, tuple[float, dict[str, Any]]] = {}
         self.stage: dict[str, Any] = {}
         self.malformed = 0
@@ -53,14 +53,14 @@ class Monitor:
         self._subscribers.append(tokens)
 
     def _alive(self, sample: zenoh.Sample) -> None:
-        """A process of this axis has come, or gone: the wire's own word for it."""
+        """A liveliness token of this axis has appeared or gone."""
         event = "came" if sample.kind == zenoh.SampleKind.PUT else "gone"
         with self._lock:
             if len(self.events) < _MAX_EVENTS:
                 self.events.append({"t_s": round(self.now(), 3), "event": event, "detail": str(sample.key_expr)})
 
     def begin(self) -> None:
-        """Let time begin now, and forget what was seen before."""
+        """Set the time to zero, and forget what was seen before."""
         with self._lock:
             self.start_s = time.monotonic()
             self.track.seconds.clear()
@@ -68,7 +68,7 @@ class Monitor:
             self.statuses.clear()
 
     def now(self) -> float:
-        """Seconds since the watch began."""
+        """Seconds since `begin`."""
         return time.monotonic() - self.start_s
 
     def _guarded(self, take: Callable[[bytes], None]) -> Callable[[zenoh.Sample], None]:
@@ -92,7 +92,7 @@ class Monitor:
         try:
             block = wire.decode_command(payload)
         except InputError:
-            # What is no number, or not even a block, is refused by whoever reads it: the breach is that it was sent.
+            # Its receiver refuses it, but the controller has sent it.
             self.track.refuse_command()
             raise
         self.track.command(block.seq, block.values)
@@ -102,40 +102,40 @@ class Monitor:
             self.events.append({"t_s": round(self.now(), 3), **json.loads(payload)})
 
     def _status(self, payload: bytes) -> None:
-        told = json.loads(payload)
-        self.statuses[str(told["instance"])] = (self.now(), told)
+        status = json.loads(payload)
+        self.statuses[str(status["instance"])] = (self.now(), status)
 
     def _stage(self, payload: bytes) -> None:
         self.stage = json.loads(payload)
 
     def ask(self) -> list[dict[str, Any]]:
-        """The status of every instance that answers now; the first is the one that serves queries."""
+        """The status of every service that answers now; the first is the one that answers queries."""
         found = []
         for reply in self._session.get(Keys(STAGE, AXIS).status, timeout=0.5):
             if reply.ok is not None:
-                told = json.loads(reply.ok.payload.to_bytes())
+                status = json.loads(reply.ok.payload.to_bytes())
                 with self._lock:
-                    self.statuses[str(told["instance"])] = (self.now(), told)
-                found.append(told)
+                    self.statuses[str(status["instance"])] = (self.now(), status)
+                found.append(status)
         return found
 
     def put(self, key: str, value: dict[str, Any]) -> None:
-        """Publish JSON, to the stage or the controller."""
+        """Publish JSON, for the stage or the controller."""
         self._session.put(key, json.dumps(value), congestion_control=SURELY)
 
     def samples(self) -> dict[str, int]:
-        """How many samples have been seen so far, and how many came."""
+        """Number of distinct samples seen so far, and of samples received."""
         with self._lock:
             return {"seen": len(self.track.seen), "received_by_monitor": self.track.received}
 
     def latest(self) -> tuple[SampleSecond | None, int]:
-        """The second before the present one, and the newest number."""
+        """The last complete second, and the newest sample number."""
         with self._lock:
             seconds = self.track.seconds
             return (seconds[-2] if len(seconds) > 1 else None), self.track.newest
 
     def close(self) -> None:
-        """Stop watching."""
+        """Unsubscribe and close the session."""
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._session.close()  # type: ignore[no-untyped-call]

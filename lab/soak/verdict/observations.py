@@ -25,11 +25,9 @@ from service.protocol import samples as wire
 
 # --- Samples and voltages
 
-# --- Which sample numbers have been seen, as few intervals as they make.
-
 
 class Intervals:
-    """A set of integers that come mostly in order; memory grows with the number of gaps only."""
+    """A set of integers, as disjoint intervals: memory grows with the number of gaps only."""
 
     def __init__(self) -> None:
         self._starts: list[int] = []
@@ -40,15 +38,15 @@ class Intervals:
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """The intervals, in order, as (first, one past the last)."""
+        """The intervals in order, as (first, one past the last)."""
         return list(zip(self._starts, self._stops, strict=True))
 
     def add(self, start: int, stop: int) -> None:
-        """Take the numbers from ``start`` to ``stop`` - 1."""
+        """Add the numbers from ``start`` to ``stop`` - 1."""
         if stop <= start:
             return
         i = bisect_right(self._starts, start)
-        # All that touch the new one are joined with it.
+        # Join all intervals that touch the new one.
         first = i - 1 if i and self._stops[i - 1] >= start else i
         last = first
         while last < len(self._starts) and self._starts[last] <= stop:
@@ -58,7 +56,7 @@ class Intervals:
         self._stops[first:last] = [stop]
 
     def add_all(self, numbers: NDArray[np.int64]) -> None:
-        """Take numbers in any order."""
+        """Add numbers in any order."""
         if not numbers.size:
             return
         if numbers[-1] - numbers[0] + 1 == numbers.size and (np.diff(numbers) == 1).all():
@@ -70,7 +68,7 @@ class Intervals:
             self.add(int(distinct[start]), int(distinct[stop]) + 1)
 
     def minus(self, other: Intervals) -> list[tuple[int, int]]:
-        """What is here and not in ``other``, as (first, one past the last)."""
+        """The numbers in this set and not in ``other``, as intervals (first, one past the last)."""
         missing = []
         for start, stop in self.spans:
             at = start
@@ -85,23 +83,23 @@ class Intervals:
         return missing
 
 
-#: Samples for which the reference and the voltages sent are remembered.
+#: Number of samples for which the reference and the voltages sent are kept.
 _RING = 16_384
-#: Numbers further apart than this are those of two lives of the stage.
-OTHER_LIFE = 10_000_000
-#: What stands at the slew limit by round-off alone is not beyond it.
+#: Sample numbers further apart than this belong to different starts of the stage.
+RESTART_GAP = 10_000_000
+#: A step that equals the slew limit up to round-off is allowed.
 ROUND_OFF = 1.0 + 1e-6
-#: Blocks that wait for the sample that they begin with.
+#: Blocks that wait for their first sample, at most.
 _MAX_WAITING = 64
 
 
 @dataclass(slots=True)
 class SampleSecond:
-    """One second of samples: how many, the sums and worst of |error| in µm, and of the voltages what was worst.
+    """One second of samples: counts, the sum and maximum of |error| in µm, and the worst voltages.
 
-    ``held`` samples had no command of their own in time: the stage held the last one. ``step_max_V``, ``beyond_V`` and
-    ``not_finite`` are of the voltages that the stage applied; ``sent_``... the same of those that it was sent.
-    ``resumed_V`` is the step with which a block began where none was seen for the samples before it.
+    ``held`` samples had no command in time: the stage held the last voltage. ``step_max_V``, ``beyond_V`` and
+    ``not_finite`` are of the voltages that the stage applied; ``sent_``... of those that it was sent. ``resumed_V`` is
+    the step at the beginning of a block whose predecessor was not seen.
     """
 
     t_s: float
@@ -121,15 +119,15 @@ class SampleSecond:
 
     @property
     def mae_um(self) -> float:
-        """Mean |error|, µm; NaN where nothing could be judged."""
+        """Mean |error|, µm; NaN if no sample could be compared with its reference."""
         return self.error_sum_um / self.judged if self.judged else math.nan
 
 
 @dataclass
 class SampleTracker:
-    """Fed with references, commands and batches of samples, in the order of arrival.
+    """Collects references, commands and samples in the order of their arrival, second by second.
 
-    ``clock`` tells the time of a batch, s, on the axis of the report.
+    ``clock`` returns the time of the run, s.
     """
 
     control: ControlTask
@@ -143,24 +141,24 @@ class SampleTracker:
         self._commanded_V = np.full(_RING, np.nan)
         self._commanded_seq = np.full(_RING, -1, dtype=np.int64)
         self._u_V, self._seq = math.nan, -2
-        #: The voltage sent for the furthest sample, and its number.
+        #: The voltage sent for the last sample so far, and the number of that sample.
         self._sent_V, self._sent_seq = math.nan, -2
-        #: By its first sample, a block that began too far from the last one sent: its voltage there, and that step.
+        #: By first sample: a block that begins too far from the last voltage sent, its first voltage and that step, V.
         self._resumed: dict[int, tuple[float, float]] = {}
         self.newest = -1
         self.received = 0
         self.repeated = 0
 
     def want(self, first: int, y_um: FloatArray) -> None:
-        """The reference from sample ``first`` on, µm."""
+        """Add the reference from sample ``first`` on, µm."""
         numbers = np.arange(first, first + y_um.size)
         self._wanted[numbers % _RING] = y_um
         self._wanted_seq[numbers % _RING] = numbers
 
     def command(self, first: int, u_V: FloatArray) -> None:
-        """Voltages sent for the samples from ``first`` on, V: as they are, whatever the stage will make of them.
+        """Add voltages sent for the samples from ``first`` on, V, as they were sent, before any limit of the stage.
 
-        The first of them follows what was last sent for the sample before it, also where a block replaces another.
+        The first one is compared with what was last sent for the sample before it, also if a block replaces another.
         """
         second = self._second()
         finite = np.isfinite(u_V)
@@ -179,19 +177,19 @@ class SampleTracker:
         numbers = np.arange(first, first + u_V.size)
         self._commanded_V[numbers % _RING] = u_V
         self._commanded_seq[numbers % _RING] = numbers
-        if not 0 < self._sent_seq - int(numbers[-1]) < OTHER_LIFE:
+        if not 0 < self._sent_seq - int(numbers[-1]) < RESTART_GAP:
             self._sent_V, self._sent_seq = float(u_V[-1]), int(numbers[-1])
 
     def refuse_command(self) -> None:
-        """A command that could not be read: no voltage that anybody may apply came of it."""
+        """Count a command that could not be decoded."""
         self._second().sent_not_finite += 1
 
     def take(self, batch: wire.SampleBatch) -> None:
-        """Samples as they came."""
+        """Add samples as they arrived."""
         second = self._second()
         seq, u_V = batch.seq, batch.u_V
         self.received += len(batch)
-        fresh = seq > self.newest if abs(int(seq[0]) - self.newest) < OTHER_LIFE else np.ones(len(batch), dtype=bool)
+        fresh = seq > self.newest if abs(int(seq[0]) - self.newest) < RESTART_GAP else np.ones(len(batch), dtype=bool)
         self.repeated += len(batch) - int(np.count_nonzero(fresh))
         self.seen.add_all(seq)
         second.samples += len(batch)
@@ -204,7 +202,7 @@ class SampleTracker:
         if finite.any():
             second.beyond_V = max(second.beyond_V, self._beyond_V(u_V[finite]))
         if fresh.all():
-            # The step is that of samples that follow one another; what lies between others nobody saw.
+            # Steps only between consecutive samples; those in between were not seen.
             before = np.concatenate(([self._u_V], u_V[:-1]))
             follows = np.diff(seq, prepend=self._seq) == 1
             if follows.any():
@@ -221,7 +219,7 @@ class SampleTracker:
             second.error_max_um = max(second.error_max_um, float(error.max()))
 
     def _second(self) -> SampleSecond:
-        """The second that is under way. One that no sample has come in ends with the number of the one before."""
+        """The present second. A second without samples keeps the last sample number of the one before."""
         now = self.clock()
         if not self.seconds or now - self.seconds[-1].t_s >= 1.0:
             self.seconds.append(SampleSecond(math.floor(now), self.seconds[-1].seq if self.seconds else 0))
@@ -231,14 +229,13 @@ class SampleTracker:
         return max(float(u_V.max()) - self.control.u_max_V, self.control.u_min_V - float(u_V.min()))
 
     def _resume(self, first: int, u_V: float) -> None:
-        """A block for which none was seen before: its controller gave one up, or what it sent did not come here.
+        """Note a block whose predecessor was not seen: the controller gave one up, or it was lost.
 
-        A stage without a command holds the last one, so the block has to begin where that ended; where it does not, the
-        voltage that the stage applies until then decides. Where neither is known, as at the beginning of a stage's
-        life, there is nothing to begin from.
+        A stage without a command holds its last voltage, so the block must begin there. If it does not, the voltage
+        that the stage applies until then decides. At the start of a stage neither is known, and nothing is judged.
         """
         control = self.control
-        follows = 0 < first - self._sent_seq < OTHER_LIFE and math.isfinite(self._sent_V)
+        follows = 0 < first - self._sent_seq < RESTART_GAP and math.isfinite(self._sent_V)
         step_V = abs(u_V - self._sent_V) if follows else math.inf
         if step_V > control.slew_V_per_s * control.dt_s * ROUND_OFF:
             self._resumed[first] = u_V, step_V
@@ -246,7 +243,8 @@ class SampleTracker:
                 self._resumed.pop(next(iter(self._resumed)))
 
     def _judge_resumed(self, second: SampleSecond, seq: NDArray[np.int64], before_V: FloatArray) -> None:
-        """``before_V``: by sample, the voltage applied before it; NaN where that sample was not seen."""
+        """Judge the blocks that begin within these samples. ``before_V``: voltage applied before each sample; NaN if
+        unknown."""
         for first in [first for first in self._resumed if seq[0] <= first <= seq[-1] or first < seq[0] < first + _RING]:
             u_V, step_V = self._resumed.pop(first)
             at = np.flatnonzero((seq == first) & np.isfinite(before_V))
@@ -258,34 +256,34 @@ class SampleTracker:
 
 # --- All observations
 
-#: The mode of a run in one process, and of one in real time.
+#: Mode of a run: in one process, or in real time.
 FAST: Final = "fast"
 REAL_TIME: Final = "real_time"
-#: What the prober asks in turns.
+#: What the prober queries in turns.
 Target = Literal["service", "echo"]
-#: Longest time that anything may take to be well again, s.
+#: Longest recovery time of all kinds, s.
 _LONGEST_S: Final = max(kind.recover_s for kind in FAULT_KINDS.values())
 
 
 @dataclass
 class FaultRecord:
-    """A fault as it really was: from ``begin_s`` to ``end_s``, and when all was well again (NaN: not, or unknown)."""
+    """A fault as it happened: from ``begin_s`` to ``end_s``, and when all was well again (NaN: not, or unknown)."""
 
     kind: str
     begin_s: float
     end_s: float = float("nan")
     recovered_s: float = float("nan")
     silent_s: float = 0.0
-    #: Seconds from its end until all was well in which the machine was too busy to tell.
+    #: Seconds from its end to the recovery in which the machine was too busy.
     busy_s: float = 0.0
     reported_by: str = ""
-    #: Until when somebody might have told of it.
+    #: What may have reported it was looked for until then, s.
     look_until_s: float = 0.0
     value: float = 0.0
 
     @property
     def ended(self) -> bool:
-        """Whether it is over."""
+        """Whether it has ended."""
         return math.isfinite(self.end_s)
 
     @property
@@ -297,7 +295,7 @@ class FaultRecord:
 
 @dataclass
 class QuerySecond:
-    """A second of the prober: round trips in µs, ages of the followed model in s, and what else it counted."""
+    """One second of the prober: round trips in µs, ages of the followed model in s, and its counts."""
 
     t_s: float
     service_us: Sequence[float]
@@ -314,8 +312,8 @@ class QuerySecond:
 
 
 def query_second(line: dict[str, Any], t_s: float) -> QuerySecond:
-    """The prober's line as a probe at ``t_s``."""
-    # Packed: a run may last for days.
+    """The prober's JSON line as a second that ends at ``t_s``."""
+    # Packed, since a run may last for days.
     service_us, echo_us, ages_s = (array("f", line[name]) for name in ("service_us", "echo_us", "ages_s"))
     names = ("failed", "unsafe", "silent_s", "error")
     return QuerySecond(t_s, service_us, echo_us, ages_s, **{name: line[name] for name in names})
@@ -323,17 +321,17 @@ def query_second(line: dict[str, Any], t_s: float) -> QuerySecond:
 
 @dataclass
 class Observations:
-    """What happened in a run of ``duration_s`` seconds.
+    """What was observed in a run of ``duration_s`` seconds.
 
     Attributes
     ----------
-    seconds, probes : of the stage's samples and of the prober. memory : by process, (t_s, kB, its number).
-    cpu : by process, (t_s, seconds of processor time so far, its number).
-    planned : faults of the plan.
-    ended : processes that ended by themselves. unsafe_blocks : answers to the controller that broke a promise.
-    bare : by second, (t_s, the most that a bare loop was late, s). others : by second, (t_s, share of all cores
-    that other processes than the soak's had).
-    counters : per service and second, what its status said: (t_s, instance, flat counters).
+    seconds, query_seconds : of the stage's samples, and of the prober.
+    memory : by process, (t_s, kB, process id). cpu : by process, (t_s, processor time so far in s, process id).
+    planned : number of faults in the plan.
+    ended : processes that ended without a fault. unsafe_blocks : answers to the controller that broke a promise.
+    loop_delays : by second, (t_s, largest delay of the bare loop in s). other_load : by second, (t_s, share of all
+    cores that other processes had).
+    counters : per service and second, from its status: (t_s, instance, counters).
     """
 
     duration_s: float
@@ -355,9 +353,9 @@ class Observations:
     other_load: list[tuple[float, float]] = field(default_factory=list)
 
     def quiet(self, t_s: float) -> bool:
-        """Whether no fault, and no recovery from one, is under way at ``t_s``.
+        """Whether no fault and no recovery is under way at ``t_s``.
 
-        Faults are in order, and none begins before the one before it has ended.
+        Faults are in order, and none begins before the previous one has ended.
         """
         at = bisect_right(self.faults, t_s + 1.0, key=lambda fault: fault.begin_s)
         for i in range(at - 1, -1, -1):
@@ -368,22 +366,22 @@ class Observations:
         return True
 
     def seconds_between(self, begin_s: float, end_s: float) -> list[SampleSecond]:
-        """Those that begin from ``begin_s`` to ``end_s``."""
+        """The seconds that begin from ``begin_s`` to ``end_s``."""
         first = bisect_left(self.seconds, begin_s, key=lambda second: second.t_s)
         return self.seconds[first : bisect_right(self.seconds, end_s, key=lambda second: second.t_s)]
 
     def query_seconds_between(self, begin_s: float, end_s: float) -> list[QuerySecond]:
-        """Those that were told from ``begin_s`` to ``end_s``."""
+        """The seconds of the prober that end from ``begin_s`` to ``end_s``."""
         first = bisect_left(self.query_seconds, begin_s, key=lambda probe: probe.t_s)
         return self.query_seconds[first : bisect_right(self.query_seconds, end_s, key=lambda probe: probe.t_s)]
 
     def events_between(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
-        """Those that came from ``begin_s`` to ``end_s``."""
+        """The events from ``begin_s`` to ``end_s``."""
         first = bisect_left(self.events, begin_s, key=lambda event: event["t_s"])
         return self.events[first : bisect_right(self.events, end_s, key=lambda event: event["t_s"])]
 
     def counters_between(self, begin_s: float, end_s: float) -> list[tuple[float, str, Mapping[str, float]]]:
-        """The counters from ``begin_s`` to ``end_s``. They come in order but for a second or two."""
+        """The counters from ``begin_s`` to ``end_s``. They are in order, except for a second or two."""
         first = bisect_left(self.counters, begin_s - 5.0, key=lambda row: row[0])
         last = bisect_left(self.counters, end_s + 5.0, key=lambda row: row[0])
         return [row for row in self.counters[first:last] if begin_s <= row[0] <= end_s]
@@ -395,7 +393,7 @@ class Observations:
 
 
 class Counters(Mapping[str, float]):
-    """Named numbers, packed: rows of the same names share them."""
+    """Named numbers, packed: rows with the same names share them."""
 
     _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
     __slots__ = ("_at", "_values")
@@ -416,7 +414,7 @@ class Counters(Mapping[str, float]):
 
 
 def flatten_status(status: dict[str, Any]) -> dict[str, float]:
-    """The numbers in a status under dotted names."""
+    """The numbers in a status, under dotted names."""
     found: dict[str, float] = {}
 
     def walk(prefix: str, value: Any) -> None:
@@ -434,11 +432,12 @@ def flatten_status(status: dict[str, Any]) -> dict[str, float]:
 
 # --- Recovery from faults
 
-#: Mean |error| in a second that counts as well again, in percent of the commanded range.
+#: Mean |error| of a second that counts as recovered, in percent of the commanded range.
 WELL_PCT: Final = 0.3
 
-#: What tells of a fault: counters of the status of which one grows (with a "+": all of them in one service), ``event``
-#: for any event, ``instance`` for another instance that answers. Kinds that are missing are nobody's business.
+#: What reports a fault: counters of the status, of which one must grow (with a "+": all of them in one service),
+#: ``event`` for any event, ``instance`` for another instance that answers. A kind that is missing here need not be
+#: reported.
 INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     "kill_primary": ("instance", "event"),
     "stop_primary": ("instance", "event", "samples.lost"),
@@ -453,7 +452,7 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
     "nan": ("samples.gates.not_finite",),
     "spike": ("samples.gates.glitch", "samples.gates.outlier"),
     "freeze": ("samples.gates.glitch", "samples.gates.outlier", "samples.gates.unexcited", "learner.jumps", "event"),
-    # A reading that stays at its end looks like a stage at rest.
+    # A reading that stays at its limit looks like a stage at rest.
     "saturate": (
         "samples.gates.glitch",
         "samples.gates.outlier",
@@ -468,15 +467,15 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def assess_recovery(observed: Observations, count: int | None = None) -> None:
-    """Fill in when all was well again, for how long nobody answered, and who told of it: for every fault, or the first
-    ``count``."""
+    """Fill in for every fault, or the first ``count``: when all was well again, how long no query was answered, and
+    what reported it."""
     mae = {round(s.t_s): 100.0 * s.mae_um / observed.range_um for s in observed.seconds if s.judged}
     machine = MachineLoad(observed.loop_delays, observed.other_load)
     begins = [fault.begin_s for fault in observed.faults[1:]]
     for fault, next_s in islice(zip(observed.faults, [*begins, math.inf], strict=False), count):
         end = fault.end_s if math.isfinite(fault.end_s) else fault.begin_s
         last = fault.window_s[1] + 2.0
-        # On a machine that is busy all takes longer: as many seconds as it was are looked at on top.
+        # On a busy machine everything takes longer: look at as many more seconds as it was busy.
         last += machine.busy_s(end, last)
         within = observed.query_seconds_between(fault.begin_s, last + 1.0)
         fault.silent_s = max((p.silent_s for p in within if p.t_s <= next_s), default=0.0)
@@ -492,39 +491,39 @@ def assess_recovery(observed: Observations, count: int | None = None) -> None:
                 if mae.get(second, math.inf) <= WELL_PCT:
                     fault.recovered_s = float(second)
                     break
-        fault.reported_by, fault.look_until_s = _told(observed, fault, last), last
+        fault.reported_by, fault.look_until_s = _reported_by(observed, fault, last), last
 
 
-def _told(observed: Observations, fault: FaultRecord, end: float) -> str:
-    """Which counter or event told of a fault until ``end``, s; "" for none, "-" where none is asked for."""
-    tellers = INDICATORS.get(fault.kind)
-    if tellers is None:
+def _reported_by(observed: Observations, fault: FaultRecord, end: float) -> str:
+    """Which counter or event reported a fault until ``end``, s; "" for none, "-" if it need not be reported."""
+    indicators = INDICATORS.get(fault.kind)
+    if indicators is None:
         return "-"
     begin = fault.begin_s
     counters = observed.counters_between(begin - 30.0, end)
-    for teller in tellers:
-        if teller == "event":
-            # Who comes and goes is of no interest but for those who were killed.
+    for indicator in indicators:
+        if indicator == "event":
+            # Liveliness counts only for services that were killed.
             alive = ("came", "gone") if not FAULT_KINDS[fault.kind].ends_service else ()
-            said = [e for e in observed.events_between(begin, end) if e.get("event") not in alive]
-            if said:
-                return f"event {said[0].get('event')}"
-        elif teller == "instance":
+            events = [e for e in observed.events_between(begin, end) if e.get("event") not in alive]
+            if events:
+                return f"event {events[0].get('event')}"
+        elif indicator == "instance":
             before = {name for t, name, _ in counters if begin - 5.0 <= t <= begin}
             new = {name for t, name, _ in counters if begin < t <= end} - before
             gone = before - {name for t, name, _ in counters if begin + 1.5 < t <= end}
             if new or gone:
                 return "another instance"
         else:
-            names = teller.split("+")
+            names = indicator.split("+")
             for who in {who for _, who, _ in counters}:
                 if all(_grew([row for row in counters if row[1] == who], name, begin) for name in names):
-                    return teller
+                    return indicator
     return ""
 
 
 def _grew(rows: list[tuple[float, str, Mapping[str, float]]], name: str, begin_s: float) -> bool:
-    """Whether a counter of one service was higher after ``begin_s`` than at last before it."""
+    """Whether a counter of one service was higher after ``begin_s`` than its last value before."""
     was = [row.get(name, 0.0) for t_s, _, row in rows if t_s <= begin_s]
     now = [row.get(name, 0.0) for t_s, _, row in rows if t_s > begin_s]
     return bool(now) and max(now) > (was[-1] if was else 0.0)

@@ -19,7 +19,7 @@ from lab.soak.verdict.invariants import Invariant, memory_slopes
 from lab.soak.verdict.observations import REAL_TIME, FaultRecord, Observations, QuerySecond, SampleSecond
 from service.storage.atomic_write import atomic_write
 
-#: Verdicts of a run that is over, and of one that goes on.
+#: Verdicts of a finished run, and of one that goes on.
 HELD, BROKEN = "held", "broken"
 RUNNING, BROKEN_SO_FAR = "running", "broken so far"
 
@@ -27,7 +27,7 @@ RUNNING, BROKEN_SO_FAR = "running", "broken so far"
 def soak_summary(
     observed: Observations, invariants: Mapping[str, Invariant], samples: Mapping[str, int], *, over: bool = True
 ) -> dict[str, Any]:
-    """The content of ``soak.json``; ``over``: whether the run is."""
+    """The content of ``soak.json``; ``over``: whether the run has ended."""
     broken = any(i.held is False for i in invariants.values())
     service, echo = observed.latency_us("service"), observed.latency_us("echo")
 
@@ -54,7 +54,7 @@ def soak_summary(
 
 
 def of_kinds(faults: Iterable[FaultRecord]) -> dict[str, Any]:
-    """By kind: how many faults, and how they ended."""
+    """By kind: how many faults there were, and how they ended."""
     kinds: dict[str, list[FaultRecord]] = {}
     for fault in faults:
         kinds.setdefault(fault.kind, []).append(fault)
@@ -77,7 +77,7 @@ def _most(values: list[float]) -> float | None:
 
 
 def verdict_line(found: Mapping[str, Any]) -> str:
-    """Such as ``held; not judged: memory (too short a run)``."""
+    """The verdict in one line, such as ``held; not judged: memory (too short a run)``."""
     left = [f"{name} ({found['invariants'][name]['why']})" for name in found["not_judged"]]
     return str(found["verdict"]) + (f"; not judged: {', '.join(left)}" if left else "")
 
@@ -89,13 +89,11 @@ def write_summary(path: Path, found: Mapping[str, Any]) -> None:
         file.write(text.encode())
 
 
-# --- ``seconds.csv`` of a soak: what was seen in each second, to look up what a verdict or a picture only hints at.
-
+# --- seconds.csv
 
 #: Name of the file.
 SECONDS: Final = "seconds.csv"
-#: ``calm``: no fault was on, and none had yet to be recovered from. ``held``: samples without their voltage in time.
-#: Empty: nothing was seen.
+#: ``calm``: no fault and no recovery. ``held``: samples without their voltage in time. Empty: not observed.
 COLUMNS: Final = (
     "t_s", "calm", "fault", "samples", "held", "error_mean_pct", "error_max_pct", "answers", "failed", "unsafe",
     "query_p50_us", "query_max_us", "echo_p50_us", "echo_max_us", "silent_s", "snapshot_age_max_s", "bare_late_s",
@@ -106,7 +104,8 @@ T = TypeVar("T")
 
 
 def write_seconds(path: Path, observed: Observations) -> None:
-    """Write a row for every second of the run. What is told at the end of a second is in the row of that end.
+    """Write a row for every second of the run. A value that is measured at the end of a second is in that second's
+    row.
 
     Raises OSError.
     """
@@ -126,7 +125,7 @@ def write_seconds(path: Path, observed: Observations) -> None:
 
 
 def _faults_by_second(observed: Observations) -> defaultdict[int, list[str]]:
-    """Kinds of the faults that were on in each whole second; one that has not ended is on until the end of the run."""
+    """Kinds of the faults in each whole second. A fault that has not ended lasts until the end of the run."""
     on: defaultdict[int, list[str]] = defaultdict(list)
     for fault in observed.faults:
         end_s = fault.end_s if fault.ended else observed.duration_s
@@ -160,7 +159,7 @@ def _of_prober(rows: Sequence[QuerySecond]) -> list[object]:
 
 
 def _by_second(rows: Iterable[T], at: Callable[[T], float]) -> dict[int, list[T]]:
-    """By the whole second in which they were told."""
+    """Rows by the whole second of their time."""
     return {k: list(those) for k, those in groupby(sorted(rows, key=at), lambda row: math.floor(at(row)))}
 
 
@@ -174,7 +173,7 @@ def _number(value: float, digits: int) -> str:
 def report(
     found: dict[str, Any], observed: Observations, plan: SoakPlan, pictures: list[str], interrupted: bool
 ) -> str:
-    """The page, from what is in ``soak.json`` and what it leaves out."""
+    """The report, from the content of ``soak.json`` and the observations."""
     lines = [f"# Soak: {verdict_line(found)}", ""]
     how = "in real time, in processes" if observed.mode == REAL_TIME else "in one process, as fast as it goes"
     lines.append(

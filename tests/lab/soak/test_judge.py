@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lab.soak.fault_plan import FAULT_KINDS, make_plan
-from lab.soak.session import _excused
+from lab.soak.session import unrecordable
 from lab.soak.task import ControlTask
 from lab.soak.verdict.invariants import TRACKING_PCT
 from lab.soak.verdict.observations import (
@@ -280,12 +280,12 @@ def test_what_was_seen_just_before_the_router_went_proves_nothing() -> None:
         first += 1640 if k == 10 else 1000
         second.seq = first - 1
     observed.faults = [FaultRecord("restart_router", 10.4, 10.5)]
-    ((start, stop),) = _excused(observed).spans
+    ((start, stop),) = unrecordable(observed).spans
     # From what was not written yet before the fault to the end of the time in which all must be well again.
     assert start == 9_000
     assert stop == 10_000 + 1640 + 1000 * (math.floor(10.5 + FAULT_KINDS["restart_router"].recover_s) - 10)
     observed.faults = [FaultRecord("gap", 10.4, 10.5)]
-    assert len(_excused(observed)) == 0
+    assert len(unrecordable(observed)) == 0
 
 
 def test_status_is_flattened() -> None:
