@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim.diagnosis.warm import warm as warm_diagnosis
-from sim.effects import KINDS, Chain, simulate
+from sim.effects import EFFECTS, Chain, simulate
 from sim.stage.presets import PRESETS
 from sim.stage.stage import Stage
 
@@ -13,7 +13,7 @@ from sim.stage.stage import Stage
 def warm() -> None:
     """Run every effect and every preset over two samples, and the diagnosis' loops."""
     u_V = np.zeros(2)
-    for kind in KINDS.values():
+    for kind in EFFECTS.values():
         if kind.block is not None:
             simulate(Chain((kind(),)), u_V, 1e-3)
     for make in PRESETS.values():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sim.diagnosis.export import ExportedStage
 from sim.diagnosis.result import TEST, Diagnosis, NamedCause
-from sim.effects import KINDS
+from sim.effects import EFFECTS
 
 # --- How a diagnosis speaks of numbers.
 
@@ -192,7 +192,7 @@ def surest(cause: NamedCause) -> str:
 
 
 def _section(place: int, cause: NamedCause) -> list[str]:
-    kind = KINDS.get(cause.name)
+    kind = EFFECTS.get(cause.name)
     lines = [f"## {place + 1}. {plain(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
     numbers = []
     for name, value in list(cause.parameters.items())[:MOST_NUMBERS]:

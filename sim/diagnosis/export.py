@@ -17,7 +17,7 @@ from sim.diagnosis.model.fit_data import ActsOn, FitData
 from sim.diagnosis.model.nominal import BoucWenStage, FileStage, LinearStage, loop_numbers
 from sim.diagnosis.model.stage_model import CauseModel, StageModel
 from sim.diagnosis.result import Diagnosis
-from sim.effects import KINDS, Chain, Effect, effect, simulate
+from sim.effects import EFFECTS, Chain, Effect, effect, simulate
 from sim.stage.config import StageConfig
 
 #: Label of the effect that carries the sensor's offset.
@@ -25,7 +25,7 @@ OFFSET = "sensor_offset"
 
 
 def _clip(name: str, **values: float) -> dict[str, float]:
-    kind = KINDS[name]
+    kind = EFFECTS[name]
     return {key: float(np.clip(v, kind.parameter(key).low, kind.parameter(key).high)) for key, v in values.items()}
 
 
@@ -51,7 +51,7 @@ def nominal_effects(fit: ModelFit) -> list[Effect]:
         ]
     slope, beta, gamma = loop_numbers(p)
     d = float(p[0])
-    k = KINDS["mechanics"].parameter("stiffness_N_per_m").default
+    k = EFFECTS["mechanics"].parameter("stiffness_N_per_m").default
     return [
         make("bouc_wen", d_um_per_V=d, alpha=slope / d, beta_per_V=beta, gamma_per_V=gamma),
         offset,

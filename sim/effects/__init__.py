@@ -1,7 +1,8 @@
-"""The effects library: one file is one cause, and adding an effect is adding a file.
+"""Library of the effects that a simulated stage is composed of; each module is one effect.
 
-``KINDS`` holds every kind by name; ``effect("creep", gain_per_decade=0.012)`` makes one with values; ``a + b`` makes a
-chain; `simulate` runs it over a recording's voltages. `docs/effects.md` walks through one.
+``effect("creep", gain_per_decade=0.012)`` makes an effect with parameter values, ``a + b`` makes a chain, and
+``simulate`` runs it over voltages. ``EFFECTS`` holds all kinds by name. To add one, add a module with a ``KIND``; see
+``docs/effects.md``.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ import pkgutil
 from types import MappingProxyType
 
 from adaptive.errors import InputError
-from sim.effects.base import Block, Context, Effect, Kind, Parameter, Place, block
-from sim.effects.chain import Chain, Plan, plan, simulate
+from sim.effects.base import Block, Chain, Context, Effect, Kind, Parameter, Place, block
+from sim.effects.simulation import Plan, plan, simulate
 
 
 def _find() -> dict[str, Kind]:
-    """Every module of this package that holds a ``KIND``."""
+    """The ``KIND`` of every module of this package that has one."""
     found: dict[str, Kind] = {}
     for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         kind = getattr(importlib.import_module(f"{__name__}.{module}"), "KIND", None)
@@ -25,25 +26,25 @@ def _find() -> dict[str, Kind]:
     return dict(sorted(found.items(), key=lambda item: item[1].place))
 
 
-#: All effects by name, in the order of the chain.
-KINDS = MappingProxyType(_find())
-#: Those that are causes of the catalogue, which a diagnosis may name.
-CAUSES = MappingProxyType({name: kind for name, kind in KINDS.items() if kind.cause})
+#: All kinds by name, in the order of the chain.
+EFFECTS = MappingProxyType(_find())
+#: The kinds that a diagnosis may name as a cause.
+CAUSES = MappingProxyType({name: kind for name, kind in EFFECTS.items() if kind.cause})
 
 
 def effect(name: str, *, label: str = "", **values: float) -> Effect:
-    """The effect ``name`` with these parameter values, the others at their defaults.
+    """The effect ``name`` with these parameter values; the others have their defaults.
 
-    Raises InputError for a name or a parameter that does not exist, and for a value outside its physical range.
+    Raises InputError on an unknown effect or parameter, and on a value outside its physical range.
     """
-    if name not in KINDS:
-        raise InputError(f"effect: got {name!r}, expected one of: {', '.join(KINDS)}")
-    return KINDS[name](label=label, **values)
+    if name not in EFFECTS:
+        raise InputError(f"effect: got {name!r}, expected one of: {', '.join(EFFECTS)}")
+    return EFFECTS[name](label=label, **values)
 
 
 __all__ = [
     "CAUSES",
-    "KINDS",
+    "EFFECTS",
     "Block",
     "Chain",
     "Context",

@@ -7,7 +7,6 @@ stage change, below it neither.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -37,7 +36,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: (0.0,),
     block=run,
-    neutral=MappingProxyType({"slope_um_per_V": 0.0}),
     signature="the two branches are not point-symmetric; even harmonics",
     mistaken_for=("sensor_nonlinearity", "hysteresis_shape"),
     tells_apart="a sensor's polynomial is single-valued and the same in both directions",

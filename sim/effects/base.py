@@ -1,40 +1,36 @@
-"""What an effect is: one cause, its parameters and units, and its compiled step.
+"""What an effect is: its parameters with units, its compiled step, and chains of effects.
 
-An effect serves twice. A stage is composed of effects (`sim.stage.stage`), and a diagnosis finds out which effect a
-recording holds by fitting the parameters of the same step. ``a + b`` makes a `Chain` (`sim.effects.chain`).
+An effect is one physical cause. A stage is composed of effects (`sim.stage.stage`), and ``a + b`` makes a `Chain`.
 
-Signals through the chain are arrays of one value a sample: the value at the *end* of the step from ``t_k`` to
-``t_(k+1)`` over which the command ``u_k`` is held. How a signal goes from one end to the next is known in closed
-form (`sim.effects.holds`), so that no linear part has an error that depends on the step.
+A signal through the chain is an array with one value per sample: the value at the *end* of the step from ``t_k`` to
+``t_(k+1)``, over which the command ``u_k`` is held. The shape of the signal within a step is known in closed form
+(`sim.effects.holds`), so no linear part has an error that depends on the step.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 from numba import types
 
 from adaptive.errors import InputError
 
-if TYPE_CHECKING:
-    from sim.effects.chain import Chain
-
 _types: Any = types
 _cfunc: Any = numba.cfunc
 _DOUBLES = _types.CPointer(_types.float64)
-#: block(p, s, x, v, w, n, k0): parameters, state, signal (changed in place), drive voltage, displacement of the
-#: other axis, number of samples, index of the reading that x[0] leads to.
+#: block(p, s, x, v, w, n, k0): coefficients, state, signal (changed in place), voltage at the actuator, displacement of
+#: the other axis, number of samples, index of the reading that x[0] becomes.
 BLOCK_SIGNATURE = _types.void(*[_DOUBLES] * 5, _types.int64, _types.int64)
 
 
 class Place(IntEnum):
-    """Where in the chain an effect acts, in the order of the signal's way."""
+    """Where in the chain an effect acts, in the order of the signal."""
 
     DAC = 10
     AMPLIFIER = 20
@@ -48,7 +44,7 @@ class Place(IntEnum):
     CROSS_TALK = 60
     DRIFT = 70
     GAIN = 71
-    # the electronics filter the sensor's noise too: that tells their lag from the amplifier's
+    # before the lag, because the electronics filter the noise too; that tells their lag from the amplifier's
     NOISE = 80
     SENSOR_LAG = 81
     DELAY = 82
@@ -58,12 +54,12 @@ class Place(IntEnum):
     TIMING = 90
 
 
-#: From here on signals are what the sensor makes of the displacement.
+#: From here on, the signal is the sensor's image of the displacement.
 SENSOR_FROM = Place.NOISE
 
 
 class Block:
-    """A compiled step of an effect over n samples; compiled (or loaded from the cache) when first asked for."""
+    """The step of an effect over n samples, compiled (or loaded from the cache) at the first use."""
 
     def __init__(self, function: Callable[..., None]) -> None:
         self.function = function
@@ -71,28 +67,28 @@ class Block:
 
     @property
     def address(self) -> int:
-        """Address of the machine code, for the chain's loop."""
+        """Address of the machine code, for the loop over the chain."""
         if self._compiled is None:
             self._compiled = _cfunc(BLOCK_SIGNATURE, cache=True)(self.function)
         return int(self._compiled.address)
 
 
 def block(function: Callable[..., None]) -> Block:
-    """Make ``function(p, s, x, v, w, n, k0)`` the step of an effect. Arguments are bare pointers to doubles."""
+    """Decorator: make ``function(p, s, x, v, w, n, k0)`` the step of an effect; p to w are pointers to doubles."""
     return Block(function)
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What an effect's coefficients depend on besides its own parameters.
+    """What the coefficients of an effect depend on besides its own parameters.
 
     Attributes
     ----------
     dt_s : sample time, s.
-    seed : 53-bit number, the same for equal stage seed, axis and label.
-    hold_per_s : how signals between amplifier and mechanics go from sample to sample: exponentially at this
-        rate (1/s), the amplifier's; infinity is a jump at the start of the step (a bare D/A with hold).
-    payload_ratio : mass added to the moved mass, by `payload_change`.
+    seed : 53-bit number that follows from the stage's seed, the axis and the label.
+    hold_per_s : shape of the signals between amplifier and mechanics within a step: exponential at this rate, 1/s, that
+        of the amplifier. Infinity is a jump at the start of the step (a D/A converter with hold alone).
+    payload_ratio : mass added by `payload_change`, relative to the moved mass.
     """
 
     dt_s: float
@@ -111,11 +107,9 @@ class Parameter:
     high: float
     default: float
     meaning: str
-    log: bool = False
-    """A fit should move it on a logarithmic scale."""
 
     def check(self, value: Any, label: str) -> float:
-        """``value`` as a float within the range, or InputError."""
+        """``value`` as a float. Raises InputError where it is not a number within the range."""
         try:
             number = float(value)
         except (TypeError, ValueError):
@@ -123,7 +117,7 @@ class Parameter:
         if isinstance(value, bool) or not self.low <= number <= self.high:
             raise InputError(
                 f"{label}.{self.name}: got {value!r}, expected a number from {self.low:g} to {self.high:g} "
-                f"{self.unit} ({self.meaning}); give a value in this range"
+                f"{self.unit} ({self.meaning})"
             )
         return number
 
@@ -135,11 +129,10 @@ def _no_state(values: Mapping[str, float], context: Context) -> Sequence[float]:
     return ()
 
 
-def _registered(name: str) -> Kind:
-    """The kind of that name in this process; how kinds travel between processes."""
-    from sim.effects import KINDS
-
-    return KINDS[name]
+def _kind_named(name: str) -> Kind:
+    """The kind ``name``, from the module of its name. Pickled kinds are loaded by it."""
+    kind: Kind = importlib.import_module(f"sim.effects.{name}").KIND
+    return kind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,16 +141,15 @@ class Kind:
 
     Attributes
     ----------
-    name : its name everywhere: stage files, reports, tests.
+    name : its name in stage files, reports and tests; also that of its module.
     place : where in the chain it acts.
-    parameters : in the order in which they are documented.
+    parameters : in the order of the documentation.
     derive : (values, context) -> the coefficients ``p`` that the block reads.
-    rest : (values, context) -> the state ``s`` of a stage that has always been at 0 V. Its length may not depend
-        on the values, so that parameters can change while the stage runs.
+    rest : (values, context) -> the state ``s`` of a stage that has always been at 0 V. Its length must not depend on
+        the values, so that parameters can change while the stage runs.
     block : the compiled step; None where the effect acts through the coefficients of others.
-    neutral : parameter values with which it does nothing, for nested fits.
     signature, mistaken_for, tells_apart, source : for people and reports.
-    cause : True for the causes of the catalogue that a diagnosis may name; False for what every stage has.
+    cause : True for a cause that a diagnosis may name; False for what every stage has.
     """
 
     name: str
@@ -168,7 +160,6 @@ class Kind:
     signature: str
     source: str
     rest: Derive = _no_state
-    neutral: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     mistaken_for: tuple[str, ...] = ()
     tells_apart: str = ""
     cause: bool = True
@@ -177,10 +168,10 @@ class Kind:
         return f"Kind({self.name!r})"
 
     def __reduce__(self) -> tuple[Callable[[str], Kind], tuple[str]]:
-        return _registered, (self.name,)
+        return _kind_named, (self.name,)
 
     def parameter(self, name: str, label: str = "") -> Parameter:
-        """The parameter of that name, or InputError."""
+        """The parameter ``name``. Raises InputError where there is none."""
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
@@ -210,6 +201,7 @@ class Effect:
 
     @property
     def name(self) -> str:
+        """Name of the kind."""
         return self.kind.name
 
     @property
@@ -228,6 +220,63 @@ class Effect:
         return Effect(self.kind, numbers, self.label)
 
     def __add__(self, other: Effect | Chain) -> Chain:
-        from sim.effects.chain import Chain
-
         return Chain((self,)) + other
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Effects ordered by their place. ``chain + effect`` and ``chain + chain`` compose.
+
+    Effects of one place keep their order. Raises InputError where two effects have the same label.
+    """
+
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        ordered = tuple(sorted(self.effects, key=lambda e: e.kind.place))
+        object.__setattr__(self, "effects", ordered)
+        labels = [e.label for e in ordered]
+        for label in labels:
+            if labels.count(label) > 1:
+                raise InputError(
+                    f"effects: {label!r} appears twice, expected unique labels; give one of them another label"
+                )
+
+    def __add__(self, other: Effect | Chain | Iterable[Effect]) -> Chain:
+        more = (other,) if isinstance(other, Effect) else tuple(other)
+        return Chain(self.effects + more)
+
+    def __iter__(self) -> Iterator[Effect]:
+        return iter(self.effects)
+
+    def __len__(self) -> int:
+        return len(self.effects)
+
+    def __contains__(self, label: object) -> bool:
+        return any(e.label == label for e in self.effects)
+
+    def __getitem__(self, label: str) -> Effect:
+        for effect in self.effects:
+            if effect.label == label:
+                return effect
+        known = ", ".join(e.label for e in self.effects)
+        raise InputError(f"effects: no {label!r} in this chain, expected one of: {known}")
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """All parameter values by ``label.parameter``."""
+        return {f"{e.label}.{name}": value for e in self.effects for name, value in e.values.items()}
+
+    def replace(self, values: Mapping[str, float]) -> Chain:
+        """The chain with parameters changed by ``label.parameter``. Raises InputError on names and ranges."""
+        grouped: dict[str, dict[str, float]] = {}
+        for path, value in values.items():
+            label, _, name = path.rpartition(".")
+            self[label].kind.parameter(name, label)
+            grouped.setdefault(label, {})[name] = value
+        return Chain(tuple(e.replace(**grouped[e.label]) if e.label in grouped else e for e in self.effects))
+
+    def without(self, label: str) -> Chain:
+        """The chain without the effect ``label``. Raises InputError where there is none."""
+        gone = self[label]
+        return Chain(tuple(e for e in self.effects if e is not gone))

@@ -8,7 +8,6 @@ is stepped in closed form.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -45,14 +44,11 @@ KIND = Kind(
     place=Place.CREEP,
     parameters=(
         Parameter("gain_per_decade", "1", -0.02, 0.1, 0.015, "growth per decade of time, relative to the step"),
-        Parameter(
-            "t0_s", "s", 0.005, 1.0, 0.1, "shortest time constant; the longest is ten thousand times that", log=True
-        ),
+        Parameter("t0_s", "s", 0.005, 1.0, 0.1, "shortest time constant; the longest is ten thousand times that"),
     ),
     derive=derive,
     rest=lambda values, context: [0.0] * (POLES + 1),
     block=run,
-    neutral=MappingProxyType({"gain_per_decade": 0.0}),
     signature="holds rise linearly in log t, in proportion to the last step and with its sign",
     mistaken_for=("thermal_drift", "gain_drift"),
     tells_apart="thermal drift does not follow the steps",

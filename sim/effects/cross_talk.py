@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -33,7 +32,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: (0.0, 0.0),
     block=run,
-    neutral=MappingProxyType({"static": 0.0, "rate_s": 0.0}),
     signature="correlates with the other axis",
     tells_apart="drive the axes separately",
     source="1.17 % in the chapter (Fig. 2.2); 0.01 to 1 % in the field",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -33,7 +32,6 @@ KIND = Kind(
     ),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"bits": 0.0}),
     signature="voltage levels on a grid of a few tenths of a millivolt",
     source="the chapter's DS1103 controller: 16 bit over -10 to 10 V (section 2.2.1)",
     cause=False,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -47,7 +46,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: [-1.0] + [0.0] * _slots(context),
     block=run,
-    neutral=MappingProxyType({"delay_s": 0.0}),
     signature="phase in proportion to the frequency at gain 1",
     mistaken_for=("amplifier_lag", "sensor_lag", "hysteresis_shape"),
     tells_apart="a lag also loses gain; the loop of a hysteresis persists as the frequency goes to zero",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from adaptive.compiled import compiled
@@ -45,13 +44,12 @@ KIND = Kind(
     parameters=(
         Parameter("slope_um_per_V", "µm/V", 0.0, 1e4, 0.6, "slope of the curve that the loop lies around"),
         Parameter("square_um_per_V2", "µm/V²", -10.0, 10.0, 0.0, "curvature of that curve: asymmetry"),
-        Parameter("stiffness_per_V", "1/V", 0.01, 100.0, 0.9, "how fast a branch is approached", log=True),
+        Parameter("stiffness_per_V", "1/V", 0.01, 100.0, 0.9, "how fast a branch is approached"),
         Parameter("start_share", "1", 0.0, 1.0, 0.15, "slope just after a reversal, as a share of the mean slope"),
     ),
     derive=derive,
     rest=lambda values, context: (0.0, 0.0),
     block=run,
-    neutral=MappingProxyType({"slope_um_per_V": 0.0, "square_um_per_V2": 0.0}),
     signature="minor loops that do not close on the point where they began",
     source="Coleman and Hodgdon 1986 (equation form); magnitude: 1 to 2 % of a full stroke",
     cause=False,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -35,13 +34,12 @@ KIND = Kind(
         Parameter("gain", "1", -0.5, 0.5, 0.0, "constant relative change of the gain"),
         Parameter("ramp_per_min", "1/min", -0.2, 0.2, 0.01, "steady relative change"),
         Parameter("amplitude", "1", -0.5, 0.5, 0.0, "relative change by relaxation"),
-        Parameter("tau_s", "s", 1.0, 1e5, 300.0, "time constant of the relaxation", log=True),
+        Parameter("tau_s", "s", 1.0, 1e5, 300.0, "time constant of the relaxation"),
         Parameter("walk_per_sqrt_min", "1/√min", 0.0, 0.05, 0.0, "random walk, standard deviation after a minute"),
     ),
     derive=derive,
     rest=lambda values, context: (0.0,),
     block=run,
-    neutral=MappingProxyType({"gain": 0.0, "ramp_per_min": 0.0, "amplitude": 0.0, "walk_per_sqrt_min": 0.0}),
     signature="residual in proportion to the displacement, the slope changes over time",
     mistaken_for=("creep", "thermal_drift"),
     tells_apart="gain drift by temperature needs a log of the temperature",

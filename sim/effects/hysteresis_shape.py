@@ -7,7 +7,6 @@ the effect is the loop alone and a gain is not taken for it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -48,13 +47,12 @@ KIND = Kind(
             3.0,
             "height of the additional loop for strokes of four times the largest threshold and more",
         ),
-        Parameter("largest_V", "V", 0.05, 200.0, 2.0, "largest threshold", log=True),
+        Parameter("largest_V", "V", 0.05, 200.0, 2.0, "largest threshold"),
         Parameter("fading", "1", -2.0, 6.0, 1.0, "how much rarer large thresholds are than small ones"),
     ),
     derive=derive,
     rest=lambda values, context: [0.0] * PLAYS,
     block=run,
-    neutral=MappingProxyType({"width_um": 0.0}),
     signature="a loop that persists as the frequency goes to zero; odd harmonics; the residual repeats with the loop",
     mistaken_for=("asymmetry", "rate_dependence", "delay", "stick_slip"),
     tells_apart="the loop of a delay vanishes as the frequency goes to zero",

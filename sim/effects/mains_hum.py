@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -36,7 +35,6 @@ KIND = Kind(
     ),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"amplitude_um": 0.0}),
     signature="narrow lines, also at zero input",
     mistaken_for=("resonance",),
     tells_apart="change the sample rate to tell it from an alias",

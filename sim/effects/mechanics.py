@@ -34,9 +34,9 @@ KIND = Kind(
     name="mechanics",
     place=Place.MECHANICS,
     parameters=(
-        Parameter("mass_kg", "kg", 1e-6, 1e3, 0.2789, "moved mass m", log=True),
-        Parameter("damping_N_s_per_m", "N s/m", 1e-3, 1e9, 8.9055e5, "damping b", log=True),
-        Parameter("stiffness_N_per_m", "N/m", 1.0, 1e12, 3.5244e8, "stiffness k", log=True),
+        Parameter("mass_kg", "kg", 1e-6, 1e3, 0.2789, "moved mass m"),
+        Parameter("damping_N_s_per_m", "N s/m", 1e-3, 1e9, 8.9055e5, "damping b"),
+        Parameter("stiffness_N_per_m", "N/m", 1.0, 1e12, 3.5244e8, "stiffness k"),
         Parameter("payload_kg", "kg", 0.0, 1e3, 0.0, "mass of a payload"),
     ),
     derive=derive,

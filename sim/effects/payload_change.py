@@ -6,8 +6,6 @@ without either is refused.
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 from sim.effects.base import Kind, Parameter, Place
 
 KIND = Kind(
@@ -16,7 +14,6 @@ KIND = Kind(
     parameters=(Parameter("payload_ratio", "1", 0.0, 20.0, 1.0, "added mass relative to the moved mass"),),
     derive=lambda values, context: (),
     block=None,
-    neutral=MappingProxyType({"payload_ratio": 0.0}),
     signature="the known mode moves, the DC gain does not",
     mistaken_for=("resonance",),
     tells_apart="a change of stiffness moves the DC gain too",

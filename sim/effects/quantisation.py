@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -27,7 +26,6 @@ KIND = Kind(
     parameters=(Parameter("step_um", "µm", 0.0, 10.0, 100.0 / 65536, "step of the grid; 0: none"),),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"step_um": 0.0}),
     signature="few distinct levels, dead patches at low rate",
     mistaken_for=("stick_slip",),
     tells_apart="the levels lie on one grid everywhere",

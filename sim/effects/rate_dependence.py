@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -49,14 +48,13 @@ KIND = Kind(
     place=Place.HYSTERESIS,
     parameters=(
         Parameter("growth_per_decade", "1", -0.3, 1.0, 0.1, "relative growth of the loop per decade of rate"),
-        Parameter("corner_V_per_s", "V/s", 0.01, 1e5, 10.0, "rate above which it grows", log=True),
-        Parameter("width_um", "µm", 0.01, 100.0, 11.0, "height of the loop that it acts on", log=True),
-        Parameter("largest_V", "V", 0.05, 200.0, 2.0, "largest threshold of that loop", log=True),
+        Parameter("corner_V_per_s", "V/s", 0.01, 1e5, 10.0, "rate above which it grows"),
+        Parameter("width_um", "µm", 0.01, 100.0, 11.0, "height of the loop that it acts on"),
+        Parameter("largest_V", "V", 0.05, 200.0, 2.0, "largest threshold of that loop"),
     ),
     derive=derive,
     rest=lambda values, context: [0.0] * (2 + 2 * PLAYS),
     block=run,
-    neutral=MappingProxyType({"growth_per_decade": 0.0}),
     signature="loop width varies with the rate beyond what one linear filter explains",
     mistaken_for=("amplifier_lag", "sensor_lag", "delay", "resonance", "hysteresis_shape"),
     tells_apart="fit the linear part first, then test again at another amplitude",

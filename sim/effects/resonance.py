@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -33,14 +32,13 @@ KIND = Kind(
     name="resonance",
     place=Place.MECHANICS,
     parameters=(
-        Parameter("frequency_Hz", "Hz", 5.0, 1e5, 400.0, "undamped frequency without payload", log=True),
-        Parameter("damping_ratio", "1", 0.001, 100.0, 0.03, "damping ratio without payload", log=True),
+        Parameter("frequency_Hz", "Hz", 5.0, 1e5, 400.0, "undamped frequency without payload"),
+        Parameter("damping_ratio", "1", 0.001, 100.0, 0.03, "damping ratio without payload"),
         Parameter("payload_ratio", "1", 0.0, 20.0, 0.0, "mass of the payload relative to the moved mass"),
     ),
     derive=derive,
     rest=lambda values, context: (0.0, 0.0, 0.0),
     block=run,
-    neutral=MappingProxyType({"frequency_Hz": 1e5, "damping_ratio": 0.7}),
     signature="ringing after steps; a peak and -180° in the response",
     mistaken_for=("mains_hum", "payload_change"),
     tells_apart="hum is a fixed line that is there without excitation",

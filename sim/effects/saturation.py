@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -29,7 +28,6 @@ KIND = Kind(
     ),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"low_V": -1000.0, "high_V": 1000.0}),
     signature="flat tops at the same voltage at every rate",
     mistaken_for=("slew_limit",),
     tells_apart="a sensor that ends is told apart by a monitor of the voltage",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -34,7 +33,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: (0.0, 0.0, 0.0),
     block=run,
-    neutral=MappingProxyType({"tau_s": 0.0}),
     signature="gain AND noise roll off",
     mistaken_for=("amplifier_lag", "delay"),
     tells_apart="a monitor of the voltage; the spectrum of the noise at rest",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -28,7 +27,6 @@ KIND = Kind(
     parameters=(Parameter("rms_um", "µm", 0.0, 10.0, 0.005, "standard deviation before any lag of the electronics"),),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"rms_um": 0.0}),
     signature="white, the same at rest and in motion",
     source="about 5 nm rms at full bandwidth for a 100 µm capacitive sensor",
     cause=False,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -30,11 +29,10 @@ KIND = Kind(
     parameters=(
         Parameter("square", "1", -0.02, 0.02, 0.0006, "largest error of the square term, relative to the range"),
         Parameter("cubic", "1", -0.02, 0.02, 0.0, "largest error of the cubic term, relative to the range"),
-        Parameter("range_um", "µm", 0.1, 1e4, 100.0, "range of the sensor", log=True),
+        Parameter("range_um", "µm", 0.1, 1e4, 100.0, "range of the sensor"),
     ),
     derive=derive,
     block=run,
-    neutral=MappingProxyType({"square": 0.0, "cubic": 0.0}),
     signature="the same error at the same displacement, at all rates and in both directions",
     mistaken_for=("asymmetry",),
     tells_apart="the curve of the actuator needs a second sensor to be told apart",

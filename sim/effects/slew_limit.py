@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -24,11 +23,10 @@ def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
 KIND = Kind(
     name="slew_limit",
     place=Place.SLEW,
-    parameters=(Parameter("rate_V_per_s", "V/s", 10.0, 1e6, 2000.0, "largest rate, at the command's scale", log=True),),
+    parameters=(Parameter("rate_V_per_s", "V/s", 10.0, 1e6, 2000.0, "largest rate, at the command's scale"),),
     derive=derive,
     rest=lambda values, context: (0.0,),
     block=run,
-    neutral=MappingProxyType({"rate_V_per_s": 1e6}),
     signature="triangle-like output, only above a rate; straight ramps after steps",
     mistaken_for=("saturation", "amplifier_lag"),
     tells_apart="saturation depends on the level, a lag does not depend on the amplitude",

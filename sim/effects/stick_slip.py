@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -39,7 +38,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: (0.0, 0.0),
     block=run,
-    neutral=MappingProxyType({"width_um": 0.0}),
     signature="flat after each reversal, then a jump; constant width at all amplitudes",
     mistaken_for=("hysteresis_shape", "quantisation"),
     tells_apart="the loop of piezoelectric hysteresis shrinks with the amplitude",

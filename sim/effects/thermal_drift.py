@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
@@ -33,7 +32,7 @@ KIND = Kind(
     place=Place.DRIFT,
     parameters=(
         Parameter("amplitude_um", "µm", -20.0, 20.0, 0.5, "total way of the relaxation"),
-        Parameter("tau_s", "s", 1.0, 1e5, 300.0, "its time constant", log=True),
+        Parameter("tau_s", "s", 1.0, 1e5, 300.0, "its time constant"),
         Parameter("ramp_um_per_min", "µm/min", -10.0, 10.0, 0.0, "steady drift"),
         Parameter("walk_um_per_sqrt_min", "µm/√min", 0.0, 1.0, 0.0, "random walk, standard deviation after a minute"),
         Parameter("offset_um", "µm", -1e3, 1e3, 0.0, "constant offset"),
@@ -41,7 +40,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: (0.0,),
     block=run,
-    neutral=MappingProxyType({"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}),
     signature="also there at zero input; follows the temperature where that is logged",
     mistaken_for=("creep", "gain_drift"),
     tells_apart="it does not follow the steps, creep does",

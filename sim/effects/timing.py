@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
-from adaptive.types import FloatArray
 from sim.effects.base import Context, Kind, Parameter, Place, block
 from sim.effects.counter_noise import uniform
 
@@ -49,15 +45,6 @@ def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
     return values["repeat_probability"], values["slow_ppm"] * 1e-6, float(_slots(context)), float(context.seed)
 
 
-def resample_clock(y_um: FloatArray, fast_ppm: float) -> FloatArray:
-    """Readings (n,) of a sensor whose clock runs ``fast_ppm`` fast (slow where negative), by linear interpolation.
-
-    For recordings as a whole: a fast clock looks ahead, which no stage can do sample by sample.
-    """
-    index = np.arange(y_um.size, dtype=np.float64)
-    return np.interp(index * (1.0 + fast_ppm * 1e-6), index, y_um)
-
-
 KIND = Kind(
     name="timing",
     place=Place.TIMING,
@@ -68,7 +55,6 @@ KIND = Kind(
     derive=derive,
     rest=lambda values, context: [0.0, -1.0] + [0.0] * _slots(context),
     block=run,
-    neutral=MappingProxyType({"repeat_probability": 0.0, "slow_ppm": 0.0}),
     signature="gaps, zero differences; a phase that grows with time",
     mistaken_for=("delay",),
     tells_apart="a delay is constant",

@@ -19,7 +19,7 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.effects import Chain, Plan, plan
-from sim.effects.kernel import run_chain
+from sim.effects.simulation import run_chain
 from sim.stage.config import StageConfig, changed
 
 

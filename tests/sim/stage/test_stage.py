@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
-from sim.effects import KINDS, Chain
+from sim.effects import EFFECTS, Chain
 from sim.signals.signals import growing_triangles, training_input, triangle
 from sim.stage.config import StageConfig
 from sim.stage.file import from_dict, load_stage, save_stage, to_dict
@@ -22,7 +22,7 @@ from sim.stage.stage import Stage
 DT = 1e-3
 EVERYTHING = StageConfig(
     "everything",
-    Chain(tuple(kind() for kind in KINDS.values() if kind.name not in ("linear_actuator", "generalised_play"))),
+    Chain(tuple(kind() for kind in EFFECTS.values() if kind.name not in ("linear_actuator", "generalised_play"))),
     rich_chain(),
     seed=4,
     changes=((0.05, {"creep.gain_per_decade": 0.03}), (0.1, {"axis2/resonance.payload_ratio": 1.0})),
