@@ -96,16 +96,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _chosen(only: list[str], seeds: int) -> list[tuple[str, int]]:
-    from sim.scenarios import KINDS
+    from sim.scenarios import SCENARIO_KINDS
 
-    every = [(kind, seed) for kind in KINDS for seed in range(1, seeds + 1)]
+    every = [(kind, seed) for kind in SCENARIO_KINDS for seed in range(1, seeds + 1)]
     if not only:
         return every
     chosen: list[tuple[str, int]] = []
     for name in only:
         kind, slash, number = name.partition("/")
-        if kind not in KINDS or (slash and not (number.isdigit() and int(number) >= 1)):
-            raise FieldError("--only", repr(name), f"a kind, or kind/seed; kinds: {', '.join(KINDS)}")
+        if kind not in SCENARIO_KINDS or (slash and not (number.isdigit() and int(number) >= 1)):
+            raise FieldError("--only", repr(name), f"a kind, or kind/seed; kinds: {', '.join(SCENARIO_KINDS)}")
         chosen += [(kind, int(number))] if slash else [pair for pair in every if pair[0] == kind]
     return list(dict.fromkeys(chosen))
 

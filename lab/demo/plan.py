@@ -17,8 +17,8 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.signals.signals import training_input
-from sim.signals.unseen_reference import demo_reference
+from sim.signals.references import demo_reference
+from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.file import load_stage
 from sim.stage.presets import preset

@@ -16,7 +16,7 @@ from lab.rehearsal.plant import Plant, PlantFactory, check_numbers, run_checked
 from service.answers.guard import Limits
 from service.config.config import LEARN
 from service.protocol.errors import FieldError
-from sim.signals.signals import CHAPTER_AMPLITUDE_V, training_input
+from sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
 
 #: Time over which the drive goes from where a plant rests to the lowest voltage, and rest there, s.
 APPROACH_S, REST_S = 0.5, 0.5

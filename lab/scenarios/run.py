@@ -26,7 +26,7 @@ from service.protocol.samples import SampleBatch
 from service.server.models import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from sim.scenarios import Scenario
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 
@@ -37,7 +37,7 @@ MODELS: Final = (ADAPTIVE, FROZEN)
 BLOCK, LEAD, MARGIN = 20, 40, 20
 SLEW_V_PER_S: Final = 4000.0
 IDENTIFY_S: Final = 10.0
-#: Readings at rest from which the noise floor is taken, s.
+#: SensorGlitches at rest from which the noise floor is taken, s.
 FLOOR_S: Final = 2.0
 
 #: Called with the simulated time done, s.
@@ -116,7 +116,7 @@ def run_scenario(
                 y_um[name][part] = stage.run(states[name], u_V[name][part])[0]
             seq = np.arange(part.start, part.stop)
             t_s: FloatArray = (seq * dt).astype(np.float64)
-            read = scenario.readings.spoil(done, y_um[ADAPTIVE][part])
+            read = scenario.glitches.applied(done, y_um[ADAPTIVE][part])
             for k, verdict in zip(seq, axis.handle(SampleBatch(seq, t_s, u_V[ADAPTIVE][part], read)), strict=True):
                 gate[k] = names.setdefault(verdict, len(names))
             if (done + BLOCK) % 1000 == 0:

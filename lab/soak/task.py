@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
 from service.protocol.keys import Keys
-from sim.signals.unseen_reference import DemoReference
+from sim.signals.references import DemoReference
 
 STAGE, AXIS = "soak", "x"
 SERVED = "lssvm_adaptive"

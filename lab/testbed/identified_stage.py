@@ -12,7 +12,7 @@ from adaptive.errors import InputError, NumericsError
 from adaptive.types import InverseModel
 from service.identification.identifying import identify_one
 from service.storage.model_file import BundleMeta, write_bundle
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 

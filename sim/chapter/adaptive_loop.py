@@ -14,7 +14,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
-from sim.signals.unseen_reference import Reference
+from sim.signals.references import Reference
 from sim.stage.closed_loop import PID, Run
 from sim.stage.stage import Stage, StageState
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, Record, record
-from sim.signals import signals
+from sim.signals import voltages
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 
@@ -66,7 +66,7 @@ def loop_width(u_V: FloatArray, y_um: FloatArray) -> float:
 def characterise(config: StageConfig) -> Characterisation:
     """Run the triangles on each axis alone and the sines on the first."""
     stage = Stage(config)
-    _, u = signals.growing_triangles(DT_S, AMPLITUDES_V)
+    _, u = voltages.growing_triangles(DT_S, AMPLITUDES_V)
     first = record(stage, "triangles", u)
     second = record(stage, "triangles, second axis", np.zeros(u.size), u) if config.second_axis is not None else None
     ends = np.cumsum([0.0, *(2.0 * a for a in AMPLITUDES_V)]) / 6.0
@@ -77,7 +77,7 @@ def characterise(config: StageConfig) -> Characterisation:
         triangles.append(Width(amplitude, 1.0 / (end_s - start_s), float(np.ptp(y)), loop_width(u[part], y)))
     sines, widths = [], []
     for frequency in FREQUENCIES_HZ:
-        run = record(stage, f"{frequency:g} Hz", signals.sine(0.0, _SINE_V, frequency, _CYCLES, DT_S)[1])
+        run = record(stage, f"{frequency:g} Hz", voltages.sine(0.0, _SINE_V, frequency, _CYCLES, DT_S)[1])
         last = slice(run.u_V.size - round(1.0 / (frequency * DT_S)), run.u_V.size)
         sines.append(run)
         stroke = float(np.ptp(run.y_um[last]))

@@ -21,7 +21,7 @@ from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Score
 from sim.chapter.references import control_references
 from sim.effects import effect
-from sim.signals.unseen_reference import Reference
+from sim.signals.references import Reference
 from sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage

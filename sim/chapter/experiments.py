@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.signals import signals
+from sim.signals import voltages
 from sim.stage.config import StageConfig
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
@@ -100,11 +100,11 @@ def experiments(name: str, *, seed: int = 0, quick: bool = False) -> Experiments
     """
     config = preset(name, seed=seed, dt_s=DT_S)
     stage = Stage(config)
-    third = [("minor loops", signals.minor_loops(dt_s=DT_S)[1]), ("sine 5 Hz", signals.sine(0.0, 7.5, 5.0, 20)[1])]
-    third += [(f"multi-tone {n + 1}", signals.multitone(10.0, DT_S, seed=n)[1]) for n in range(1 if quick else 4)]
+    third = [("minor loops", voltages.minor_loops(dt_s=DT_S)[1]), ("sine 5 Hz", voltages.sine(0.0, 7.5, 5.0, 20)[1])]
+    third += [(f"multi-tone {n + 1}", voltages.multitone(10.0, DT_S, seed=n)[1]) for n in range(1 if quick else 4)]
     return Experiments(
         config,
-        record(stage, "training", signals.training_input(DT_S)[1]),
-        record(stage, "generalisation", signals.generalisation_input(DT_S)[1]),
+        record(stage, "training", voltages.training_input(DT_S)[1]),
+        record(stage, "generalisation", voltages.generalisation_input(DT_S)[1]),
         tuple(record(stage, title, u) for title, u in third),
     )

@@ -9,8 +9,8 @@ import numpy as np
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, Experiments, Record
-from sim.signals.unseen_reference import Reference, demo_reference
-from sim.stage.timebase import times
+from sim.signals.references import Reference, demo_reference
+from sim.signals.sample_times import sample_times
 
 #: Step of the central differences that give velocity and acceleration of a formula, s.
 _STEP_S = 1e-4
@@ -20,7 +20,7 @@ _TOP = 0.9
 
 def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float, dt_s: float = DT_S) -> Reference:
     """Reference of a smooth formula y(t), µm; its derivatives by central differences with 0.1 ms steps."""
-    t = times(duration_s, dt_s)
+    t = sample_times(duration_s, dt_s)
     now, before, after = formula(t), formula(t - _STEP_S), formula(t + _STEP_S)
     return Reference(t, now, (after - before) / (2.0 * _STEP_S), (after - 2.0 * now + before) / _STEP_S**2)
 

@@ -1,1 +1,34 @@
-"""signals."""
+"""Signals for simulated stages: ``voltages`` to apply, ``references`` to follow, and ``sample_times``."""
+
+from sim.signals.references import DemoReference, Motion, Reference, demo_reference
+from sim.signals.sample_times import sample_times
+from sim.signals.voltages import (
+    CHAPTER_AMPLITUDE_V,
+    Excitation,
+    diagnosis_excitation,
+    generalisation_input,
+    growing_triangles,
+    minor_loops,
+    multitone,
+    sine,
+    training_input,
+    triangle,
+)
+
+__all__ = [
+    "CHAPTER_AMPLITUDE_V",
+    "DemoReference",
+    "Excitation",
+    "Motion",
+    "Reference",
+    "demo_reference",
+    "diagnosis_excitation",
+    "generalisation_input",
+    "growing_triangles",
+    "minor_loops",
+    "multitone",
+    "sample_times",
+    "sine",
+    "training_input",
+    "triangle",
+]

@@ -14,7 +14,7 @@ import numpy as np
 
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray, InverseModel
-from sim.signals.unseen_reference import Reference
+from sim.signals.references import Reference
 from sim.stage.stage import Stage, StageState
 
 

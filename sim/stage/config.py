@@ -10,7 +10,7 @@ from adaptive.errors import InputError
 from sim.effects import Chain
 
 #: ``(t_s, {"label.parameter": value})``; ``"axis2/label.parameter"`` is a parameter of the second axis.
-Change = tuple[float, Mapping[str, float]]
+ParameterChange = tuple[float, Mapping[str, float]]
 SECOND = "axis2/"
 
 
@@ -36,7 +36,7 @@ class StageConfig:
     seed: int = 0
     u_min_V: float = -2.0
     u_max_V: float = 10.0
-    changes: tuple[Change, ...] = ()
+    changes: tuple[ParameterChange, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dt_s) and 1e-6 <= self.dt_s <= 1.0):

@@ -14,7 +14,7 @@ from typing import Any
 
 from adaptive.errors import InputError, ModelFileError
 from sim.effects import Chain, effect
-from sim.stage.config import Change, StageConfig
+from sim.stage.config import ParameterChange, StageConfig
 
 SCHEMA = 1
 _KEYS = ("schema", "name", "dt_s", "seed", "u_min_V", "u_max_V", "effects", "second_axis", "changes")
@@ -89,7 +89,7 @@ def _chain(rows: Any, where: str) -> Chain:
     return Chain(tuple(effects))
 
 
-def _change(row: Any, i: int) -> Change:
+def _change(row: Any, i: int) -> ParameterChange:
     table = _table(row, f"changes[{i}]")
     _only(table, ("t_s", "set"), f"changes[{i}]")
     values = _table(table.get("set"), f"changes[{i}].set")

@@ -7,7 +7,7 @@ import pytest
 
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

@@ -25,15 +25,15 @@ from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
 from baselines.fit import fit_linear, fit_mpi
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from sim.signals.signals import generalisation_input, multitone, training_input
-from sim.stage.config import Change
+from sim.signals.voltages import generalisation_input, multitone, training_input
+from sim.stage.config import ParameterChange
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 
 DT_S = 1e-3
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
 SEEDS = (1, 2, 3)
-GAIN_STEP: tuple[Change, ...] = ((6.0, {"gain_drift.gain": -0.06}),)
+GAIN_STEP: tuple[ParameterChange, ...] = ((6.0, {"gain_drift.gain": -0.06}),)
 #: Factors of the stated deviation within which 68 % and 95 % of the errors are to lie.
 ONE, INTERVAL_95 = 1.0, 1.96
 #: (least, most) share within the one, and within the other.
@@ -47,7 +47,7 @@ HELD_OUT_END: Limits = ((0.85, 0.97), (0.97, 1.0))
 OTHER_RECORDING: Limits = ((0.65, 0.79), (0.88, 0.97))
 
 
-def rich(seed: int, u_V: FloatArray, changes: tuple[Change, ...] = ()) -> FloatArray:
+def rich(seed: int, u_V: FloatArray, changes: tuple[ParameterChange, ...] = ()) -> FloatArray:
     """Readings of the rich stage, to which ``changes`` happen."""
     stage = Stage(preset("rich", seed=seed, changes=changes))
     return np.asarray(stage.run(stage.initial_state(), u_V)[0])

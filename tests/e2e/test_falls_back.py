@@ -24,7 +24,7 @@ from service.runtime.session import open_client
 from service.stage_node.faults import fault_key
 from service.stage_node.node import status_key
 from service.storage.model_file import BundleMeta, write_bundle
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 from tests.service.conftest import unused_port

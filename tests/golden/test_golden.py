@@ -71,7 +71,7 @@ from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
 from service.storage.checkpoint_keeper import restore_newest
 from service.storage.model_file import Bundle, BundleMeta
 from sim.recordings import ColumnMap, Recording, read, repaired
-from sim.signals.signals import multitone, training_input
+from sim.signals.voltages import multitone, training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

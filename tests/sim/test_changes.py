@@ -13,7 +13,7 @@ from adaptive.types import FloatArray, InverseModel
 from baselines.fit import fit_mpi
 from sim.changes.columns import Scales, Stretch, base_of
 from sim.changes.compare import Comparison, compare
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.presets import preset
 from sim.stage.stage import Stage

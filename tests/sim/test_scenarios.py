@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from sim.scenarios import KINDS, Readings, Scenario, scenario
-from sim.scenarios.kinds import dwell
-from sim.scenarios.motion import Parts, Tones, in_band, strokes
-from sim.scenarios.readings import glitch_burst
+from sim.scenarios import SCENARIO_KINDS, Scenario, SensorGlitches, dwell, glitch_burst, scenario
+from sim.signals.references import Sequenced, Tones, in_band, strokes
 from sim.stage.stage import Stage
 
-KINDS_SEEDS = [(kind, seed) for kind in KINDS for seed in (1, 2)]
+KINDS_SEEDS = [(kind, seed) for kind in SCENARIO_KINDS for seed in (1, 2)]
 
 
 def shortened(kind: str, seed: int) -> Scenario:
@@ -22,11 +20,11 @@ def shortened(kind: str, seed: int) -> Scenario:
     return dwell(seed, np.random.default_rng(seed), 4.0) if kind == "dwell" else scenario(kind, seed)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SCENARIO_KINDS)
 def test_a_seed_gives_the_same_scenario_again_and_another_seed_another(kind: str) -> None:
     first, again, other = shortened(kind, 1), shortened(kind, 1), shortened(kind, 2)
     assert first.changes == again.changes
-    assert first.readings == again.readings
+    assert first.glitches == again.glitches
     assert first.text == again.text
     assert np.array_equal(first.reference().y_um, again.reference().y_um)
     assert first.name == f"{kind}/1"
@@ -103,17 +101,17 @@ def test_a_rest_takes_a_time(rest_s: float) -> None:
 
 
 def test_glitches_spoil_their_samples_only_and_the_same_in_blocks() -> None:
-    bad = Readings(((3, 2, 5.0), (9, 1, float("nan")), (12, 4, -1.0)))
+    bad = SensorGlitches(((3, 2, 5.0), (9, 1, float("nan")), (12, 4, -1.0)))
     y = np.arange(20.0)
     kept = y.copy()
-    whole = bad.spoil(0, y)
+    whole = bad.applied(0, y)
     assert np.array_equal(y, kept)
     expected = y.copy()
     expected[3:5] += 5.0
     expected[9] = np.nan
     expected[12:16] -= 1.0
     assert np.array_equal(whole, expected, equal_nan=True)
-    blocks = np.concatenate([bad.spoil(k, y[k : k + 7]) for k in range(0, 20, 7)])
+    blocks = np.concatenate([bad.applied(k, y[k : k + 7]) for k in range(0, 20, 7)])
     assert np.array_equal(blocks, whole, equal_nan=True)
 
 
@@ -149,9 +147,9 @@ def test_what_cannot_be_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="seed: got 0"):
         scenario("noise", 0)
     with pytest.raises(InputError, match="runs"):
-        Readings(((3, 0, 1.0),))
+        SensorGlitches(((3, 0, 1.0),))
     with pytest.raises(InputError, match="parts"):
-        Parts(((0.3, Tones(1.0)),))
+        Sequenced(((0.3, Tones(1.0)),))
     with pytest.raises(InputError, match="frequency_Hz"):
         Tones(1.0, (1.0,), (), ())
 

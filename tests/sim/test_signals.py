@@ -8,18 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from sim.signals.signals import (
+from sim.signals.references import DemoReference, demo_reference
+from sim.signals.sample_times import sample_times
+from sim.signals.voltages import (
     diagnosis_excitation,
     generalisation_input,
     growing_triangles,
     minor_loops,
     multitone,
     sine,
-    times,
     training_input,
     triangle,
 )
-from sim.signals.unseen_reference import DemoReference, demo_reference
 
 
 def test_chapters_inputs() -> None:
@@ -38,11 +38,11 @@ def test_chapters_inputs() -> None:
 
 
 def test_times_are_counted() -> None:
-    assert times(0.3, 0.1).tolist() == [0.0, 0.1, 0.2]
-    assert times(3600.0, 1e-3)[-1] == 3599999 * 1e-3
+    assert sample_times(0.3, 0.1).tolist() == [0.0, 0.1, 0.2]
+    assert sample_times(3600.0, 1e-3)[-1] == 3599999 * 1e-3
     for duration, dt in ((1.0, 0.0), (0.0, 1e-3), (np.nan, 1e-3), (1.0, np.inf)):
         with pytest.raises(InputError):
-            times(duration, dt)
+            sample_times(duration, dt)
 
 
 def test_shapes() -> None:
@@ -98,7 +98,7 @@ def test_reference_is_consistent_and_stays_in_range(seed: int, low: float, span:
 
 def test_reference_is_the_same_in_pieces() -> None:
     plan = DemoReference(20.0, 5.0, 80.0, seed=2)
-    t = times(20.0, 1e-3)
+    t = sample_times(20.0, 1e-3)
     whole = plan.at(t)
     pieces = np.concatenate([plan.at(t[a:b]).y_um for a, b in ((0, 1), (1, 777), (777, 15000), (15000, 20000))])
     np.testing.assert_allclose(pieces, whole.y_um, rtol=0.0, atol=1e-12)

@@ -12,7 +12,7 @@ from pathlib import Path
 from service.protocol.errors import FieldError
 from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from service.runtime.stopping import StopSignal
-from sim.stage.config import Change, StageConfig
+from sim.stage.config import ParameterChange, StageConfig
 
 EPILOG = """\
 The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="the ready line is JSON too")
 
 
-def parse_change(text: str) -> Change:
+def parse_change(text: str) -> ParameterChange:
     """``"30:gain_drift.gain=-0.06,resonance.payload_ratio=1"`` as (30.0, {...}). Raises InputError."""
     time_text, _, rest = text.partition(":")
     values: dict[str, float] = {}

@@ -15,7 +15,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftFilter
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
-from sim.signals.unseen_reference import demo_reference
+from sim.signals.references import demo_reference
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

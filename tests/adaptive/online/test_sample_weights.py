@@ -14,7 +14,7 @@ from adaptive.online.drift import DriftConfig, DriftFilter
 from adaptive.online.kernel_window import ResidualWindow, WeightConfig
 from adaptive.online.learner import Learner
 from adaptive.types import Sample
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

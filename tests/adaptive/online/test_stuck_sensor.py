@@ -11,7 +11,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import AdmissionState, watch_reading
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

@@ -13,9 +13,8 @@ from lab.cli import main
 from lab.scenarios.judgement import FACTOR, FLOORS, judge, table, windows
 from lab.scenarios.pictures import draw_course, draw_overview
 from lab.scenarios.run import ADAPTIVE, FROZEN, Course, noise_floor_um, run_scenario
-from sim.scenarios import KINDS, Scenario, scenario
-from sim.scenarios.kinds import LOW_UM, dwell
-from sim.scenarios.motion import Parts, Shifted, Tones, demo_motion, strokes
+from sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
+from sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes
 from sim.stage.presets import preset
 
 GATES = ("learnt", "glitch")
@@ -99,9 +98,9 @@ def test_adapting_wins_where_the_stage_changes() -> None:
 def test_after_a_rest_the_strokes_are_as_good_as_before() -> None:
     """The ten minutes of the scenarios in small: what the window knows of the range survives a rest."""
     hertz, level, rest_s = 0.9, 33.0, 20.0
-    motion = Parts(
+    motion = Sequenced(
         (
-            (4.0, demo_motion(4.0, LOW_UM, 80.0, 102)),
+            (4.0, DemoReference(4.0, LOW_UM, 80.0, 102)),
             (10.0, strokes(LOW_UM, 80.0, hertz, 4.0)),
             (10.0 + rest_s, Tones(level)),
             (16.0 + rest_s, strokes(LOW_UM, 80.0, hertz, 10.0 + rest_s)),
@@ -125,7 +124,7 @@ LEFT_BEHIND = {"gain_ramp": 0.5, "creep": 0.2, "offset_jump": 0.05, "band": 0.3,
 ELSEWHERE = {"gain_step", "dwell"}
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ELSEWHERE])
+@pytest.mark.parametrize("kind", [kind for kind in SCENARIO_KINDS if kind not in ELSEWHERE])
 def test_in_no_half_second_is_adapting_worse_whatever_happens(kind: str) -> None:
     """As they are drawn from seed 1, with all of the time to settle, and cut short after."""
     s = scenario(kind, 1)
@@ -147,12 +146,12 @@ def test_in_no_half_second_is_adapting_worse_whatever_happens(kind: str) -> None
 
 
 def test_no_kind_is_left_out() -> None:
-    assert len(KINDS) == 10
-    assert set(KINDS) > ELSEWHERE
+    assert len(SCENARIO_KINDS) == 10
+    assert set(SCENARIO_KINDS) > ELSEWHERE
 
 
 def test_a_motion_that_begins_later_is_the_same_motion() -> None:
-    motion = demo_motion(5.0, LOW_UM, 80.0, 7)
+    motion = DemoReference(5.0, LOW_UM, 80.0, 7)
     t = np.arange(0.0, 4.0, 1e-3)
     assert np.allclose(Shifted(motion, 2.0).at(t + 2.0).y_um, motion.at(t).y_um)
 

@@ -31,8 +31,8 @@ from service.runtime.delivery import SURELY
 from service.runtime.session import open_client
 from service.server.axis import Axis
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle
-from sim.signals.signals import training_input
-from sim.signals.unseen_reference import demo_reference
+from sim.signals.references import demo_reference
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 from tests.online_models import PlainModel

@@ -29,7 +29,7 @@ from service.protocol.samples import SampleBatch
 from service.server import models
 from service.server.axis import Axis
 from service.storage.model_file import Bundle, BundleMeta
-from sim.signals.signals import multitone, training_input
+from sim.signals.voltages import multitone, training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

@@ -36,7 +36,7 @@ from service.server.models import load_axis
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle
 from service.storage.recorder import Recorder, RecorderConfig
 from sim.recordings import Recording, read
-from sim.signals.signals import multitone, training_input
+from sim.signals.voltages import multitone, training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

@@ -32,7 +32,7 @@ from service.server import competing, models
 from service.server.axis import Axis
 from service.server.axis_state import restore_axis
 from service.storage.model_file import Bundle, BundleMeta
-from sim.signals.signals import training_input
+from sim.signals.voltages import training_input
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 from tests.online_models import PlainModel

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim.effects import Chain, Effect, effect, simulate
-from sim.signals.signals import sine, triangle
+from sim.signals.voltages import sine, triangle
 
 DT = 1e-3
 LINEAR = Chain((effect("linear_actuator", gain_um_per_V=10.0),))

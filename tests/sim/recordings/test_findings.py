@@ -198,7 +198,7 @@ def test_repair_puts_every_good_sample_where_it_was(gone: set[int], nans: set[in
 
 @pytest.mark.parametrize("name", ["rich", "bouc_wen"])
 def test_simulated_stages_are_healthy_and_swapped_ones_are_seen(name: str) -> None:
-    from sim.signals.signals import training_input
+    from sim.signals.voltages import training_input
     from sim.stage.presets import preset
     from sim.stage.stage import Stage
 

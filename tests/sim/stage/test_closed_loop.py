@@ -10,7 +10,7 @@ import pytest
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import Feedforward, FloatArray, StateDict
 from sim.effects import Chain, effect
-from sim.signals.unseen_reference import demo_reference
+from sim.signals.references import demo_reference
 from sim.stage.closed_loop import CHAPTER_GAINS, PID, track, ultimate_gain
 from sim.stage.config import StageConfig
 from sim.stage.presets import preset

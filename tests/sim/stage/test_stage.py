@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
 from sim.effects import EFFECTS, Chain
-from sim.signals.signals import growing_triangles, training_input, triangle
+from sim.signals.voltages import growing_triangles, training_input, triangle
 from sim.stage.config import StageConfig
 from sim.stage.file import from_dict, load_stage, save_stage, to_dict
 from sim.stage.presets import PRESETS, preset, rich_chain

@@ -1,4 +1,4 @@
-"""Times from a count of samples, never summed."""
+"""Sample times, computed from the count of samples and never summed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
 
-def times(duration_s: float, dt_s: float) -> FloatArray:
-    """``k dt_s`` for all samples before ``duration_s``. Raises InputError unless both are positive and finite."""
+def sample_times(duration_s: float, dt_s: float) -> FloatArray:
+    """``k dt_s`` (n,) s for all samples before ``duration_s``. Raises InputError unless both are above 0 and finite."""
     if not (math.isfinite(dt_s) and dt_s > 0.0):
         raise InputError(f"dt_s: got {dt_s!r}, expected a sample time above 0 s")
     if not (math.isfinite(duration_s) and duration_s >= dt_s):

@@ -1,7 +1,6 @@
-"""Voltages and references: the chapter's signals, triangles, sines, diagnosis excitation.
+"""Voltage signals: those of the chapter, triangles, sines, multi-tones, and the excitation for a diagnosis.
 
-All return ``(t_s, values)`` as (n,) arrays; times are ``k dt_s``, computed from the count. Voltages are in V at the
-command's scale. The reference that no model has seen comes from `sim.signals.unseen_reference`.
+All return ``(t_s, u_V)``, (n,) arrays with times ``k dt_s``; voltages are at the scale of the command.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.signals.unseen_reference import DemoReference, Reference, demo_reference
-from sim.stage.timebase import times
+from sim.signals.sample_times import sample_times
 
-#: The chapter prints an amplitude of 5 in (2.37) and (2.45), which peaks at 9.8 V. Its tables and ranges
-#: (thresholds (2.38) up to 7.2434 V = 12/13 of 7.847 V, 89.306 µm) belong to a peak of 7.85 V: an amplitude of 4.
+#: Amplitude A of (2.37) and (2.45). The chapter prints 5, which peaks at 9.8 V. Its tables and ranges (thresholds
+#: (2.38) up to 7.2434 V = 12/13 of 7.847 V, 89.306 µm) belong to a peak of 7.85 V, an amplitude of 4.
 CHAPTER_AMPLITUDE_V = 4.0
 
 
@@ -26,9 +24,9 @@ def training_input(
 ) -> tuple[FloatArray, FloatArray]:
     """(2.37): ``u = A e^(-0.11 t) [sin(6 pi t e^(-0.345 t) - 1.55) + 1]``; 500 samples at 0.02 s by default.
 
-    The printed A is 5; see `CHAPTER_AMPLITUDE_V` for why 4 is the default.
+    See `CHAPTER_AMPLITUDE_V` for the default of A.
     """
-    t = times(duration_s, dt_s)
+    t = sample_times(duration_s, dt_s)
     wave = np.sin(6.0 * np.pi * t * np.exp(-0.345 * t) - 1.55) + 1.0
     return t, amplitude_V * np.exp(-0.11 * t) * wave
 
@@ -37,7 +35,7 @@ def generalisation_input(
     dt_s: float = 0.02, duration_s: float = 10.0, amplitude_V: float = CHAPTER_AMPLITUDE_V
 ) -> tuple[FloatArray, FloatArray]:
     """(2.45): ``u = A e^(-0.14 t) [cos(3 pi t e^(-0.092 t) - 3.15) + 1]``; 500 samples at 0.02 s by default."""
-    t = times(duration_s, dt_s)
+    t = sample_times(duration_s, dt_s)
     wave = np.cos(3.0 * np.pi * t * np.exp(-0.092 * t) - 3.15) + 1.0
     return t, amplitude_V * np.exp(-0.14 * t) * wave
 
@@ -45,14 +43,14 @@ def generalisation_input(
 def growing_triangles(
     dt_s: float = 1e-3, amplitudes_V: tuple[float, ...] = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), rate_V_per_s: float = 6.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Triangles from 0 V of growing amplitude at a constant rate, as in Fig. 2.2."""
+    """Triangles from 0 V of growing amplitude at a constant rate, as in Fig. 2.2. Raises InputError on bad values."""
     if not amplitudes_V or min(amplitudes_V) <= 0.0 or rate_V_per_s <= 0.0:
         raise InputError(f"amplitudes_V, rate_V_per_s: got {amplitudes_V}, {rate_V_per_s}, expected positive numbers")
     corners_V = [0.0]
     for amplitude in amplitudes_V:
         corners_V += [amplitude, 0.0]
     corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
-    t = times(float(corners_s[-1]), dt_s)
+    t = sample_times(float(corners_s[-1]), dt_s)
     return t, np.interp(t, corners_s, corners_V)
 
 
@@ -60,7 +58,7 @@ def triangle(
     low_V: float, high_V: float, frequency_Hz: float, cycles: float, dt_s: float = 1e-3
 ) -> tuple[FloatArray, FloatArray]:
     """A triangle wave from ``low_V`` up to ``high_V`` and back, ``cycles`` times."""
-    t = times(cycles / frequency_Hz, dt_s)
+    t = sample_times(cycles / frequency_Hz, dt_s)
     phase = np.mod(t * frequency_Hz, 1.0)
     return t, low_V + (high_V - low_V) * (1.0 - np.abs(1.0 - 2.0 * phase))
 
@@ -68,8 +66,8 @@ def triangle(
 def sine(
     low_V: float, high_V: float, frequency_Hz: float, cycles: float, dt_s: float = 1e-3
 ) -> tuple[FloatArray, FloatArray]:
-    """A sine from ``low_V`` up to ``high_V`` and back, ``cycles`` times, beginning at the bottom (Fig. 2.3)."""
-    t = times(cycles / frequency_Hz, dt_s)
+    """A sine from ``low_V`` up to ``high_V`` and back, ``cycles`` times (Fig. 2.3)."""
+    t = sample_times(cycles / frequency_Hz, dt_s)
     return t, low_V + (high_V - low_V) * 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t))
 
 
@@ -81,7 +79,7 @@ def minor_loops(
     rate_V_per_s: float = 6.0,
     dt_s: float = 1e-3,
 ) -> tuple[FloatArray, FloatArray]:
-    """One large loop from 0 V with ``loops`` minor loops of depth ``inner_V`` on the way up and on the way down."""
+    """A large loop from 0 V with ``loops`` minor loops of depth ``inner_V`` on each branch."""
     levels = np.linspace(low_V, high_V, loops + 2)[1:-1]
     corners_V = [0.0, low_V]
     for level in levels:
@@ -91,16 +89,16 @@ def minor_loops(
         corners_V += [float(level), float(level) + inner_V]
     corners_V += [low_V, 0.0]
     corners_s = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners_V)) / rate_V_per_s)))
-    t = times(float(corners_s[-1]), dt_s)
+    t = sample_times(float(corners_s[-1]), dt_s)
     return t, np.interp(t, corners_s, corners_V)
 
 
 def multitone(
     duration_s: float, dt_s: float = 1e-3, low_V: float = 0.5, high_V: float = 7.5, seed: int = 0, tones: int = 6
 ) -> tuple[FloatArray, FloatArray]:
-    """A sum of sines between 0.5 and 20 Hz, amplitudes falling as 1/f, all within the given voltages."""
+    """A sum of sines between 0.5 and 20 Hz with amplitudes falling as 1/f, within the given voltages."""
     rng = np.random.default_rng(seed)
-    t = times(duration_s, dt_s)
+    t = sample_times(duration_s, dt_s)
     frequency = np.exp(rng.uniform(math.log(0.5), math.log(20.0), tones))
     phase = rng.uniform(0.0, 2.0 * np.pi, tones)
     weight = 1.0 / frequency
@@ -111,30 +109,37 @@ def multitone(
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """A recording's commands: time, both axes' voltages, and where each part lies."""
+    """Commands for both axes, and where each part of them lies.
+
+    Attributes
+    ----------
+    t_s, u_V, u2_V : (n,) times s, voltages of the first and of the second axis V.
+    parts : (name, first sample, sample after the last) in order.
+    """
 
     t_s: FloatArray
     u_V: FloatArray
     u2_V: FloatArray
     parts: tuple[tuple[str, int, int], ...]
-    """(name, first sample, sample after the last) in order."""
 
 
 def diagnosis_excitation(dt_s: float = 5e-4, full_V: float = 8.0) -> Excitation:
-    """About 65 s that make every cause of the catalogue visible: rests, steps with holds, nested triangles, sines
-    of 1 to 20 Hz, a small chirp, the chapter's decaying sine, the other axis alone.
+    """About 65 s that make every cause of the catalogue visible.
+
+    It holds rests, steps with holds, nested triangles, sines of 1 to 20 Hz, a small chirp, the chapter's decaying sine,
+    and motion of the other axis alone.
     """
     half = 0.5 * full_V
     rate = full_V / 1.0
 
     def rest(seconds: float, level: float = 0.0) -> FloatArray:
-        return np.full(times(seconds, dt_s).size, level)
+        return np.full(sample_times(seconds, dt_s).size, level)
 
     def path(corners: tuple[float, ...]) -> FloatArray:
         at = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners)) / rate)))
-        return np.interp(times(float(at[-1]), dt_s), at, corners)
+        return np.interp(sample_times(float(at[-1]), dt_s), at, corners)
 
-    t_chirp = times(4.0, dt_s)
+    t_chirp = sample_times(4.0, dt_s)
     top_Hz = min(600.0, 0.35 / dt_s)
     growth = math.log(top_Hz / 2.0)
     sweep = 2.0 * np.pi * 2.0 * 4.0 / growth * np.expm1(t_chirp / 4.0 * growth)
@@ -167,21 +172,3 @@ def diagnosis_excitation(dt_s: float = 5e-4, full_V: float = 8.0) -> Excitation:
         if name == "other_axis":
             u2[first:last] = other
     return Excitation(np.arange(u.size, dtype=np.float64) * dt_s, u, u2, parts)
-
-
-__all__ = [
-    "CHAPTER_AMPLITUDE_V",
-    "DemoReference",
-    "Excitation",
-    "Reference",
-    "demo_reference",
-    "diagnosis_excitation",
-    "generalisation_input",
-    "growing_triangles",
-    "minor_loops",
-    "multitone",
-    "sine",
-    "times",
-    "training_input",
-    "triangle",
-]
