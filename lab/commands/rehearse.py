@@ -49,15 +49,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load, identify, run, draw. Returns 0 where nothing went wrong in any run, else 1."""
-    from lab.rehearsal import CLASSES, KINDS, STANDARD, RehearsalConfig, factory_of, rehearse, standard_events
-    from lab.rehearsal.table import remarks, table
+    from lab.rehearsal import CLASSES, EVENT_KINDS, STANDARD, RehearsalConfig, factory_of, rehearse, standard_events
+    from lab.rehearsal.rehearsal import remarks, table
     from service.storage.output_folder import clear_output
 
     if args.events == "list":
-        for name, (kind, _) in CLASSES.items():
-            print(
-                f"{name:<18}{KINDS[kind].category:<8}{KINDS[kind].text}{'' if name in STANDARD else ' (not standard)'}"
-            )
+        for name, (kind_name, _) in CLASSES.items():
+            kind = EVENT_KINDS[kind_name]
+            print(f"{name:<18}{kind.category:<8}{kind.text}{'' if name in STANDARD else ' (not standard)'}")
         return 0
     if args.seed < 0:
         raise FieldError("--seed", args.seed, "an integer from 0 on")

@@ -9,7 +9,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from lab.demo.plan import MODELS, TEACHER, Plan
-from lab.demo.result import Run, empty
+from lab.demo.result import DemoRun, empty
 from service.client.pending import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
@@ -22,7 +22,7 @@ from sim.stage.stage import Stage
 Progress = Callable[[int, dict[str, float]], None]
 
 
-def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> Run:
+def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
     """Run the plan on twin stages, the teacher's samples going into ``axis``."""
     wanted = plan.reference()
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
@@ -75,4 +75,4 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
                 memory[name] = reply.memory
     samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
     ticks = {"count": n, "late": 0, "bare_late": 0}
-    return Run(y_um, u_V, std_V, np.asarray(durations), 0, samples, ticks, notes)
+    return DemoRun(y_um, u_V, std_V, np.asarray(durations), 0, samples, ticks, notes)

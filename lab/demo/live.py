@@ -14,7 +14,7 @@ import zenoh
 
 from lab.demo.fast import Progress
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
-from lab.demo.result import Run
+from lab.demo.result import DemoRun
 from lab.testbed.processes import Child
 from lab.testbed.rig import READY_S, Rig
 from service.client.client import Client
@@ -70,7 +70,7 @@ def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: 
             commands.undeclare()  # type: ignore[no-untyped-call]
 
 
-def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], progress: Progress) -> Run:
+def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], progress: Progress) -> DemoRun:
     """Run the plan in real time on the processes of ``rig``; ``config`` is that of the service.
 
     Raises ServiceError if a process fails.
@@ -132,7 +132,7 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
             time.sleep(0.05)
 
 
-def _collect(result: Path, server: Child, stage: Child, loop: Child) -> Run:
+def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     with np.load(result) as kept:
         y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
         query_s, late = kept["query_s"], int(kept["late"])
@@ -147,4 +147,4 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> Run:
         "stage_late": summary["late"],
         "bare_late": loop.last_json()["late"],
     }
-    return Run(y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks)
+    return DemoRun(y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks)

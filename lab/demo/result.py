@@ -69,7 +69,7 @@ def table(summary: dict[str, Any]) -> str:
 
 
 @dataclass(slots=True)
-class Run:
+class DemoRun:
     """Motion of the twin stages, by model, and what happened on the way.
 
     Attributes

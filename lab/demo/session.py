@@ -16,7 +16,7 @@ from lab.demo.live import record_identification, run_live
 from lab.demo.own_stage import plan_for
 from lab.demo.pictures import draw_loops, draw_tracking
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
-from lab.demo.result import Run
+from lab.demo.result import DemoRun
 from lab.testbed.identified_stage import write_service_config
 from lab.testbed.rig import Rig
 from service.config.config import read_config
@@ -40,7 +40,7 @@ class Done:
     """A finished demonstration."""
 
     plan: Plan
-    run: Run
+    run: DemoRun
     summary: dict[str, Any]
 
 
@@ -163,7 +163,7 @@ def _scene(plan: Plan) -> SceneConfig:
     return SceneConfig(f"{STAGE}/{AXIS}", models, range_um=plan.range_um)
 
 
-def _records(plan: Plan, done: Run) -> list[Record]:
+def _records(plan: Plan, done: DemoRun) -> list[Record]:
     seq = np.arange(plan.ticks)
     t_s = seq.astype(np.float64) * plan.dt_s
     wanted_um = plan.reference()[0]

@@ -1,4 +1,4 @@
-"""What a rehearsal is asked for."""
+"""The configuration of a rehearsal."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ from service.protocol.errors import FieldError
 
 @dataclass(frozen=True, slots=True)
 class RehearsalConfig:
-    """How a rehearsal goes; defaults are those of the service.
+    """The configuration of a rehearsal; defaults are those of the service.
 
     Attributes
     ----------
-    identify_s : length of the excitation, s. support : support vectors of the model.
-    excite_low_V, excite_high_V : voltages that the excitation lies between, V; None: the limits of the drive.
-    settle_s : closed loop before the event, s. after_s : and after it has come in whole, or is over, s.
-    block : samples asked for at a time. snapshot_every : samples between two snapshots, as in the axis' configuration.
-    band : shares of the identified displacement range between which the reference moves.
-    slew_V_per_s : slew limit of the axis, V/s; None: 500 spans of the drive a second.
-    compete : models that are identified beside the one that learns; they compete with it, and stand in for it. Of
+    identify_s : length of the excitation, s. support : number of support vectors of the model.
+    excite_low_V, excite_high_V : range of the excitation, V; None: the limits of the drive.
+    settle_s : closed loop before the event, s. after_s : closed loop after the event has come completely or ended, s.
+    block : samples per query. snapshot_every : samples between two snapshots, as in the axis' configuration.
+    band : range of the reference, as shares of the identified displacement range.
+    slew_V_per_s : slew limit of the axis, V/s; None: 500 spans of the drive per second.
+    compete : models that are identified beside the one that learns; they compete with it and replace it if needed. Of
     "linear", "mpi", "bouc_wen"; empty for none.
     learner : settings of the learner, as in the table ``[axis.learner]`` of a configuration.
     reference : makes the motion of a run; None: ramps, holds and tones at random speeds.
+
+    Raises FieldError on values out of range.
     """
 
     identify_s: float = 10.0

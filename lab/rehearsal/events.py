@@ -1,8 +1,8 @@
-"""What happens in a rehearsal: one event a run, at a known time, of a known size.
+"""The events of a rehearsal: one per run, at a known time, of a known size.
 
-Two categories are told apart. ``INTACT``: stage and sensor are sound, or the stage has changed and the sensor says so;
-the error must stay small and nothing may be called a fault of the sensor. ``SENSOR``: the sensor does not say where the
-stage is; this must be noticed, and must not steer the stage.
+There are two categories. ``INTACT``: stage and sensor work, or the stage has changed and the sensor shows it; the
+error must stay small, and nothing may be reported as a sensor fault. ``SENSOR``: the sensor does not show where the
+stage is; this must be reported, and must not move the stage.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ INTACT: Final = "intact"
 SENSOR: Final = "sensor"
 
 
-class Kind(NamedTuple):
-    """category : INTACT or SENSOR. where : what it acts on. unit : of ``Event.size``. text : for people."""
+class EventKind(NamedTuple):
+    """A kind of event. category : INTACT or SENSOR. where : what it acts on. unit : of ``Event.size``. text :
+    description."""
 
     category: str
     where: str
@@ -30,30 +31,30 @@ class Kind(NamedTuple):
 #: What an event acts on.
 NOTHING, PHYSICS, READING, MESSAGE, REFERENCE = "nothing", "physics", "reading", "message", "reference"
 
-#: By the name of the kind. "range" is the commanded range, peak to peak.
-KINDS: Final[dict[str, Kind]] = {
-    "none": Kind(INTACT, NOTHING, "", "nothing happens"),
-    "gain": Kind(INTACT, PHYSICS, "share of the gain", "the stage's gain changes"),
-    "zero": Kind(INTACT, PHYSICS, "share of the range", "the stage's zero shifts"),
-    "payload": Kind(INTACT, PHYSICS, "share of the moved mass", "a payload is put on"),
-    "lag": Kind(INTACT, PHYSICS, "s", "the amplifier becomes slower"),
-    "knock": Kind(INTACT, PHYSICS, "share of the range", "somebody touches the table: the stage rings"),
-    "hum": Kind(INTACT, READING, "share of the range", "mains hum on the reading"),
-    "spikes": Kind(INTACT, READING, "share of the range", "single readings are wrong, ten a second"),
-    "bursts": Kind(INTACT, READING, "share of the range", "readings are wrong for a few ms, three times a second"),
-    "gap": Kind(INTACT, MESSAGE, "", "no samples are sent"),
-    "losses": Kind(INTACT, MESSAGE, "share of the samples", "samples are lost at random"),
-    "duplicates": Kind(INTACT, MESSAGE, "share of the samples", "samples come twice"),
-    "reversed": Kind(INTACT, MESSAGE, "", "the samples of a message come in reverse order"),
-    "number_jump": Kind(INTACT, MESSAGE, "numbers", "the count of the samples jumps and goes on from there"),
-    "number_stray": Kind(INTACT, MESSAGE, "numbers", "one sample has a number far ahead"),
-    "clock": Kind(INTACT, MESSAGE, "s", "the stage's clock is set"),
-    "rail": Kind(INTACT, REFERENCE, "", "the reference asks for more than the stage reaches"),
-    "stuck": Kind(SENSOR, READING, "", "the sensor repeats one reading"),
-    "stuck_noise": Kind(SENSOR, READING, "share of the range, rms", "the sensor shows one place and noise"),
-    "sensor_gain": Kind(SENSOR, READING, "factor", "the sensor shows a multiple of the motion"),
-    "sign": Kind(SENSOR, READING, "", "the sensor's sign is flipped"),
-    "foreign": Kind(SENSOR, READING, "", "the readings are those of another stage"),
+#: Kinds of events by name. "range" is the commanded range, peak to peak.
+EVENT_KINDS: Final[dict[str, EventKind]] = {
+    "none": EventKind(INTACT, NOTHING, "", "nothing happens"),
+    "gain": EventKind(INTACT, PHYSICS, "share of the gain", "the stage's gain changes"),
+    "zero": EventKind(INTACT, PHYSICS, "share of the range", "the stage's zero shifts"),
+    "payload": EventKind(INTACT, PHYSICS, "share of the moved mass", "a payload is put on"),
+    "lag": EventKind(INTACT, PHYSICS, "s", "the amplifier becomes slower"),
+    "knock": EventKind(INTACT, PHYSICS, "share of the range", "somebody touches the table: the stage rings"),
+    "hum": EventKind(INTACT, READING, "share of the range", "mains hum on the reading"),
+    "spikes": EventKind(INTACT, READING, "share of the range", "single readings are wrong, ten a second"),
+    "bursts": EventKind(INTACT, READING, "share of the range", "readings are wrong for a few ms, three times a second"),
+    "gap": EventKind(INTACT, MESSAGE, "", "no samples are sent"),
+    "losses": EventKind(INTACT, MESSAGE, "share of the samples", "samples are lost at random"),
+    "duplicates": EventKind(INTACT, MESSAGE, "share of the samples", "samples come twice"),
+    "reversed": EventKind(INTACT, MESSAGE, "", "the samples of a message come in reverse order"),
+    "number_jump": EventKind(INTACT, MESSAGE, "numbers", "the count of the samples jumps and goes on from there"),
+    "number_stray": EventKind(INTACT, MESSAGE, "numbers", "one sample has a number far ahead"),
+    "clock": EventKind(INTACT, MESSAGE, "s", "the stage's clock is set"),
+    "rail": EventKind(INTACT, REFERENCE, "", "the reference asks for more than the stage reaches"),
+    "stuck": EventKind(SENSOR, READING, "", "the sensor repeats one reading"),
+    "stuck_noise": EventKind(SENSOR, READING, "share of the range, rms", "the sensor shows one place and noise"),
+    "sensor_gain": EventKind(SENSOR, READING, "factor", "the sensor shows a multiple of the motion"),
+    "sign": EventKind(SENSOR, READING, "", "the sensor's sign is flipped"),
+    "foreign": EventKind(SENSOR, READING, "", "the readings are those of another stage"),
 }
 
 
@@ -63,10 +64,12 @@ class Event:
 
     Attributes
     ----------
-    name : of the class of events that it is counted under. kind : a key of ``KINDS``.
+    name : of its class, under which it is counted. kind : a key of ``EVENT_KINDS``.
     at_s : when it begins, s from the start of the closed loop; at least 2 s.
-    size : how large, in the unit of its kind. over_s : time over which a change comes, or for which a fault lasts, s.
-    seed : for what of it is left to chance.
+    size : in the unit of its kind. over_s : time over which a change comes, or for which a fault lasts, s.
+    seed : of its random parts.
+
+    Raises FieldError on values out of range.
     """
 
     name: str
@@ -77,8 +80,8 @@ class Event:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise FieldError("event.kind", repr(self.kind), f"one of {', '.join(KINDS)}")
+        if self.kind not in EVENT_KINDS:
+            raise FieldError("event.kind", repr(self.kind), f"one of {', '.join(EVENT_KINDS)}")
         if not 2.0 <= self.at_s <= 1e5:
             raise FieldError("event.at_s", f"{self.at_s:g} s", "2 s or later: what was before is compared with it")
         if not (np.isfinite(self.size) and 0.0 <= self.over_s <= 1e5):
@@ -89,22 +92,22 @@ class Event:
     @property
     def category(self) -> str:
         """INTACT or SENSOR."""
-        return KINDS[self.kind].category
+        return EVENT_KINDS[self.kind].category
 
     @property
     def where(self) -> str:
         """What it acts on."""
-        return KINDS[self.kind].where
+        return EVENT_KINDS[self.kind].where
 
     @property
     def end_s(self) -> float:
-        """When it has come in whole, or is over, s from the start."""
+        """When the change is complete or the fault has ended, s from the start."""
         return self.at_s + self.over_s
 
     @property
     def text(self) -> str:
-        """As a person would say it."""
-        return f"{KINDS[self.kind].text}{_sized(self)}{_when(self)}"
+        """Description with size and duration."""
+        return f"{EVENT_KINDS[self.kind].text}{_sized(self)}{_when(self)}"
 
 
 def _sized(event: Event) -> str:
@@ -134,9 +137,9 @@ def _when(event: Event) -> str:
     return f", for {event.over_s:.2g} s" if event.over_s else ""
 
 
-#: How physical changes come: suffix of the name, time over which, s.
+#: How physical changes come: suffix of the name, and time over which they come, s.
 _RAMPS: Final = (("at_once", 0.0), ("fast", 0.2), ("slow", 10.0))
-#: The classes of events: name → (kind, time over which it comes; None: drawn).
+#: Classes of events: name → (kind, time over which it comes, s; None: drawn).
 CLASSES: Final[dict[str, tuple[str, float | None]]] = {
     "none": ("none", 0.0),
     **{f"{kind}_{how}": (kind, over) for kind in ("gain", "zero", "payload", "lag") for how, over in _RAMPS},
@@ -148,20 +151,20 @@ CLASSES: Final[dict[str, tuple[str, float | None]]] = {
         )
     },
 }  # fmt: skip
-#: The classes that a rehearsal goes through where none are named: one of each sort, seconds each.
+#: The classes of a rehearsal by default: one of each sort, some seconds each.
 STANDARD: Final = (
     "none", "gain_at_once", "gain_fast", "zero_at_once", "payload_at_once", "lag_fast", "knock", "hum", "spikes",
     "bursts", "gap", "losses", "number_jump", "number_stray", "clock", "rail", "stuck", "stuck_noise", "sensor_gain",
     "sign", "foreign",
 )  # fmt: skip
-#: Count jumps that are drawn; the largest leaves room for numbers after it.
+#: Jumps of the sample count that are drawn; the largest leaves room for numbers after it.
 _JUMPS: Final = (1000.0, 100_000.0, float(2**62 - 2**40))
 
 
 def draw(name: str, seed: int, at_s: float) -> Event:
-    """An event of the class ``name`` (a key of ``CLASSES``), its size and length drawn by ``seed``.
+    """Draw an event of the class ``name`` (a key of ``CLASSES``): its size and length depend on ``seed``.
 
-    Raises FieldError on a name that is not known.
+    Raises FieldError on an unknown name.
     """
     if name not in CLASSES:
         raise FieldError("events", repr(name), f"some of {', '.join(CLASSES)}")

@@ -1,4 +1,4 @@
-"""The identification of a plant, as ``dehyst identify`` does it with a recording."""
+"""Identifies a plant, as ``dehyst identify`` does from a recording."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from service.config.config import LEARN
 from service.protocol.errors import FieldError
 from sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
 
-#: Time over which the drive goes from where a plant rests to the lowest voltage, and rest there, s.
+#: Time of the ramp from the voltage at rest to the lowest voltage, and of the rest there, s.
 APPROACH_S, REST_S = 0.5, 0.5
-#: The largest voltage of the chapter's excitation, as a share of twice its amplitude.
+#: The largest voltage of the chapter's excitation as a share of twice its amplitude.
 _PEAK: Final = 0.981
-#: Slew limit where none is given: spans of the drive a second.
+#: Default slew limit, spans of the drive per second.
 SLEW_SPANS_PER_S: Final = 500.0
 
 
 @dataclass(frozen=True, slots=True)
-class Identified:
+class IdentifiedPlant:
     """What is known of a plant before the loop is closed.
 
     Attributes
@@ -50,15 +50,17 @@ class Identified:
 
 def identify(
     plant_factory: PlantFactory, config: RehearsalConfig, progress: Callable[[float], None] = lambda _: None
-) -> Identified:
-    """Identify the models from the chapter's excitation on a new plant. Raises FieldError where it
-    answers what is no motion, InputError where no model can be identified."""
+) -> IdentifiedPlant:
+    """Identify the models from the chapter's excitation on a new plant.
+
+    Raises FieldError if the answer of the plant is no motion, InputError if no model can be identified.
+    """
     plant = plant_factory()
     check_numbers(plant)
     dt_s = plant.dt_s
-    low_V, high_V = excited(plant, config)
+    low_V, high_V = excitation_range(plant, config)
     progress(0.0)
-    approach(plant, low_V)
+    go_to_lowest(plant, low_V)
     wave_V = training_input(dt_s, config.identify_s)[1] / (2.0 * CHAPTER_AMPLITUDE_V * _PEAK)
     u_V = np.asarray(low_V + (high_V - low_V) * np.clip(wave_V, 0.0, 1.0))
     _, y_um = run_checked(plant, u_V)
@@ -81,14 +83,14 @@ def identify(
     slew = config.slew_V_per_s or SLEW_SPANS_PER_S * (plant.u_max_V - plant.u_min_V)
     limits = Limits(plant.u_min_V, plant.u_max_V, slew)
     progress(1.0)
-    return Identified(
+    return IdentifiedPlant(
         models, u_V, y_um, dt_s, limits, features.y_min_um, features.y_max_um, features.y_rest_um,
         report.heldout_mae_pct,
     )  # fmt: skip
 
 
-def excited(plant: Plant, config: RehearsalConfig) -> tuple[float, float]:
-    """Voltages that the excitation lies between. Raises FieldError where the drive does not reach them."""
+def excitation_range(plant: Plant, config: RehearsalConfig) -> tuple[float, float]:
+    """Lowest and highest voltage of the excitation, V. Raises FieldError if they are beyond the drive."""
     low = plant.u_min_V if config.excite_low_V is None else config.excite_low_V
     high = plant.u_max_V if config.excite_high_V is None else config.excite_high_V
     if not plant.u_min_V <= low < high <= plant.u_max_V:
@@ -99,8 +101,8 @@ def excited(plant: Plant, config: RehearsalConfig) -> tuple[float, float]:
     return low, high
 
 
-def approach(plant: Plant, low_V: float) -> None:
-    """Bring a plant from its rest to the lowest voltage of the excitation, and let it rest there."""
+def go_to_lowest(plant: Plant, low_V: float) -> None:
+    """Move a plant from its rest to the lowest voltage of the excitation, and let it rest there."""
     rest_V = min(max(0.0, plant.u_min_V), plant.u_max_V)
     if rest_V == low_V:
         return

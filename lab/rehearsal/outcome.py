@@ -1,4 +1,4 @@
-"""What a run came to, in figures: errors in percent of the commanded range, rails, and what was called trouble."""
+"""The outcome of a run in figures: errors in percent of the commanded range, voltage limits, and reported troubles."""
 
 from __future__ import annotations
 
@@ -9,42 +9,42 @@ import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.events import SENSOR, Event
-from lab.rehearsal.loop import Course
+from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
 
-#: Windows that the worst is looked for in, s; error that must not last, percent of the range.
+#: Window of the worst mean error, s; error that must not last, percent of the range.
 WINDOW_S: Final = 0.5
 LARGE_PCT: Final = 5.0
-#: What "before" and "settled" are taken over, s.
+#: Time over which "before" and "settled" are taken, s.
 QUIET_S: Final = 2.0
-#: A voltage this near to a limit, as a share of the drive, is at the limit.
+#: A voltage this close to a limit, as a share of the drive, is at the limit.
 RAIL_SHARE: Final = 1e-3
-#: A stage that is this near to where it is wanted, percent of the range, is at the rail because the reference is.
+#: A stage this close to its reference, percent of the range, is at the limit because of the reference.
 ASKED_PCT: Final = 2.0
-#: A run ends at a rail where the voltage is at a limit for the whole of its end, s.
+#: A run ends at a limit if the voltage is there for its last part of this length, s.
 END_S: Final = 0.1
-#: What is interrupted for no longer than this, s, goes on: a stage that swings, or a voltage from limit to limit.
+#: Interruptions up to this, s, do not count: a stage that swings, or a voltage that changes from limit to limit.
 BREAK_S: Final = 0.01
-#: A reference that moves by less than this share of the range in a second is at rest.
+#: A reference that moves by less than this share of the range per second is at rest.
 REST_PER_S: Final = 0.02
-#: While a sensor is wrong, an error up to this, percent of the range, or so many times the frozen model's, is in order.
+#: Error allowed during a sensor fault: percent of the range, or this multiple of the frozen model's error.
 SENSOR_PCT, SENSOR_FACTOR = 1.0, 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """Errors of one model in one run, percent of the commanded range; nan where the run has no such part.
+class ErrorFigures:
+    """Errors of one model in one run, percent of the commanded range; NaN if the run has no such part.
 
     Attributes
     ----------
     before_pct : mean absolute error of the last 2 s before the event. first_second_pct, then_pct : of the first second
-    from the event on, and of 1 to 4 s after it. during_pct : while it lasts, nan where it does not last.
-    settled_pct : of the last 2 s of the run. worst_half_second_pct : the largest mean over half a second from the event
-    on. worst_pct : the largest error from the event on. large_s : longest time for which the error stayed above 5 %, in
-    the whole run, but for what is beyond reach: where the voltage is at the limit that draws the stage to its target.
-    A moment below, of up to 10 ms, does not end it. large_at_s : when that began, s after the event
-    (negative: before it); nan where it never was. rail_s : longest time at a limit of the drive that the reference did
-    not ask for. ends_at_rail : whether the run ended so.
+    from the event on, and of 1 to 4 s after it. during_pct : during the event, NaN if it does not last.
+    settled_pct : of the last 2 s of the run. worst_half_second_pct : largest mean over half a second from the event
+    on. worst_pct : largest error from the event on. large_s : longest time with an error above 5 % in the whole run,
+    where the reference is within reach, that is, unless the voltage is at the limit that moves the stage towards it.
+    Interruptions up to 10 ms do not count. large_at_s : when that began, s after the event (negative: before it); NaN
+    if never. rail_s : longest time at a limit of the drive that the reference did not require. ends_at_rail : whether
+    the run ended so.
     """
 
     before_pct: float
@@ -62,13 +62,13 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """Something that the axis called wrong.
+    """A trouble that the axis reported.
 
     Attributes
     ----------
-    name : what it said. named_s : when it first said so, s after the event began (negative: before it).
-    motion_s : for how long the reference had moved by then since the event began, s. until_s : when it no longer said
-    anything, s after the event began; nan where it went on to the end.
+    name : of the trouble. named_s : when it was first reported, s after the event began (negative: before it).
+    motion_s : how long the reference had moved by then since the event began, s. until_s : when the report ended, s
+    after the event began; NaN if it lasted to the end.
     """
 
     name: str
@@ -83,14 +83,16 @@ class Outcome:
 
     Attributes
     ----------
-    event : what happened. text : as a person would say it. category : INTACT or SENSOR. left_out : why it did not.
-    adaptive, frozen : the two models. worst_ratio : worst half second of the adaptive one over that of the frozen one.
-    sensor_excess : while a sensor is wrong, the largest mean error over half a second as a share of what is in order
-    (the larger of 1 % and 1.5 times the frozen model's in the same half second); nan for other events.
-    troubles : in the order in which they began. false_troubles : names of those that began while nothing had happened.
-    healthy_s : for how long nothing had happened, s.
-    named_s : motion, s, from the event to its first naming; nan where it was not named, or is no fault of a sensor.
-    noted : names of the events that the axis noted from the event on, with how many of each.
+    event : what happened. text : its description. category : INTACT or SENSOR. left_out : why it did not happen.
+    adaptive, frozen : the two models. worst_ratio : worst half second of the adaptive model over that of the frozen
+    one.
+    sensor_excess : during a sensor fault, the largest mean error over half a second as a share of what is allowed (the
+    larger of 1 % and 1.5 times the frozen model's in the same half second); NaN for other events.
+    troubles : in the order in which they began. false_troubles : names of those that began before anything had
+    happened.
+    healthy_s : how long nothing had happened, s.
+    named_s : motion, s, from the event to its first report; NaN if it was not reported, or is no sensor fault.
+    noted : names of the axis' events from the event on, with their counts.
     simulated_s : length of the run, s.
     """
 
@@ -98,8 +100,8 @@ class Outcome:
     text: str
     category: str
     left_out: str
-    adaptive: Figures
-    frozen: Figures
+    adaptive: ErrorFigures
+    frozen: ErrorFigures
     worst_ratio: float
     sensor_excess: float
     troubles: tuple[Trouble, ...]
@@ -110,13 +112,13 @@ class Outcome:
     simulated_s: float
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON form: what is not finite becomes null, numbers have seven digits."""
-        told: dict[str, Any] = _plain(asdict(self))
-        return told
+        """JSON form: values that are not finite become null, numbers have seven digits."""
+        form: dict[str, Any] = _plain(asdict(self))
+        return form
 
 
-def figures(course: Course, event: Event, range_um: float, limits: Limits, dt_s: float) -> Figures:
-    """The figures of one course."""
+def figures(course: LoopRecord, event: Event, range_um: float, limits: Limits, dt_s: float) -> ErrorFigures:
+    """The figures of one run of one model."""
     error_pct = _error_pct(course, range_um)
     n = error_pct.size
     at, end = round(event.at_s / dt_s), round(event.end_s / dt_s)
@@ -124,11 +126,11 @@ def figures(course: Course, event: Event, range_um: float, limits: Limits, dt_s:
     window = max(1, round(WINDOW_S / dt_s))
     pause = round(BREAK_S / dt_s)
     beyond = _beyond_reach(course, event, limits, dt_s)
-    rail = bridged(_at_limit(course, limits) & (error_pct > ASKED_PCT) & ~beyond, pause)
-    # The last interruption cannot be told from an end of it.
+    rail = gaps_filled(_at_limit(course, limits) & (error_pct > ASKED_PCT) & ~beyond, pause)
+    # An interruption at the very end cannot be told from the end of the time at the limit.
     last = rail[n - max(1, round(END_S / dt_s)) : n - pause]
-    large, from_tick = longest(bridged((error_pct > LARGE_PCT) & ~beyond, pause))
-    return Figures(
+    large, from_tick = longest_stretch(gaps_filled((error_pct > LARGE_PCT) & ~beyond, pause))
+    return ErrorFigures(
         before_pct=_mean(error_pct[max(0, at - quiet) : at]),
         first_second_pct=_mean(error_pct[at : at + second]),
         then_pct=_mean(error_pct[at + second : at + 4 * second]),
@@ -138,20 +140,20 @@ def figures(course: Course, event: Event, range_um: float, limits: Limits, dt_s:
         worst_pct=float(error_pct[at:].max()),
         large_s=large * dt_s,
         large_at_s=(from_tick - at) * dt_s if large else float("nan"),
-        rail_s=longest(rail)[0] * dt_s,
+        rail_s=longest_stretch(rail)[0] * dt_s,
         ends_at_rail=bool(last.all()),
     )
 
 
 def outcome(
-    event: Event, adaptive: Course, frozen: Course, range_um: float, limits: Limits, dt_s: float, left_out: str
+    event: Event, adaptive: LoopRecord, frozen: LoopRecord, range_um: float, limits: Limits, dt_s: float, left_out: str
 ) -> Outcome:
-    """The outcome of a run; both courses are of the same reference."""
+    """The outcome of a run; both records have the same reference."""
     one, other = (figures(course, event, range_um, limits, dt_s) for course in (adaptive, frozen))
     troubles = _troubles(adaptive, event, range_um, dt_s)
     sensor = event.category == SENSOR
     healthy_s = adaptive.t_s.size * dt_s if event.kind == "none" else event.at_s
-    # What begins before a sensor is wrong, or when it is well again, is no word about its fault.
+    # A report before or after a sensor fault is not about it.
     true = [t for t in troubles if sensor and 0.0 <= t.named_s <= event.over_s]
     noted: dict[str, int] = {}
     for t_s, name, _ in adaptive.events:
@@ -176,15 +178,15 @@ def outcome(
 
 
 def moving_mean(values: FloatArray, window: int) -> FloatArray:
-    """Means over every ``window`` neighbours; over all of them where there are fewer."""
+    """Means over every ``window`` neighbours; over all values if there are fewer."""
     window = min(window, values.size)
     total = np.concatenate([[0.0], np.cumsum(values)])
     means: FloatArray = (total[window:] - total[:-window]) / window
     return means
 
 
-def bridged(holds: BoolArray, most: int) -> BoolArray:
-    """``holds`` (n,), with the gaps of up to ``most`` samples filled where it holds before and after them."""
+def gaps_filled(holds: BoolArray, most: int) -> BoolArray:
+    """``holds`` (n,) with gaps of up to ``most`` samples filled where it is true on both sides."""
     at = np.arange(holds.size)
     before = np.maximum.accumulate(np.where(holds, at, -holds.size))
     after = np.minimum.accumulate(np.where(holds, at, 2 * holds.size)[::-1])[::-1]
@@ -192,8 +194,8 @@ def bridged(holds: BoolArray, most: int) -> BoolArray:
     return filled
 
 
-def longest(holds: BoolArray) -> tuple[int, int]:
-    """(length, beginning) of the longest stretch in which it holds; (0, 0) where it nowhere does."""
+def longest_stretch(holds: BoolArray) -> tuple[int, int]:
+    """(length, first index) of the longest stretch that is true; (0, 0) if there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
     if not edges.size:
         return 0, 0
@@ -201,7 +203,7 @@ def longest(holds: BoolArray) -> tuple[int, int]:
     return int(lengths.max()), int(edges[2 * int(lengths.argmax())])
 
 
-def _error_pct(course: Course, range_um: float) -> FloatArray:
+def _error_pct(course: LoopRecord, range_um: float) -> FloatArray:
     error: FloatArray = 100.0 / range_um * np.abs(course.wanted_um - course.true_um)
     return error
 
@@ -210,9 +212,9 @@ def _mean(values: FloatArray) -> float:
     return float(values.mean()) if values.size else float("nan")
 
 
-def _beyond_reach(course: Course, event: Event, limits: Limits, dt_s: float) -> BoolArray:
-    """(n,) where the reference asks for what is beyond reach: by the event, or where the voltage is at the limit that
-    draws the stage to where it is wanted, and does not get it there."""
+def _beyond_reach(course: LoopRecord, event: Event, limits: Limits, dt_s: float) -> BoolArray:
+    """(n,) where the reference is beyond reach: by the event, or because the voltage is at the limit that moves the
+    stage towards it and does not get it there."""
     t_s, u = course.t_s, course.u_V
     by_event = (t_s >= event.at_s) & (t_s <= event.end_s + dt_s) & (event.kind == "rail")
     rising = np.sign(np.dot(u - u.mean(), course.true_um - course.true_um.mean()))
@@ -222,12 +224,12 @@ def _beyond_reach(course: Course, event: Event, limits: Limits, dt_s: float) -> 
     return beyond
 
 
-def _at_limit(course: Course, limits: Limits) -> BoolArray:
+def _at_limit(course: LoopRecord, limits: Limits) -> BoolArray:
     near = RAIL_SHARE * (limits.u_max_V - limits.u_min_V)
     return (course.u_V <= limits.u_min_V + near) | (course.u_V >= limits.u_max_V - near)
 
 
-def _troubles(course: Course, event: Event, range_um: float, dt_s: float) -> tuple[Trouble, ...]:
+def _troubles(course: LoopRecord, event: Event, range_um: float, dt_s: float) -> tuple[Trouble, ...]:
     at = round(event.at_s / dt_s)
     moving = np.abs(np.diff(course.wanted_um, prepend=course.wanted_um[0])) > REST_PER_S * range_um * dt_s
     moved_s = dt_s * np.cumsum(moving[at:])
@@ -243,7 +245,7 @@ def _troubles(course: Course, event: Event, range_um: float, dt_s: float) -> tup
     return tuple(found)
 
 
-def _sensor_excess(adaptive: Course, frozen: Course, event: Event, range_um: float, dt_s: float) -> float:
+def _sensor_excess(adaptive: LoopRecord, frozen: LoopRecord, event: Event, range_um: float, dt_s: float) -> float:
     part = slice(round(event.at_s / dt_s), round(event.end_s / dt_s))
     window = max(1, round(WINDOW_S / dt_s))
     one, other = (moving_mean(_error_pct(course, range_um)[part], window) for course in (adaptive, frozen))

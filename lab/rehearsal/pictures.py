@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from adaptive.types import FloatArray
-from lab.rehearsal.loop import Course
-from lab.rehearsal.rehearsing import Rehearsal, Run
-from lab.rehearsal.table import remarks
+from lab.rehearsal.loop import LoopRecord
+from lab.rehearsal.rehearsal import EventRun, Rehearsal, remarks
 from service.reports.plot_style import envelope, traces
 
 #: Colour-blind safe; the learning model is the dark one.
@@ -46,7 +45,7 @@ def draw_rehearsal(path: Path, rehearsal: Rehearsal) -> None:
     figure.savefig(path)
 
 
-def _error_pct(course: Course, run: Run) -> FloatArray:
+def _error_pct(course: LoopRecord, run: EventRun) -> FloatArray:
     """(n,) mean absolute error, percent of the range, about each sample."""
     error = 100.0 / run.range_um * np.abs(course.wanted_um - course.true_um)
     window = max(1, round(MEAN_S / (course.t_s[1] - course.t_s[0])))

@@ -1,8 +1,8 @@
-"""What a rehearsal takes for a stage: an object or a function that turns a block of voltages into displacements.
+"""What a rehearsal accepts as a stage: an object or a function that turns a block of voltages into displacements.
 
 Time line of sample k, ``dt_s`` apart: the reading ``read_um[k]`` is taken at the instant at which ``u_V[k]`` begins to
-be applied. So ``read_um[k]`` does not depend on ``u_V[k]``, and the voltage shows in the reading ``k + 1`` at the
-earliest. A plant begins at rest, with the voltage of its drive that is nearest to zero.
+be applied. So ``read_um[k]`` does not depend on ``u_V[k]``; the voltage shows in reading ``k + 1`` at the earliest. A
+plant begins at rest, at the voltage of its drive nearest to zero.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PlantFunction = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @runtime_checkable
 class Plant(Protocol):
-    """A stage. It keeps its own state from one block to the next.
+    """A stage. It keeps its state from one block to the next.
 
     Attributes
     ----------
@@ -43,20 +43,20 @@ class Plant(Protocol):
         ...
 
 
-#: Makes a new plant, at rest. Two plants of one factory are alike to the last bit, their noise included.
+#: Makes a new plant, at rest. All plants of one factory give the same bits, including their noise.
 PlantFactory = Callable[[], Plant]
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Something physical that happens to a stage, from the next sample that it runs on.
+    """A physical change of a stage, from the next sample on.
 
     Attributes
     ----------
     kind : ``gain`` (displacement grows by the share ``size``), ``zero`` (it shifts by ``size`` µm), ``payload`` (the
-    moved mass grows by the share ``size``), ``lag`` (the drive gets a further time constant of ``size`` s), ``knock``
+    moved mass grows by the share ``size``), ``lag`` (the drive gets another time constant of ``size`` s), ``knock``
     (the stage rings with an amplitude of ``size`` µm; nothing else changes).
-    over_s : time over which it comes, linearly, s; 0 at once. seed : for what of it is left to chance.
+    over_s : time over which it comes, linearly, s; 0 at once. seed : of its random parts.
     """
 
     kind: str
@@ -67,17 +67,17 @@ class Change:
 
 @runtime_checkable
 class Changeable(Protocol):
-    """A plant that takes physical events itself; for others they are emulated from outside, as far as that goes."""
+    """A plant that applies physical events itself; other plants are disturbed from outside as far as possible."""
 
     def change(self, change: Change) -> bool:
-        """Let it happen from the next sample on. False where this plant cannot: it is then emulated."""
+        """Apply the change from the next sample on. Return False if this plant cannot: it is then emulated."""
         ...
 
 
 class FunctionPlant:
-    """A plant around a function; what the function keeps is its own affair.
+    """A plant around a function; any state is kept by the function.
 
-    Raises FieldError where the numbers are missing or impossible.
+    Raises FieldError if sample time or limits are missing or impossible.
     """
 
     def __init__(self, function: PlantFunction, dt_s: float, u_min_V: float, u_max_V: float) -> None:
@@ -90,7 +90,7 @@ class FunctionPlant:
 
 
 def check_numbers(plant: Plant) -> None:
-    """FieldError unless sample time and drive of a plant are possible."""
+    """Raise FieldError unless sample time and limits of a plant are possible."""
     for name, value in (("dt_s", plant.dt_s), ("u_min_V", plant.u_min_V), ("u_max_V", plant.u_max_V)):
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
             raise FieldError(f"plant.{name}", repr(value), "a finite number")
@@ -101,9 +101,10 @@ def check_numbers(plant: Plant) -> None:
 
 
 def run_checked(plant: Plant, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``plant.run`` with its answer looked at. Raises FieldError on a wrong shape or a true displacement not finite.
+    """``plant.run`` with its result checked. Raises FieldError on a wrong shape or a true displacement that is not
+    finite.
 
-    A reading may be anything, as a sensor's may.
+    A reading may be anything, as that of a sensor may.
     """
     got = _guarded("run", plant.run, u_V.copy())
     shape = f"({u_V.size},)"
@@ -132,11 +133,12 @@ def run_checked(plant: Plant, u_V: FloatArray) -> tuple[FloatArray, FloatArray]:
 def factory_of(
     given: object, dt_s: float | None = None, u_min_V: float | None = None, u_max_V: float | None = None
 ) -> PlantFactory:
-    """What makes new plants from ``given``: a plant, a function of the voltages, or what makes one of the two.
+    """A factory of new plants from ``given``: a plant, a function of the voltages, or something that makes one of the
+    two.
 
-    An object is copied for each run (``copy.deepcopy``), so that each begins as it is now; a class or another callable
-    that needs no argument is called. Where both the plant and the arguments tell sample time or drive, the
-    arguments count. Raises FieldError where it is none of these or a number is missing.
+    An object is copied for each run (``copy.deepcopy``), so that each run begins with its present state. A class or
+    another callable without arguments is called. If both the plant and the arguments give sample time or limits, the
+    arguments count. Raises FieldError if it is none of these or a number is missing.
     """
     called = _needs_no_argument(given)
 
@@ -144,7 +146,7 @@ def factory_of(
         made = _guarded("making it", given) if called else copy.deepcopy(given)
         return _as_plant(made, dt_s, u_min_V, u_max_V)
 
-    make()  # what is wrong with it is told now and not at the first run
+    make()  # report errors now, not at the first run
     return make
 
 
@@ -173,7 +175,7 @@ def _as_plant(made: object, dt_s: float | None, u_min_V: float | None, u_max_V: 
 
 
 def _guarded(what: str, call: Any, *arguments: object) -> Any:
-    """What a call into the user's code returns; FieldError saying where it raised."""
+    """The result of a call into the user's code; FieldError with file and line if it raised."""
     try:
         return call(*arguments)
     except Exception as error:

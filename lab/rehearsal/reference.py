@@ -1,7 +1,7 @@
-"""The motion that a rehearsal asks for: holds and ramps at random speeds with rounded corners, and tones upon them.
+"""The motion of a rehearsal: holds and ramps at random speeds with rounded corners, plus tones.
 
-Position, velocity and acceleration are closed forms that belong to one another exactly; the acceleration is smooth (it
-is twice continuously differentiable). Nothing of it is in the excitation that a model is identified from.
+Position, velocity and acceleration are closed forms that match exactly; the acceleration is twice continuously
+differentiable. The excitation that a model is identified from contains nothing of it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from service.protocol.errors import FieldError
 
 
 class Motion(NamedTuple):
-    """(n,) displacement µm, velocity µm/s, acceleration µm/s², all of the same instants."""
+    """(n,) displacement µm, velocity µm/s, acceleration µm/s², all at the same instants."""
 
     y_um: FloatArray
     v_um_per_s: FloatArray
@@ -26,7 +26,7 @@ class Motion(NamedTuple):
 
 
 class Reference(Protocol):
-    """A motion that can be asked for at any time."""
+    """A motion as a function of time."""
 
     def __call__(self, t_s: FloatArray) -> Motion:
         """The motion at the (n,) ascending times ``t_s``, s from the start of the closed loop."""
@@ -34,13 +34,13 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """What a reference has to keep to.
+class ReferenceRequest:
+    """What a reference must respect.
 
     Attributes
     ----------
-    start_um : where the stage rests at first; the reference begins there, at rest. low_um, high_um : the band that it
-    moves in thereafter. duration_s : its length, s. seed : of all that is drawn.
+    start_um : where the stage rests at first; the reference begins there, at rest. low_um, high_um : range of the
+    motion after that. duration_s : its length, s. seed : of everything random.
     """
 
     start_um: float
@@ -51,28 +51,29 @@ class Wish:
 
 
 #: Makes the reference of a run.
-ReferenceMaker = Callable[[Wish], Reference]
+ReferenceMaker = Callable[[ReferenceRequest], Reference]
 
-#: Amplitude of all tones together as a share of the band, by which the ramps keep away from its ends: drawn between.
+#: Range of the amplitude of all tones together, as a share of the band; the ramps stay away from its ends by as much.
 TONES_SHARE = (0.02, 0.45)
-#: Speeds of the ramps, of the span that is left to them a second; the fastest of a run is drawn. Times of the holds, s.
+#: Speeds of the ramps in spans per second, from the slowest to the fastest, which is drawn per run. Lengths of the
+#: holds, s.
 SLOWEST, FASTEST = 0.3, (1.5, 8.0)
 HOLD_S = (0.1, 0.6)
-#: Half the time that a corner is rounded over, s.
+#: Half the time over which a corner is rounded, s.
 CORNER_S = (0.03, 0.12)
-#: Frequencies of the tones, Hz, how many there are, and when they set in, s.
+#: Frequencies of the tones, Hz, their number, and when they fade in, s.
 TONES_HZ, TONES = (0.4, 8.0), 4
 TONES_FROM_S = (0.6, 1.8)
 
 
 class RandomReference:
-    """Ramps and holds between random levels, with tones upon them; its speed and which of the two prevails are drawn.
+    """Ramps and holds between random levels, with tones; its speed and the share of the tones are drawn.
 
     ``tones_share``: amplitude of all tones together as a share of the band, below 0.5; None: drawn. Raises FieldError
-    on a band that has no width.
+    on a band without width.
     """
 
-    def __init__(self, wish: Wish, tones_share: float | None = None) -> None:
+    def __init__(self, wish: ReferenceRequest, tones_share: float | None = None) -> None:
         span = wish.high_um - wish.low_um
         if not (math.isfinite(span) and span > 0.0):
             raise FieldError("reference", f"{wish.low_um} to {wish.high_um} µm", "a band of finite width")
@@ -83,7 +84,7 @@ class RandomReference:
         fastest = _between(rng, *FASTEST)
         low, high = wish.low_um + share * span, wish.high_um - share * span
         left = high - low
-        # Knots of a broken line: (time, level). It begins with a rest and a gentle ramp into the band.
+        # Knots of a polyline: (time, level). It begins with a rest and a slow ramp into the band.
         knots = [(-1.0, wish.start_um), (0.15, wish.start_um), (1.0, low + rng.uniform(0.2, 0.8) * left)]
         up = bool(rng.integers(2))
         while knots[-1][0] < wish.duration_s + 1.0:
@@ -102,7 +103,7 @@ class RandomReference:
         self._start_um = float(wish.start_um)
         self._corner_s = times[1:-1]
         self._bend = np.diff(slopes)
-        # Neighbouring corners may not overlap, or the line would be cut deeper than each alone does.
+        # Neighbouring corners must not overlap, or the line would be cut deeper than each alone cuts it.
         shortest = np.minimum(np.diff(times)[:-1], np.diff(times)[1:])
         self._half_s = np.minimum(rng.uniform(*CORNER_S, self._bend.size), 0.5 * shortest)
         hertz = np.exp(rng.uniform(math.log(TONES_HZ[0]), math.log(TONES_HZ[1]), TONES))
@@ -116,7 +117,7 @@ class RandomReference:
         y, v, a = np.full(t.size, self._start_um), np.zeros(t.size), np.zeros(t.size)
         for corner_s, bend, half_s in zip(self._corner_s, self._bend, self._half_s, strict=True):
             first, last = np.searchsorted(t, (corner_s - half_s, corner_s + half_s))
-            # The acceleration is a bump of area ``bend`` about the corner; velocity and position are its integrals.
+            # The acceleration is a pulse of area ``bend`` about the corner; velocity and position are its integrals.
             q = np.clip((t[first:last] - corner_s) / half_s, -1.0, 1.0)
             q2 = q * q
             a[first:last] += bend / half_s * (35.0 / 32.0) * (1.0 - q2) ** 3
@@ -124,7 +125,7 @@ class RandomReference:
             y[first:last] += bend * half_s * _ramp(q, q2)
             v[last:] += bend
             y[last:] += bend * (t[last:] - corner_s)
-        fade = Step(*TONES_FROM_S)(t)
+        fade = SmoothStep(*TONES_FROM_S)(t)
         angle = np.multiply.outer(t, self._omega) + self._phase
         sine, cosine = np.sin(angle), np.cos(angle)
         tones = Motion(
@@ -141,15 +142,15 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _ramp(q: FloatArray, q2: FloatArray) -> FloatArray:
-    """Integral from -1 to q of the smooth step whose slope is the bump (35/32)(1 - q²)³; at 1 it is 1."""
-    # ∫ of 1/2 + (35/32)(q - q³ + 3/5 q⁵ - q⁷/7), with its value at -1 taken off.
+    """Integral from -1 to q of the smooth step whose slope is the pulse (35/32)(1 - q²)³; 1 at q = 1."""
+    # ∫ of 1/2 + (35/32)(q - q³ + 3/5 q⁵ - q⁷/7), minus its value at -1.
     got: FloatArray = 0.5 * q + (35.0 / 32.0) * q2 * (0.5 - q2 * (0.25 - q2 * (0.1 - q2 / 56.0)))
     at_minus_one = -0.5 + (35.0 / 32.0) * (0.5 - 0.25 + 0.1 - 1.0 / 56.0)
     return got - at_minus_one
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SmoothStep:
     """A smooth step from 0 to 1 between two times, s, three times continuously differentiable."""
 
     from_s: float
@@ -175,10 +176,8 @@ def _product(f: Motion, g: Motion) -> Motion:
 
 @dataclass(frozen=True, slots=True)
 class Excursion:
-    """``base`` with a visit to ``level_um`` between two times: it goes there within ``way_s``, stays, and comes back.
-
-    Both ways lie within the two times.
-    """
+    """``base`` with an excursion to ``level_um`` between two times: there within ``way_s``, a stay, and back within
+    ``way_s``."""
 
     base: Reference
     level_um: float
@@ -187,8 +186,8 @@ class Excursion:
     way_s: float = 0.3
 
     def __call__(self, t_s: FloatArray) -> Motion:
-        there = Step(self.from_s, self.from_s + self.way_s)(t_s)
-        back = Step(self.to_s - self.way_s, self.to_s)(t_s)
+        there = SmoothStep(self.from_s, self.from_s + self.way_s)(t_s)
+        back = SmoothStep(self.to_s - self.way_s, self.to_s)(t_s)
         weight = Motion(*(one - other for one, other in zip(there, back, strict=True)))
         y, v, a = self.base(t_s)
         away = _product(weight, Motion(self.level_um - y, -v, -a))

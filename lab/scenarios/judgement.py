@@ -1,4 +1,4 @@
-"""The judgement over scenarios: in no half second may adapting be worse than not adapting. Table and JSON."""
+"""Judges scenarios: in no half second may adapting be worse than not adapting. Table and JSON."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.types import FloatArray
-from lab.scenarios.run import ADAPTIVE, FROZEN, Course
+from lab.scenarios.run import ADAPTIVE, FROZEN, ScenarioRecord
 
 #: In every window of this length, s, the adaptive mean absolute error may be at most ...
 WINDOW_S: Final = 0.5
@@ -16,21 +16,21 @@ WINDOW_S: Final = 0.5
 FACTOR: Final = 1.1
 #: ... plus this many noise floors.
 FLOORS: Final = 3.0
-#: What "settled" is taken over, s: the end of the run, and what lies just before the change.
+#: Length of "settled" at the end of the run, and of "before" just before the change, s.
 SETTLED_S: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How a scenario came out; errors are mean absolute errors in percent of the commanded range.
+    """The verdict on a scenario; errors are mean absolute errors in percent of the commanded range.
 
     Attributes
     ----------
-    before_pct, first_second_pct, settled_pct : of the adaptive model, before it began to happen (up to 10 s), in the
-    first second, and at the end (10 s); ``frozen_*`` of the model that does not adapt.
-    worst_ratio : largest error of a window over what that window allows; held where at most 1.
+    before_pct, first_second_pct, settled_pct : of the adaptive model, before the change (up to 10 s), in the first
+    second, and at the end (10 s); ``frozen_*`` of the model that does not adapt.
+    worst_ratio : largest error of a window over what that window allows; held if at most 1.
     worst_s : middle of that window, s. worst_pct, worst_frozen_pct : the two errors in it.
-    broken_share : share of all windows that allow less than was there.
+    broken_share : share of all windows above what they allow.
     floor_pct : noise floor at the end.
     """
 
@@ -61,7 +61,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """Mean absolute errors of every window of a course, µm; ``t_s`` is a window's middle."""
+    """Mean absolute errors of every window, µm; ``t_s`` is the middle of a window."""
 
     t_s: FloatArray
     adaptive_um: FloatArray
@@ -70,12 +70,12 @@ class Windows:
 
     @property
     def ratio(self) -> FloatArray:
-        """What was there over what is allowed."""
+        """Adaptive error over what is allowed."""
         return self.adaptive_um / self.allowed_um
 
 
-def windows(course: Course) -> Windows:
-    """Every window there is: one begins at each sample."""
+def windows(course: ScenarioRecord) -> Windows:
+    """All windows: one begins at each sample."""
     dt = course.scenario.stage.dt_s
     span = max(1, round(WINDOW_S / dt))
 
@@ -89,13 +89,13 @@ def windows(course: Course) -> Windows:
     return Windows(t_s, adaptive, frozen, FACTOR * frozen + FLOORS * moving(course.floor_um))
 
 
-def judge(course: Course) -> Verdict:
-    """The verdict over a course."""
+def judge(course: ScenarioRecord) -> Verdict:
+    """The verdict on a scenario."""
     s = course.scenario
     dt, percent = s.stage.dt_s, 100.0 / s.range_um
     w = windows(course)
     worst = int(np.argmax(w.ratio))
-    # A dwell is judged by its strokes: what moved before the rest stands for "before".
+    # A dwell is judged by its strokes: "before" is the motion before the rest.
     change = round((s.quiet_s[0] if s.quiet_s else s.change_s) / dt)
     begin = round(s.change_s / dt)
     settled = round(SETTLED_S / dt)
@@ -129,7 +129,7 @@ def judge(course: Course) -> Verdict:
 
 
 def table(verdicts: list[Verdict], markdown: bool = False) -> str:
-    """A row a scenario, for people; ``markdown`` for a page."""
+    """One row per scenario; ``markdown`` for a page."""
     head = (
         "scenario",
         "what happens",

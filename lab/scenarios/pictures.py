@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from lab.scenarios.judgement import FACTOR, FLOORS, WINDOW_S, Verdict, windows
-from lab.scenarios.run import ADAPTIVE, FROZEN, Course
+from lab.scenarios.run import ADAPTIVE, FROZEN, ScenarioRecord
 from service.reports.plot_style import MOST_TRACE_POINTS, envelope, traces
 
 #: Colour-blind safe; the adaptive model is the dark one.
 ADAPTIVE_COLOUR, FROZEN_COLOUR, ALLOWED_COLOUR, EVENT_COLOUR = "#004d40", "#e69f00", "#999999", "#d55e00"
 
 
-def draw_course(path: Path, course: Course, verdict: Verdict) -> None:
+def draw_course(path: Path, course: ScenarioRecord, verdict: Verdict) -> None:
     """Reference, errors, mean errors of every window beside what is allowed, and what the learner said of samples."""
     s = course.scenario
     dt, percent = s.stage.dt_s, 100.0 / s.range_um

@@ -1,8 +1,8 @@
-"""One scenario, run: adapting and not adapting on twin stages, by the service's own axis and at its own delays.
+"""Runs one scenario: adapting and not adapting on twin stages, through the service's own axis with its delays.
 
-Both twins have the same stage, noise and reference, and both models are one to begin with: that which was identified
-from the chapter's training signal. The axis answers in blocks, asked ahead, from snapshots of a certain age, as it
-does for a controller on the wire.
+Both twins have the same stage, noise and reference, and both models begin as the one that was identified from the
+chapter's training signal. The axis answers in blocks, queried ahead, from snapshots of a certain age, as for a
+controller in the network.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from sim.stage.stage import Stage
 ADAPTIVE: Final = "lssvm_adaptive"
 FROZEN: Final = "lssvm_memory"
 MODELS: Final = (ADAPTIVE, FROZEN)
-#: Points a query, how many samples ahead it is asked, and how many more its snapshot is old.
+#: Points per query, samples that it is asked ahead, and samples that its snapshot is older still.
 BLOCK, LEAD, MARGIN = 20, 40, 20
 SLEW_V_PER_S: Final = 4000.0
 IDENTIFY_S: Final = 10.0
-#: SensorGlitches at rest from which the noise floor is taken, s.
+#: Length of the readings at rest that give the noise floor, s.
 FLOOR_S: Final = 2.0
 
 #: Called with the simulated time done, s.
@@ -45,15 +45,15 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """How one scenario went; arrays of (n,) samples, µm.
+class ScenarioRecord:
+    """One scenario as it went; arrays of (n,) samples, µm.
 
     Attributes
     ----------
-    wanted_um : the reference. error_um : by model, reference less reading; the reading is that without glitches.
-    floor_um : rms noise of a reading at rest, of the stage as it is at that sample.
-    verdicts : samples by what the learner said of them. counters : the learner's own, at the end.
-    gate : (n,) index into ``gates`` of what the learner said of each sample.
+    wanted_um : the reference. error_um : by model, reference minus reading without glitches.
+    floor_um : rms noise of a reading at rest, of the stage at that sample.
+    verdicts : counts of the learner's verdicts on samples. counters : of the learner, at the end.
+    gate : (n,) index into ``gates`` of the learner's verdict on each sample.
     """
 
     scenario: Scenario
@@ -68,7 +68,7 @@ class Course:
 
 @lru_cache(maxsize=64)
 def identified(stage: StageConfig) -> LssvmInverse:
-    """The model of a rested stage, from the chapter's training signal (2.37) at the stage's sample time."""
+    """The model of a stage at rest, from the chapter's training signal (2.37) at the stage's sample time."""
     rested = Stage(stage)
     u_V = training_input(stage.dt_s, IDENTIFY_S)[1]
     y_um, _ = rested.run(rested.initial_state(), u_V)
@@ -76,7 +76,7 @@ def identified(stage: StageConfig) -> LssvmInverse:
 
 
 def noise_floor_um(stage: StageConfig) -> float:
-    """Standard deviation, µm, of the readings of a stage at rest, slow drift taken out."""
+    """Standard deviation, µm, of the readings of a stage at rest, without slow drift."""
     rested = Stage(replace(stage, changes=()))
     n = round(FLOOR_S / stage.dt_s)
     y_um, _ = rested.run(rested.initial_state(), np.zeros(n))
@@ -86,8 +86,8 @@ def noise_floor_um(stage: StageConfig) -> float:
 
 def run_scenario(
     scenario: Scenario, settings: dict[str, Any] | None = None, progress: Progress = lambda _: None
-) -> Course:
-    """Run it. ``settings`` are those of an ``[axis.learner]`` table. Raises InputError on settings that are wrong."""
+) -> ScenarioRecord:
+    """Run a scenario. ``settings``: as in a table ``[axis.learner]``. Raises InputError on wrong settings."""
     model = identified(scenario.stage)
     dt = scenario.stage.dt_s
     limits = Limits(scenario.stage.u_min_V, scenario.stage.u_max_V, SLEW_V_PER_S)
@@ -127,7 +127,7 @@ def run_scenario(
         as_of = max(-1, part.start - LEAD - MARGIN)
         for name in MODELS:
             points = (wanted.y_um[part], wanted.v_um_per_s[part], wanted.a_um_per_s2[part])
-            # The samples are of the adaptive twin's stage, which the axis tracks; the other's memory travels.
+            # The axis tracks the adaptive twin's stage; the other twin sends its memory along.
             mine = name == ADAPTIVE
             pending = commanded.before(part.start) if mine else None
             query = FeedforwardQuery(*points, None if mine else memory, name, as_of, last_V[name], pending)
@@ -138,7 +138,7 @@ def run_scenario(
             else:
                 memory = reply.memory
     learner = axis.learner
-    return Course(
+    return ScenarioRecord(
         scenario=scenario,
         wanted_um=wanted.y_um[:n],
         error_um={name: wanted.y_um[:n] - y_um[name] for name in MODELS},
@@ -151,7 +151,7 @@ def run_scenario(
 
 
 def _floor(scenario: Scenario, n: int) -> FloatArray:
-    """The noise floor at every sample: it moves where a change moves the sensor's noise."""
+    """The noise floor at every sample; a change of the sensor's noise changes it."""
     floor = np.full(n, noise_floor_um(scenario.stage))
     chain = scenario.stage.effects
     for t_s, values in scenario.changes:

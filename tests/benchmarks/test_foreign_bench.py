@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks.foreign import HEAD, LINE, by_class, goals, line, main, read, table, told
-from lab.rehearsal.events import KINDS, SENSOR, draw
+from lab.rehearsal.events import EVENT_KINDS, SENSOR, draw
 from tests.foreign.plants import random_plant
 
 
@@ -18,7 +18,8 @@ def run(name: str, **given: Any) -> dict[str, Any]:
     figures = {"first_second_pct": 0.1, "settled_pct": 0.02, "ends_at_rail": False, "large_s": 0.0, "large_at_s": None}
     kind = draw(name, 1, 4.0).kind
     record = {
-        "seed": 1, "class": name, "category": KINDS[kind].category, "text": name, "event": {"kind": kind, "size": 0.06},
+        "seed": 1, "class": name, "category": EVENT_KINDS[kind].category, "text": name,
+        "event": {"kind": kind, "size": 0.06},
         "stage": {"hysteresis": "plays", "dt_s": 1e-3}, "adaptive": figures | {"first_second_pct": 0.1},
         "frozen": {"settled_pct": 0.5}, "worst_ratio": 0.5, "sensor_excess": None, "troubles": [],
         "false_troubles": [], "healthy_s": 360.0, "named_s": None, "cpu_s": 1.0,

@@ -34,9 +34,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from adaptive.online.sensor_trial import SENSOR_FAULTS
 from adaptive.types import FloatArray
 from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
-from lab.rehearsal.disturbance import Line, Message, Sensor, World
-from lab.rehearsal.identification import approach, excited
-from lab.rehearsal.reference import Excursion, Reference, Step
+from lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, MessageLine
+from lab.rehearsal.identification import excitation_range, go_to_lowest
+from lab.rehearsal.reference import Excursion, Reference, SmoothStep
 from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
 from service.protocol.query import FeedforwardQuery
@@ -80,13 +80,13 @@ class Bench:
         config = AxisConfig("x", Path("x"), known.limits, compete=("linear",), snapshot_every=BLOCK)
         self.axis = load_axis("stage", config, bundle=Bundle(dict(known.models), meta))
         self.range_um = known.high_um - known.low_um
-        self.world = World(self.range_um, 0.5 * (known.low_um + known.high_um), known.rest_um)
-        low_V, _ = excited(factory(), CONFIG)
+        self.world = EventScale(self.range_um, 0.5 * (known.low_um + known.high_um), known.rest_um)
+        low_V, _ = excitation_range(factory(), CONFIG)
         self.now: dict[str, Any] = {
             "plant": factory(), "tick": 0, "number": 1, "clock_s": 0.0, "count": 1, "newest": -1, "before_V": low_V,
             "commanded": PendingCommands(), "message": None, "gain": 1.0, "zero": 0.0,
         }  # fmt: skip
-        approach(self.now["plant"], low_V)
+        go_to_lowest(self.now["plant"], low_V)
         #: (BLOCK,) errors, shares of the range, and what was called wrong, by block since the last begin.
         self.errors: list[FloatArray] = []
         self.troubles: list[str] = []
@@ -108,7 +108,7 @@ class Bench:
         angle = np.multiply.outer(t_s, omega) + phase
         size_um = self.range_um * AMPLITUDES
         y, v, a = np.sin(angle) @ size_um, np.cos(angle) @ (size_um * omega), -np.sin(angle) @ (size_um * omega**2)
-        s, ds, dds = Step(0.0, 1.0)(t_s)
+        s, ds, dds = SmoothStep(0.0, 1.0)(t_s)
         way_um = self.world.middle_um - self.world.rest_um + y
         return Motion(self.world.rest_um + s * way_um, ds * way_um + s * v, dds * way_um + 2.0 * ds * v + s * a)
 
@@ -122,8 +122,8 @@ class Bench:
         now, axis, limits = self.now, self.axis, self.axis.limits
         blocks = max(1, round(seconds / DT_S / BLOCK))
         event = event or Event("none", "none", max(2.0, self.time_s))
-        sensor = Sensor(event, self.world, DT_S, now["tick"] + blocks * BLOCK)
-        line = Line(event, DT_S, now["number"])
+        sensor = DisturbedSensor(event, self.world, DT_S, now["tick"] + blocks * BLOCK)
+        line = MessageLine(event, DT_S, now["number"])
         step_V = limits.slew_V_per_s * DT_S * (1.0 + 1e-9)
         for _ in range(blocks):
             first = now["tick"]

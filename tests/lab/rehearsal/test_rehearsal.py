@@ -11,30 +11,30 @@ import pytest
 from adaptive.errors import InputError
 from lab.rehearsal import (
     CLASSES,
+    EVENT_KINDS,
     INTACT,
-    KINDS,
     SENSOR,
-    Course,
     Event,
     FunctionPlant,
+    LoopRecord,
     Plant,
     RandomReference,
+    ReferenceRequest,
     RehearsalConfig,
-    Wish,
     draw,
     factory_of,
     rehearse,
 )
-from lab.rehearsal.disturbance import Line, Sensor, Stand, World
-from lab.rehearsal.outcome import bridged, longest, outcome
+from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
 from lab.rehearsal.plant import run_checked
 from lab.rehearsal.reference import Excursion
-from lab.rehearsal.table import remarks, table
+from lab.rehearsal.rehearsal import remarks, table
 from service.answers.guard import Limits
 from service.protocol.samples import MAX_SEQ
 from tests.foreign.plants import issue_plant, random_plant
 
-WORLD = World(range_um=100.0, middle_um=50.0, rest_um=0.0)
+WORLD = EventScale(range_um=100.0, middle_um=50.0, rest_um=0.0)
 SHORT = RehearsalConfig(identify_s=10.0, settle_s=2.0, after_s=4.0, support=200)
 DT_S = 1e-3
 
@@ -122,7 +122,7 @@ def test_a_plant_that_does_not_move_is_told_of() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_reference_belongs_together_and_keeps_to_its_band(seed: int) -> None:
-    wish = Wish(start_um=0.0, low_um=10.0, high_um=90.0, duration_s=8.0, seed=seed)
+    wish = ReferenceRequest(start_um=0.0, low_um=10.0, high_um=90.0, duration_s=8.0, seed=seed)
     t_s = np.arange(80_000) * 1e-4
     y, v, a = RandomReference(wish)(t_s)
     assert (y[0], v[0], a[0]) == (0.0, 0.0, 0.0)
@@ -138,7 +138,7 @@ def test_the_reference_belongs_together_and_keeps_to_its_band(seed: int) -> None
 
 
 def test_an_excursion_goes_there_and_comes_back_smoothly() -> None:
-    wish = Wish(0.0, 10.0, 90.0, 8.0, 1)
+    wish = ReferenceRequest(0.0, 10.0, 90.0, 8.0, 1)
     base = RandomReference(wish)
     t_s = np.arange(8000) * 1e-3
     y, v, _ = Excursion(base, 105.0, 3.0, 4.0)(t_s)
@@ -156,10 +156,12 @@ def test_every_class_is_drawn_by_its_seed_and_says_what_it_is() -> None:
         one = draw(name, 5, 3.0)
         assert one == draw(name, 5, 3.0)
         assert one.text
-        assert one.category == KINDS[one.kind].category
+        assert one.category == EVENT_KINDS[one.kind].category
         assert json.loads(json.dumps(one.size)) == one.size
-    assert {KINDS[kind].category for kind in ("stuck", "stuck_noise", "sensor_gain", "sign", "foreign")} == {SENSOR}
-    assert {kind.category for kind in KINDS.values()} == {INTACT, SENSOR}
+    assert {EVENT_KINDS[kind].category for kind in ("stuck", "stuck_noise", "sensor_gain", "sign", "foreign")} == {
+        SENSOR
+    }
+    assert {kind.category for kind in EVENT_KINDS.values()} == {INTACT, SENSOR}
     with pytest.raises(InputError, match="some of none"):
         draw("thunder", 0, 3.0)
     with pytest.raises(InputError, match="2 s or later"):
@@ -167,7 +169,7 @@ def test_every_class_is_drawn_by_its_seed_and_says_what_it_is() -> None:
 
 
 def stood(event: Event, u_V: np.ndarray, block: int = 7) -> np.ndarray:
-    stand = Stand(Line2(), event, WORLD)
+    stand = DisturbedPlant(Line2(), event, WORLD)
     return np.concatenate([stand.run(k, u_V[k : k + block])[0] for k in range(0, u_V.size, block)])
 
 
@@ -183,7 +185,7 @@ def test_physics_are_emulated_where_the_plant_takes_none() -> None:
     steps = np.where(np.arange(4000) < 3000, 40.0, 50.0)
     lag = stood(Event("l", "lag", 2.0, 0.01), steps)
     assert lag[3011] == pytest.approx(50.0 - 10.0 * np.exp(-1.1), abs=0.1)
-    stand = Stand(Line2(), Event("p", "payload", 2.0, 1.0), WORLD)
+    stand = DisturbedPlant(Line2(), Event("p", "payload", 2.0, 1.0), WORLD)
     stand.run(0, u_V)
     assert "payload" in stand.left_out
 
@@ -191,8 +193,8 @@ def test_physics_are_emulated_where_the_plant_takes_none() -> None:
 def test_a_plant_takes_its_own_events_at_the_sample() -> None:
     factory = issue_plant(2)
     changed, plain = (
-        Stand(factory(), Event("z", "zero", 2.0, 0.1), WORLD),
-        Stand(factory(), Event("n", "none", 2.0), WORLD),
+        DisturbedPlant(factory(), Event("z", "zero", 2.0, 0.1), WORLD),
+        DisturbedPlant(factory(), Event("n", "none", 2.0), WORLD),
     )
     u_V = np.full(2500, 4.0)
     after = [np.concatenate([stand.run(k, u_V[k : k + 5])[0] for k in range(0, 2500, 5)]) for stand in (changed, plain)]
@@ -212,7 +214,7 @@ def test_a_plant_takes_its_own_events_at_the_sample() -> None:
 )
 def test_a_sensor_is_wrong_while_it_lasts_and_not_longer(kind: str, size: float, expected: Any) -> None:
     event = Event(kind, kind, 2.0, size, over_s=1.0, seed=4)
-    sensor = Sensor(event, WORLD, DT_S, 4000)
+    sensor = DisturbedSensor(event, WORLD, DT_S, 4000)
     y = 50.0 + 30.0 * np.sin(np.arange(4000) * 0.01)
     read = np.concatenate([sensor.read(k, y[k : k + 5]) for k in range(0, 4000, 5)])
     inside = slice(2000, 3000)
@@ -225,13 +227,13 @@ def test_a_sensor_is_wrong_while_it_lasts_and_not_longer(kind: str, size: float,
 
 def test_glitches_are_few_and_large_and_foreign_readings_are_another_motion() -> None:
     y = np.full(6000, 50.0)
-    spikes = Sensor(Event("s", "spikes", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
+    spikes = DisturbedSensor(Event("s", "spikes", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
     hit = np.flatnonzero(spikes)
     assert 10 <= hit.size <= 60
     assert np.abs(spikes[hit]).min() >= 0.2 * 50.0
-    bursts = Sensor(Event("b", "bursts", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
-    assert 2 <= longest(bursts != 0.0)[0] <= 16
-    foreign = Sensor(Event("f", "foreign", 2.0, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y)
+    bursts = DisturbedSensor(Event("b", "bursts", 2.0, 0.5, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y) - y
+    assert 2 <= longest_stretch(bursts != 0.0)[0] <= 16
+    foreign = DisturbedSensor(Event("f", "foreign", 2.0, over_s=3.0, seed=1), WORLD, DT_S, 6000).read(0, y)
     assert 20.0 < np.ptp(foreign[2000:5000]) < 150.0
     assert (foreign[5000:] == y[5000:]).all()
 
@@ -239,7 +241,7 @@ def test_glitches_are_few_and_large_and_foreign_readings_are_another_motion() ->
 def carried(kind: str, size: float, over_s: float = 0.0, first: int = 2000) -> Any:
     event = Event(kind, kind, 2.0, size, over_s, seed=2)
     values = np.arange(float(first), first + 5.0)
-    return Line(event, DT_S, first_number=11).carry(first, values, values)
+    return MessageLine(event, DT_S, first_number=11).carry(first, values, values)
 
 
 def test_messages_are_lost_doubled_turned_round_and_misnumbered() -> None:
@@ -265,14 +267,14 @@ def test_messages_are_lost_doubled_turned_round_and_misnumbered() -> None:
 # What comes of it.
 
 
-def course(error_um: np.ndarray, u_V: np.ndarray, trouble: np.ndarray | None = None) -> Course:
+def course(error_um: np.ndarray, u_V: np.ndarray, trouble: np.ndarray | None = None) -> LoopRecord:
     n = error_um.size
     t_s = np.arange(n) * DT_S
     wanted_um = 50.0 + 50.0 * np.sin(2.0 * np.pi * t_s)
     zero = np.zeros(n, dtype=np.int16)
     said = zero if trouble is None else trouble.astype(np.int16)
     true_um = wanted_um - error_um
-    return Course(
+    return LoopRecord(
         t_s, wanted_um, true_um, true_um, u_V, zero.astype(np.uint8), zero, ("learnt",), said, ("", "sensor_frozen"), ()
     )
 
@@ -308,10 +310,10 @@ def test_figures_are_of_the_parts_that_they_are_named_after() -> None:
 def test_what_swings_about_its_limit_is_one_stretch() -> None:
     holds = np.zeros(100, dtype=bool)
     holds[[10, 13, 17, 40]] = True
-    assert np.flatnonzero(bridged(holds, 3)).tolist() == [*range(10, 18), 40]
-    assert longest(bridged(holds, 3)) == (8, 10)
-    assert longest(bridged(holds, 30)) == (31, 10)
-    assert longest(np.zeros(5, dtype=bool)) == (0, 0)
+    assert np.flatnonzero(gaps_filled(holds, 3)).tolist() == [*range(10, 18), 40]
+    assert longest_stretch(gaps_filled(holds, 3)) == (8, 10)
+    assert longest_stretch(gaps_filled(holds, 30)) == (31, 10)
+    assert longest_stretch(np.zeros(5, dtype=bool)) == (0, 0)
     # From limit to limit, 200 times a second, to the end.
     n, quiet = 9000, np.full(9000, 5.0)
     swing = np.where(np.arange(n) >= 6000, 40.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(n) * DT_S), 0.0)

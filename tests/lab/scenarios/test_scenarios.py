@@ -12,7 +12,7 @@ import pytest
 from lab.cli import main
 from lab.scenarios.judgement import FACTOR, FLOORS, judge, table, windows
 from lab.scenarios.pictures import draw_course, draw_overview
-from lab.scenarios.run import ADAPTIVE, FROZEN, Course, noise_floor_um, run_scenario
+from lab.scenarios.run import ADAPTIVE, FROZEN, ScenarioRecord, noise_floor_um, run_scenario
 from sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
 from sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes
 from sim.stage.presets import preset
@@ -20,7 +20,9 @@ from sim.stage.presets import preset
 GATES = ("learnt", "glitch")
 
 
-def course(adaptive_um: float, frozen_um: float, floor_um: float = 0.0, at: slice = slice(6000, 6500)) -> Course:
+def course(
+    adaptive_um: float, frozen_um: float, floor_um: float = 0.0, at: slice = slice(6000, 6500)
+) -> ScenarioRecord:
     """Ten seconds of which half a second has these errors, and all else none."""
     s = replace(scenario("gain_step", 1), duration_s=10.0, change_s=5.0)
     n = 10_000
@@ -29,7 +31,7 @@ def course(adaptive_um: float, frozen_um: float, floor_um: float = 0.0, at: slic
     gate = np.zeros(n, dtype=np.int16)
     gate[7000:7003] = 1
     floor = np.full(n, max(floor_um, 1e-12))
-    return Course(s, np.zeros(n), errors, floor, {"learnt": 9997, "glitch": 3}, {}, GATES, gate)
+    return ScenarioRecord(s, np.zeros(n), errors, floor, {"learnt": 9997, "glitch": 3}, {}, GATES, gate)
 
 
 def test_every_window_counts_and_the_worst_is_found() -> None:
@@ -170,7 +172,7 @@ def test_the_command_writes_numbers_and_says_by_its_status_whether_all_held(
 
     settings_seen = []
 
-    def stand_in(chosen: Scenario, settings: object = None, progress: object = None) -> Course:
+    def stand_in(chosen: Scenario, settings: object = None, progress: object = None) -> ScenarioRecord:
         settings_seen.append(settings)
         return course(0.5 if chosen.seed == 1 else 2.0, 1.0)
 

@@ -1,0 +1,233 @@
+"""A rehearsal: identify a plant, close the loop over it through the real axis, let events happen, and tabulate them.
+
+One process, no network, no clock: the same plant, configuration and seed give the same numbers on the same machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lab.rehearsal.config import RehearsalConfig
+from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from lab.rehearsal.events import REFERENCE, SENSOR, STANDARD, Event, draw
+from lab.rehearsal.identification import IdentifiedPlant, excitation_range, go_to_lowest, identify
+from lab.rehearsal.loop import LoopRecord, idle_samples, run_adaptive, run_frozen, times
+from lab.rehearsal.outcome import LARGE_PCT, SENSOR_FACTOR, SENSOR_PCT, Outcome, outcome
+from lab.rehearsal.plant import PlantFactory
+from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
+from service.config.config import LEARN, AxisConfig
+from service.protocol.errors import FieldError
+from service.server.models import load_axis
+from service.storage.model_file import Bundle, BundleMeta
+
+#: Stage and axis name of the rehearsed axis.
+STAGE, AXIS = "rehearsal", "x"
+#: Called with the present step and its progress, 0 to 1.
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class EventRun:
+    """One event: the records of the learning and of the frozen model, and their outcome."""
+
+    event: Event
+    range_um: float
+    adaptive: LoopRecord
+    frozen: LoopRecord
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What was identified, and the runs in the order of their events."""
+
+    identified: IdentifiedPlant
+    runs: tuple[EventRun, ...]
+    seed: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form, without the records."""
+        known = self.identified
+        return {
+            "schema": 1,
+            "seed": self.seed,
+            "dt_s": known.dt_s,
+            "u_min_V": known.limits.u_min_V,
+            "u_max_V": known.limits.u_max_V,
+            "identified_low_um": known.low_um,
+            "identified_high_um": known.high_um,
+            "heldout_mae_pct": known.heldout_mae_pct,
+            "runs": [run.outcome.as_dict() | {"range_um": run.range_um} for run in self.runs],
+        }
+
+
+def standard_events(seed: int, settle_s: float, names: Sequence[str] = STANDARD) -> tuple[Event, ...]:
+    """One event of each class named (keys of ``CLASSES``), within a second after ``settle_s``, drawn with ``seed``.
+
+    Raises FieldError on an unknown name.
+    """
+    rng = np.random.default_rng([seed, 1])
+    return tuple(draw(name, seed, settle_s + float(rng.uniform(0.0, 1.0))) for name in names)
+
+
+def rehearse(
+    plant_factory: PlantFactory,
+    *,
+    config: RehearsalConfig | None = None,
+    events: Sequence[Event] | None = None,
+    seed: int = 0,
+    progress: Progress = lambda _what, _share: None,
+) -> Rehearsal:
+    """Identify a plant, then run the closed loop once for each event, learning and frozen, each on a new plant.
+
+    Parameters
+    ----------
+    plant_factory : makes the plant, at rest and always the same; see `lab.rehearsal.plant`.
+    events : what happens, one per run; None: one of each standard class, drawn with ``seed``.
+    seed : of the reference and, if ``events`` is None, of the events.
+
+    Raises FieldError if the answer of the plant is no motion, InputError if no model can be identified from it.
+    """
+    config = config or RehearsalConfig()
+    events = standard_events(seed, config.settle_s) if events is None else tuple(events)
+    known = identify(plant_factory, config, lambda share: progress("identifying", share))
+    runs = []
+    for event in events:
+
+        def say(share: float, event: Event = event) -> None:
+            progress(event.text, share)
+
+        runs.append(run_event(plant_factory, known, config, event, seed, say))
+    return Rehearsal(known, tuple(runs), seed)
+
+
+def run_event(
+    plant_factory: PlantFactory,
+    known: IdentifiedPlant,
+    config: RehearsalConfig,
+    event: Event,
+    seed: int,
+    progress: Callable[[float], None] = lambda _: None,
+) -> EventRun:
+    """The closed loop with one event. Raises as `rehearse` does."""
+    dt_s, block = known.dt_s, config.block
+    stage_span = known.high_um - known.low_um
+    # With numbers from 1 on, a snapshot falls on the last sample of a block and knows all samples so far.
+    first_number = idle_samples(dt_s, block) + 1
+    axis = load_axis(STAGE, _axis_config(known, config), bundle=_bundle(known))
+    duration_s = event.end_s + config.after_s
+    n = math.ceil(duration_s / dt_s / block) * block
+    wish = ReferenceRequest(
+        known.rest_um, known.low_um + config.band[0] * stage_span, known.low_um + config.band[1] * stage_span,
+        n * dt_s, seed,
+    )  # fmt: skip
+    reference: Reference = (config.reference or RandomReference)(wish)
+    t_s = times(n, dt_s)
+    base = reference(t_s)
+    range_um = float(np.ptp(base.y_um[round(2.0 / dt_s) :]))
+    if not range_um > 0.0:
+        raise FieldError("reference", "a constant", "a motion: errors are measured by its range")
+    wanted = base
+    if event.where == REFERENCE:
+        level_um = axis.limits.y_max_um if event.seed % 2 else axis.limits.y_min_um
+        wanted = Excursion(reference, level_um, event.at_s, event.end_s)(t_s)
+    wanted = Motion(np.clip(wanted.y_um, axis.limits.y_min_um, axis.limits.y_max_um), wanted[1], wanted[2])
+    scale = EventScale(range_um, float(0.5 * (wish.low_um + wish.high_um)), known.rest_um)
+    low_V, _ = excitation_range(plant_factory(), config)
+
+    def new_plant() -> DisturbedPlant:
+        plant = plant_factory()
+        go_to_lowest(plant, low_V)
+        return DisturbedPlant(plant, event, scale)
+
+    learning = new_plant()
+    adaptive = run_adaptive(
+        axis, learning, DisturbedSensor(event, scale, dt_s, n), MessageLine(event, dt_s, first_number), wanted, low_V,
+        block, first_number, lambda done: progress(done / n) if done % (100 * block) == 0 else None,
+    )  # fmt: skip
+    frozen = run_frozen(known.models[LEARN], new_plant(), wanted, low_V, axis.limits, block)
+    progress(1.0)
+    result = outcome(event, adaptive, frozen, range_um, axis.limits, dt_s, learning.left_out)
+    return EventRun(event, range_um, adaptive, frozen, result)
+
+
+def _axis_config(known: IdentifiedPlant, config: RehearsalConfig) -> AxisConfig:
+    return AxisConfig(
+        AXIS, Path("rehearsal"), known.limits, compete=config.compete, snapshot_every=config.snapshot_every,
+        learner=dict(config.learner),
+    )  # fmt: skip
+
+
+def _bundle(known: IdentifiedPlant) -> Bundle:
+    meta = BundleMeta(
+        STAGE, AXIS, known.dt_s, y_min_um=known.low_um, y_max_um=known.high_um,
+        u_min_V=float(known.u_V.min()), u_max_V=float(known.u_V.max()),
+    )  # fmt: skip
+    return Bundle(dict(known.models), meta)
+
+
+# --- The table
+
+#: Time above 5 % of the range that is remarked, s.
+LARGE_S = 0.1
+
+HEAD = (
+    "what happens", "before", "first 1 s", "1 to 4 s", "settled", "frozen settled", "worst 0.5 s / frozen",
+    "named after", "remarks",
+)  # fmt: skip
+
+
+def row(result: Outcome) -> tuple[str, ...]:
+    """The cells of a run."""
+    one, other = result.adaptive, result.frozen
+    text = f"{result.text} (left out)" if result.left_out else result.text
+    named = f"{result.named_s:.2f} s" if math.isfinite(result.named_s) else "not" if result.category == SENSOR else "-"
+    errors = (one.before_pct, one.first_second_pct, one.then_pct, one.settled_pct, other.settled_pct)
+    return (
+        text, *(f"{value:.3f}" for value in errors), f"{result.worst_ratio:.2f}", named, ", ".join(remarks(result))
+    )  # fmt: skip
+
+
+def remarks(result: Outcome) -> list[str]:
+    """What is wrong in a run, and what the axis reported, in words."""
+    one = result.adaptive
+    found = []
+    if one.ends_at_rail:
+        found.append("ENDS AT A RAIL")
+    if one.large_s > LARGE_S:
+        found.append(f"above {LARGE_PCT:g} % for {one.large_s:.2f} s")
+    if result.category == SENSOR and result.sensor_excess > 1.0:
+        found.append(f"steered by a wrong sensor: {result.sensor_excess:.2g} times what is in order")
+    names = [trouble.name for trouble in result.troubles]
+    return [*found, *(f"said: {name}" for name in dict.fromkeys(names))]
+
+
+def table(rehearsal: Rehearsal, markdown: bool = False) -> str:
+    """All runs as a table; ``markdown`` for a page."""
+    rows = [HEAD, *(row(run.outcome) for run in rehearsal.runs)]
+    if markdown:
+        lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+        return "\n".join([lines[0], "|" + "---|" * len(HEAD), *lines[1:]])
+    widths = [max(len(cells[i]) for cells in rows) for i in range(len(HEAD))]
+    lines = ["  ".join(_aligned(cells, widths)).rstrip() for cells in rows]
+    known = rehearsal.identified
+    lines.insert(1, "-" * len(lines[0]))
+    lines += [
+        "errors: mean absolute, % of the commanded range; identified: "
+        f"{known.low_um:.4g} to {known.high_um:.4g} µm, off by {known.heldout_mae_pct:.3f} % of the voltage span",
+        "named after: motion, s, until the axis said that the sensor is wrong; in order is then an error up to "
+        f"{SENSOR_PCT:g} % or {SENSOR_FACTOR:g} times the frozen model's",
+    ]
+    return "\n".join(lines)
+
+
+def _aligned(cells: Sequence[str], widths: Sequence[int]) -> list[str]:
+    last = len(cells) - 1
+    pairs = enumerate(zip(cells, widths, strict=True))
+    return [cell.ljust(width) if i in (0, last) else cell.rjust(width) for i, (cell, width) in pairs]
