@@ -1,27 +1,61 @@
-"""The one door to numba: typed, cached on disk, without the interpreter's lock."""
+"""Numba: the decorators of all compiled code, and the vector loops that several modules need.
+
+All compiled code is cached on disk and runs without the interpreter's lock.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+
+from adaptive.types import FloatArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compile a loop over samples or rows. IEEE order of operations is kept: results are reproducible."""
+    """Compile a loop over samples or rows. The order of operations is kept, so results are reproducible."""
     return cast(F, numba.njit(cache=True, nogil=True, fastmath=False)(function))
 
 
 def compiled_contracting(function: F) -> F:
-    """The same, with a product rounded once together with the sum that it goes into, where the processor can: half the
-    steps where all is products and sums, in order; the last bit is the processor's."""
+    """As `compiled`, but a product and the sum it enters may be fused (FMA). The last bit depends on the processor."""
     return cast(F, numba.njit(cache=True, nogil=True, fastmath={"contract"})(function))
 
 
 def compiled_reassociating(function: F) -> F:
-    """As `compiled_contracting`, with sums free to be reordered so that they vectorise; NaN and infinities keep their
-    meaning."""
+    """As `compiled_contracting`, and sums may be reordered so that they vectorise. NaN and infinities stay valid."""
     return cast(F, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))
+
+
+@compiled_reassociating
+def dot(a: FloatArray, b: FloatArray, n: int) -> float:  # pragma: no cover - compiled
+    """Scalar product of the first n elements."""
+    total = 0.0
+    for j in range(n):
+        total += a[j] * b[j]
+    return total
+
+
+#: float64 has a single dtype object, so that ``is`` is enough, and ten times as fast as ``==``.
+DOUBLE = np.dtype(np.float64)
+
+
+@compiled
+def all_finite_doubles(values: FloatArray) -> bool:  # pragma: no cover - compiled
+    """`all_finite` of contiguous (n,) float64. Another kind of array would be compiled for, which takes seconds."""
+    for i in range(values.shape[0]):  # noqa: SIM110  # a generator would not compile
+        if not math.isfinite(values[i]):
+            return False
+    return True
+
+
+def all_finite(values: FloatArray) -> bool:
+    """True where no value of an array is NaN or infinite: ``np.isfinite(values).all()`` in a third of its time."""
+    if values.flags.carray and values.ndim == 1 and values.dtype is DOUBLE:
+        return bool(all_finite_doubles(values))
+    return bool(np.isfinite(values).all())

@@ -15,14 +15,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adaptive.compiled import compiled, compiled_reassociating
+from adaptive.compiled import compiled, compiled_reassociating, dot
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
 from adaptive.state_codec import prefixed, under
-from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from adaptive.window.arithmetic import dot
-from adaptive.window.arrays import IntArray
+from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 
 # --- The compiled loops of a served inverse LSSVM: voltages and deviations of a trajectory, and its memory carried on.
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 #: What a model writes into a file: arrays and JSON scalars under flat names.
 StateDict = dict[str, Any]
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from adaptive.compiled import all_finite
 from adaptive.features import FeatureMap
-from adaptive.finite import all_finite
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftConfig, DriftFilter

@@ -10,8 +10,8 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from adaptive.compiled import all_finite
 from adaptive.errors import InputError
-from adaptive.finite import all_finite
 from adaptive.types import FloatArray, StateDict
 from baselines.fit_report import Domain
 

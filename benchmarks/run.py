@@ -43,9 +43,7 @@ def page(report: dict[str, Any]) -> str:
         ("update_over_dsymv", "ratio"),
         ("memory_pass_us", "memory"),
         ("predict_us", "predict"),
-        ("variance_us", "variance"),
         ("cholesky_update_us", "Cholesky"),
-        ("plain_update_us", "numpy"),
         ("refit_us", "refit"),
     )
     lines.append(f"{'N':>6}" + "".join(f"{title:>10}" for _, title in columns))

@@ -72,7 +72,8 @@ class LearnerConfig:
         parts = {name: asdict(getattr(self, name)) for name in names}
         flat = joined(parts)
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
-        return {**own, **flat}
+        # The file format has an entry for a choice that there no longer is; older versions read it.
+        return {**own, **flat, "solver.backend": "compiled"}
 
     @classmethod
     def from_state(cls, values: StateDict) -> LearnerConfig:
@@ -83,7 +84,7 @@ class LearnerConfig:
             admission=AdmissionConfig(**under("admission.", values)),
             drift=DriftConfig(**under("drift.", values)),
             weights=WeightConfig(**under("weights.", values)),
-            solver=SolverConfig(**under("solver.", values)),
+            solver=SolverConfig(values["solver.form"], values["solver.accuracy"]),
             envelope=EnvelopeConfig(**under("envelope.", values)),
         )
 

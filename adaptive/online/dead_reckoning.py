@@ -28,8 +28,7 @@ from adaptive.compiled import compiled
 from adaptive.features import FeatureMap, advance
 from adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
 from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
-from adaptive.window.arrays import IntArray
+from adaptive.types import FloatArray, IntArray, StateDict
 
 #: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
 STEPS, SLOPE_SHARE = 2, 1e-5

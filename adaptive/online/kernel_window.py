@@ -12,9 +12,9 @@ from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, Hyperparameters, StateDict, WindowData
+from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
 from adaptive.window import arrays as ws
-from adaptive.window.arrays import IntArray, Status
+from adaptive.window.arrays import Status
 from adaptive.window.config import SolverConfig, WindowConfig
 from adaptive.window.healing import Healing
 from adaptive.window.window import Window
@@ -83,7 +83,7 @@ class ResidualWindow:
         self.eviction: Eviction = eviction
         widths = tuple(float(w) for w in model.widths)
         s = solver or SolverConfig()
-        self._config = WindowConfig(capacity, widths, model.gamma, (), s.form, s.backend, s.accuracy)
+        self._config = WindowConfig(capacity, widths, model.gamma, s.form, s.accuracy)
         #: Variance of the kernel part away from samples, V².
         self.kernel_variance = model.kernel_variance
         self._window = Window(self._config)
@@ -203,7 +203,7 @@ class ResidualWindow:
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""
-        return self._window.X, self._window.alpha, float(self._window.arrays.beta[0])
+        return self._window.X, self._window.alpha, self._window.bias
 
     def counters(self) -> dict[str, int]:
         """Of the window's numerics."""
@@ -244,7 +244,7 @@ class ResidualWindow:
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
-        made._config = WindowConfig(c.capacity, widths, float(hyper.gamma), c.linear, c.form, c.backend, c.accuracy)
+        made._config = WindowConfig(c.capacity, widths, float(hyper.gamma), c.form, c.accuracy)
         made.kernel_variance = self.kernel_variance
         made._window = Window(made._config)
         if len(self._window):
@@ -277,7 +277,7 @@ class ResidualWindow:
         """Go on from a ``state_dict``. Raises InputError where it is of another capacity or number of inputs."""
         c = self._config
         widths = tuple(float(w) for w in values["widths"])
-        self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.linear, c.form, c.backend, c.accuracy)
+        self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.form, c.accuracy)
         self._window = Window.from_state(self._config, values)
         self._healing = Healing.from_state(self._window, under("healing.", values))
         self._born = np.array(values["born"], dtype=np.int64)

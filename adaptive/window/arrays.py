@@ -1,35 +1,37 @@
-"""The explicit state of a sliding window: plain arrays that compiled code of any module can take and step.
+"""The explicit state of a sliding window: plain arrays that compiled code takes and steps in place.
 
-A window of ``N`` slots with d features and p unpenalised coefficients is one `WindowArrays`, a tuple of
-arrays. Nothing else is hidden anywhere: copying the arrays copies the window. Only the first
-``C[COUNT]`` slots are in use. Rows of ``V``, and elements of ``F`` and ``C``, go by the names below.
+A window of N slots with d features is one `WindowArrays`, a tuple of arrays. There is no hidden state: a copy of the
+arrays is a copy of the window. Only the first ``C[COUNT]`` slots are in use. The names below index the rows of ``V``
+and ``U``, and the elements of ``F`` and ``C``.
+
+A call from Python costs some 0.15 µs for each array that it hands over, which is more than half of a prediction. The
+*handle* of a window is one array that holds the addresses and sizes of all of them.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import carray, types  # type: ignore[attr-defined]
+from numba.extending import intrinsic
 
-from adaptive.types import FloatArray
-
-IntArray = NDArray[np.int64]
+from adaptive.compiled import compiled
+from adaptive.types import FloatArray, IntArray
 
 
 class WindowArrays(NamedTuple):
-    """State of a window; see `adaptive.window.window` for what it means and `allocate` for how it starts.
+    """State of a window. R is the kernel matrix of (2.27) with the noise variances, P its inverse.
 
-    P : (N, N) lower triangle of R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS and PLUS of
-        V). In the Cholesky form the upper triangle holds L' with R = L L' in the order of ``order``; the strictly
-        lower one keeps it as it was before the last replacement, its diagonal in row PK of V.
+    P : (N, N). Inverse form: the lower triangle is R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS
+        and PLUS of V). Cholesky form: the upper triangle is L' with R = L L', in the order of ``order``; the strictly
+        lower one keeps L as it was before the last replacement, with its diagonal in row PK of V.
     R : (N, N) Omega + diag(1/(gamma w)), both triangles.
     X : (d, N) features.  scaled : (d, N) features divided by their widths.  inverse_widths : (d,).
-    H : (p, N) design.  S : (p, N) P H; in the Cholesky form L^-1 H, by position.  G : (p, p) lower factor of H'PH.
-    beta : (p,).  linear : (p - 1,) features in the linear part.
-    V : (ROWS, N) vectors.  U : (p + 4, max(N, p + d)) what `undo` needs.  F : floats.  C : counters.
-    order : (N,) slot at each position of the factor (Cholesky form).  small : (3, max(d, p)) scratch.
+    S : (N,) P 1; in the Cholesky form L^-1 1, by position.
+    V : (ROWS, N) vectors.  U : (UNDO_ROWS, max(N, 1 + d)) what a refused step restores.  F : floats.  C : counters.
+    order : (N,) slot at each position of the factor (Cholesky form).  point : (d,) scratch.
     """
 
     P: FloatArray
@@ -37,31 +39,31 @@ class WindowArrays(NamedTuple):
     X: FloatArray
     scaled: FloatArray
     inverse_widths: FloatArray
-    H: FloatArray
     S: FloatArray
-    G: FloatArray
-    beta: FloatArray
-    linear: IntArray
     V: FloatArray
     U: FloatArray
     F: FloatArray
     C: IntArray
     order: IntArray
-    small: FloatArray
+    point: FloatArray
 
 
-# Rows of V. SY is P y (Cholesky form: L^-1 y, by position); MINUS and PLUS are the pending rank-2 term; PK is
-# the column that the last replacement took out of P; DIAGONAL that of R^-1 by slot, where the Cholesky form carries it
-# along (C[CARRIED]); the rest is scratch.
+# Rows of V. Y: targets. W: noise weights. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
+# PLUS: the pending rank-2 term. PK: the column that the last replacement took out of P. DIAGONAL: that of R^-1 by slot,
+# where the Cholesky form carries it along. The others are scratch.
 Y, W, ALPHA, SY, MINUS, PLUS, COLUMN, Z, PK, BITS, TRIAL, K, DIAGONAL = range(13)
 ROWS = 13
 
-# Elements of F.
-GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, PIVOT = range(8)
-FLOATS = 8
+# Rows of U. UNDO_POINT: beta, then the features of the slot.
+UNDO_S, UNDO_SY, UNDO_ALPHA, UNDO_R, UNDO_POINT = range(5)
+UNDO_ROWS = 5
 
-# Elements of C. UNDO_PLACE: where in the factor the replaced sample stood. CARRIED: for how many more steps the
-# Cholesky form carries DIAGONAL along; 0 where it does not know it.
+# Elements of F. BETA: the bias b of (2.29). GRAM: square root of 1'P 1.
+GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, BETA, GRAM = range(9)
+FLOATS = 9
+
+# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE: position in the factor of the sample that
+# was replaced. CARRIED: number of steps for which the Cholesky form still updates DIAGONAL; 0 where it is not valid.
 (
     COUNT,
     FORM,
@@ -85,24 +87,18 @@ COUNTERS = 16
 #: The counters that add up over a window's life.
 EVENTS = slice(STEPS, UNDO_PLACE)
 
-#: Largest size of a feature or a target that is taken: they are normalised, of order 1. Of a window that has held much
-#: larger ones, all digits are theirs; with this one a step of refinement brings the others back.
+#: Largest size of a feature or a target that is taken. They are normalised, of order 1.
 MOST = 1e9
-#: gamma w, one over the noise variance of a sample: outside of these double precision has no digit for noise or kernel.
+#: Range of gamma w, one over a sample's noise variance. Outside, double precision cannot tell noise from kernel.
 LEAST_PRECISION, MOST_PRECISION = 1e-15, 1e15
-#: Least and most that targets may be scaled by at once.
-LEAST_FACTOR, MOST_FACTOR = 1e-9, 1e9
 
-#: A refinement that leaves more than this share of the residual that asked for it shows an inverse gone wrong.
+#: A refinement that leaves more than this share of the residual that called for it shows a wrong factorisation ...
 CONTRACTION = 0.5
-#: ... unless it is this small beside target and weights: where hardly more samples than linear terms are held, alpha is
-#: nearly nothing, and what is left is rounding.
+#: ... unless the residual is below this share of target and weights: then it is rounding.
 NEGLIGIBLE = 1e-13
-#: The Schur complement of a new sample is at least its noise variance 1/(gamma w); below this share of it, P is wrong.
+#: The Schur complement of a new sample is at least its noise variance 1/(gamma w). Below this share of it, P is wrong.
 SCHUR_SHARE = 0.5
-#: An unpenalised column whose pivot falls below this share is not told apart by the samples: its coefficient is 0.
-PIVOT_SHARE = 1e-11
-#: A sample without which the unpenalised part is not determined leaves nothing of its diagonal but rounding.
+#: Where a sample alone determines the bias, no more than this share of its diagonal element is left.
 UNDETERMINED = 1e-13
 #: A few units in the last place of the terms of a row's residual.
 ROUND_OFF = 1e-15
@@ -115,30 +111,26 @@ INVERSE_FORM, CHOLESKY_FORM = range(2)
 
 
 class Status(IntEnum):
-    """How a step of the window ended. All but ACCEPTED leave the window as it was."""
+    """Result of a step of the window. After all but ACCEPTED the window is as it was before."""
 
     ACCEPTED = 0
     #: A value that is not finite or larger than MOST, a weight that is not positive or whose noise is out of range.
     BAD_INPUT = 1
     #: The step would have left the finite numbers or lost positive definiteness.
     ILL_CONDITIONED = 2
-    #: No such slot: out of range, a full window appended to, an empty one shrunk.
+    #: No such slot: out of range, or no free slot in a full window.
     NO_SLOT = 3
-    #: `undo` has nothing to take back.
-    NOTHING_TO_UNDO = 4
 
 
-ACCEPTED, BAD_INPUT, ILL_CONDITIONED, NO_SLOT, NOTHING_TO_UNDO = range(5)
+ACCEPTED, BAD_INPUT, ILL_CONDITIONED, NO_SLOT = range(4)
 
 
-def allocate(
-    capacity: int, widths: FloatArray, gamma: float, linear: tuple[int, ...], tolerance: float, form: int
-) -> WindowArrays:
-    """An empty window of ``capacity`` slots. All arrays are C-ordered; nothing is allocated after this.
+def allocate(capacity: int, widths: FloatArray, gamma: float, tolerance: float, form: int) -> WindowArrays:
+    """An empty window of ``capacity`` slots. All arrays are C-ordered; steps allocate nothing.
 
     ``widths`` (d,), ``tolerance``: relative error of alpha from which a step is followed by a refinement.
     """
-    dimension, p = widths.size, 1 + len(linear)
+    dimension = widths.size
     F = np.zeros(FLOATS)
     F[GAMMA], F[TOLERANCE] = gamma, tolerance
     C = np.zeros(COUNTERS, dtype=np.int64)
@@ -149,17 +141,13 @@ def allocate(
         X=np.zeros((dimension, capacity)),
         scaled=np.zeros((dimension, capacity)),
         inverse_widths=1.0 / widths,
-        H=np.zeros((p, capacity)),
-        S=np.zeros((p, capacity)),
-        G=np.zeros((p, p)),
-        beta=np.zeros(p),
-        linear=np.array(linear, dtype=np.int64),
+        S=np.zeros(capacity),
         V=np.zeros((ROWS, capacity)),
-        U=np.zeros((p + 4, max(capacity, p + dimension))),
+        U=np.zeros((UNDO_ROWS, max(capacity, 1 + dimension))),
         F=F,
         C=C,
         order=np.arange(capacity, dtype=np.int64),
-        small=np.zeros((3, max(dimension, p))),
+        point=np.zeros(dimension),
     )
 
 
@@ -172,3 +160,56 @@ def take_over(arrays: WindowArrays, source: WindowArrays) -> None:
     """Write the state of ``source``, a window of the same sizes, into ``arrays`` in place."""
     for field, kept in zip(arrays, source, strict=True):
         field[...] = kept
+
+
+# --- The handle of a window: one array in place of all of them.
+
+_FIELDS = len(WindowArrays._fields)
+
+
+def handle_of(arrays: WindowArrays) -> IntArray:
+    """(36,) addresses of all arrays, then two sizes of each. Valid only while these arrays live: keep both together.
+
+    Raises TypeError where an array is not C-ordered float64 or int64, as `allocate` makes them.
+    """
+    handle = np.zeros(3 * _FIELDS, dtype=np.int64)
+    for i, array in enumerate(arrays):
+        if not array.flags.c_contiguous or array.dtype not in (np.float64, np.int64):
+            raise TypeError(f"{WindowArrays._fields[i]}: a C-ordered array of float64 or int64 is needed")
+        handle[i] = array.ctypes.data
+        handle[_FIELDS + 2 * i : _FIELDS + 2 * i + array.ndim] = array.shape
+    return handle
+
+
+def _to_pointer(context: Any, address: Any) -> Any:
+    def generate(target: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], target.get_value_type(types.voidptr))
+
+    return types.voidptr(types.int64), generate
+
+
+_pointer: Any = intrinsic(_to_pointer)
+
+
+@compiled
+def _matrix(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i], h[_FIELDS + 2 * i + 1]), np.float64)
+
+
+@compiled
+def _vector(h: IntArray, i: int) -> FloatArray:  # pragma: no cover - compiled
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.float64)
+
+
+@compiled
+def _integers(h: IntArray, i: int) -> IntArray:  # pragma: no cover - compiled
+    return carray(_pointer(h[i]), (h[_FIELDS + 2 * i],), np.int64)
+
+
+@compiled
+def arrays_of(h: IntArray) -> WindowArrays:  # pragma: no cover - compiled
+    """The window behind a handle, in the order of `WindowArrays`."""
+    return WindowArrays(
+        _matrix(h, 0), _matrix(h, 1), _matrix(h, 2), _matrix(h, 3), _vector(h, 4), _vector(h, 5), _matrix(h, 6),
+        _matrix(h, 7), _vector(h, 8), _integers(h, 9), _integers(h, 10), _vector(h, 11),
+    )  # fmt: skip

@@ -1,69 +1,115 @@
-"""The sliding window by the Cholesky factor R = L L': for kernels too ill-conditioned for the inverse.
+"""The Cholesky form of the window: the factor R = L L', samples out of it and into it, and the diagonal of R^-1.
 
-The sample that leaves is a rank-1 *update* of the factor behind it, a chain of rotations and hence stable;
-the sample that comes goes to the end: one forward solve. T = L^-1 [H y] goes through the same rotations, so
-that beta follows in O(N p) and alpha by one back solve. The error of alpha grows with cond(R), not with its
-square as that of the inverse does, for about twice the time.
+The sample that leaves is a rank-1 *update* of the factor behind it, a chain of rotations, which is stable. The new
+sample goes to the end of the factor, by one forward solve. T = L^-1 [1 y] (S and SY) goes through the same rotations.
+The error of alpha grows with cond(R), not with its square as in the inverse form, for about twice the time.
 
-Column j of L is row j of ``P`` (contiguous). Positions are the order of the factor, ``order`` names their
-slots: the slot a sample lies in never matters to the numerics. Rotations can't be turned back to the last bit, so a
-step first copies the factor into the triangle of P that is free.
+Column j of L is row j of ``P`` (contiguous). *Positions* are the order of the factor; ``order`` holds the slot at each
+position. The slot of a sample does not influence the numerics. Rotations cannot be reversed to the last bit, so a step
+first copies the factor into the free triangle of P.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled_reassociating
+from adaptive.compiled import compiled_reassociating, dot
 from adaptive.types import FloatArray
-from adaptive.window.arithmetic import add_scaled, dot, finite, half_norm_small, left_out, solve_small
 from adaptive.window.arrays import (
-    ACCEPTED,
-    ALPHA,
     BITS,
     CARRIED,
-    COLUMN,
     COUNT,
     CURSOR,
     DIAGONAL,
-    GAMMA,
-    ILL_CONDITIONED,
     MINUS,
     PK,
     PLUS,
-    SCHUR_SHARE,
     SY,
-    TRIAL,
-    UNDO,
-    UNDO_APPEND,
-    UNDO_NOTHING,
     UNDO_PLACE,
-    UNDO_REPLACE,
     UNDO_SLOT,
     K,
     WindowArrays,
     Y,
-    Z,
 )
-from adaptive.window.common import (
-    factor_gram,
-    keep_for_undo,
-    move_sample,
-    restore_sample,
-    restore_solution,
-    row_residual,
-    solve_linear,
-    write_sample,
-)
-from adaptive.window.passes import backward_columns, forward_columns, rotate_column, shift_columns
 
-# --- The factor of `adaptive.window.cholesky_form`: solves, a sample in and out of it, what follows from it, keeping
-# it.
+# --- The O(N²) passes over the factor.
+
+
+@compiled_reassociating
+def forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
+    """b <- L^-1 b in place, L' in the upper triangle of P[:n, :n]; two columns at a time."""
+    k = 0
+    while k + 1 < n:
+        r0, r1 = P[k], P[k + 1]
+        t0 = b[k] / r0[k]
+        t1 = (b[k + 1] - r0[k + 1] * t0) / r1[k + 1]
+        b[k] = t0
+        b[k + 1] = t1
+        a0, a1, rest = r0[k + 2 : n], r1[k + 2 : n], b[k + 2 : n]
+        for i in range(rest.shape[0]):
+            rest[i] -= a0[i] * t0 + a1[i] * t1
+        k += 2
+    if k < n:
+        b[k] /= P[k, k]
+
+
+@compiled_reassociating
+def backward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
+    """b <- L'^-1 b in place, L' in the upper triangle of P[:n, :n]; two rows at a time."""
+    k = n - 1
+    while k >= 1:
+        r0, r1 = P[k - 1], P[k]
+        s0, s1 = 0.0, 0.0
+        a0, a1, rest = r0[k + 1 : n], r1[k + 1 : n], b[k + 1 : n]
+        for i in range(rest.shape[0]):
+            s0 += a0[i] * rest[i]
+            s1 += a1[i] * rest[i]
+        b[k] = (b[k] - s1) / r1[k]
+        b[k - 1] = (b[k - 1] - s0 - r0[k] * b[k]) / r0[k - 1]
+        k -= 2
+    if k == 0:
+        r0, s0 = P[0], 0.0
+        for i in range(1, n):
+            s0 += r0[i] * b[i]
+        b[0] = (b[0] - s0) / r0[0]
+
+
+@compiled_reassociating
+def shift_columns(P: FloatArray, n: int, position: int, b: FloatArray) -> None:
+    """The columns of L before ``position`` lose that row, and take their part in b <- L^-1 b."""
+    for k in range(position):
+        row = P[k]
+        t = b[k] / row[k]
+        b[k] = t
+        a, rest = row[k + 1 : position], b[k + 1 : position]
+        for i in range(rest.shape[0]):
+            rest[i] -= a[i] * t
+        to, rest = row[position : n - 1], b[position : n - 1]
+        for i in range(rest.shape[0]):
+            to[i] = row[position + 1 + i]
+        for i in range(rest.shape[0]):
+            rest[i] -= to[i] * t
+
+
+@compiled_reassociating
+def rotate_column(
+    old: FloatArray, new: FloatArray, x: FloatArray, b: FloatArray, cosine: float, sine: float, t: float
+) -> None:
+    """One rotation of the rank-1 update over the rest of a column, and that column's part in b <- L^-1 b."""
+    for i in range(x.shape[0]):
+        before, other = old[i], x[i]
+        after = cosine * before + sine * other
+        x[i] = cosine * other - sine * before
+        new[i] = after
+        b[i] -= after * t
+
+
+# --- The factor.
 
 
 @compiled_reassociating
 def position_of(A: WindowArrays, slot: int) -> int:
-    """Where in the factor a slot stands."""
+    """Position in the factor of a slot, -1 where it has none."""
     for i in range(A.C[COUNT]):
         if A.order[i] == slot:
             return i
@@ -95,15 +141,12 @@ def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
 
     ``b`` is by position without the one that leaves. COUNT is one less afterwards.
     """
-    n, p = A.C[COUNT], A.H.shape[0]
-    x, tau = A.V[PLUS], A.small[2]
+    n, x = A.C[COUNT], A.V[PLUS]
     row = A.P[position]
     for i in range(position + 1, n):
         x[i] = row[i]
     shift_columns(A.P, n, position, b)
-    for c in range(p):
-        tau[c] = A.S[c, position]
-    tau_y = A.V[SY, position]
+    tau, tau_y = A.S[position], A.V[SY, position]
     for k in range(position + 1, n):
         old, new = A.P[k], A.P[k - 1]
         r = np.sqrt(old[k] * old[k] + x[k] * x[k])
@@ -112,10 +155,9 @@ def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
         t = b[k - 1] / r
         b[k - 1] = t
         rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
-        for c in range(p):
-            value = A.S[c, k]
-            A.S[c, k - 1] = cosine * value + sine * tau[c]
-            tau[c] = cosine * tau[c] - sine * value
+        value = A.S[k]
+        A.S[k - 1] = cosine * value + sine * tau
+        tau = cosine * tau - sine * value
         value = A.V[SY, k]
         A.V[SY, k - 1] = cosine * value + sine * tau_y
         tau_y = cosine * tau_y - sine * value
@@ -130,28 +172,10 @@ def add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
     for k in range(n):
         A.P[k, n] = half[k]
     A.P[n, n] = diagonal
-    for c in range(A.H.shape[0]):
-        A.S[c, n] = (A.H[c, slot] - dot(half, A.S[c], n)) / diagonal
+    A.S[n] = (1.0 - dot(half, A.S, n)) / diagonal
     A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
     A.order[n] = slot
     A.C[COUNT] = n + 1
-
-
-@compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G <- the factor of T_H'T_H. False where that is not finite."""
-    return factor_gram(A, A.S)
-
-
-@compiled_reassociating
-def finish(A: WindowArrays) -> bool:
-    """beta and alpha from T = L^-1 [H y]. False, with both spoilt, where they are not finite."""
-    n, t = A.C[COUNT], A.V[Z]
-    good = solve_linear(A, A.S, t)
-    backward(A, t)
-    for i in range(n):
-        A.V[ALPHA, A.order[i]] = t[i]
-    return good and finite(t, n)
 
 
 @compiled_reassociating
@@ -166,11 +190,8 @@ def keep_factor(A: WindowArrays) -> None:
 
 
 @compiled_reassociating
-def take_back(A: WindowArrays) -> None:
-    """The window as it was before the sample of UNDO_SLOT was taken out of the factor, to the last bit.
-
-    COUNT is what it was then.
-    """
+def restore_factor(A: WindowArrays) -> None:
+    """The factor and its order as `keep_factor` found them, to the last bit. COUNT is what it was then."""
     n, place = A.C[COUNT], A.C[UNDO_PLACE]
     for i in range(n):
         source, target = A.P[n - 1 - i], A.P[i, i + 1 : n]
@@ -181,31 +202,16 @@ def take_back(A: WindowArrays) -> None:
     for r in range(n - 1 - place):
         A.order[n - 1 - r] = A.order[n - 2 - r]
     A.order[place] = A.C[UNDO_SLOT]
-    restore_solution(A)
-    restore_sample(A)
-    factor_design(A)
-    A.C[UNDO] = UNDO_NOTHING
 
 
-@compiled_reassociating
-def shift_targets(A: WindowArrays, delta: FloatArray) -> None:
-    """T_y gains L^-1 delta; ``delta`` is by slot."""
-    t = A.V[TRIAL]
-    gather(A, delta, t)
-    forward(A, t)
-    add_scaled(A.V[SY], 1.0, t, A.C[COUNT])
-
-
-# --- The diagonal of R^-1 in the Cholesky form, which a factor does not know: what leave-one-out needs of it.
-#
-# From the factor alone it takes O(N³). Once known it follows a step in O(N²): with the column c = R^-1 e_k of a sample,
+# --- The diagonal of R^-1 for leave-one-out, (Pc)_ii. From the factor alone it takes O(N³). Once known it follows a
+# step in O(N²), with the column c = R^-1 e_k of the sample k:
 #
 #     it leaves:  d_i <- d_i - c_i²/c_k  (c of the factor before),
 #     it comes:   d_i <- d_i + c_i²/c_k, d_k = c_k  (c of the factor after).
 #
-# Each step that carries it along also takes one element anew from the factor, in turn, so that none is older than a
-# round of the window and errors don't add up. Where nobody asks for a round it is let go, and steps are as fast as
-# ever.
+# Each such step also computes one element anew from the factor, in turn, so that no element is older than a round of
+# the window and errors do not add up. The diagonal is dropped when nobody has asked for it for a round.
 
 
 @compiled_reassociating
@@ -237,15 +243,15 @@ def _column(A: WindowArrays, place: int, out: FloatArray) -> None:
 
 
 @compiled_reassociating
-def prepare(A: WindowArrays, place: int) -> None:
-    """Before the sample at ``place`` leaves the factor: its column, which `leave` needs, into BITS."""
+def before_leaving(A: WindowArrays, place: int) -> None:
+    """Before the sample at ``place`` leaves the factor: put its column of R^-1 into BITS."""
     if A.C[CARRIED] > 0:
         _column(A, place, A.V[BITS])
 
 
 @compiled_reassociating
-def leave(A: WindowArrays, slot: int, n: int) -> None:
-    """The sample of ``slot``, one of n, has left."""
+def after_leaving(A: WindowArrays, slot: int, n: int) -> None:
+    """Follow the diagonal after the sample of ``slot``, one of n, has left the factor."""
     if A.C[CARRIED] > 0:
         c, d = A.V[BITS], A.V[DIAGONAL]
         own = c[slot]
@@ -254,8 +260,8 @@ def leave(A: WindowArrays, slot: int, n: int) -> None:
 
 
 @compiled_reassociating
-def come(A: WindowArrays, slot: int) -> None:
-    """A sample has come, into ``slot``, at the end of the factor. One element in turn is taken anew."""
+def after_coming(A: WindowArrays, slot: int) -> None:
+    """Follow the diagonal after the sample of ``slot`` has come to the end of the factor; one element is made anew."""
     n = A.C[COUNT]
     if A.C[CARRIED] > 0:
         A.C[CARRIED] -= 1
@@ -272,8 +278,8 @@ def come(A: WindowArrays, slot: int) -> None:
 
 
 @compiled_reassociating
-def ask(A: WindowArrays) -> FloatArray:
-    """The diagonal by slot; carried along from now on for as many steps as there are samples. O(N³) if not yet."""
+def diagonal(A: WindowArrays) -> FloatArray:
+    """The diagonal of R^-1 by slot; it is carried along for the next N steps. O(N³) where it is not known yet."""
     n = A.C[COUNT]
     d: FloatArray = A.V[DIAGONAL]
     if A.C[CARRIED] == 0:
@@ -281,174 +287,3 @@ def ask(A: WindowArrays) -> FloatArray:
             d[A.order[place]] = _half_column(A, place, A.V[MINUS])
     A.C[CARRIED] = n
     return d
-
-
-@compiled_reassociating
-def _begin_to_take_out(A: WindowArrays, slot: int) -> int:
-    """Keep all that `take_back` needs. Returns the position of ``slot``."""
-    place = position_of(A, slot)
-    keep_for_undo(A, slot, UNDO_REPLACE)
-    A.C[UNDO_PLACE] = place
-    keep_factor(A)
-    prepare(A, place)
-    return place
-
-
-@compiled_reassociating
-def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    """The sample of ``slot`` makes way for a new one whose kernel column is in COLUMN. Returns a status."""
-    n = A.C[COUNT]
-    column, half = A.V[COLUMN], A.V[TRIAL]
-    place = _begin_to_take_out(A, slot)
-    for i in range(place):
-        half[i] = column[A.order[i]]
-    for i in range(place + 1, n):
-        half[i - 1] = column[A.order[i]]
-    delete(A, place, half)
-    noise = 1.0 / (A.F[GAMMA] * w)
-    s = 1.0 + noise - dot(half, half, n - 1)
-    good = s > SCHUR_SHARE * noise
-    if good:
-        A.C[COUNT] = n
-        write_sample(A, slot, x, y, w)
-        A.C[COUNT] = n - 1
-        add(A, slot, half, np.sqrt(s))
-        good = finish(A)
-    if not good:
-        A.C[COUNT] = n
-        take_back(A)
-        return ILL_CONDITIONED
-    leave(A, slot, n)
-    come(A, slot)
-    return ACCEPTED
-
-
-@compiled_reassociating
-def undo(A: WindowArrays) -> None:
-    """Take back the last replace or append, to the last bit; the caller has seen that there is one."""
-    if A.C[UNDO] == UNDO_REPLACE:
-        take_back(A)
-    else:
-        A.C[COUNT] -= 1
-        restore_solution(A)
-        factor_design(A)
-        A.C[UNDO] = UNDO_NOTHING
-    A.C[CARRIED] = 0
-
-
-@compiled_reassociating
-def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    """A new slot takes a sample whose kernel column is in COLUMN. Returns a status."""
-    n = A.C[COUNT]
-    half = A.V[TRIAL]
-    gather(A, A.V[COLUMN], half)
-    forward(A, half)
-    noise = 1.0 / (A.F[GAMMA] * w)
-    s = 1.0 + noise - dot(half, half, n)
-    if not s > SCHUR_SHARE * noise:
-        return ILL_CONDITIONED
-    keep_for_undo(A, n, UNDO_APPEND)
-    write_sample(A, n, x, y, w)
-    add(A, n, half, np.sqrt(s))
-    if not finish(A):
-        undo(A)
-        return ILL_CONDITIONED
-    come(A, n)
-    return ACCEPTED
-
-
-@compiled_reassociating
-def remove(A: WindowArrays, slot: int) -> int:
-    """Empty a slot; the last slot's sample moves into it. Returns a status."""
-    last = A.C[COUNT] - 1
-    scratch = A.V[TRIAL]
-    place = _begin_to_take_out(A, slot)
-    for i in range(last + 1):
-        scratch[i] = 0.0
-    delete(A, place, scratch)
-    if not finish(A):
-        A.C[COUNT] = last + 1
-        take_back(A)
-        return ILL_CONDITIONED
-    leave(A, slot, last + 1)
-    if slot != last:
-        A.C[COUNT] = last + 1
-        move_sample(A, last, slot)
-        A.C[COUNT] = last
-        A.order[position_of(A, last)] = slot
-        A.V[ALPHA, slot] = A.V[ALPHA, last]
-        A.V[DIAGONAL, slot] = A.V[DIAGONAL, last]
-    A.C[UNDO] = UNDO_NOTHING
-    return ACCEPTED
-
-
-@compiled_reassociating
-def resum(A: WindowArrays) -> bool:
-    """T = L^-1 [H y] anew, and all that follows from it. O(N² p)."""
-    for c in range(A.H.shape[0]):
-        gather(A, A.H[c], A.S[c])
-        forward(A, A.S[c])
-    gather(A, A.V[Y], A.V[SY])
-    forward(A, A.V[SY])
-    return finish(A)
-
-
-@compiled_reassociating
-def refine(A: WindowArrays) -> bool:
-    """T anew, and one step of iterative refinement on beta and alpha, by R as it is kept. O(N² p)."""
-    n, p = A.C[COUNT], A.H.shape[0]
-    good = resum(A)
-    t, correction = A.V[MINUS], A.small[2, :p]
-    for i in range(n):
-        t[i] = row_residual(A, A.order[i])
-    forward(A, t)
-    for c in range(p):
-        correction[c] = dot(A.S[c], t, n)
-    solve_small(A.G, correction)
-    for c in range(p):
-        add_scaled(t, -correction[c], A.S[c], n)
-        A.beta[c] += correction[c]
-    backward(A, t)
-    for i in range(n):
-        A.V[ALPHA, A.order[i]] += t[i]
-    return good and finite(A.beta, p) and finite(A.V[ALPHA], n)
-
-
-@compiled_reassociating
-def variance(A: WindowArrays, k: FloatArray, u: FloatArray) -> float:
-    """1 - k'Pk + u'G^-1 u with the design row h of the point in ``u``, which is overwritten. In units of scale."""
-    n, half = A.C[COUNT], A.V[MINUS]
-    gather(A, k, half)
-    forward(A, half)
-    latent = 1.0 - dot(half, half, n)
-    for c in range(u.shape[0]):
-        u[c] -= dot(A.S[c], half, n)
-    return max(latent + half_norm_small(A.G, u), 0.0)
-
-
-@compiled_reassociating
-def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """alpha_i / (P_ii - S_i G^-1 S_i') into ``out``. O(N² p) where the diagonal of P is carried along, else O(N³).
-
-    S_i G^-1 S_i' is the sum of squares of row i of L'^-1 T g'^-1, with g the factor of G.
-    """
-    n, p, t, u = A.C[COUNT], A.H.shape[0], A.V[TRIAL], A.small[1]
-    d = ask(A)
-    for i in range(n):
-        out[i] = d[i]
-    for c in range(p):
-        for r in range(n):
-            t[r] = 0.0
-        for k in range(c + 1):
-            r = c - k
-            u[r] = 1.0 if k == 0 else 0.0
-            for j in range(r + 1, c + 1):
-                u[r] -= A.G[j, r] * u[j]
-            # A column that the samples do not tell apart has no part in it.
-            u[r] = u[r] / A.G[r, r] if A.G[r, r] > 0.0 and A.G[c, c] > 0.0 else 0.0
-            add_scaled(t, u[r], A.S[r], n)
-        backward(A, t)
-        for i in range(n):
-            out[A.order[i]] -= t[i] * t[i]
-    for i in range(n):
-        out[i] = left_out(A.V[ALPHA, i], d[i], out[i])

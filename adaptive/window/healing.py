@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import NumericsError
-from adaptive.types import StateDict
+from adaptive.types import IntArray, StateDict
 from adaptive.window import arrays as ws
-from adaptive.window.arrays import IntArray
+from adaptive.window import steps
 from adaptive.window.window import Window
 
 # --- Refreshing a window's factorisation beside its work: begin, factor elsewhere, catch up, swap.
@@ -26,7 +26,7 @@ from adaptive.window.window import Window
 
 
 #: What a factorisation is made from; factoring does not write to these.
-_FIELDS = ("R", "X", "scaled", "H")
+_FIELDS = ("R", "X", "scaled")
 
 
 class Refresh:
@@ -65,7 +65,7 @@ class Refresh:
         catch-up refused.
         """
         n, source, copy = len(self._source), self._source.arrays, self._copy
-        if not self._factored or n < self._count or source.C[ws.FORM] != self._form:
+        if not self._factored or source.C[ws.FORM] != self._form:
             return False
         y, w = source.V[ws.Y], source.V[ws.W]
         for slot in self.changed_slots():
@@ -78,7 +78,7 @@ class Refresh:
         copy.arrays.C[ws.CURSOR : ws.UNDO_PLACE] = source.C[ws.CURSOR : ws.UNDO_PLACE]
         copy.arrays.C[ws.REFRESHES] += 1
         copy.arrays.F[ws.RESIDUAL : ws.LAST_WORST + 1] = source.F[ws.RESIDUAL : ws.LAST_WORST + 1]
-        if not copy.resum():
+        if not steps.resum(copy.arrays):
             return False
         copy.arrays.C[ws.UNDO] = ws.UNDO_NOTHING
         self._source.arrays = copy.arrays

@@ -1,64 +1,141 @@
-"""The sliding window by the inverse P = R^-1: one kernel column and one fused pass over one triangle a step.
+"""The inverse form of the window: products with P = R^-1, of which only the lower triangle is stored.
 
-Replacing slot k, with the new kernel column b (b_k := 0) and p = P e_k:
-
-    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/(gamma w) - b'q,  q_k := -1,
-    P <- P - p p'/p_kk + q q'/s.
-
-The rank-2 term of a step stays *pending* until the next one and is then applied in the same pass over
-memory that computes z: P is read and written once a step, one triangle of it. A step that turns out bad is
-refused by not adopting its pending term, which makes rolling back free. S = P H and Sy = P y ride along in
-O(N p). Only one triangle exists, so that P can't lose its symmetry, which is what makes such recursions explode.
+The rank-2 change of P that a step brings stays *pending*, as the vectors m (MINUS) and q (PLUS), until the next step
+multiplies by P. One pass over the triangle then applies the change and multiplies, so that P is read and written once
+a step. A step is refused by dropping its pending term. With a single triangle P cannot lose its symmetry, which is
+what makes such recursions diverge.
 """
 
 from __future__ import annotations
 
-import numpy as np
-
-from adaptive.compiled import compiled_reassociating
+from adaptive.compiled import compiled_reassociating, dot
 from adaptive.types import FloatArray
-from adaptive.window.arithmetic import add_scaled, dot, half_norm_small, left_out
-from adaptive.window.arrays import (
-    ACCEPTED,
-    ALPHA,
-    COLUMN,
-    COUNT,
-    GAMMA,
-    ILL_CONDITIONED,
-    MINUS,
-    PENDING,
-    PK,
-    PLUS,
-    SCHUR_SHARE,
-    SY,
-    TRIAL,
-    UNDO,
-    UNDO_APPEND,
-    UNDO_NOTHING,
-    UNDO_REPLACE,
-    UNDO_SLOT,
-    WindowArrays,
-    Y,
-    Z,
-)
-from adaptive.window.common import (
-    factor_gram,
-    keep_for_undo,
-    move_sample,
-    restore_sample,
-    restore_solution,
-    solve_linear,
-    write_sample,
-)
-from adaptive.window.passes import advance, product, quadratic
+from adaptive.window.arrays import COUNT, MINUS, PENDING, PLUS, UNDO, UNDO_NOTHING, WindowArrays
 
-# --- What a step of `adaptive.window.inverse_form` is made of: products with P and what is pending, S and Sy, columns
-# of P.
+#: From this size on four rows at a time are faster than two.
+_FOUR_ROWS = 400
+
+# --- The O(N²) passes over the triangle. Two or four rows go together, so that the vectors beside the matrix are read
+# once for all of them. The order of the sums is fixed. Inner loops run from 0, some over slices: an index that could
+# be negative would be checked for wrapping round, and the loop would not vectorise.
+
+
+@compiled_reassociating
+def advance(P: FloatArray, n: int, m: FloatArray, q: FloatArray, b: FloatArray, z: FloatArray) -> None:
+    """P <- P - m m' + q q' and z <- P b with the new P, in one pass over its lower triangle, [:n, :n].
+
+    Written out in one function: a call for each group of rows would cost a third of the time at N = 500.
+    """
+    for i in range(n):
+        z[i] = 0.0
+    i = 0
+    if n >= _FOUR_ROWS:
+        while i + 3 < n:
+            m0, q0, b0, s0 = -m[i], q[i], b[i], 0.0
+            m1, q1, b1, s1 = -m[i + 1], q[i + 1], b[i + 1], 0.0
+            m2, q2, b2, s2 = -m[i + 2], q[i + 2], b[i + 2], 0.0
+            m3, q3, b3, s3 = -m[i + 3], q[i + 3], b[i + 3], 0.0
+            r0, r1, r2, r3 = P[i], P[i + 1], P[i + 2], P[i + 3]
+            for j in range(i):
+                mj, qj, bj = m[j], q[j], b[j]
+                v0 = r0[j] + m0 * mj + q0 * qj
+                v1 = r1[j] + m1 * mj + q1 * qj
+                v2 = r2[j] + m2 * mj + q2 * qj
+                v3 = r3[j] + m3 * mj + q3 * qj
+                r0[j] = v0
+                r1[j] = v1
+                r2[j] = v2
+                r3[j] = v3
+                s0 += v0 * bj
+                s1 += v1 * bj
+                s2 += v2 * bj
+                s3 += v3 * bj
+                z[j] += v0 * b0 + v1 * b1 + v2 * b2 + v3 * b3
+            z[i] += s0
+            z[i + 1] += s1
+            z[i + 2] += s2
+            z[i + 3] += s3
+            for k in range(i, i + 4):
+                for j in range(i, k + 1):
+                    v = P[k, j] - m[k] * m[j] + q[k] * q[j]
+                    P[k, j] = v
+                    z[k] += v * b[j]
+                    if j < k:
+                        z[j] += v * b[k]
+            i += 4
+    while i + 1 < n:
+        m0, q0, b0, s0 = -m[i], q[i], b[i], 0.0
+        m1, q1, b1, s1 = -m[i + 1], q[i + 1], b[i + 1], 0.0
+        r0, r1 = P[i], P[i + 1]
+        for j in range(i):
+            mj, qj, bj = m[j], q[j], b[j]
+            v0 = r0[j] + m0 * mj + q0 * qj
+            v1 = r1[j] + m1 * mj + q1 * qj
+            r0[j] = v0
+            r1[j] = v1
+            s0 += v0 * bj
+            s1 += v1 * bj
+            z[j] += v0 * b0 + v1 * b1
+        v0 = r0[i] + m0 * m[i] + q0 * q[i]
+        v1 = r1[i] + m1 * m[i] + q1 * q[i]
+        v2 = r1[i + 1] + m1 * m[i + 1] + q1 * q[i + 1]
+        r0[i] = v0
+        r1[i] = v1
+        r1[i + 1] = v2
+        z[i] += s0 + v0 * b0 + v1 * b1
+        z[i + 1] += s1 + v1 * b0 + v2 * b1
+        i += 2
+    if i < n:
+        m0, q0, b0, s0 = -m[i], q[i], b[i], 0.0
+        r0 = P[i]
+        for j in range(i):
+            v0 = r0[j] + m0 * m[j] + q0 * q[j]
+            r0[j] = v0
+            s0 += v0 * b[j]
+            z[j] += v0 * b0
+        v0 = r0[i] + m0 * m[i] + q0 * q[i]
+        r0[i] = v0
+        z[i] += s0 + v0 * b0
+
+
+@compiled_reassociating
+def product(P: FloatArray, n: int, b: FloatArray, z: FloatArray) -> None:
+    """z <- P b from the lower triangle of P[:n, :n]; P is only read."""
+    for i in range(n):
+        z[i] = 0.0
+    i = 0
+    while i + 1 < n:
+        b0, b1, s0, s1 = b[i], b[i + 1], 0.0, 0.0
+        r0, r1 = P[i], P[i + 1]
+        for j in range(i):
+            s0 += r0[j] * b[j]
+            s1 += r1[j] * b[j]
+            z[j] += r0[j] * b0 + r1[j] * b1
+        z[i] += s0 + r0[i] * b0 + r1[i] * b1
+        z[i + 1] += s1 + r1[i] * b0 + r1[i + 1] * b1
+        i += 2
+    if i < n:
+        b0, s0 = b[i], 0.0
+        r0 = P[i]
+        for j in range(i):
+            s0 += r0[j] * b[j]
+            z[j] += r0[j] * b0
+        z[i] += s0 + r0[i] * b0
+
+
+# --- P with its pending change.
+
+
+@compiled_reassociating
+def add_scaled(a: FloatArray, factor: float, b: FloatArray, n: int) -> None:
+    """a <- a + factor b over the first n elements."""
+    for j in range(n):
+        a[j] += factor * b[j]
 
 
 @compiled_reassociating
 def multiply(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
-    """Apply what is pending, and z <- P b over the slots in use. The last step can't be undone after this."""
+    """Apply the pending change, and z <- P b over the slots in use. The last step can't be undone after this."""
     n = A.C[COUNT]
     minus, plus = A.V[MINUS], A.V[PLUS]
     if A.C[PENDING] != 0:
@@ -73,19 +150,8 @@ def multiply(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
 
 
 @compiled_reassociating
-def flush(A: WindowArrays) -> None:
-    """Apply what is pending; P is then R^-1 itself."""
-    if A.C[PENDING] != 0:
-        trial = A.V[TRIAL]
-        for j in range(A.C[COUNT]):
-            trial[j] = 0.0
-        multiply(A, trial, A.V[Z])
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
 def solve(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
-    """z <- R^-1 b without applying what is pending."""
+    """z <- R^-1 b. The pending change is taken into account, but stays pending."""
     n = A.C[COUNT]
     product(A.P, n, b, z)
     if A.C[PENDING] != 0:
@@ -95,20 +161,8 @@ def solve(A: WindowArrays, b: FloatArray, z: FloatArray) -> None:
 
 
 @compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G <- the factor of H'PH. False where that is not finite."""
-    return factor_gram(A, A.H)
-
-
-@compiled_reassociating
-def finish(A: WindowArrays) -> bool:
-    """beta and alpha from S and Sy, (2.29). False, with both spoilt, where they are not finite."""
-    return solve_linear(A, A.H, A.V[ALPHA])
-
-
-@compiled_reassociating
 def lift_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """p <- P e_slot, and zero that row and column: the pass then writes the new ones exactly."""
+    """p <- P e_slot, and set that row and column to zero: the next pass then writes the new ones exactly."""
     n, row = A.C[COUNT], A.P[slot]
     for j in range(slot + 1):
         p[j] = row[j]
@@ -120,7 +174,7 @@ def lift_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
 
 @compiled_reassociating
 def lower_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """Write a lifted column back."""
+    """Write back a column that `lift_column` took out."""
     for j in range(slot + 1):
         A.P[slot, j] = p[j]
     for i in range(slot + 1, A.C[COUNT]):
@@ -128,208 +182,10 @@ def lower_column(A: WindowArrays, slot: int, p: FloatArray) -> None:
 
 
 @compiled_reassociating
-def take_out(A: WindowArrays, slot: int, p: FloatArray) -> None:
-    """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
-    n = A.C[COUNT]
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], -A.S[c, slot] / p[slot], p, n)
-        A.S[c, slot] = 0.0
-    add_scaled(A.V[SY], -A.V[SY, slot] / p[slot], p, n)
-    A.V[SY, slot] = 0.0
-
-
-@compiled_reassociating
-def take_in(A: WindowArrays, slot: int, q: FloatArray, s: float) -> None:
-    """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
-    n = A.C[COUNT]
-    for c in range(A.H.shape[0]):
-        add_scaled(A.S[c], dot(q, A.H[c], n) / s, q, n)
-    add_scaled(A.V[SY], dot(q, A.V[Y], n) / s, q, n)
-
-
-@compiled_reassociating
-def pend(target: FloatArray, source: FloatArray, scale: float, n: int) -> None:
-    for j in range(n):
-        target[j] = source[j] * scale
-
-
-@compiled_reassociating
-def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
-    """The sample of ``slot`` makes way for a new one whose kernel column is in COLUMN. Returns a status."""
-    n = A.C[COUNT]
-    b, z, p, q = A.V[COLUMN], A.V[Z], A.V[PK], A.V[TRIAL]
-    b[slot] = 0.0
-    multiply(A, b, z)
-    keep_for_undo(A, slot, UNDO_REPLACE)
-    lift_column(A, slot, p)
-    pkk = p[slot]
-    factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
-    for j in range(n):
-        q[j] = z[j] - factor * p[j]
-    q[slot] = 0.0
-    noise = 1.0 / (A.F[GAMMA] * w)
-    s = 1.0 + noise - dot(b, q, n)
-    # What P gains and loses on its diagonal bounds what it does elsewhere.
-    good = pkk > 0.0 and s > SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
-    if good:
-        q[slot] = -1.0
-        take_out(A, slot, p)
-        write_sample(A, slot, x, y, w)
-        take_in(A, slot, q, s)
-        good = finish(A)
-    if not good:
-        # write_sample may not have run: restoring writes the same values again.
-        restore_solution(A)
-        restore_sample(A)
-        factor_design(A)
-        lower_column(A, slot, p)
-        A.C[UNDO] = UNDO_NOTHING
-        return ILL_CONDITIONED
-    pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
-    A.V[MINUS, slot] = 0.0
-    pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n)
-    A.C[PENDING] = 1
-    return ACCEPTED
-
-
-@compiled_reassociating
-def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
-    """A new slot takes a sample whose kernel column is in COLUMN. Returns a status."""
-    n = A.C[COUNT]
-    b, q = A.V[COLUMN], A.V[TRIAL]
-    multiply(A, b, q)
-    noise = 1.0 / (A.F[GAMMA] * w)
-    s = 1.0 + noise - dot(b, q, n)
-    keep_for_undo(A, n, UNDO_APPEND)
-    good = s > SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
-    if good:
-        q[n] = -1.0
-        for c in range(A.H.shape[0]):
-            A.S[c, n] = 0.0
-        A.V[SY, n] = 0.0
-        for j in range(n + 1):
-            A.P[n, j] = 0.0
-        write_sample(A, n, x, y, w)
-        A.C[COUNT] = n + 1
-        take_in(A, n, q, s)
-        good = finish(A)
-        A.C[COUNT] = n
-    if not good:
-        restore_solution(A)
-        factor_design(A)
-        A.C[UNDO] = UNDO_NOTHING
-        return ILL_CONDITIONED
-    A.C[COUNT] = n + 1
-    for j in range(n + 1):
-        A.V[MINUS, j] = 0.0
-    pend(A.V[PLUS], q, 1.0 / np.sqrt(s), n + 1)
-    A.C[PENDING] = 1
-    return ACCEPTED
-
-
-@compiled_reassociating
-def undo(A: WindowArrays) -> None:
-    """Take back the last replace or append; the caller has seen that there is one."""
-    kind, slot = A.C[UNDO], A.C[UNDO_SLOT]
-    if kind == UNDO_APPEND:
-        A.C[COUNT] -= 1
-    restore_solution(A)
-    if kind == UNDO_REPLACE:
-        restore_sample(A)
-        lower_column(A, slot, A.V[PK])
-    factor_design(A)
-    for j in range(A.C[COUNT]):
-        A.V[MINUS, j] = 0.0
-        A.V[PLUS, j] = 0.0
-    A.C[PENDING] = 0
-    A.C[UNDO] = UNDO_NOTHING
-
-
-@compiled_reassociating
-def remove(A: WindowArrays, slot: int) -> int:
-    """Empty a slot; the last slot's sample moves into it. Returns a status."""
-    flush(A)
-    n, p = A.C[COUNT], A.V[PK]
-    keep_for_undo(A, slot, UNDO_NOTHING)
-    lift_column(A, slot, p)
-    pkk = p[slot]
-    good = pkk > 0.0 and np.isfinite(dot(p, p, n) / pkk)
-    if good:
-        take_out(A, slot, p)
-        good = finish(A)
-    if not good:
-        restore_solution(A)
-        factor_design(A)
-        lower_column(A, slot, p)
-        return ILL_CONDITIONED
-    pend(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
-    A.V[MINUS, slot] = 0.0
-    A.C[PENDING] = 1
-    flush(A)
-    last = n - 1
-    if slot != last:
-        own = A.P[last, last]
-        for j in range(slot):
-            A.P[slot, j] = A.P[last, j]
-        for i in range(slot + 1, last):
-            A.P[i, slot] = A.P[last, i]
-        A.P[slot, slot] = own
-        for c in range(A.H.shape[0]):
-            A.S[c, slot] = A.S[c, last]
-        A.V[SY, slot] = A.V[SY, last]
-        A.V[ALPHA, slot] = A.V[ALPHA, last]
-        move_sample(A, last, slot)
-    for j in range(n):
-        A.P[last, j] = 0.0
-    A.C[COUNT] = last
-    return ACCEPTED
-
-
-@compiled_reassociating
-def refine(A: WindowArrays) -> bool:
-    """One step of iterative refinement on S, Sy and with them on beta and alpha, by R as it is kept. O(N² p)."""
-    n, p = A.C[COUNT], A.H.shape[0]
-    residual, z = A.V[COLUMN], A.V[Z]
-    for c in range(p + 1):
-        known = A.H[c] if c < p else A.V[Y]
-        unknown = A.S[c] if c < p else A.V[SY]
-        for i in range(n):
-            residual[i] = known[i] - dot(A.R[i], unknown, n)
-        solve(A, residual, z)
-        add_scaled(unknown, 1.0, z, n)
-    return finish(A)
-
-
-@compiled_reassociating
-def resum(A: WindowArrays) -> bool:
-    """S = P H and Sy = P y anew, and all that follows from them. O(N² p)."""
-    for c in range(A.H.shape[0]):
-        solve(A, A.H[c], A.S[c])
-    solve(A, A.V[Y], A.V[SY])
-    return finish(A)
-
-
-@compiled_reassociating
-def variance(A: WindowArrays, k: FloatArray, u: FloatArray) -> float:
-    """1 - k'Pk + u'G^-1 u with the design row h of the point in ``u``, which is overwritten. In units of scale."""
-    n = A.C[COUNT]
-    latent = 1.0 - quadratic(A.P, n, k)
-    if A.C[PENDING] != 0:
-        latent += dot(A.V[MINUS], k, n) ** 2 - dot(A.V[PLUS], k, n) ** 2
-    for c in range(u.shape[0]):
-        u[c] -= dot(A.S[c], k, n)
-    return max(latent + half_norm_small(A.G, u), 0.0)
-
-
-@compiled_reassociating
-def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """alpha_i / (P_ii - S_i G^-1 S_i') into ``out``."""
-    p = A.H.shape[0]
-    u = A.small[1, :p]
+def diagonal(A: WindowArrays, out: FloatArray) -> None:
+    """out <- the diagonal of R^-1 by slot, the pending change included."""
+    P, minus, plus, pending = A.P, A.V[MINUS], A.V[PLUS], A.C[PENDING] != 0
     for i in range(A.C[COUNT]):
-        diagonal = A.P[i, i]
-        if A.C[PENDING] != 0:
-            diagonal += A.V[PLUS, i] ** 2 - A.V[MINUS, i] ** 2
-        for c in range(p):
-            u[c] = A.S[c, i]
-        out[i] = left_out(A.V[ALPHA, i], diagonal, diagonal - half_norm_small(A.G, u))
+        out[i] = P[i, i]
+        if pending:
+            out[i] += plus[i] ** 2 - minus[i] ** 2

@@ -1,208 +1,537 @@
-"""One compiled step of either form of the window, with its checks: what `Window` and other compiled code call.
+"""The steps of the sliding window, compiled: its prediction, and one sample in, out, or with another weight.
 
-Every function takes the window's arrays and returns a status (`window_state.Status`) or a number. Nothing
-allocates, nothing raises, and no step leaves the window non-finite: one that would is refused, counted and taken back.
-What it holds and its solution are then what they were to the last bit; so is the factor of the Cholesky form, while
-the inverse form's P may have taken in the rank-2 term that was pending, which is its value but for rounding.
+Replacing slot k in the inverse form, with the kernel column b of the new sample (b_k := 0) and p = P e_k:
+
+    z = P b,  q = z - p (p'b)/p_kk,  q_k := 0,  s = 1 + 1/(gamma w) - b'q,  q_k := -1,
+    P <- P - p p'/p_kk + q q'/s.
+
+S = P 1 and Sy = P y follow in O(N). The solution is (2.29): b = 1'Sy/(1'S) and alpha = Sy - b S. The Cholesky form is
+described in `adaptive.window.cholesky_form`.
+
+Every function takes the arrays of the window and returns a `Status` as int, or a number. Nothing allocates and nothing
+raises. A step that would leave the finite numbers is refused, counted and taken back: samples, alpha and bias are then
+what they were to the last bit, and so is the factor of the Cholesky form. P of the inverse form may have taken in the
+rank-2 term that was pending, so that it is the same up to rounding.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled_reassociating
-from adaptive.types import FloatArray
+from adaptive.compiled import compiled, compiled_reassociating, dot
+from adaptive.kernels import rbf_column
+from adaptive.types import FloatArray, IntArray
 from adaptive.window import cholesky_form as cholesky
 from adaptive.window import inverse_form as inverse
-from adaptive.window.arithmetic import add_scaled, bounded, dot
 from adaptive.window.arrays import (
     ACCEPTED,
     ALPHA,
     BAD_INPUT,
     BAD_INPUTS,
+    BETA,
+    BITS,
+    CARRIED,
     COLUMN,
     CONTRACTION,
     COUNT,
     CURSOR,
     FORM,
+    GAMMA,
+    GRAM,
     ILL_CONDITIONED,
     ILL_STEPS,
     INVERSE_FORM,
     LAST_WORST,
-    LEAST_FACTOR,
+    LEAST_PRECISION,
+    MINUS,
     MOST,
-    MOST_FACTOR,
+    MOST_PRECISION,
     NEGLIGIBLE,
     NO_SLOT,
-    NOTHING_TO_UNDO,
+    PENDING,
+    PK,
+    PLUS,
     REFINEMENTS,
     RESIDUAL,
+    RESIDUALS_EXCEEDED,
+    ROUND_OFF,
     ROUND_WORST,
     ROUNDS,
+    SCHUR_SHARE,
     STEPS,
     SY,
+    TOLERANCE,
+    TRIAL,
+    UNDETERMINED,
     UNDO,
+    UNDO_ALPHA,
+    UNDO_APPEND,
     UNDO_NOTHING,
-    UNDONE,
+    UNDO_PLACE,
+    UNDO_POINT,
+    UNDO_R,
+    UNDO_REPLACE,
+    UNDO_S,
+    UNDO_SLOT,
+    UNDO_SY,
+    UNDO_W,
+    UNDO_Y,
     K,
+    W,
     WindowArrays,
     Y,
     Z,
-)
-from adaptive.window.common import (
-    acceptable,
-    acceptable_weight,
-    design_value,
-    keep_for_undo,
-    kernel_column,
-    restore_solution,
-    rotate_residual,
-    row_residual,
+    arrays_of,
 )
 
-# --- What either form of the window answers: means, variances, leave-one-out residuals, what is left of its rows.
+# --- The kernel column of a point, and what the window predicts there.
+
+
+@compiled_reassociating
+def kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
+    """K, (2.31), of the samples in use with the point ``x`` (d,) into ``out`` (N,)."""
+    for i in range(A.X.shape[0]):
+        A.point[i] = x[i] * A.inverse_widths[i]
+    rbf_column(A.scaled, A.C[COUNT], A.point, out, A.V[BITS])
 
 
 @compiled_reassociating
 def predict(A: WindowArrays, x: FloatArray) -> float:
-    """Mean at one point. O(N d). Its scratch is the window's: one thread at a time."""
+    """Mean at one point, (2.32). O(N d). Its scratch is the window's: one thread at a time."""
     k = A.V[K]
     kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
-    for c in range(A.beta.shape[0]):
-        mean += A.beta[c] * design_value(A, x, c)
+    mean: float = dot(k, A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
     return mean
+
+
+@compiled
+def predict_by_handle(handle: IntArray, x: FloatArray) -> float:  # pragma: no cover - compiled
+    """`predict` of the window behind a handle."""
+    return predict(arrays_of(handle), x)
+
+
+@compiled_reassociating
+def nearest(A: WindowArrays, x: FloatArray) -> tuple[int, float]:
+    """Slot of the sample with the largest kernel value to ``x`` (d,), and that value; (-1, 0) while it is empty."""
+    n, k = A.C[COUNT], A.V[K]
+    kernel_column(A, x, k)
+    slot, most = -1, -1.0
+    for j in range(n):
+        if k[j] > most:
+            slot, most = j, k[j]
+    return slot, max(most, 0.0)
 
 
 @compiled_reassociating
 def scale(A: WindowArrays) -> float:
-    """Variance of the kernel process by its likelihood, y'alpha/(N - p): the unit of variances; 0 while N <= p."""
-    n, p = A.C[COUNT], A.beta.shape[0]
-    if n <= p:
+    """Variance of the kernel process by its likelihood, y'alpha/(N - 1): the unit of variances; 0 while N <= 1."""
+    n = A.C[COUNT]
+    if n <= 1:
         return 0.0
     total: float = max(dot(A.V[Y], A.V[ALPHA], n), 0.0)
-    degrees: float = n - p
+    degrees: float = n - 1
     return total / degrees
 
 
-@compiled_reassociating
-def predict_with_variance(A: WindowArrays, x: FloatArray) -> tuple[float, float, float]:
-    """Mean, variance of the function in units of `scale`, and `scale`, at one point: one call for all. O(N²)."""
-    k, p = A.V[K], A.beta.shape[0]
-    kernel_column(A, x, k)
-    mean: float = dot(k, A.V[ALPHA], A.C[COUNT])
-    u = A.small[1, :p]
-    for c in range(p):
-        u[c] = design_value(A, x, c)
-        mean += A.beta[c] * u[c]
-    if A.C[FORM] == INVERSE_FORM:
-        return mean, inverse.variance(A, k, u), scale(A)
-    return mean, cholesky.variance(A, k, u), scale(A)
+# --- A sample in a slot, and what a refused step restores.
 
 
 @compiled_reassociating
-def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
-    """Exact leave-one-out residuals into ``out`` (N,). O(N p²); in the Cholesky form as `window_diagonal` says."""
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.leave_one_out(A, out)
-    else:
-        cholesky.leave_one_out(A, out)
+def acceptable_weight(A: WindowArrays, w: float) -> bool:
+    """True where double precision can tell the sample's noise variance 1/(gamma w) from the kernel."""
+    precision: float = A.F[GAMMA] * w
+    return precision >= LEAST_PRECISION and precision <= MOST_PRECISION
 
 
 @compiled_reassociating
-def worst_residual(A: WindowArrays) -> float:
-    """Largest residual of all rows, in units of the target. O(N²)."""
-    n, worst = A.C[COUNT], 0.0
-    for i in range(n):
-        residual = abs(row_residual(A, i))
-        if not residual <= worst:
-            worst = residual
-    return worst
-
-
-# --- The targets of either form of the window moved all at once: as a gain and an offset, or each by its own amount.
+def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
+    """Features and target finite and at most MOST, a weight as above."""
+    good = abs(y) <= MOST and acceptable_weight(A, w)
+    for j in range(x.shape[0]):
+        good = good and abs(x[j]) <= MOST
+    return good
 
 
 @compiled_reassociating
-def rescale_targets(A: WindowArrays, gain: float, offset: float) -> int:
-    """All targets y <- (1 + gain) y + offset, in O(N p): the offset lies in the span of the unpenalised part."""
-    n, y, sy, alpha, first = A.C[COUNT], A.V[Y], A.V[SY], A.V[ALPHA], A.S[0]
-    factor, most, total = 1.0 + gain, abs(offset), 0.0
-    if factor >= LEAST_FACTOR and factor <= MOST_FACTOR and most <= MOST:
-        for j in range(n):
-            most = max(most, abs(factor * y[j] + offset))
-            total += (factor * sy[j] + offset * first[j]) * 0.0 + factor * alpha[j] * 0.0
-    else:
-        most = np.inf
-    if not most <= MOST:
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    for c in range(A.beta.shape[0]):
-        total += factor * A.beta[c] * 0.0
-    if total != 0.0:
-        A.C[ILL_STEPS] += 1
-        return ILL_CONDITIONED
+def write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
+    """Put a sample into a slot, and its kernel column (in COLUMN, but for the slot's own element) into R."""
+    column, row, n = A.V[COLUMN], A.R[slot], A.C[COUNT]
     for j in range(n):
-        y[j] = factor * y[j] + offset
-        sy[j] = factor * sy[j] + offset * first[j]
-        alpha[j] *= factor
-    for c in range(A.beta.shape[0]):
-        A.beta[c] *= factor
-    A.beta[0] += offset
+        row[j] = column[j]
+        A.R[j, slot] = column[j]
+    A.R[slot, slot] = 1.0 + 1.0 / (A.F[GAMMA] * w)
+    for i in range(x.shape[0]):
+        A.X[i, slot] = x[i]
+        A.scaled[i, slot] = x[i] * A.inverse_widths[i]
+    A.V[Y, slot] = y
+    A.V[W, slot] = w
+
+
+@compiled_reassociating
+def keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
+    """Copy into U what a step on ``slot`` overwrites, all but P."""
+    for j in range(A.C[COUNT]):
+        A.U[UNDO_S, j] = A.S[j]
+        A.U[UNDO_SY, j] = A.V[SY, j]
+        A.U[UNDO_ALPHA, j] = A.V[ALPHA, j]
+        A.U[UNDO_R, j] = A.R[slot, j]
+    A.U[UNDO_POINT, 0] = A.F[BETA]
+    for i in range(A.X.shape[0]):
+        A.U[UNDO_POINT, 1 + i] = A.X[i, slot]
+    A.F[UNDO_Y] = A.V[Y, slot]
+    A.F[UNDO_W] = A.V[W, slot]
+    A.C[UNDO] = kind
+    A.C[UNDO_SLOT] = slot
+
+
+@compiled_reassociating
+def restore_solution(A: WindowArrays) -> None:
+    """S, Sy, bias and alpha as `keep_for_undo` found them. Nothing is left to undo then."""
+    for j in range(A.C[COUNT]):
+        A.S[j] = A.U[UNDO_S, j]
+        A.V[SY, j] = A.U[UNDO_SY, j]
+        A.V[ALPHA, j] = A.U[UNDO_ALPHA, j]
+    A.F[BETA] = A.U[UNDO_POINT, 0]
+    factor_gram(A)
     A.C[UNDO] = UNDO_NOTHING
+
+
+@compiled_reassociating
+def restore_sample(A: WindowArrays) -> None:
+    """The sample of the slot, and its row of R, as `keep_for_undo` found them."""
+    slot = A.C[UNDO_SLOT]
+    for j in range(A.C[COUNT]):
+        A.R[slot, j] = A.U[UNDO_R, j]
+        A.R[j, slot] = A.U[UNDO_R, j]
+    for i in range(A.X.shape[0]):
+        A.X[i, slot] = A.U[UNDO_POINT, 1 + i]
+        A.scaled[i, slot] = A.X[i, slot] * A.inverse_widths[i]
+    A.V[Y, slot] = A.F[UNDO_Y]
+    A.V[W, slot] = A.F[UNDO_W]
+
+
+# --- The solution (2.29) from S and Sy.
+
+
+@compiled_reassociating
+def finite(a: FloatArray, n: int) -> bool:
+    """True where the first n elements are all finite."""
+    total = 0.0
+    for j in range(n):
+        total += a[j] * 0.0
+    return total == 0.0
+
+
+@compiled_reassociating
+def add_up(a: FloatArray, n: int) -> float:
+    """Sum of the first n elements."""
+    total = 0.0
+    for j in range(n):
+        total += a[j]
+    return total
+
+
+@compiled_reassociating
+def factor_gram(A: WindowArrays) -> bool:
+    """GRAM <- sqrt(1'P 1), 0 where that is not positive. False where it is not finite."""
+    n = A.C[COUNT]
+    gram = add_up(A.S, n) if A.C[FORM] == INVERSE_FORM else dot(A.S, A.S, n)
+    A.F[GRAM] = np.sqrt(gram) if gram > 0.0 else 0.0
+    return bool(np.isfinite(gram))
+
+
+@compiled_reassociating
+def solve_bias(A: WindowArrays, moment: float) -> float:
+    """moment/(1'P 1): the bias for the moment 1'P y; 0 where no sample determines it."""
+    root = A.F[GRAM]
+    return moment / root / root if root > 0.0 else 0.0
+
+
+@compiled_reassociating
+def finish(A: WindowArrays) -> bool:
+    """Bias and alpha from S and Sy, (2.29). False, with both spoilt, where they are not finite."""
+    n, sy, inverse_form = A.C[COUNT], A.V[SY], A.C[FORM] == INVERSE_FORM
+    good = factor_gram(A)
+    moment = add_up(sy, n) if inverse_form else dot(A.S, sy, n)
+    # Before it is solved for: a vanishing 1'P 1 would hide it.
+    good = good and bool(np.isfinite(moment))
+    A.F[BETA] = solve_bias(A, moment)
+    rest = A.V[ALPHA] if inverse_form else A.V[Z]
+    for j in range(n):
+        rest[j] = sy[j]
+    inverse.add_scaled(rest, -A.F[BETA], A.S, n)
+    good = good and bool(np.isfinite(A.F[BETA])) and finite(rest, n)
+    if inverse_form:
+        return good
+    cholesky.backward(A, rest)
+    for i in range(n):
+        A.V[ALPHA, A.order[i]] = rest[i]
+    return good and finite(rest, n)
+
+
+# --- One sample in and out in the inverse form. The kernel column of the new sample is in COLUMN.
+
+
+@compiled_reassociating
+def _scale_into(target: FloatArray, source: FloatArray, factor: float, n: int) -> None:
+    for j in range(n):
+        target[j] = source[j] * factor
+
+
+@compiled_reassociating
+def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
+    """S and Sy lose the term p p'/p_kk, the slot's elements exactly."""
+    n = A.C[COUNT]
+    inverse.add_scaled(A.S, -A.S[slot] / p[slot], p, n)
+    A.S[slot] = 0.0
+    inverse.add_scaled(A.V[SY], -A.V[SY, slot] / p[slot], p, n)
+    A.V[SY, slot] = 0.0
+
+
+@compiled_reassociating
+def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
+    """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
+    n = A.C[COUNT]
+    inverse.add_scaled(A.S, add_up(q, n) / s, q, n)
+    inverse.add_scaled(A.V[SY], dot(q, A.V[Y], n) / s, q, n)
+
+
+@compiled_reassociating
+def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+    n = A.C[COUNT]
+    b, z, p, q = A.V[COLUMN], A.V[Z], A.V[PK], A.V[TRIAL]
+    b[slot] = 0.0
+    inverse.multiply(A, b, z)
+    keep_for_undo(A, slot, UNDO_REPLACE)
+    inverse.lift_column(A, slot, p)
+    pkk = p[slot]
+    factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
+    for j in range(n):
+        q[j] = z[j] - factor * p[j]
+    q[slot] = 0.0
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(b, q, n)
+    # What P gains and loses on its diagonal bounds what it does elsewhere.
+    good = pkk > 0.0 and s > SCHUR_SHARE * noise and np.isfinite(dot(p, p, n) / pkk + dot(q, q, n) / s)
+    if good:
+        q[slot] = -1.0
+        _take_out_inverse(A, slot, p)
+        write_sample(A, slot, x, y, w)
+        _take_in_inverse(A, q, s)
+        good = finish(A)
+    if not good:
+        # write_sample may not have run: restoring writes the same values again.
+        restore_solution(A)
+        restore_sample(A)
+        inverse.lower_column(A, slot, p)
+        return ILL_CONDITIONED
+    _scale_into(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
+    A.V[MINUS, slot] = 0.0
+    _scale_into(A.V[PLUS], q, 1.0 / np.sqrt(s), n)
+    A.C[PENDING] = 1
     return ACCEPTED
 
 
 @compiled_reassociating
-def shift_targets(A: WindowArrays, delta: FloatArray) -> int:
-    """All targets y <- y + delta, (N,) by slot. O(N²): one product."""
-    n, shifted = A.C[COUNT], A.V[COLUMN]
-    for j in range(n):
-        shifted[j] = A.V[Y, j] + delta[j]
-    if not bounded(shifted, n, MOST):
-        A.C[BAD_INPUTS] += 1
-        return BAD_INPUT
-    keep_for_undo(A, 0, UNDO_NOTHING)
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.solve(A, delta, A.V[Z])
-        add_scaled(A.V[SY], 1.0, A.V[Z], n)
-        good = inverse.finish(A)
-    else:
-        cholesky.shift_targets(A, delta)
-        good = cholesky.finish(A)
+def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+    n = A.C[COUNT]
+    b, q = A.V[COLUMN], A.V[TRIAL]
+    inverse.multiply(A, b, q)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(b, q, n)
+    keep_for_undo(A, n, UNDO_APPEND)
+    good = s > SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
+    if good:
+        q[n] = -1.0
+        A.S[n] = 0.0
+        A.V[SY, n] = 0.0
+        for j in range(n + 1):
+            A.P[n, j] = 0.0
+        write_sample(A, n, x, y, w)
+        A.C[COUNT] = n + 1
+        _take_in_inverse(A, q, s)
+        good = finish(A)
+        A.C[COUNT] = n
     if not good:
         restore_solution(A)
-        factor_design(A)
-        A.C[ILL_STEPS] += 1
         return ILL_CONDITIONED
-    for j in range(n):
-        A.V[Y, j] = shifted[j]
+    A.C[COUNT] = n + 1
+    for j in range(n + 1):
+        A.V[MINUS, j] = 0.0
+    _scale_into(A.V[PLUS], q, 1.0 / np.sqrt(s), n + 1)
+    A.C[PENDING] = 1
+    return ACCEPTED
+
+
+# --- The same in the Cholesky form.
+
+
+@compiled_reassociating
+def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> int:
+    n = A.C[COUNT]
+    column, half = A.V[COLUMN], A.V[TRIAL]
+    place = cholesky.position_of(A, slot)
+    keep_for_undo(A, slot, UNDO_REPLACE)
+    A.C[UNDO_PLACE] = place
+    cholesky.keep_factor(A)
+    cholesky.before_leaving(A, place)
+    for i in range(place):
+        half[i] = column[A.order[i]]
+    for i in range(place + 1, n):
+        half[i - 1] = column[A.order[i]]
+    cholesky.delete(A, place, half)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(half, half, n - 1)
+    good = s > SCHUR_SHARE * noise
+    if good:
+        A.C[COUNT] = n
+        write_sample(A, slot, x, y, w)
+        A.C[COUNT] = n - 1
+        cholesky.add(A, slot, half, np.sqrt(s))
+        good = finish(A)
+    if not good:
+        A.C[COUNT] = n
+        _restore_replaced_cholesky(A)
+        return ILL_CONDITIONED
+    cholesky.after_leaving(A, slot, n)
+    cholesky.after_coming(A, slot)
     return ACCEPTED
 
 
 @compiled_reassociating
-def factor_design(A: WindowArrays) -> bool:
-    """G anew from S."""
+def _restore_replaced_cholesky(A: WindowArrays) -> None:
+    """The window as it was before the sample of UNDO_SLOT was replaced, to the last bit. COUNT is what it was."""
+    cholesky.restore_factor(A)
+    restore_solution(A)
+    restore_sample(A)
+
+
+@compiled_reassociating
+def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
+    n = A.C[COUNT]
+    half = A.V[TRIAL]
+    cholesky.gather(A, A.V[COLUMN], half)
+    cholesky.forward(A, half)
+    noise = 1.0 / (A.F[GAMMA] * w)
+    s = 1.0 + noise - dot(half, half, n)
+    if not s > SCHUR_SHARE * noise:
+        return ILL_CONDITIONED
+    keep_for_undo(A, n, UNDO_APPEND)
+    write_sample(A, n, x, y, w)
+    cholesky.add(A, n, half, np.sqrt(s))
+    if not finish(A):
+        take_back(A)
+        return ILL_CONDITIONED
+    cholesky.after_coming(A, n)
+    return ACCEPTED
+
+
+# --- Checks: one row's residual after each step, and iterative refinement where it is too large.
+
+
+@compiled_reassociating
+def row_residual(A: WindowArrays, i: int) -> float:
+    """y_i - b - R_i alpha: zero but for the error of the recursion. In units of the target."""
+    fitted = dot(A.R[i], A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
+    residual: float = A.V[Y, i] - fitted
+    return residual
+
+
+@compiled_reassociating
+def rotate_residual(A: WindowArrays) -> bool:
+    """Check the next row of the round. False where its residual exceeds the tolerance or is not a number.
+
+    The row of the newest sample does not see the error of P, every other row does; a round of N steps has checked all
+    rows. A residual r is an error gamma r of alpha. The tolerance is therefore a share of the size of the training
+    errors, rms(alpha)/gamma, and thereby the allowed relative error of alpha; the rounding of the scalar product
+    itself is added.
+    """
+    n = A.C[COUNT]
+    i = A.C[CURSOR]
+    if i >= n:
+        i = 0
+    residual = abs(row_residual(A, i))
+    A.F[RESIDUAL] = residual
+    if not residual <= A.F[ROUND_WORST]:
+        A.F[ROUND_WORST] = residual
+    i += 1
+    if i >= n:
+        i = 0
+        A.F[LAST_WORST] = A.F[ROUND_WORST]
+        A.F[ROUND_WORST] = 0.0
+        A.C[ROUNDS] += 1
+    A.C[CURSOR] = i
+    length = np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
+    allowed = A.F[TOLERANCE] * length / (np.sqrt(n) * A.F[GAMMA])
+    good: bool = residual <= allowed + ROUND_OFF * (abs(A.V[Y, i]) + abs(A.F[BETA]) + length)
+    if not good:
+        A.C[RESIDUALS_EXCEEDED] += 1
+    return good
+
+
+@compiled_reassociating
+def resum(A: WindowArrays) -> bool:
+    """S, Sy, bias and alpha anew from the inverse or factor as it stands. O(N²). False where they are not finite."""
+    n, ones = A.C[COUNT], A.V[COLUMN]
+    for j in range(n):
+        ones[j] = 1.0
     if A.C[FORM] == INVERSE_FORM:
-        return inverse.factor_design(A)
-    return cholesky.factor_design(A)
+        inverse.solve(A, ones, A.S)
+        inverse.solve(A, A.V[Y], A.V[SY])
+    else:
+        cholesky.gather(A, ones, A.S)
+        cholesky.forward(A, A.S)
+        cholesky.gather(A, A.V[Y], A.V[SY])
+        cholesky.forward(A, A.V[SY])
+    return finish(A)
+
+
+@compiled_reassociating
+def _refine_inverse(A: WindowArrays) -> bool:
+    """One step of iterative refinement of S and Sy."""
+    n, residual, z, sy = A.C[COUNT], A.V[COLUMN], A.V[Z], A.V[SY]
+    for i in range(n):
+        residual[i] = 1.0 - dot(A.R[i], A.S, n)
+    inverse.solve(A, residual, z)
+    inverse.add_scaled(A.S, 1.0, z, n)
+    for i in range(n):
+        residual[i] = A.V[Y, i] - dot(A.R[i], sy, n)
+    inverse.solve(A, residual, z)
+    inverse.add_scaled(sy, 1.0, z, n)
+    return finish(A)
+
+
+@compiled_reassociating
+def _refine_cholesky(A: WindowArrays) -> bool:
+    """S and Sy anew, and one step of iterative refinement of bias and alpha."""
+    n, good, t = A.C[COUNT], resum(A), A.V[MINUS]
+    for i in range(n):
+        t[i] = row_residual(A, A.order[i])
+    cholesky.forward(A, t)
+    correction = solve_bias(A, dot(A.S, t, n))
+    inverse.add_scaled(t, -correction, A.S, n)
+    A.F[BETA] += correction
+    cholesky.backward(A, t)
+    for i in range(n):
+        A.V[ALPHA, A.order[i]] += t[i]
+    return good and bool(np.isfinite(A.F[BETA])) and finite(A.V[ALPHA], n)
 
 
 @compiled_reassociating
 def refine(A: WindowArrays) -> bool:
-    """One step of iterative refinement of beta and alpha, counted. O(N² p). False where it left the finite."""
+    """One step of iterative refinement of bias and alpha with R, counted. O(N²). False where it left the finite."""
     A.C[REFINEMENTS] += 1
     if A.C[FORM] == INVERSE_FORM:
-        return inverse.refine(A)
-    return cholesky.refine(A)
+        return _refine_inverse(A)
+    return _refine_cholesky(A)
 
 
 @compiled_reassociating
 def _refined(A: WindowArrays) -> bool:
-    """Refine after a row's residual was found too large. False where that did not bring the same row down.
+    """Refine after a row's residual was found too large. False where that did not reduce the same row's residual.
 
-    Refinement contracts by the error of P. An inverse that is wrong enough for it not to contract is one that
-    the coming steps would blow up: the step is better refused.
+    Refinement contracts by the error of P. Where it does not contract, the coming steps would diverge: the step is
+    refused.
     """
     row = A.C[CURSOR] - 1
     if row < 0:
@@ -210,27 +539,43 @@ def _refined(A: WindowArrays) -> bool:
     before = A.F[RESIDUAL]
     good = refine(A)
     n = A.C[COUNT]
-    size = abs(A.V[Y, row]) + abs(A.beta[0]) + np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
+    size = abs(A.V[Y, row]) + abs(A.F[BETA]) + np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
     return good and abs(row_residual(A, row)) <= max(CONTRACTION * before, NEGLIGIBLE * size)
 
 
 @compiled_reassociating
-def _take_back(A: WindowArrays) -> None:
-    if A.C[FORM] == INVERSE_FORM:
-        inverse.undo(A)
+def take_back(A: WindowArrays) -> None:
+    """Take back the last replacement or appended sample, which has just been made."""
+    kind, slot = A.C[UNDO], A.C[UNDO_SLOT]
+    if kind == UNDO_APPEND:
+        A.C[COUNT] -= 1
+        restore_solution(A)
+    elif A.C[FORM] == INVERSE_FORM:
+        restore_solution(A)
+        restore_sample(A)
+        inverse.lower_column(A, slot, A.V[PK])
     else:
-        cholesky.undo(A)
+        _restore_replaced_cholesky(A)
+    if A.C[FORM] == INVERSE_FORM:
+        for j in range(A.C[COUNT]):
+            A.V[MINUS, j] = 0.0
+            A.V[PLUS, j] = 0.0
+        A.C[PENDING] = 0
+    else:
+        A.C[CARRIED] = 0
 
 
 @compiled_reassociating
 def _checked(A: WindowArrays, status: int) -> int:
-    """What a step comes to once the next row of the round is looked at. A refused one is counted, the row looked at
-    again next time: the residual of what was taken back is not the window's."""
+    """Status of a step after the next row of the round was checked.
+
+    A refused step is counted. Its row is checked again next time: the residual was that of a solution which is gone.
+    """
     if status == ACCEPTED:
         residual, worst, last = A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST]
         cursor, rounds = A.C[CURSOR], A.C[ROUNDS]
         if not rotate_residual(A) and not _refined(A):
-            _take_back(A)
+            take_back(A)
             A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST] = residual, worst, last
             A.C[CURSOR], A.C[ROUNDS] = cursor, rounds
             status = ILL_CONDITIONED
@@ -239,12 +584,7 @@ def _checked(A: WindowArrays, status: int) -> int:
     return status
 
 
-@compiled_reassociating
-def _conclude(A: WindowArrays, status: int) -> int:
-    status = _checked(A, status)
-    if status == ACCEPTED:
-        A.C[STEPS] += 1
-    return status
+# --- The steps.
 
 
 @compiled_reassociating
@@ -260,8 +600,11 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
         return NO_SLOT
     kernel_column(A, x, A.V[COLUMN])
     if A.C[FORM] == INVERSE_FORM:
-        return _conclude(A, inverse.replace(A, slot, x, y, w))
-    return _conclude(A, cholesky.replace(A, slot, x, y, w))
+        status = _checked(A, _replace_inverse(A, slot, x, y, w))
+    else:
+        status = _checked(A, _replace_cholesky(A, slot, x, y, w))
+    A.C[STEPS] += status == ACCEPTED
+    return status
 
 
 @compiled_reassociating
@@ -274,58 +617,59 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         return NO_SLOT
     kernel_column(A, x, A.V[COLUMN])
     if A.C[FORM] == INVERSE_FORM:
-        return _conclude(A, inverse.append(A, x, y, w))
-    return _conclude(A, cholesky.append(A, x, y, w))
-
-
-@compiled_reassociating
-def undo(A: WindowArrays) -> int:
-    """Take back the last `replace` or `append`, if nothing but predictions happened since. O(N), or O(N²)."""
-    if A.C[UNDO] == UNDO_NOTHING:
-        return NOTHING_TO_UNDO
-    _take_back(A)
-    A.C[UNDONE] += 1
-    return ACCEPTED
-
-
-@compiled_reassociating
-def remove(A: WindowArrays, slot: int) -> int:
-    """Empty ``slot``; the sample of the last slot moves into it. O(N²)."""
-    if slot < 0 or slot >= A.C[COUNT]:
-        return NO_SLOT
-    if A.C[FORM] == INVERSE_FORM:
-        status = inverse.remove(A, slot)
+        status = _checked(A, _append_inverse(A, x, y, w))
     else:
-        status = cholesky.remove(A, slot)
-    if status != ACCEPTED:
-        A.C[ILL_STEPS] += 1
+        status = _checked(A, _append_cholesky(A, x, y, w))
+    A.C[STEPS] += status == ACCEPTED
     return status
 
 
 @compiled_reassociating
 def reweight(A: WindowArrays, slot: int, w: float) -> int:
-    """Give the sample in ``slot`` the noise weight w: out and in again, which stays exact for any change. O(N²)."""
+    """Give the sample in ``slot`` the noise weight w: out and in again, which is exact for any change. O(N²)."""
     if slot < 0 or slot >= A.C[COUNT]:
         return NO_SLOT
     if not acceptable_weight(A, w):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
-    x = A.small[0, : A.X.shape[0]]
+    x = A.point
     for i in range(x.shape[0]):
         x[i] = A.X[i, slot]
     for j in range(A.C[COUNT]):
         A.V[COLUMN, j] = A.R[slot, j]
     if A.C[FORM] == INVERSE_FORM:
-        status = _checked(A, inverse.replace(A, slot, x, A.V[Y, slot], w))
-    else:
-        status = _checked(A, cholesky.replace(A, slot, x, A.V[Y, slot], w))
-    A.C[UNDO] = UNDO_NOTHING
-    return status
+        return _checked(A, _replace_inverse(A, slot, x, A.V[Y, slot], w))
+    return _checked(A, _replace_cholesky(A, slot, x, A.V[Y, slot], w))
+
+
+# --- Leave-one-out.
 
 
 @compiled_reassociating
-def resum(A: WindowArrays) -> bool:
-    """S, Sy, beta and alpha anew from the inverse or factor as it stands. O(N² p)."""
+def leave_one_out(A: WindowArrays, out: FloatArray) -> None:
+    """Exact leave-one-out residuals alpha_i/(P_ii - S_i²/(1'S)) into ``out`` (N,); NaN for a single sample.
+
+    O(N) in the inverse form. In the Cholesky form O(N²) where the diagonal of P is carried along, else O(N³).
+    """
+    n, root = A.C[COUNT], A.F[GRAM]
     if A.C[FORM] == INVERSE_FORM:
-        return inverse.resum(A)
-    return cholesky.resum(A)
+        inverse.diagonal(A, out)
+        alpha, s = A.V[ALPHA], A.S
+        for i in range(n):
+            half = s[i] / root if root > 0.0 else 0.0
+            out[i] = _left_out(alpha[i], out[i], out[i] - half * half)
+        return
+    known, t = cholesky.diagonal(A), A.V[TRIAL]
+    factor = 1.0 / root if root > 0.0 else 0.0
+    for i in range(n):
+        t[i] = factor * A.S[i]
+    cholesky.backward(A, t)
+    for i in range(n):
+        slot = A.order[i]
+        out[slot] = _left_out(A.V[ALPHA, slot], known[slot], known[slot] - t[i] * t[i])
+
+
+@compiled_reassociating
+def _left_out(alpha: float, diagonal: float, without: float) -> float:
+    """The leave-one-out residual alpha/without; NaN where the other samples do not determine the bias."""
+    return alpha / without if without > UNDETERMINED * diagonal else np.nan

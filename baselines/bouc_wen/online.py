@@ -14,9 +14,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from adaptive.compiled import compiled
+from adaptive.compiled import all_finite, compiled
 from adaptive.errors import InputError
-from adaptive.finite import all_finite
 from adaptive.online import drift as drift_step
 from adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
 from adaptive.state_codec import prefixed, under

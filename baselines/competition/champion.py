@@ -17,12 +17,11 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
+from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
 from adaptive.errors import InputError, ModelFileError
-from adaptive.finite import DOUBLE, all_finite, all_finite_doubles
 from adaptive.inverse_model import LssvmInverse, evaluate_point
 from adaptive.state_codec import prefixed, under
-from adaptive.types import Feedforward, FloatArray, InverseModel, StateDict
-from adaptive.window.arrays import IntArray
+from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.linear import LinearInverse
 from baselines.prandtl_ishlinskii.inverse import MpiInverse

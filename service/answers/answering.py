@@ -10,7 +10,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from adaptive.finite import all_finite
+from adaptive.compiled import all_finite
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, check_voltages

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptive.finite import all_finite
+from adaptive.compiled import all_finite
 from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse

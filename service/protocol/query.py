@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adaptive.finite import all_finite
+from adaptive.compiled import all_finite
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
 from service.protocol.samples import (

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptive.finite import all_finite
+from adaptive.compiled import all_finite
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
 

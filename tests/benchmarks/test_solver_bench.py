@@ -18,12 +18,9 @@ from lab.cli import main
 WINDOW_KEYS = {
     "update_min_us",
     "update_p99_over_median",
-    "variance_us",
-    "variance_over_dsymv",
     "dsymv_us",
     "memory_pass_us",
     "cholesky_update_us",
-    "plain_update_us",
     "loo_us",
     "cholesky_loo_us",
     "refit_over_update",

@@ -187,19 +187,13 @@ def test_the_solver_is_the_users_choice(model: LssvmInverse, form: Form) -> None
     for held in (window, made, again):
         assert (held._window.config.form, held._window.config.accuracy) == (form, 1e-7)
         assert held._window.form == ("inverse" if form == "auto" else form)
-    plain = ResidualWindow.from_model(model, 100, "nearest", SolverConfig(backend="plain"))
-    assert plain.learn(np.full(model.widths.size, 9.0), 0.1) == admission.LEARNT
     assert window.learn(np.full(model.widths.size, 9.0), 0.1) == admission.LEARNT
-    point = np.full(model.widths.size, 0.5)
-    assert plain.mean(point) == pytest.approx(window.mean(point), abs=1e-8)
 
 
 def test_a_solver_that_does_not_exist_is_refused() -> None:
     for change, field in (
         ({"form": "lu"}, "form"),
-        ({"backend": "gpu"}, "backend"),
         ({"accuracy": 0.0}, "accuracy"),
-        ({"form": "cholesky", "backend": "plain"}, "plain backend has the inverse form only"),
     ):
         with pytest.raises(InputError, match=field):
             SolverConfig(**change)  # type: ignore[arg-type]
