@@ -21,7 +21,7 @@ from benchmarks.sample_feed import AXIS, STAGE, sent
 from service.background.retuning.adoption import Retuned
 from service.client.client import Client
 from service.config.config import AxisConfig, read_config
-from service.failover.state_transfer import ask_for_state
+from service.failover.state_transfer import fetch_state
 from service.protocol.errors import ServiceError
 from service.protocol.samples import joined
 from service.server.axis import Axis
@@ -137,7 +137,7 @@ def _live_state(client: Client) -> StateDict:
     """The state of the service as it hands it to a standby. Raises ServiceError where it does not."""
     until = time.monotonic() + CONNECT_S
     while time.monotonic() < until:
-        data = ask_for_state(client._session, client.keys.state, CONNECT_S)
+        data = fetch_state(client._session, client.keys.state, CONNECT_S)
         if data is not None:
             return decode_checkpoint(data)[1]
         time.sleep(0.1)  # it refuses while its learner is busy for seconds

@@ -20,7 +20,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from service.failover.state_transfer import join
+from service.failover.state_transfer import join_parts
 from service.operating.request import Request, decode_request, encode_request
 from service.protocol import model as wire_model
 from service.protocol import query as wire_query
@@ -103,7 +103,7 @@ def _framed_checkpoint(data: bytes) -> None:
 def _parts(data: bytes) -> None:
     """Parts of a state, each of up to three bytes behind its place: as many as the first says, or nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
-    whole = join((piece[:8], piece[8:]) for piece in pieces)
+    whole = join_parts((piece[:8], piece[8:]) for piece in pieces)
     if whole is None:
         return
     of = int.from_bytes(pieces[0][4:8], "little")

@@ -1,1 +1,14 @@
-"""Who serves an axis: one instance, backed by others that hold the same model and take over when it goes."""
+"""Failover of an axis: one instance serves, standbys hold the same model, and one of them takes over if it fails.
+
+`role_control` decides the role of an instance, `claims` holds the rule of precedence, `reachability` detects a lost
+router, `standby_model` keeps the model of a standby equal to the served one, `state_transfer` sends its state, and
+`peer_files` reads what the other instance has left on the disk.
+"""
+
+from __future__ import annotations
+
+from service.failover.peer_files import PeerFiles, standby_folder
+from service.failover.reachability import Reachability
+from service.failover.role_control import RoleControl
+
+__all__ = ["PeerFiles", "Reachability", "RoleControl", "standby_folder"]

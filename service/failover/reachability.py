@@ -1,7 +1,7 @@
-"""Whether an instance behind routers is on the wire at all.
+"""Whether an instance behind routers is connected to one of them.
 
-One that has lost its router hears that everybody has gone, when it is itself that has: nobody could ask it if it took
-over, and when the router is there again two would serve, of which the one that never stopped had to stand down.
+An instance that loses its router sees the claims of all others disappear. It must not take over then: nobody could
+query it, and after the reconnection two instances would serve, of which the one that never failed would stand down.
 """
 
 from __future__ import annotations
@@ -11,31 +11,31 @@ from typing import Final
 
 import zenoh
 
-#: So long after the wire has told that somebody has gone it is known whether one's own router has, s; seen: 5 ms.
-_KNOWN_S: Final = 0.02
-#: So long after a router is there again everybody behind it has been heard of, s; they come with it.
-_HEARD_S: Final = 0.5
+#: Time from the loss of a claim until the loss of the router is known too, s; 5 ms were measured.
+_ROUTER_LOSS_KNOWN_S: Final = 0.02
+#: Time from a reconnection until the claims behind the router are known, s.
+_CLAIMS_KNOWN_S: Final = 0.5
 
 
-class Reach:
-    """Of one session.
+class Reachability:
+    """Reachability of one session.
 
     Parameters
     ----------
-    behind_routers : whether others reach it through routers only, as they do a service that listens nowhere.
+    behind_routers : True if others reach this instance through routers only: it listens at no endpoint.
     """
 
     def __init__(self, session: zenoh.Session, behind_routers: bool) -> None:
         self._session = session
         self._behind_routers = behind_routers
-        self._without_at = -_HEARD_S
+        self._unconnected_at = -_CLAIMS_KNOWN_S
 
-    def cut_off(self) -> bool:
-        """Whether that nobody is heard of says nothing about them. Takes 20 ms behind routers; in no callback."""
+    def is_cut_off(self) -> bool:
+        """True if missing claims do not show that the others have failed. Takes 20 ms; do not call it in a callback."""
         if not self._behind_routers:
             return False
-        time.sleep(_KNOWN_S)
+        time.sleep(_ROUTER_LOSS_KNOWN_S)
         now = time.monotonic()
         if not self._session.info.routers_zid():
-            self._without_at = now
-        return now - self._without_at < _HEARD_S
+            self._unconnected_at = now
+        return now - self._unconnected_at < _CLAIMS_KNOWN_S

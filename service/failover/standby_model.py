@@ -1,8 +1,8 @@
-"""A standby's model: the samples as they come, and the state of the serving instance from which they go on.
+"""The model of a standby: the state of the serving instance, and the samples since then.
 
-The learner is deterministic: from one state on, the same samples give the same model to the last bit. Until the state
-is there, samples are recorded and held back; those that it has seen already are left out, the others are learnt after
-it.
+The learner is deterministic: the same state and the same samples give the same model, bit by bit. Until the standby has
+received the state, it records the samples and keeps them in memory. Then it learns those that the state does not
+include.
 """
 
 from __future__ import annotations
@@ -21,53 +21,57 @@ from service.server.axis_state import restore_axis
 from service.storage.checkpoint import decode_checkpoint
 from service.storage.checkpoint_keeper import learn_again
 
-#: Samples that are remembered, to be learnt again behind a state that is older than they are.
-KEPT: Final = 30_000
-#: In a recording: what came while a standby held no state yet.
+#: Samples kept in memory, to be learnt after an older state.
+KEPT_SAMPLES: Final = 30_000
+#: Verdict in a recording of samples that arrived before the standby had a state.
 NOT_SYNCED: Final = "not_synced"
 
 
-class Shadow:
-    """Between the intake of a standby and its axis. All methods but :meth:`gate` run by way of ``Intake.call``.
+class StandbyModel:
+    """Stands between the intake of a standby and its axis. Call all methods in the thread that handles samples.
 
     Parameters
     ----------
-    kept : samples that are remembered.
-    changed : called after the axis has gone on from another state, torn : where the samples do not follow on the state
-    that was taken; both in the thread that handles samples.
+    kept : samples kept in memory.
+    on_restored : called after the axis has continued from another state.
+    on_gap : called if samples are missing between the received state and the samples since then.
+
+    Attributes
+    ----------
+    synced : True if the axis holds the model of the serving instance. syncs : count of received states.
     """
 
     def __init__(
         self,
         axis: Axis,
         intake: Intake,
-        kept: int = KEPT,
-        changed: Callable[[], None] = lambda: None,
-        torn: Callable[[], None] = lambda: None,
+        kept: int = KEPT_SAMPLES,
+        on_restored: Callable[[], None] = lambda: None,
+        on_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self.synced = False
         self.syncs = 0
         self._axis = axis
         self._intake = intake
         self._kept = kept
-        self._changed = changed
-        self._torn = torn
-        #: The sample after which the first one is still to come; -1 for none.
-        self._seam = -1
+        self._on_restored = on_restored
+        self._on_gap = on_gap
+        #: Last sample of the received state while no sample after it has been learnt; else -1.
+        self._state_seq = -1
         self._recent: deque[SampleBatch] = deque()
         self._count = 0
-        #: Whether samples that were held back are no longer remembered.
-        self._forgotten = False
+        #: Whether samples were dropped from memory before they were learnt.
+        self._overflowed = False
 
     def gate(self, batch: SampleBatch) -> SampleBatch | None:
-        """For ``Intake.gate``: remembers the samples, and keeps them back until there is a state."""
+        """For ``Intake.gate``: keep the samples in memory; pass them on once the state has been received, else None."""
         self._recent.append(batch)
         self._count += len(batch)
         while self._count > self._kept and len(self._recent) > 1:
             self._count -= len(self._recent.popleft())
-            self._forgotten |= not self.synced
+            self._overflowed |= not self.synced
         if self.synced:
-            self._look_at_seam([batch])
+            self._check_gap([batch])
             return batch
         sink = self._intake.sink
         if sink is not None:
@@ -75,9 +79,9 @@ class Shadow:
         return None
 
     def take_state(self, data: bytes) -> int:
-        """Go on from the serving instance's state; the sample that it had seen last.
+        """Continue from the state of the serving instance; returns the number of its last sample.
 
-        Raises ModelFileError where it does not match this axis; the axis is then as it was.
+        Raises ModelFileError if the state does not match this axis, which is then unchanged.
         """
         meta, state = decode_checkpoint(data)
         axis = self._axis
@@ -86,70 +90,69 @@ class Shadow:
             raise ModelFileError(f"axis is {meta.axis!r}, expected {axis.config.name!r}")
         restore_axis(axis, state)
         self.synced = True
-        self._forgotten = False
+        self._overflowed = False
         self.syncs += 1
-        # All of them are in the recording.
-        self._seam = meta.seq
-        rest = behind(list(self._recent), meta.seq)
-        self._look_at_seam(rest)
-        for batch in rest:
+        self._state_seq = meta.seq
+        newer = newer_than(list(self._recent), meta.seq)
+        self._check_gap(newer)
+        for batch in newer:  # all of them are in the recording already
             axis.handle(batch)
         self._rebase()
         return meta.seq
 
     @property
     def newest_seq(self) -> int:
-        """The newest sample that has come and is remembered; -1 for none."""
+        """Number of the newest sample in memory; -1 for none."""
         return int(self._recent[-1].seq[-1]) if self._recent else -1
 
-    def give_up(self, inherit: Callable[[int], str] = lambda _: "") -> str:
-        """There is nobody to take a state from: go on from the best there is, and learn what was held back.
+    def take_over(self, restore: Callable[[int], str] = lambda _: "") -> str:
+        """Serve from now on: without a received state, continue from the best state there is and learn the samples.
 
-        ``inherit`` is given the newest sample's number, may put another state into the axis, and says what that is.
-        Returns in words from what this instance goes on; "" where it held the state already.
+        ``restore`` gets the number of the newest sample; it may restore the axis and returns from what, in words, or
+        "". Returns from what this instance continues, in words; "" if it held the state of the serving instance.
         """
         if self.synced:
             return ""
         self.synced = True
         axis = self._axis
-        inherited = inherit(self.newest_seq)
-        told = inherited or f"its own state of sample {axis.handled_seq}"
-        if self._forgotten and not inherited and axis.config.recorder is not None:
+        restored = restore(self.newest_seq)
+        source = restored or f"its own state of sample {axis.handled_seq}"
+        if self._overflowed and not restored and axis.config.recorder is not None:
             learn_again(axis, axis.config.recorder)
-        held = list(self._recent)
-        again = behind(held, axis.handled_seq) if inherited or self._forgotten else held
-        for batch in again:
+        kept = list(self._recent)
+        unlearnt = newer_than(kept, axis.handled_seq) if restored or self._overflowed else kept
+        for batch in unlearnt:
             axis.handle(batch)
-        self._forgotten = False
+        self._overflowed = False
         self._rebase()
-        return f"{told}, then {sum(map(len, again))} samples that had been held back"
+        return f"{source}, then {sum(map(len, unlearnt))} samples from memory"
 
-    def hold(self) -> None:
-        """Wait for a state again: what serves now is another instance."""
-        self.synced = self._forgotten = False
+    def stand_down(self) -> None:
+        """Wait for a state again: another instance serves."""
+        self.synced = self._overflowed = False
         self._recent.clear()
         self._count = 0
 
-    def _look_at_seam(self, batches: list[SampleBatch]) -> None:
-        """A sample that was on its way while the state was copied may be neither in the state nor behind it."""
-        if self._seam < 0 or not batches:
+    def _check_gap(self, batches: list[SampleBatch]) -> None:
+        """A sample in transit while the state was copied may be neither in the state nor among the samples after it."""
+        if self._state_seq < 0 or not batches:
             return
-        first, seam = int(batches[0].seq[0]), self._seam
-        self._seam = -1
-        if first > seam + 1:
-            self._torn()
+        first, state_seq = int(batches[0].seq[0]), self._state_seq
+        self._state_seq = -1
+        if first > state_seq + 1:
+            self._on_gap()
 
     def _rebase(self) -> None:
         rebase = getattr(self._intake.sink, "rebase", None)
         if rebase is not None:
             rebase(self._axis.sequence.received)
-        self._changed()
+        self._on_restored()
 
 
-def behind(batches: list[SampleBatch], seq: int) -> list[SampleBatch]:
-    """What came after sample ``seq``, in the order of arrival; where that one is not there, all with higher numbers.
+def newer_than(batches: list[SampleBatch], seq: int) -> list[SampleBatch]:
+    """The samples that arrived after sample ``seq``; if that one is not among them, all with higher numbers.
 
-    The order and not the number decides: a stage that has begun to count anew sends lower numbers than before.
+    The order of arrival decides, not the number: a stage that restarts its count sends lower numbers than before.
     """
     for i in range(len(batches) - 1, -1, -1):
         at = np.flatnonzero(batches[i].seq == seq)

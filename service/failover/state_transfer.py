@@ -1,9 +1,9 @@
-"""The state of an axis on its way to a standby: megabytes that must not make anybody wait.
+"""Transfer of the state of an axis to a standby, in small parts and with low priority.
 
-A router passes the messages of a sender on in their order, and what it sends to one receiver at one priority too. One
-message of five megabytes keeps all that come behind it waiting, answers and samples of others included, until a standby
-that has no processor just then has read it. So it goes in parts of less than a packet of the network's, with pauses,
-behind everything else, and is given up, to be asked for again, rather than waited for.
+A router forwards the messages of one priority to one receiver in order. One message of five megabytes would delay all
+messages behind it, answers and samples included, until a busy standby has read it. The state is therefore sent in parts
+that are smaller than a network packet, with pauses, at low priority. A lost part ends the transfer; the standby then
+asks again with longer pauses.
 """
 
 from __future__ import annotations
@@ -15,27 +15,26 @@ from typing import Any, Final
 
 import zenoh
 
-#: Of one part; a packet holds 64 KiB.
+#: Size of a part, bytes; a packet holds 64 KiB.
 _PART_BYTES: Final = 56 * 1024
-#: So many make no state of ours any more, 256 MB; whoever sends them is not to fill this end's memory.
-_MOST_PARTS: Final = 4681
-#: With each part: its index, and how many there are.
+#: Most parts that are accepted, 256 MB together: a sender must not use up the memory of the receiver.
+_MAX_PARTS: Final = 4681
+#: Attachment of each part: its index and the number of parts.
 _PLACE: Final = struct.Struct("<II")
-#: Pauses between two parts, s: the first time that it is asked for, and at most.
-PAUSE_S, MOST_PAUSE_S = 0.001, 0.016
-#: Silence after which a part, the end, or the question is taken for lost, s, and pauses on top of it: who asks again
-#: asks for longer ones, and is patient with a machine that is busy.
-_SILENT_S, _SILENT_PAUSES = 0.5, 100
-_LOOK_S: Final = 0.002
+#: Pause between two parts, s: in the first transfer, and at most.
+PAUSE_S, MAX_PAUSE_S = 0.001, 0.016
+#: Longest silence before a part counts as lost: these seconds and that many pauses.
+_SILENCE_S, _SILENCE_PAUSES = 0.5, 100
+_POLL_S: Final = 0.002
 
 
 def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
-    """Answer ``query`` with the bytes of ``buffers``; at the pace that its parameter ``pause_s`` asks for."""
+    """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s."""
     try:
         pause_s = float(query.parameters.get("pause_s") or PAUSE_S)
     except ValueError:
         pause_s = PAUSE_S
-    pause_s = min(MOST_PAUSE_S, max(0.0, pause_s)) if pause_s == pause_s else PAUSE_S
+    pause_s = min(MAX_PAUSE_S, max(0.0, pause_s)) if pause_s == pause_s else PAUSE_S
     whole = memoryview(b"".join(buffers))
     starts = range(0, len(whole), _PART_BYTES)
     for i, start in enumerate(starts):
@@ -44,9 +43,9 @@ def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
         time.sleep(pause_s)
 
 
-def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
-    """The bytes that `send_state` answers with, or None where nobody does, or not all came: this end was too slow."""
-    # Replies are of the kind of their query.
+def fetch_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
+    """The bytes that `send_state` answers with; None if nobody answers or a part is lost."""
+    # Replies inherit priority and congestion control from their query.
     replies = session.get(
         f"{key}?pause_s={pause_s:g}",
         timeout=timeout_s,
@@ -54,36 +53,36 @@ def ask_for_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: f
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    return join(_parts(replies, _SILENT_S + _SILENT_PAUSES * pause_s))
+    return join_parts(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s))
 
 
-def join(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
-    """The whole of its parts, each after its place, as soon as it is whole; None at the first that is not the next."""
-    whole, taken, of = bytearray(), 0, 0
+def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
+    """The joined parts, given as (attachment, part), after the last one; None if one is missing or malformed."""
+    joined, taken, total = bytearray(), 0, 0
     for place, part in parts:
         if len(place) != _PLACE.size:
             return None
         i, n = _PLACE.unpack(place)
-        if i != taken or not taken < n <= _MOST_PARTS or (taken and n != of) or len(part) > _PART_BYTES:
+        if i != taken or not taken < n <= _MAX_PARTS or (taken and n != total) or len(part) > _PART_BYTES:
             return None
-        whole += part
-        taken, of = taken + 1, n
-        if taken == of:
-            return bytes(whole)
+        joined += part
+        taken, total = taken + 1, n
+        if taken == total:
+            return bytes(joined)
     return None
 
 
-def _parts(replies: zenoh.Handler[zenoh.Reply], silent_s: float) -> Iterator[tuple[bytes, bytes]]:
-    """Places and parts as they come, until there are no more: the end may be lost like any part of them."""
-    heard = time.monotonic()
-    while time.monotonic() < heard + silent_s:
+def _parts(replies: zenoh.Handler[zenoh.Reply], silence_s: float) -> Iterator[tuple[bytes, bytes]]:
+    """(attachment, part) of each reply, until the query ends or nothing arrives for ``silence_s``."""
+    last_s = time.monotonic()
+    while time.monotonic() < last_s + silence_s:
         try:
             reply = replies.try_recv()
         except zenoh.ZError:
-            return  # that was all, or the question's time is over
+            return  # no more replies, or the query has timed out
         if reply is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             continue
-        heard = time.monotonic()
+        last_s = time.monotonic()
         place = reply.ok.attachment if reply.ok is not None else None
         yield (b"", b"") if reply.ok is None or place is None else (place.to_bytes(), reply.ok.payload.to_bytes())

@@ -15,9 +15,9 @@ import zenoh
 from threadpoolctl import threadpool_limits
 
 from service.config.config import AxisConfig, ServeConfig
-from service.failover.reachability import Reach
-from service.failover.storage import Estate, of_standby
-from service.failover.succession import Succession
+from service.failover.peer_files import PeerFiles, standby_folder
+from service.failover.reachability import Reachability
+from service.failover.role_control import RoleControl
 from service.intake.sinks import SampleSink, SampleWatcher
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
@@ -72,7 +72,7 @@ def as_standby(config: ServeConfig) -> ServeConfig:
             "clients look for it there; or use a router",
         )
     axes = tuple(
-        replace(axis, recorder=of_standby(axis.recorder), checkpoints=of_standby(axis.checkpoints))
+        replace(axis, recorder=standby_folder(axis.recorder), checkpoints=standby_folder(axis.checkpoints))
         for axis in config.axes
     )
     return replace(config, axes=axes, listen=config.standby_listen, connect=(*config.connect, *config.listen))
@@ -110,17 +110,17 @@ class Service:
     ) -> None:
         self.config = as_standby(config) if standby else config
         # Where the other one of the two keeps its files.
-        self._estates = [
-            Estate(axis.checkpoints, axis.recorder)
+        self._peer_files = [
+            PeerFiles(axis.checkpoints, axis.recorder)
             if standby
-            else Estate(of_standby(axis.checkpoints), of_standby(axis.recorder))
+            else PeerFiles(standby_folder(axis.checkpoints), standby_folder(axis.recorder))
             for axis in config.axes
         ]
         self.standby = standby
         self._stopped = stopped
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self.axes: list[AxisServer] = []
-        self._successions: list[Succession] = []
+        self._role_controls: list[RoleControl] = []
         self._factory = factory
         self._sinks = sinks
         self._session: zenoh.Session | None = None
@@ -150,7 +150,7 @@ class Service:
         alone_s = PATIENCE_S if config.connect else 0.0
         patience_s = STANDBY_PATIENCE_S if self.standby else PAIR_PATIENCE_S if config.standby_listen else alone_s
         try:
-            for axis, estate in zip(loaded, self._estates, strict=True):
+            for axis, peer_files in zip(loaded, self._peer_files, strict=True):
                 server = AxisServer(
                     self._session,
                     Keys(config.stage, axis.config.name),
@@ -162,18 +162,18 @@ class Service:
                 )
                 self.axes.append(server)
                 _restore(server)
-                reach = Reach(self._session, behind_routers=not config.listen)
-                succession = Succession(self._session, server, patience_s, reach, estate)
-                self._successions.append(succession)
+                reachability = Reachability(self._session, behind_routers=not config.listen)
+                control = RoleControl(self._session, server, patience_s, reachability, peer_files)
+                self._role_controls.append(control)
                 server.listen()
-                succession.start()
-            for succession in self._successions:
-                if not succession.settled.wait(patience_s + SETTLE_S):
-                    raise SessionError(f"axis {succession.server.keys.axis}: it could not be declared; see its events")
+                control.start()
+            for control in self._role_controls:
+                if not control.settled.wait(patience_s + SETTLE_S):
+                    raise SessionError(f"axis {control.server.keys.axis}: it could not be declared; see its events")
             self._publisher.start()
             until = time.monotonic() + SYNC_S
-            for succession in self._successions:
-                while not succession.ready.wait(0.1) and time.monotonic() < until and not self._stopped():
+            for control in self._role_controls:
+                while not control.ready.wait(0.1) and time.monotonic() < until and not self._stopped():
                     pass
         except BaseException:
             self.close()
@@ -185,9 +185,9 @@ class Service:
         self._wake.set()
         if self._publisher.is_alive():
             self._publisher.join()
-        for succession in self._successions:
-            succession.close()
-        self._successions = []
+        for control in self._role_controls:
+            control.close()
+        self._role_controls = []
         for axis in self.axes:
             axis.undeclare()
             if axis.intake.sink is not None:

@@ -296,20 +296,20 @@ def test_viewers_that_are_killed_or_stopped_harm_nobody(tmp_path: Path, processe
 def test_the_greatest_claim_serves() -> None:
     keys = Keys("demo", "x")
     claims = Claims(keys, "i-me")
-    assert (claims.first(), claims.next_epoch()) == (None, 1)
-    claims.hear(keys.claim(3, "i-me"), True)  # one's own is no news
-    assert claims.first() is None
-    claims.hear(keys.claim(1, "i-b"), True)
-    claims.hear(keys.claim(2, "i-a"), True)
-    claims.hear(keys.claim(2, "i-c"), True)
-    assert claims.first() == Claim(2, "i-c")
-    claims.hear(keys.claim(2, "i-c"), False)
-    assert claims.first() == Claim(2, "i-a")
-    claims.hear(keys.claim(2, "i-a"), False)
-    claims.hear(keys.claim(1, "i-b"), False)
-    assert (claims.first(), claims.next_epoch()) == (None, 3)
-    claims.hear("dehyst/v1/demo/x/alive/i-b", True)
-    assert claims.first() is None
+    assert (claims.highest(), claims.next_epoch()) == (None, 1)
+    claims.update(keys.claim(3, "i-me"), True)  # one's own is no news
+    assert claims.highest() is None
+    claims.update(keys.claim(1, "i-b"), True)
+    claims.update(keys.claim(2, "i-a"), True)
+    claims.update(keys.claim(2, "i-c"), True)
+    assert claims.highest() == Claim(2, "i-c")
+    claims.update(keys.claim(2, "i-c"), False)
+    assert claims.highest() == Claim(2, "i-a")
+    claims.update(keys.claim(2, "i-a"), False)
+    claims.update(keys.claim(1, "i-b"), False)
+    assert (claims.highest(), claims.next_epoch()) == (None, 3)
+    claims.update("dehyst/v1/demo/x/alive/i-b", True)
+    assert claims.highest() is None
     assert parse_claim("x") is None
     assert np.all([Claim(2, "a") > Claim(1, "z"), Claim(2, "b") > Claim(2, "a")])
 

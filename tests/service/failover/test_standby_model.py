@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import ModelFileError
-from service.failover.standby_model import NOT_SYNCED, Shadow, behind
-from service.failover.storage import Estate, inherit, of_standby
+from service.failover.peer_files import PeerFiles, restore_from_peer, standby_folder
+from service.failover.standby_model import NOT_SYNCED, StandbyModel, newer_than
 from service.intake.intake import Intake
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -46,12 +46,12 @@ class Sink:
         return True
 
 
-def standby(kept: int = 30_000, torn: Callable[[], None] = lambda: None) -> tuple[Axis, Shadow, Sink, Intake]:
+def standby(kept: int = 30_000, on_gap: Callable[[], None] = lambda: None) -> tuple[Axis, StandbyModel, Sink, Intake]:
     axis, sink = make_axis(), Sink()
     intake = Intake(axis, lambda: None, sink)
-    shadow = Shadow(axis, intake, kept, torn=torn)
-    intake.gate = shadow.gate
-    return axis, shadow, sink, intake
+    model = StandbyModel(axis, intake, kept, on_gap=on_gap)
+    intake.gate = model.gate
+    return axis, model, sink, intake
 
 
 def arrive(intake: Intake, batch: SampleBatch) -> None:
@@ -68,17 +68,17 @@ def state_of(of: Axis, **changes: Any) -> bytes:
 
 def test_every_sample_is_recorded_once_and_the_model_is_the_same_to_the_last_bit() -> None:
     serving = make_axis()
-    axis, shadow, sink, intake = standby()
+    axis, model, sink, intake = standby()
     serving.handle(recording(0, 400))
     for first in range(300, 500, 5):
         arrive(intake, recording(first, 5))
     assert [seq for seq, _ in sink.rows] == list(range(300, 500))
     assert {word for _, word in sink.rows} == {NOT_SYNCED}
-    assert (axis.handled_seq, shadow.synced) == (-1, False)
+    assert (axis.handled_seq, model.synced) == (-1, False)
 
-    shadow.take_state(state_of(serving))
+    model.take_state(state_of(serving))
     serving.handle(recording(400, 100))
-    assert shadow.synced
+    assert model.synced
     assert same(serving, axis)
     assert sink.index == axis.sequence.received == 500
     for first in range(500, 600, 5):
@@ -92,14 +92,14 @@ def test_every_sample_is_recorded_once_and_the_model_is_the_same_to_the_last_bit
 def test_a_stage_that_began_anew_while_samples_were_held_back_does_not_confuse_them() -> None:
     """Its numbers are lower than before: what came before the state is told by the order, not by the number."""
     serving = make_axis()
-    axis, shadow, _, intake = standby()
+    axis, model, _, intake = standby()
     serving.handle(recording(10_000, 300))
     for first in (*range(10_200, 10_300, 5), *range(0, 400, 5)):
         arrive(intake, recording(first, 5))
     for first in range(0, 300, 5):
         serving.handle(recording(first, 5))
     assert serving.sequence.restarts == 1
-    shadow.take_state(state_of(serving))
+    model.take_state(state_of(serving))
     for first in range(300, 400, 5):
         serving.handle(recording(first, 5))
     assert axis.sequence.counters() == serving.sequence.counters()
@@ -110,41 +110,41 @@ def test_a_stage_that_began_anew_while_samples_were_held_back_does_not_confuse_t
 def test_behind_is_what_came_after(numbers: list[int], size: int, seq: int) -> None:
     cuts = [np.array(numbers[i : i + size], dtype=np.int64) for i in range(0, len(numbers), size)]
     batches = [SampleBatch(cut, *(cut.astype(float) for _ in range(3))) for cut in cuts]
-    found = [int(n) for batch in behind(batches, seq) for n in batch.seq]
+    found = [int(n) for batch in newer_than(batches, seq) for n in batch.seq]
     at = numbers.index(seq) + 1 if seq in numbers else None
     assert found == (numbers[at:] if at is not None else [n for n in numbers if n > seq])
 
 
 @pytest.mark.parametrize(("first", "expected"), [(400, 0), (405, 1)])
 def test_a_sample_that_is_neither_in_the_state_nor_behind_it_is_noticed(first: int, expected: int) -> None:
-    torn: list[int] = []
+    gaps: list[int] = []
     serving = make_axis()
     serving.handle(recording(0, 400))
-    _, shadow, _, intake = standby(torn=lambda: torn.append(1))
-    shadow.take_state(state_of(serving))
+    _, model, _, intake = standby(on_gap=lambda: gaps.append(1))
+    model.take_state(state_of(serving))
     arrive(intake, recording(first, 5))
     arrive(intake, recording(first + 50, 5))  # a gap later on is the stage's own
-    assert len(torn) == expected
+    assert len(gaps) == expected
 
 
 def test_a_state_of_another_axis_is_refused_and_the_samples_are_still_recorded() -> None:
     serving = make_axis()
     serving.handle(recording(0, 100))
-    _, shadow, sink, intake = standby()
+    _, model, sink, intake = standby()
     with pytest.raises(ModelFileError, match="axis is 'y'"):
-        shadow.take_state(state_of(serving, axis="y"))
+        model.take_state(state_of(serving, axis="y"))
     arrive(intake, recording(100, 5))
-    assert not shadow.synced
+    assert not model.synced
     assert len(sink.rows) == 5
 
 
 def test_without_a_state_it_learns_all_that_was_held_back() -> None:
-    axis, shadow, sink, intake = standby()
+    axis, model, sink, intake = standby()
     for first in range(0, 300, 5):
         arrive(intake, recording(first, 5))
-    told = shadow.give_up()
+    told = model.take_over()
     assert "its own state of sample -1, then 300 samples" in told
-    assert shadow.give_up() == ""
+    assert model.take_over() == ""
     alone = make_axis()
     alone.handle(recording(0, 300))
     assert same(axis, alone)
@@ -156,13 +156,13 @@ def test_what_is_no_longer_remembered_is_learnt_from_the_journal(tmp_path: Path)
     axis.config = replace(axis.config, recorder=tmp_path)
     with Recorder(RecorderConfig(tmp_path, flush_s=0.005)) as recorder:
         intake = Intake(axis, lambda: None, recorder)
-        shadow = Shadow(axis, intake, kept=50)
-        intake.gate = shadow.gate
+        model = StandbyModel(axis, intake, kept=50)
+        intake.gate = model.gate
         for first in range(0, 600, 5):
             arrive(intake, recording(first, 5))
         while recorder.counters()["written"] < 600:
             pass
-        shadow.give_up()
+        model.take_over()
     alone = make_axis()
     alone.handle(recording(0, 600))
     assert axis.handled_seq == 599
@@ -170,29 +170,29 @@ def test_what_is_no_longer_remembered_is_learnt_from_the_journal(tmp_path: Path)
     assert same(axis, alone)
 
 
-def left_behind(place: Path, samples: int, kept_at: int) -> tuple[Axis, Estate]:
+def left_behind(place: Path, samples: int, kept_at: int) -> tuple[Axis, PeerFiles]:
     """An instance that handled ``samples``, wrote its last checkpoint at ``kept_at``, and was killed."""
-    axis, estate = make_axis(), Estate(place / "kept", place / "rec")
-    assert estate.checkpoints is not None
-    assert estate.recordings is not None
-    recorder = Recorder(RecorderConfig(estate.recordings, flush_s=0.005))
+    axis, files = make_axis(), PeerFiles(place / "kept", place / "rec")
+    assert files.checkpoints is not None
+    assert files.recordings is not None
+    recorder = Recorder(RecorderConfig(files.recordings, flush_s=0.005))
     intake = Intake(axis, lambda: None, recorder)
     for first in range(0, samples, 20):
         intake.handle(recording(first, 20))
         if first + 20 == kept_at:
-            folder(estate.checkpoints).write(meta(axis), axis.state_dict())
+            folder(files.checkpoints).write(meta(axis), axis.state_dict())
     recorder.close()
-    return axis, estate
+    return axis, files
 
 
 def test_who_takes_over_without_a_state_goes_on_from_what_the_other_left_behind(tmp_path: Path) -> None:
-    gone, estate = left_behind(tmp_path, 800, kept_at=600)
-    axis, shadow, _, intake = standby()
+    gone, files = left_behind(tmp_path, 800, kept_at=600)
+    axis, model, _, intake = standby()
     axis.handle(recording(0, 100))  # its own state is old
     for first in range(700, 900, 20):
         arrive(intake, recording(first, 20))
-    told = shadow.give_up(lambda newest: inherit(axis, estate, "demo", newest))
-    assert told.startswith("checkpoint 1 of the one before, sample 599, and 200 samples of its journal, then 100")
+    told = model.take_over(lambda newest: restore_from_peer(axis, files, "demo", newest))
+    assert told.startswith("checkpoint 1 of the other instance, sample 599, and 200 samples of its journal, then 100")
     gone.handle(recording(800, 100))
     assert axis.sequence.lost == 0
     assert same(axis, gone)
@@ -200,29 +200,29 @@ def test_who_takes_over_without_a_state_goes_on_from_what_the_other_left_behind(
 
 @pytest.mark.parametrize("own", [800, 1000])
 def test_what_reaches_less_far_than_its_own_state_is_left(tmp_path: Path, own: int) -> None:
-    _, estate = left_behind(tmp_path, 800, kept_at=600)
+    _, files = left_behind(tmp_path, 800, kept_at=600)
     axis = make_axis()
     axis.handle(recording(0, own))
-    assert inherit(axis, estate, "demo", 1200) == ""
+    assert restore_from_peer(axis, files, "demo", 1200) == ""
     assert axis.handled_seq == own - 1
-    assert inherit(axis, Estate(), "demo", 1200) == ""
-    assert inherit(axis, Estate(tmp_path / "nowhere", None), "demo", 1200) == ""
+    assert restore_from_peer(axis, PeerFiles(), "demo", 1200) == ""
+    assert restore_from_peer(axis, PeerFiles(tmp_path / "nowhere", None), "demo", 1200) == ""
 
 
 def test_a_damaged_checkpoint_of_the_other_is_passed_over_with_the_reason(tmp_path: Path) -> None:
-    _, estate = left_behind(tmp_path, 800, kept_at=600)
-    assert estate.checkpoints is not None
-    (estate.checkpoints / "checkpoint-000000002.ckpt").write_bytes(b"torn")
+    _, files = left_behind(tmp_path, 800, kept_at=600)
+    assert files.checkpoints is not None
+    (files.checkpoints / "checkpoint-000000002.ckpt").write_bytes(b"torn")
     axis = make_axis()
-    assert inherit(axis, estate, "demo", -1).startswith("checkpoint 1 of the one before")
+    assert restore_from_peer(axis, files, "demo", -1).startswith("checkpoint 1 of the other instance")
     assert axis.handled_seq == 799
     events = axis.take_events()
     assert [event["event"] for event in events] == ["checkpoint_refused", "learnt_again"]
-    assert "checkpoint 2 of the one before" in events[0]["detail"]
+    assert "checkpoint 2 of the other instance" in events[0]["detail"]
     # It is the other's folder: nothing of it is changed.
-    assert restore_newest(make_axis(), folder(estate.checkpoints)) == 1
+    assert restore_newest(make_axis(), folder(files.checkpoints)) == 1
 
 
 def test_the_standby_keeps_its_files_beside_those_of_the_other() -> None:
-    assert of_standby(Path("a/rec")) == Path("a/rec-standby")
-    assert of_standby(None) is None
+    assert standby_folder(Path("a/rec")) == Path("a/rec-standby")
+    assert standby_folder(None) is None

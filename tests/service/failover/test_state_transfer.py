@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from service.failover.state_transfer import MOST_PAUSE_S, PAUSE_S, ask_for_state, join, send_state
+from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, join_parts, send_state
 from service.runtime.session import open_client, open_router
 from tests.service.conftest import unused_port
 
@@ -24,13 +24,13 @@ STATE = os.urandom(4_700_000)
 
 _ASKER = """
 import sys
-from service.failover.state_transfer import ask_for_state
+from service.failover.state_transfer import fetch_state
 from service.runtime.session import open_client
 with open_client(sys.argv[1], 10.0) as session:
     print("ready", flush=True)
     whole = 0
     while True:
-        whole += ask_for_state(session, sys.argv[2], 5.0) is not None
+        whole += fetch_state(session, sys.argv[2], 5.0) is not None
         print(whole, flush=True)
 """
 
@@ -62,8 +62,8 @@ def placed(*places: tuple[int, int]) -> list[tuple[bytes, bytes]]:
     ],
 )
 def test_parts_that_make_no_whole_are_refused(parts: list[tuple[bytes, bytes]]) -> None:
-    assert join(placed((0, 3), (1, 3), (2, 3))) == b"xxx"
-    assert join(parts) is None
+    assert join_parts(placed((0, 3), (1, 3), (2, 3))) == b"xxx"
+    assert join_parts(parts) is None
 
 
 def test_what_is_whole_is_not_waited_with() -> None:
@@ -71,7 +71,7 @@ def test_what_is_whole_is_not_waited_with() -> None:
         yield from placed((0, 2), (1, 2))
         raise AssertionError("the end may be lost")
 
-    assert join(parts()) == b"xx"
+    assert join_parts(parts()) == b"xx"
 
 
 def test_nobody_fills_the_memory_of_the_one_that_asks() -> None:
@@ -83,7 +83,7 @@ def test_nobody_fills_the_memory_of_the_one_that_asks() -> None:
             taken = i + 1
             yield struct.pack("<II", i, 2**32 - 1), b"x"
 
-    assert join(without_end()) is None
+    assert join_parts(without_end()) is None
     assert taken == 1
 
 
@@ -98,16 +98,16 @@ def in_a_thread(query: zenoh.Query) -> None:
 def asked(session: zenoh.Session, pause_s: float) -> bytes | None:
     """What arrives when asked for as a standby does: a part may be lost, and more slowly the next time it comes."""
     for _ in range(6):
-        data = ask_for_state(session, KEY, 5.0, pause_s)
+        data = fetch_state(session, KEY, 5.0, pause_s)
         if data is not None:
             return data
-        pause_s = max(PAUSE_S, min(2.0 * pause_s, MOST_PAUSE_S))
+        pause_s = max(PAUSE_S, min(2.0 * pause_s, MAX_PAUSE_S))
     return None
 
 
 def test_it_arrives_whole_at_any_pace(endpoint: str) -> None:
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
-        assert ask_for_state(asking, KEY, 1.0) is None
+        assert fetch_state(asking, KEY, 1.0) is None
         serving.declare_queryable(KEY, in_a_thread)
         time.sleep(0.2)
         assert asked(asking, PAUSE_S) == STATE
@@ -156,7 +156,7 @@ def test_a_part_that_is_missing_is_noticed(endpoint: str, lost: int | None, ende
         serving.declare_queryable(KEY, answer)
         time.sleep(0.2)
         begin = time.monotonic()
-        assert ask_for_state(asking, KEY, 20.0) is None
+        assert fetch_state(asking, KEY, 20.0) is None
         assert time.monotonic() - begin < 10.0
         for query in kept:
             query.drop()

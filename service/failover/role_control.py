@@ -1,0 +1,262 @@
+"""Decides whether one axis of one instance serves or stands by, and changes its role.
+
+A thread of its own decides when claims change: callbacks of zenoh only store what arrives.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, Final
+
+import zenoh
+
+from adaptive.errors import DehystError, ModelFileError
+from service.failover.claims import Claim, Claims
+from service.failover.peer_files import PeerFiles, restore_from_peer
+from service.failover.reachability import Reachability
+from service.failover.standby_model import StandbyModel
+from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state
+from service.protocol.json_message import fields_of
+from service.server.endpoints import PRIMARY, STANDBY, AxisServer
+
+#: Events of the serving instance after which its model no longer follows from the samples alone.
+MODEL_EVENTS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
+#: Longest time for the transfer of the state, and pause before the next attempt, s.
+_TRANSFER_S: Final = 3.0
+_TRANSFER_PAUSE_S: Final = 0.3
+#: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
+_CLAIM_LOST_S: Final = 2.0
+_POLL_S: Final = 1.0
+_LEAST_WAIT_S: Final = 0.01
+#: Longest time for a change of role, and for restoring a received state, in the thread that handles samples, s.
+_CHANGE_S: Final = 60.0
+_RESTORE_S: Final = 10.0
+
+
+class RoleControl:
+    """The role of one axis of one instance.
+
+    Parameters
+    ----------
+    server : of the axis; it listens already. search_s : time to look for a serving instance before serving, s.
+    reachability : of this instance. peer_files : checkpoints and recordings of the other instance on this host.
+
+    Attributes
+    ----------
+    settled : set once the role is known.
+    ready : set once this instance serves, holds the served model, or was refused it.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        server: AxisServer,
+        search_s: float,
+        reachability: Reachability,
+        peer_files: PeerFiles,
+    ) -> None:
+        self.server = server
+        self.claims = Claims(server.keys, server.instance)
+        self.model = StandbyModel(
+            server.axis, server.intake, on_restored=server.keeper.at_once, on_gap=self._refetch_state
+        )
+        self._peer_files = peer_files
+        self._reachability = reachability
+        self._refusal = ""
+        self._pause_s = PAUSE_S
+        self._session = session
+        self._search_s = search_s
+        self._stopping = False
+        #: Whether the state of the serving instance must be fetched, and whether that is going on.
+        self._outdated = True
+        self._fetching = False
+        self._token: Any = None
+        self._epoch = 0
+        self._rival_at: float | None = None
+        self._subscribers: list[Any] = []
+        self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=True)
+        self.settled = threading.Event()
+        self.ready = threading.Event()
+        server.synced = False
+        server.intake.gate = self.model.gate
+
+    def start(self) -> None:
+        """Look for other instances and take a role."""
+        keys = self.server.keys
+        self._subscribers = [
+            self._session.liveliness().declare_subscriber(keys.claim_any, self._on_claim, history=True),
+            self._session.declare_subscriber(keys.event, self._on_event),
+            self._session.declare_subscriber(keys.status, self._on_status),
+        ]
+        self._thread.start()
+
+    def close(self) -> None:
+        """Withdraw the claim and end the thread. The server stays open."""
+        self._stopping = True
+        self.claims.changed.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._subscribers = []
+        self._drop_claim()
+
+    def _on_claim(self, sample: zenoh.Sample) -> None:
+        self.claims.update(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    def _on_event(self, sample: zenoh.Sample) -> None:
+        event = fields_of(sample.payload.to_bytes())
+        if event.get("instance") != self.server.instance and event.get("event") in MODEL_EVENTS:
+            self._refetch_state()
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        """Compare the digest of the served model, published once a second, with the own one of the same sample."""
+        status = fields_of(sample.payload.to_bytes())
+        server = self.server
+        if server.role == PRIMARY or not server.synced or status.get("instance") == server.instance:
+            return
+        if self._outdated or self._fetching:
+            return  # the present model is about to be replaced
+        seq, theirs = status.get("snapshot_seq"), status.get("fingerprint")
+        if isinstance(seq, int) and isinstance(theirs, str) and server.axis.differs(seq, theirs):
+            server.axis.note("standby_differed", f"at sample {seq}; the state is fetched again")
+            self._refetch_state()
+
+    def _refetch_state(self) -> None:
+        self._outdated = True
+        self.claims.changed.set()
+
+    def _run(self) -> None:
+        until = time.monotonic() + self._search_s
+        while not self._stopping:
+            self.claims.changed.clear()
+            try:
+                self._decide(until)
+            except Exception as error:
+                self.server.axis.note("internal_error", f"standby: {type(error).__name__}: {error}")
+            highest = self.claims.highest()
+            if self.server.role == STANDBY and highest is None:
+                wait_s = max(_LEAST_WAIT_S, until - time.monotonic())
+            else:
+                wait_s = _TRANSFER_PAUSE_S if self.server.role == STANDBY and self._outdated else _POLL_S
+            self.claims.changed.wait(wait_s)
+
+    def _decide(self, until: float) -> None:
+        highest = self.claims.highest()
+        if self.server.role == PRIMARY:
+            if highest is not None and highest > Claim(self._epoch, self.server.instance):
+                self._stand_down(highest.instance)
+            else:
+                self._check_rival(highest)
+            return
+        if highest is None:
+            # A standby knows that the serving instance is gone; a new instance looks for one first. Without a router
+            # neither is known.
+            searched = self.settled.is_set() or time.monotonic() >= until
+            if searched and not self._reachability.is_cut_off() and self.claims.highest() is None:
+                self._take_over()
+            return
+        self.settled.set()
+        if self._outdated:
+            self._take_state()
+
+    def _check_rival(self, rival: Claim | None) -> None:
+        """Claim again if a rival with a lower claim goes on serving.
+
+        The rival may not have received the claim: zenoh 1.10 did not deliver it to an instance that had been suspended.
+        It does deliver a new claim.
+        """
+        now = time.monotonic()
+        if rival is None:
+            self._rival_at = None
+        elif self._rival_at is None:
+            self._rival_at = now
+        elif now - self._rival_at >= _CLAIM_LOST_S:
+            self._rival_at = now
+            self._claim()
+            detail = f"as number {self._epoch}: {rival.instance} serves as number {rival.epoch} and does not stand down"
+            self.server.axis.note("claimed_anew", detail)
+
+    def _claim(self) -> None:
+        """Declare a claim above all known ones, then withdraw the previous one."""
+        server, before = self.server, self._token
+        server.epoch = self._epoch = max(self._epoch + 1, self.claims.next_epoch())
+        self._token = self._session.liveliness().declare_token(server.keys.claim(self._epoch, server.instance))
+        if before is not None:
+            before.undeclare()
+
+    def _take_over(self) -> None:
+        server = self.server
+        self._claim()
+        server.serve()
+        server.intake.call(self._leave_standby, _CHANGE_S)
+        self._outdated = False
+        server.synced = True
+        self.settled.set()
+        self.ready.set()
+
+    def _stand_down(self, other: str) -> None:
+        server = self.server
+        server.axis.note("stood_down", f"{other} serves: it took over while this instance was unreachable")
+        # First: the status must not claim that this is the served model.
+        server.synced = False
+        server.stand_down()
+        self._drop_claim()
+        self._rival_at = None
+        server.intake.call(self._enter_standby, _CHANGE_S)
+        self._outdated = True
+        self._take_state()
+
+    def _leave_standby(self) -> None:
+        axis = self.server.axis
+        # The first instance takes over from nobody and continues from its own state.
+        source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
+        self.server.intake.gate = None
+        if self._epoch > 1:
+            model = f"not synced: it continues from {source}" if source else "with the model of the one before"
+            axis.note("took_over", f"as number {self._epoch}, {model}", synced=not source)
+
+    def _restore(self, newest_seq: int) -> str:
+        return restore_from_peer(self.server.axis, self._peer_files, self.server.keys.stage, newest_seq)
+
+    def _enter_standby(self) -> None:
+        self.model.stand_down()
+        self.server.leave_tuning()
+        self.server.intake.gate = self.model.gate
+
+    def _take_state(self) -> None:
+        """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
+        self._fetching, self._outdated = True, False  # a callback may set it again meanwhile
+        taken = False
+        try:
+            taken = self._fetch_and_restore()
+        finally:
+            self._fetching = False
+            self._outdated = self._outdated or not taken
+
+    def _fetch_and_restore(self) -> bool:
+        data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s)
+        # After a failure on a busy machine the next transfer is slower.
+        self._pause_s = min(2.0 * self._pause_s, MAX_PAUSE_S)
+        if data is None:
+            return False
+        try:
+            self.server.intake.call(lambda: self.model.take_state(data), _RESTORE_S)
+        except DehystError as error:
+            if str(error) != self._refusal:
+                self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
+            self._refusal = str(error)
+            if isinstance(error, ModelFileError):
+                # Another configuration: this instance stays without the served model, and records samples.
+                self.ready.set()
+            return False
+        self._refusal, self._pause_s = "", PAUSE_S
+        self.server.synced = True
+        self.ready.set()
+        return True
+
+    def _drop_claim(self) -> None:
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
