@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks import run
 from benchmarks.drift import bench_drift
+from benchmarks.kalman_reference import bench_kalman
 from benchmarks.peers import bench_peers
 from benchmarks.solver import bench_window
 from lab.cli import main
@@ -40,6 +41,7 @@ def report() -> dict[str, object]:
         "window": {"100": bench_window(100, 50)},
         "peers": bench_peers(60, 5),
         "drift": bench_drift(400, size=50, checks=2),
+        "kalman": bench_kalman(300, 12),
     }
 
 
@@ -73,18 +75,25 @@ def test_drift_is_looked_at_in_every_form(report: dict[str, object]) -> None:
             assert row["worst_alpha_error"] < 1e-6, row
 
 
+def test_the_compiled_kalman_filter_is_that_of_filterpy(report: dict[str, object]) -> None:
+    row = report["kalman"]
+    assert row["estimate_error"] < 1e-12  # type: ignore[index]
+    assert row["covariance_error"] < 1e-12  # type: ignore[index]
+    assert row["compiled_us"] > 0.0 < row["reference_us"]  # type: ignore[index]
+
+
 def test_the_page_names_every_size(report: dict[str, object]) -> None:
     page = run.page(report)
     assert "100" in page
     assert "krls" in page
-    assert page.count("updates") == len(report["drift"]) + 1  # type: ignore[arg-type]
+    assert page.count("updates") == len(report["drift"]) + 2  # type: ignore[arg-type]
 
 
 def test_the_command_reports_every_size_every_peer_and_the_drift(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`dehyst bench --json` itself; only the work behind each of its keys is made smaller."""
-    asked: dict[str, list[tuple[Any, ...]]] = {"window": [], "peers": [], "drift": []}
+    asked: dict[str, list[tuple[Any, ...]]] = {"window": [], "peers": [], "drift": [], "kalman": []}
 
     def window(n: int, repeats: int) -> dict[str, float]:
         asked["window"].append((n, repeats))
@@ -98,7 +107,12 @@ def test_the_command_reports_every_size_every_peer_and_the_drift(
         asked["drift"].append((updates, size))
         return [row | {"size": float(size)} for row in bench_drift(200, size // 5, checks=2, **more)]
 
-    for name, stand_in in (("bench_window", window), ("bench_peers", peers), ("bench_drift", drift)):
+    def kalman(updates: int) -> dict[str, float]:
+        asked["kalman"].append((updates,))
+        return bench_kalman(100, 6)
+
+    stand_ins = {"bench_window": window, "bench_peers": peers, "bench_drift": drift, "bench_kalman": kalman}
+    for name, stand_in in stand_ins.items():
         monkeypatch.setattr(run, name, stand_in)
     assert main(["bench", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -118,4 +132,6 @@ def test_the_command_reports_every_size_every_peer_and_the_drift(
     assert [n for n, _ in asked["peers"]] == [500]
     assert asked["drift"] == [(1_000_000, 100), (1_000_000, 500)]
     assert {row["size"] for row in told["drift"]} == {100.0, 500.0}
+    assert asked["kalman"] == [(20_000,)]
+    assert told["kalman"]["estimate_error"] < 1e-12
     assert {row["form"] for row in told["drift"] if row["size"] == 100.0} == {"inverse", "cholesky", "auto"}
