@@ -1,7 +1,7 @@
-"""Recordings in: one reader per format, units only as stated, problems reported as data.
+"""Recordings from files: one reader per format, units only as stated, problems reported as data.
 
-``read(path, mapping)`` gives a :class:`Recording` in the canonical columns, ``check`` what is wrong with it,
-``require_usable`` refuses what cannot be used, ``repaired`` puts the rest on a whole time grid.
+``read(path, mapping)`` gives a `Recording` in the project's columns, ``check`` lists its problems, ``require_usable``
+refuses what cannot be used, and ``repaired`` puts the rest on a regular time grid.
 """
 
 from sim.recordings.columns import ColumnMap, load_map

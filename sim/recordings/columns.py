@@ -1,7 +1,7 @@
-"""What a foreign column means: names and units as the user states them, never guessed.
+"""The meaning of a file's columns: names and units as the user states them, never guessed.
 
-A unit comes from one of two places: the end of the column's own name (``y_nm``), or an option. A column without
-either is refused with the option that would mend it.
+A unit comes from the end of the column's own name (``y_nm``) or from an option. A column without either is refused
+with the option that adds it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _VOLTAGE = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "kV": 1e3}
 _LENGTH = {"um": 1.0, "µm": 1.0, "μm": 1.0, "nm": 1e-3, "pm": 1e-6, "mm": 1e3, "m": 1e6}
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 _RATE = {"Hz": 1.0, "hz": 1.0, "kHz": 1e3}
-#: Kelvin also differ by an offset, which the reader takes off.
+#: Kelvin also have an offset, which the reader subtracts.
 _TEMPERATURE = {"C": 1.0, "degC": 1.0, "K": 1.0}
 KELVIN_AT_0_C = 273.15
 
@@ -46,13 +46,15 @@ class ColumnMap:
     columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 u3 monitor temperature``,
         and the scalars ``dt`` and ``rate``).
     units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; ``s ms us ns min``; ``C K``; ``Hz kHz``).
-    scale : quantity -> factor from the file's number to the canonical unit, for what has no unit of its kind (10
-        for a sensor of 10 µm per volt). In place of a unit.
-    index : quantity -> which part of an array of several dimensions, one ``:`` for the samples (``":,0,2"``).
+    scale : quantity -> factor from the file's number to the canonical unit, in place of a unit, for a column in
+        another quantity (10 for a sensor of 10 µm per volt).
+    index : quantity -> part of an array of several dimensions, with one ``:`` for the samples (``":,0,2"``).
     dt_s : sample time, s, where the file has no time column.
-    sensor_late : samples by which the sensor's column lies late in the file, as its provenance says; the readings
-        are moved back by as many samples, and as many samples at the end are dropped.
-    delimiter, decimal : of a text file, where its header line does not tell.
+    sensor_late : samples by which the sensor's column is late in the file. The readings are moved back by as many
+        samples, and as many samples at the end are dropped.
+    delimiter, decimal : of a text file, where its header line does not show them.
+
+    Raises InputError on an unknown quantity or unit, and on values out of range.
     """
 
     columns: dict[str, str] = field(default_factory=dict)
@@ -93,7 +95,7 @@ _SCALARS: dict[str, type] = {"dt_s": float, "sensor_late": int, "delimiter": str
 def load_map(path: Path) -> ColumnMap:
     """Read a :class:`ColumnMap` from a TOML file with its field names as keys and tables.
 
-    Raises InputError where the file is missing, no TOML, or has an unknown key.
+    Raises InputError where the file is missing, is not TOML, or has an unknown key.
     """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -122,16 +124,16 @@ def _typed(path: Path, key: str, value: object, kind: type) -> object:
 
 
 def unit_of_name(quantity: str, column: str) -> str | None:
-    """The unit that a column's name ends in (``_nm``, `` [nm]``, ``(nm)``), if it is one of the quantity's."""
+    """The unit at the end of a column's name (``_nm``, `` [nm]``, ``(nm)``); None unless it is one of the quantity."""
     factors = QUANTITIES[quantity][1]
     match = re.search(r"(?:_|[\s_]*[\[(])([A-Za-zµμ]+)[\])]?$", column)
     return match.group(1) if match and match.group(1) in factors else None
 
 
 def default_column(source: str, quantity: str, names: list[str]) -> str | None:
-    """The column that bears the quantity's own name with a unit, or without one; None where there is none.
+    """The column with the name of the quantity, with or without a unit; None where there is none.
 
-    Raises InputError where several do.
+    Raises InputError where there are several.
     """
     canonical, _ = QUANTITIES[quantity]
     if canonical in names:
@@ -145,9 +147,9 @@ def default_column(source: str, quantity: str, names: list[str]) -> str | None:
 
 
 def factor_and_unit(source: str, quantity: str, column: str, mapping: ColumnMap) -> tuple[float, str]:
-    """Factor from the file's numbers to the canonical unit, and the unit's name.
+    """Factor from the file's numbers to the canonical unit, and the name of the unit.
 
-    Raises InputError naming the file, the column, the accepted units and the option to add, where no unit is known.
+    Raises InputError where no unit is known, naming the file, the column, the accepted units and the option to add.
     """
     if quantity in mapping.scale:
         return mapping.scale[quantity], "scaled"

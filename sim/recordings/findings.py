@@ -1,7 +1,7 @@
-"""What is wrong with a recording, as data: gaps, doubles, dropouts, flat tops, not-numbers, wrong bases, swaps.
+"""Problems of a recording, as data: gaps, doubles, dropouts, clipping, values that are not finite, units, swaps.
 
-A finding never raises. Three grades: ``note`` (worth knowing), ``warning`` (results suffer), ``refusal`` (nothing
-can be learnt from this; :func:`require_usable` raises).
+`check` never raises. A finding has one of three grades: ``note`` (worth knowing), ``warning`` (results suffer) and
+``refusal`` (the recording cannot be used; `require_usable` raises).
 """
 
 from __future__ import annotations
@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.recordings.causality import swapped
 from sim.recordings.recording import Recording
 from sim.recordings.repair import dropout_mask, repeat_mask, runs
 
 Severity = Literal["note", "warning", "refusal"]
 
-#: Fewer samples than this teach nothing; below the second number a hold-out test says little.
+#: Fewest samples that can be used, and fewest for which a hold-out test means something.
 LEAST_SAMPLES, FEW_SAMPLES = 200, 1000
-#: Ranges beyond which a unit was probably mistaken: µm of a piezo stage, V of its command or its amplifier.
+#: Plausible spans of a piezo stage's displacement, µm, and of its command or amplifier, V.
 PLAUSIBLE_UM, PLAUSIBLE_V = (0.01, 5000.0), (0.01, 2000.0)
 #: Share of samples without a finite value above which a recording is refused.
 MOST_NOT_FINITE = 0.2
-#: Run of equal extreme readings of a noisy sensor that counts as a flat top.
+#: Run of equal extreme readings of a noisy sensor that counts as clipping.
 FLAT_RUN = 5
+#: Sine of the mean lead of the displacement above which the columns may be exchanged. Loops of stages have -0.05 to
+#: -0.3; a stage without hysteresis has 0.
+LARGEST_LEAD = 0.02
+#: Below this correlation the columns do not form a loop, and are not judged.
+LEAST_CORRELATION = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +40,13 @@ class Finding:
 
     Attributes
     ----------
-    kind : what, by a fixed name (``gap``, ``doubled``, ``backwards``, ``jitter``, ``not_finite``, ``dropout``,
+    kind : fixed name of the problem (``gap``, ``doubled``, ``backwards``, ``jitter``, ``not_finite``, ``dropout``,
         ``clipped``, ``all_zero``, ``constant``, ``too_short``, ``swapped``, ``unit``, ``note``).
     severity : ``note``, ``warning`` or ``refusal``.
     column : canonical column, or "" for the whole recording.
-    count : how many samples or places.
-    at_s : where, s, the first ten.
-    message : the sentence for people, with the number found and what to do.
+    count : number of samples or places.
+    at_s : times of the first ten, s.
+    message : sentence for people, with the number found and what to do.
     """
 
     kind: str
@@ -65,7 +69,7 @@ class Finding:
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Everything found in a recording, refusals first. Never raises on data, and never changes it."""
+    """All findings, refusals first. Never raises on data and does not change the recording."""
     found = [Finding("note", "note", "", 1, (), note) for note in recording.notes]
     n = len(recording)
     if n < LEAST_SAMPLES:
@@ -82,7 +86,7 @@ def check(recording: Recording) -> list[Finding]:
         if (finding := _not_finite(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
-        if (finding := _dull(recording, name, values)) is not None:
+        if (finding := _constant(recording, name, values)) is not None:
             found.append(finding)
             values_are_sound &= finding.severity != "refusal"
             continue
@@ -97,7 +101,7 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def require_usable(recording: Recording, findings: list[Finding]) -> None:
-    """Raise InputError with every refusal among the findings, if there is one."""
+    """Raise InputError with all refusals among the findings, if there are any."""
     refusals = [finding.message for finding in findings if finding.severity == "refusal"]
     if refusals:
         raise InputError(f"{recording.source or 'recording'}: " + "; ".join(refusals))
@@ -148,14 +152,14 @@ def _not_finite(recording: Recording, name: str, values: FloatArray) -> Finding 
         return None
     share = len(bad) / len(values)
     refused = name in ("u_V", "y_um") and share > MOST_NOT_FINITE
-    message = f"{name}: {len(bad)} of {len(values)} samples ({100 * share:.2g} %) are no finite numbers"
+    message = f"{name}: {len(bad)} of {len(values)} samples ({100 * share:.2g} %) are not finite numbers"
     if refused:
         message += f", expected at most {100 * MOST_NOT_FINITE:g} %: record again"
     return Finding("not_finite", "refusal" if refused else "warning", name, len(bad), _places(recording, bad), message)
 
 
-def _dull(recording: Recording, name: str, values: FloatArray) -> Finding | None:
-    """All zeros or one constant: nothing to be learnt from it."""
+def _constant(recording: Recording, name: str, values: FloatArray) -> Finding | None:
+    """A column of one value, from which nothing can be learnt."""
     finite = values[np.isfinite(values)]
     if not len(finite) or np.ptp(finite) > 0.0:
         return None
@@ -169,7 +173,7 @@ def _dull(recording: Recording, name: str, values: FloatArray) -> Finding | None
 
 def _dropouts(recording: Recording, name: str, values: FloatArray) -> list[Finding]:
     if name not in ("y_um", "y2_um", "monitor_V"):
-        return []  # a command may well step to zero and back
+        return []  # a command may step to zero and back
     where = np.flatnonzero(dropout_mask(values))
     if not len(where):
         return []
@@ -178,13 +182,13 @@ def _dropouts(recording: Recording, name: str, values: FloatArray) -> list[Findi
 
 
 def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Finding]:
-    """Runs of one extreme value. In a sensor with noise that is clipping; in a command it may be a hold."""
+    """Runs of the extreme value: clipping in a noisy sensor, possibly a hold in a command."""
     if name == "temperature_C":
         return []
     found: list[Finding] = []
     finite = np.isfinite(values)
     same = np.abs(np.diff(values[finite])) == 0.0
-    # A sensor that repeats itself often is coarse (or rests): then equal extremes prove nothing.
+    # A sensor that often repeats a value is coarse or at rest; equal extremes then prove nothing.
     noisy = len(same) > 0 and float(np.mean(same)) < 0.3
     command = name in ("u_V", "u2_V", "u3_V")
     for which, level in (("top", float(np.max(values[finite]))), ("bottom", float(np.min(values[finite])))):
@@ -194,7 +198,7 @@ def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Find
             continue
         count = int(np.sum(long[:, 1] - long[:, 0]))
         what = f"{name}: flat {which} at {level:.5g} in {len(long)} places, {count} samples: "
-        what += "holds, or the limit of an output" if command else "the sensor or its converter is at its end"
+        what += "holds, or the limit of an output" if command else "the sensor or its converter is at its limit"
         severity: Severity = "note" if command else "warning"
         found.append(Finding("clipped", severity, name, count, _places(recording, long[:, 0]), what))
     return found
@@ -218,7 +222,7 @@ def _repeats(recording: Recording) -> list[Finding]:
         return []
     message = (
         f"{len(where)} samples repeat the one before exactly while the stage moves, first at "
-        f"{recording.t_s[where[0]]:.4g} s: a recorder that doubles what it missed"
+        f"{recording.t_s[where[0]]:.4g} s: the recorder repeats a value where it missed one"
     )
     return [Finding("doubled", "warning", "", len(where), _places(recording, where), message)]
 
@@ -234,3 +238,36 @@ def _swap(recording: Recording) -> list[Finding]:
         else "; check the columns"
     )
     return [Finding("swapped", "refusal" if certain else "warning", "", len(recording), (), message)]
+
+
+def lead(u: FloatArray, y: FloatArray) -> float:
+    """Mean sine of the angle by which ``y`` leads ``u``, (n,) each; negative where y lags, as in a passive stage.
+
+    It is the correlation of y with the slope of u, without the sign of the gain: the signed area of the loops. Samples
+    that are not finite are left out.
+    """
+    good = np.isfinite(u) & np.isfinite(y)
+    u, y = u[good] - np.mean(u[good]), y[good] - np.mean(y[good])
+    slope = 0.5 * (u[2:] - u[:-2])
+    centre = y[1:-1]
+    size = float(np.sqrt(np.sum(slope**2) * np.sum(centre**2)))
+    gain = float(np.sum(u * y))
+    return float(np.sum(slope * centre)) / size * float(np.sign(gain)) if size > 0.0 else 0.0
+
+
+def roughness(x: FloatArray) -> float:
+    """Fast noise relative to the range: the median of the fourth differences, in which slow motion vanishes."""
+    x = x[np.isfinite(x)]
+    if len(x) < 5 or np.ptp(x) == 0.0:
+        return 0.0
+    return float(np.median(np.abs(np.diff(x, n=4))) / np.sqrt(70.0) / np.ptp(x))
+
+
+def swapped(u: FloatArray, y: FloatArray) -> Literal["no", "likely", "certain"]:
+    """Whether ``u`` and ``y`` look exchanged: a displacement cannot lead its voltage, and only a sensor is noisy."""
+    good = np.isfinite(u) & np.isfinite(y)
+    if np.count_nonzero(good) < 3 or np.ptp(u[good]) == 0.0 or np.ptp(y[good]) == 0.0:
+        return "no"
+    if abs(float(np.corrcoef(u[good], y[good])[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
+        return "no"
+    return "certain" if roughness(u) > 3.0 * roughness(y) else "likely"

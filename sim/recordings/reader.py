@@ -1,4 +1,4 @@
-"""From a file to a recording in the project's own columns and units."""
+"""Reads a file into a recording with the project's columns and units."""
 
 from __future__ import annotations
 
@@ -12,22 +12,20 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.recordings.columns import KELVIN_AT_0_C, QUANTITIES, ColumnMap, default_column, factor_and_unit
-from sim.recordings.formats import read_mat, read_npz, read_parquet, read_text
-from sim.recordings.gcs import is_gcs, read_gcs
+from sim.recordings.formats import Table, is_gcs, read_gcs, read_mat, read_npz, read_parquet, read_text
 from sim.recordings.recording import Recording
-from sim.recordings.table import Table
 
-#: Recordings larger than this do not fit the machines that this is made for; a part of them does.
+#: Largest file, bytes; larger ones do not fit into the memory of common machines.
 MAX_BYTES = 2_000_000_000
 
 
 def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
-    """Read one file, or a folder of a recorder's Parquet segments in the order of their names.
+    """Read a file, or a folder of Parquet segments in the order of their names.
 
-    Formats by ending: ``.parquet``, ``.mat``, ``.npz``; everything else is text: a controller's array file where
-    it begins as one, delimited text with a header line otherwise.
+    The ending selects the format: ``.parquet``, ``.mat``, ``.npz``. Any other file is text: a controller's array file
+    where it begins as one, otherwise delimited text with a header line.
 
-    Raises InputError naming the file, what was found, what was expected and the option that would mend it.
+    Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
     path, mapping = Path(path), mapping or ColumnMap()
     if path.is_dir():
@@ -100,7 +98,7 @@ def _column(table: Table, quantity: str, mapping: ColumnMap, *, needed: bool) ->
 
 
 def _scalar(table: Table, quantity: str, mapping: ColumnMap) -> float | None:
-    """Sample time or rate stored in the file: only where the user points at it or it bears its full name."""
+    """Sample time or rate stored in the file; only where the user names it or it has its canonical name."""
     name = mapping.columns.get(quantity)
     if name is None:
         canonical = QUANTITIES[quantity][0]
@@ -130,7 +128,7 @@ def _recording(table: Table, mapping: ColumnMap, source: str, sha256: str) -> Re
     notes = list(table.notes)
     if mapping.sensor_late:
         columns = _sensor_moved(source, columns, mapping.sensor_late, len(t_s))
-        notes.append(f"sensor's column moved back by {mapping.sensor_late} samples, as asked")
+        notes.append(f"sensor's column moved back by {mapping.sensor_late} samples (sensor_late)")
     return Recording(dt_s=dt_s, source=source, sha256=sha256, notes=tuple(notes), **columns)  # type: ignore[arg-type]
 
 
@@ -147,7 +145,7 @@ def _sensor_moved(
 
 
 def _time(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
-    """Time of each sample and the nominal sample time: from a column, an option, or the format itself."""
+    """Time of each sample and the nominal sample time, from a column, an option, or the format."""
     t_s = _column(table, "t", mapping, needed=False)
     rate_hz = _scalar(table, "rate", mapping)
     stated = mapping.dt_s or _scalar(table, "dt", mapping) or (1.0 / rate_hz if rate_hz else None)
@@ -165,13 +163,13 @@ def _time(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
 
 
 def nominal_dt(source: str, t_s: FloatArray) -> float:
-    """Sample time from a time column, s: the slope of time over rounded step counts, immune to gaps and rounding."""
+    """Sample time from a time column (n,), s: the mean of the steps near the median. Raises InputError."""
     steps = np.diff(t_s)
     steps = steps[np.isfinite(steps) & (steps > 0.0)]
     if not len(steps):
-        raise InputError(f"{source}: t_s: got a time that never advances, expected increasing times in s")
+        raise InputError(f"{source}: t_s: got a time that never increases, expected increasing times in s")
     rough = float(np.median(steps))
-    # Only steps near the median count: a mean over gaps or doubled stamps would bend the time base.
+    # Gaps and doubled stamps would bias the mean.
     good = steps[np.abs(steps - rough) < 0.5 * rough]
-    # Nine digits are beyond any clock, and keep the arithmetic of the time column out of the sample time.
+    # Nine digits exceed the accuracy of any clock and remove round-off of the time column.
     return float(f"{np.mean(good) if len(good) else rough:.9g}")

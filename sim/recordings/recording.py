@@ -10,24 +10,26 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
-#: Columns of a recording: the first three are always there.
+#: Columns that every recording has, and columns that it may have.
 REQUIRED = ("t_s", "u_V", "y_um")
 OPTIONAL = ("u2_V", "y2_um", "u3_V", "monitor_V", "temperature_C")
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What a recorder saw, as it saw it: nothing is repaired, sorted or filled here.
+    """A recording as it was read; nothing is repaired, sorted or filled.
 
     Attributes
     ----------
     t_s : (n,) time, s. u_V : (n,) voltage command, V, applied from ``t_s`` on. y_um : (n,) sensor, µm.
     dt_s : nominal sample time, s.
-    source : where it came from, for people. sha256 : of the bytes read.
-    u2_V, y2_um : (n,) the other axis. u3_V : (n,) the voltage of a third axis or actuator.
+    source : its origin, for people. sha256 : digest of the bytes read.
+    u2_V, y2_um : (n,) the other axis. u3_V : (n,) voltage of a third axis or actuator.
     monitor_V : (n,) measured voltage at the actuator. temperature_C : (n,).
-    seq : (n,) sequence numbers where the recorder wrote them. reason : (n,) what the learner did with each sample.
-    notes : what the reader did that the reader of a report should know.
+    seq : (n,) sequence numbers, where recorded. reason : (n,) outcome of each sample in the learner, where recorded.
+    notes : what was done to the data when it was read.
+
+    Raises InputError where the columns differ in length or the sample time is not positive.
     """
 
     t_s: FloatArray
@@ -65,12 +67,12 @@ class Recording:
         return float(self.t_s[-1] - self.t_s[0]) + self.dt_s if len(self) else 0.0
 
     def columns(self) -> dict[str, FloatArray]:
-        """The numeric columns that are there, by canonical name."""
+        """The numeric columns of this recording, by canonical name."""
         found = {name: getattr(self, name) for name in (*REQUIRED, *OPTIONAL)}
         return {name: values for name, values in found.items() if values is not None}
 
     def part(self, start: int, stop: int) -> Recording:
-        """Samples ``start`` to ``stop`` (excluded) with all columns."""
+        """The samples from ``start`` to ``stop`` (exclusive) with all columns."""
         cut = {
             name: values[start:stop]
             for name in (*REQUIRED, *OPTIONAL, "seq", "reason")

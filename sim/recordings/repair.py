@@ -1,4 +1,4 @@
-"""A recording on a whole time grid: doubles out, short holes filled and marked, so that a model may step through."""
+"""Puts a recording on a regular time grid, so that a model can step through it: doubles out, short gaps filled."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
 from sim.recordings.recording import OPTIONAL, Recording
 
-# --- Readings that are none, by place: dropouts to zero, and samples that a recorder has doubled.
+#: Longest gap that is filled, samples. A longer one ends the usable stretch, because hysteresis remembers what happened
+#: in it.
+LONGEST_FILL = 50
 
 
 def runs(mask: BoolArray) -> NDArray[np.int64]:
-    """(k, 2) start and stop (excluded) of each run of True."""
+    """(k, 2) start and stop (exclusive) of each run of True in ``mask`` (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2)
 
 
 def dropout_mask(values: FloatArray) -> BoolArray:
-    """(n,) True where a reading is exactly zero between readings far from it: no motion goes there and back."""
+    """(n,) True where a reading is exactly zero between readings far from zero, which no motion explains."""
     mask = np.zeros(len(values), dtype=np.bool_)
     zero = values == 0.0
     if not zero.any() or zero.all():
@@ -42,33 +44,29 @@ def dropout_mask(values: FloatArray) -> BoolArray:
 
 
 def repeat_mask(recording: Recording) -> BoolArray:
-    """(n,) True where voltage and sensor both repeat the sample before exactly, though both move before and after."""
+    """(n,) True where voltage and sensor repeat the sample before exactly, although both move before and after."""
     du, dy = np.abs(np.diff(recording.u_V)), np.abs(np.diff(recording.y_um))
     mask = np.zeros(len(recording), dtype=np.bool_)
     if len(du) < 4:
         return mask
     still = (du == 0.0) & (dy == 0.0)
     steps = du[du > 0.0]
-    # Where a coarse command moves by single steps of its converter, standing still once is no double.
+    # A coarse command that moves by single converter steps may stand still for a sample; that is no repeat.
     quantum = float(np.min(steps)) if len(steps) else 0.0
     moves = du > 3.0 * quantum
     mask[2:-1] = still[1:-1] & moves[:-2] & moves[2:]
     return mask
 
 
-#: A hole longer than this ends the usable stretch: hysteresis has memory, and what went on in it is unknown.
-LONGEST_FILL = 50
-
-
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """A recording whose samples are ``dt_s`` apart, all finite.
+    """A recording whose samples are all finite and ``dt_s`` apart.
 
     Attributes
     ----------
-    recording : time from the step count.
-    valid : (n,) False where a sample was filled in: to be stepped through, not to be scored or learnt from.
-    done : what was repaired, in words; empty where nothing was.
+    recording : its times are computed from the sample count.
+    valid : (n,) False where a sample was filled in; such samples are neither scored nor learnt from.
+    done : the repairs in words; empty where there were none.
     """
 
     recording: Recording
@@ -77,12 +75,12 @@ class Repaired:
 
 
 def repaired(recording: Recording, since: int = 0) -> Repaired:
-    """The longest usable stretch of a recording on its own time grid, or that with most of its rows from ``since`` on.
+    """The longest usable stretch of a recording on a regular time grid.
 
-    Samples that repeat a time or a step are dropped, exact zeros between far readings and not-finite values are
-    interpolated, gaps of up to ``LONGEST_FILL`` samples too; a longer gap or a step back in time splits the
-    recording, and the part is taken that holds most of the rows from ``since`` on, with what comes before them.
-    Raises InputError where fewer than two samples are left.
+    Samples that repeat a time or a step are dropped. Dropouts, values that are not finite and gaps of up to
+    ``LONGEST_FILL`` samples are interpolated. A longer gap or a step back in time splits the recording; the part with
+    most of the rows from ``since`` on is returned, with the rows before them. Raises InputError where fewer than two
+    samples are left, or a column has no finite value.
     """
     done: list[str] = []
     n, dt = len(recording), recording.dt_s
@@ -135,13 +133,13 @@ def _pick(recording: Recording, keep: BoolArray) -> Recording:
 
 def _longest_stretch(recording: Recording, dt_s: float, since: int, done: list[str]) -> Recording:
     steps = np.diff(recording.t_s)
-    # A clock that is set back a little inside a run of doubles is no new recording; half a step is the limit.
+    # A clock set back by less than half a step, inside a run of doubles, does not begin a new recording.
     cuts = np.flatnonzero((steps > (LONGEST_FILL + 0.5) * dt_s) | (steps < -0.5 * dt_s)) + 1
     if not len(cuts):
         return recording
     bounds = np.concatenate([[0], cuts, [len(recording)]])
     longest = int(np.argmax(np.diff(np.maximum(bounds, since))))
     start, stop = int(bounds[longest]), int(bounds[longest + 1])
-    which = "the one with most of what is asked for" if since else "the longest"
+    which = "the one with most of the requested rows" if since else "the longest"
     done.append(f"cut into {len(cuts) + 1} parts by long gaps or steps back in time; {which} ({stop - start}) taken")
     return recording.part(start, stop)

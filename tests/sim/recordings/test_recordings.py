@@ -187,7 +187,7 @@ def test_damaged_array_files(tmp_path: Path, options: dict[str, object], message
         ("t_s,u_V,y\n0,1,2\n1,2,3\n", r"'y' for y has no unit.*um, .*nm.*--unit y=um"),
         ("t_s,u_V,sensor\n0,1,2\n", r"t_s, u_V, sensor, expected y_um: add --column y=NAME"),
         ("t_s,u_V,y_nm,y_mm\n0,1,2,3\n", "y_nm, y_mm, expected one"),
-        ("t_s,u_V,y_um\n0,1,2\n0,2,3\n", "never advances"),
+        ("t_s,u_V,y_um\n0,1,2\n0,2,3\n", "never increases"),
     ],
 )
 def test_bad_text_gets_a_message(tmp_path: Path, text: str, message: str) -> None:
