@@ -1,4 +1,4 @@
-"""``dehyst bench``: the solver beside its yardsticks and its peers.
+"""``dehyst bench``: measure the solver beside reference operations and peer packages.
 
 Needs a checkout of the sources: ``benchmarks/`` is not installed.
 """
@@ -12,10 +12,11 @@ import sys
 from pathlib import Path
 
 from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared
 
 EPILOG = """\
-Times are medians of single calls in µs, measured in turns with one BLAS thread; compare ratios between
-machines, not times. `ratio` is one update over one dsymv (a symmetric matrix times a vector) of that size.
+Times are medians of single calls in µs, measured in turns with one BLAS thread. Compare ratios across machines, not
+times. `ratio` is one update over one dsymv (a symmetric matrix times a vector) of that size.
 
   dehyst bench --latency                                       # 1 kHz, the learner's own steps
   dehyst bench --latency --rate 5000 --batch 10 --every-sample
@@ -24,9 +25,7 @@ machines, not times. `ratio` is one update over one dsymv (a symmetric matrix ti
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst bench``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    add_epilog(parser, EPILOG)
     parser.add_argument(
         "--latency", action="store_true", help="instead: query round trips beside a bare zenoh echo, with learning on"
     )
@@ -37,11 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--every-sample", action="store_true", help="with --latency: filter and window learn every sample"
     )
-    parser.add_argument("--quick", action="store_true", help="fewer repetitions: under a minute, rougher figures")
+    add_shared(parser, "quick", json={"help": "print JSON instead of tables"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print. Raises InputError where the benchmarks are not there."""
+    """Measure and print. Returns 0. Raises InputError where there is no checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / "benchmarks" / "run.py").is_file():
         raise InputError(

@@ -1,23 +1,26 @@
-"""``dehyst demo``: identify a simulated stage, run five models on twins of it, change it half way, show the table."""
+"""``dehyst demo``: identify a simulated stage, run five models on twins of it, change the stage, show the table."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
 from service.runtime.stopping import StopSignal
 
+log = logging.getLogger("dehyst.demo")
+
 EPILOG = """\
-What runs in real time: a simulated stage (five twins of one seed, one for each model), the service that learns from
-one of them, a controller that asks it for voltages ahead of time, the viewer stream, and a bare paced loop for
-comparison; each a process of its own, over zenoh on this machine's loopback. --fast runs the same plan in one
-process, and gives the same voltages. Displacements in µm, errors in percent of the commanded range.
+In real time the demo runs these processes over zenoh on loopback: a simulated stage (five twins of one seed, one for
+each model), the service that learns from one of them, a controller that asks it for voltages ahead of time, the viewer
+stream, and a bare paced loop for comparison. --fast runs the same plan in one process and gives the same voltages.
+Displacements in µm, errors in percent of the commanded range.
 
   dehyst demo
   dehyst demo --fast --out out/fast
@@ -26,41 +29,41 @@ process, and gives the same voltages. Displacements in µm, errors in percent of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
-    add("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where the results go (default: %(default)s)")
+    add_shared(parser, out={"default": Path("out/demo"), "help": "folder for the results (%(default)s)"})
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--real-time", action="store_true", help="processes over zenoh at 1 kHz (default)")
     how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
-    add("--duration", type=float, default=60.0, metavar="S", help="length of the run after identification, s (60)")
-    add(
-        "--stage", type=Path, metavar="STAGE.toml", help="a stage file in place of the usual stage, e.g. of a diagnosis"
+    add_shared(
+        parser,
+        duration={"default": 60.0, "help": "length of the run after identification, s (%(default)s)"},
+        stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
+        seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
-    add("--seed", type=int, default=20, metavar="N", help="of the stage's noise and of the reference (20)")
-    add("--view", action="store_true", help="also spawn the Rerun viewer and watch live (needs a display)")
-    add("--connect", metavar="URL", help="also stream to a viewer that runs already, rerun+http://HOST:PORT/proxy")
-    add("--json", action="store_true", help="print summary.json in place of the table")
+    add("--view", action="store_true", help="also start the Rerun viewer and watch live (needs a display)")
+    add("--connect", metavar="URL", help="also stream to a viewer that already runs, rerun+http://HOST:PORT/proxy")
+    add_shared(parser, "quiet", json={"help": "print summary.json in place of the table"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing could be measured."""
+    """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing was measured."""
     from lab.demo import session
 
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
-        raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s: the table needs a settled part")
-    if args.seed < 0:
-        raise InputError(f"--seed: got {args.seed}, expected an integer from 0 on")
+        raise InputError(f"--duration: got {args.duration:g} s, expected 8 to 86400 s; the table needs a settled part")
+    check_seed(args.seed)
     if args.fast and (args.view or args.connect):
         raise InputError("--fast: got --view or --connect with it, expected one of the two: watch a run in real time")
     view = ["--spawn"] if args.view else ["--connect", args.connect] if args.connect else []
     begin = time.perf_counter()
     stop = StopSignal(raising=True)
+    show = progress_printer(args.quiet)
 
     def say(text: str) -> None:
         stop.look()
-        print(text, file=sys.stderr, flush=True)
+        show(text)
 
     done = session.run(
         args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage
@@ -71,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         print(_result(done.summary, args.out, time.perf_counter() - begin))
     lost = done.summary["samples"]["sent"] - done.summary["samples"]["received"]
     if lost:
-        print(f"dehyst demo: {lost} samples were lost between stage and service", file=sys.stderr)
+        log.error("%d samples were lost between stage and service", lost)
     return 1 if lost else 0
 
 

@@ -1,4 +1,4 @@
-"""``dehyst rehearse``: one's own simulator before one's own stage: identify it, close the loop, let things happen."""
+"""``dehyst rehearse``: identify your own simulated stage, close the loop, and disturb it."""
 
 from __future__ import annotations
 
@@ -12,43 +12,47 @@ from pathlib import Path
 from typing import Any
 
 from adaptive.errors import DehystError, InputError
+from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
 from service.protocol.errors import FieldError
 from service.runtime.stopping import StopSignal
 
 EPILOG = """\
 FILE.py:NAME is a Python class, function or object: voltages of a block in (V), true displacement and reading out (µm).
-It has the attributes dt_s (s), u_min_V and u_max_V (V), or the options below say them. The code in FILE.py is run.
-Errors are in percent of the commanded range. Exit status 1 where a run ends at a rail, stays above 5 % for longer than
-0.1 s, or follows a sensor that is wrong.
+It has the attributes dt_s (s), u_min_V and u_max_V (V), or the options above give them. The code in FILE.py is run.
+Errors are in percent of the commanded range. Exit status 1 if a run ends at a voltage limit, stays above 5 % for longer
+than 0.1 s, or follows a wrong sensor.
 
   dehyst rehearse --plant examples/plant.py:Stage
   dehyst rehearse --plant mine.py:run --rate 1000 --u-min 0 --u-max 100 --events none,knock,gain_at_once
 """
 
-#: Files that the command writes; those of an older run are removed first.
+#: Files that the command writes; it removes those of an earlier run first.
 OURS = ("rehearsal.json", "rehearsal.md", "rehearsal.png")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--plant", required=True, metavar="FILE.py:NAME", help="the simulated stage")
     add("--rate", type=float, metavar="HZ", help="samples a second, Hz, where the plant has no dt_s")
     add("--u-min", type=float, metavar="V", help="lowest voltage of the drive, V, where the plant has no u_min_V")
     add("--u-max", type=float, metavar="V", help="highest voltage of the drive, V, where the plant has no u_max_V")
-    add("--events", metavar="A,B", help="classes of events, 'list' prints them (one of each sort)")
-    add("--seed", type=int, default=0, metavar="N", help="of the reference and of the events (0)")
+    add("--events", metavar="A,B", help="kinds of events, 'list' prints them (one of each category)")
+    add_shared(parser, seed={"help": "seed of the reference and of the events (%(default)s)"})
     add("--settle", type=float, default=4.0, metavar="S", help="closed loop before the event, s (4)")
     add("--after", type=float, default=5.0, metavar="S", help="closed loop after the event, s (5)")
-    add("--out", type=Path, default=Path("out/rehearsal"), metavar="DIR", help="where the results go (%(default)s)")
-    add("--no-picture", action="store_true", help="draw nothing")
-    add("--json", action="store_true", help="print rehearsal.json in place of the table")
+    add_shared(
+        parser,
+        "no-pictures",
+        "quiet",
+        out={"default": Path("out/rehearsal"), "help": "folder for the results (%(default)s)"},
+        json={"help": "print rehearsal.json in place of the table"},
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Load, identify, run, draw. Returns 0 where nothing went wrong in any run, else 1."""
+    """Load, identify, run, draw. Returns 0 if no run failed, else 1."""
     from lab.rehearsal import CLASSES, EVENT_KINDS, STANDARD, RehearsalConfig, factory_of, rehearse, standard_events
     from lab.rehearsal.rehearsal import remarks, table
     from service.storage.output_folder import clear_output
@@ -58,8 +62,7 @@ def run(args: argparse.Namespace) -> int:
             kind = EVENT_KINDS[kind_name]
             print(f"{name:<18}{kind.category:<8}{kind.text}{'' if name in STANDARD else ' (not standard)'}")
         return 0
-    if args.seed < 0:
-        raise FieldError("--seed", args.seed, "an integer from 0 on")
+    check_seed(args.seed)
     if args.rate is not None and not (math.isfinite(args.rate) and args.rate > 0.0):
         raise FieldError("--rate", args.rate, "samples a second, above 0 Hz")
     stop = StopSignal(raising=True)
@@ -71,21 +74,22 @@ def run(args: argparse.Namespace) -> int:
     clear_output(args.out, OURS)
     begin = time.perf_counter()
     said: list[str] = []
+    show = progress_printer(args.quiet)
 
     def progress(what: str, share: float) -> None:
         stop.look()
-        # A line when something begins, and its number in the list.
+        # One line where an event begins, with its number in the list.
         if not said or said[-1] != what:
             said.append(what)
             number = f"[{len(said) - 1}/{len(events)}] " if len(said) > 1 else ""
-            print(f"{number}{what} ...", file=sys.stderr, flush=True)
+            show(f"{number}{what} ...")
 
     done = rehearse(factory, config=config, events=events, seed=args.seed, progress=progress)
     summary: dict[str, Any] = done.as_dict() | {"plant": args.plant, "seconds": round(time.perf_counter() - begin, 2)}
     try:
         (args.out / "rehearsal.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         (args.out / "rehearsal.md").write_text(table(done, markdown=True) + "\n", encoding="utf-8")
-        if not args.no_picture:
+        if not args.no_pictures:
             from lab.rehearsal.pictures import draw_rehearsal
 
             draw_rehearsal(args.out / "rehearsal.png", done)
@@ -95,17 +99,17 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(summary))
     else:
         print(table(done))
-        print(f"done in {summary['seconds']:.0f} s; in {args.out}/: {', '.join(OURS)}", file=sys.stderr)
+        show(f"done in {summary['seconds']:.0f} s; in {args.out}/: {', '.join(OURS)}")
     return 1 if any(failed(remarks(entry.outcome)) for entry in done.runs) else 0
 
 
 def failed(marks: list[str]) -> bool:
-    """Whether one of the remarks is more than what the axis said."""
+    """Whether a remark is more than an event of the axis."""
     return any(not mark.startswith("said: ") for mark in marks)
 
 
 def load_plant(where: str) -> object:
-    """What FILE.py:NAME names. Raises FieldError where the file, its code or the name is not there or cannot be run."""
+    """The object FILE.py:NAME. Raises FieldError where file or name is missing, or the file fails."""
     file, colon, name = where.rpartition(":")
     if not (colon and file and name.isidentifier()):
         raise FieldError("--plant", repr(where), "FILE.py:NAME", "for instance examples/plant.py:Stage")
@@ -116,7 +120,7 @@ def load_plant(where: str) -> object:
     if spec is None or spec.loader is None:
         raise FieldError("--plant", file, "a Python file, its name ending in .py")
     module = importlib.util.module_from_spec(spec)
-    # As a script: what it imports may lie beside it; what it defines may look itself up by its module's name.
+    # As for a script, imports from its folder work, and the module can be found by its name.
     sys.modules[spec.name] = module
     sys.path.insert(0, str(path.resolve().parent))
     try:
@@ -125,7 +129,10 @@ def load_plant(where: str) -> object:
         raise
     except Exception as error:
         raise FieldError(
-            "--plant", f"{file}: {type(error).__name__}: {error}", "a file that Python runs to its end", "mend the file"
+            "--plant",
+            f"{file}: {type(error).__name__}: {error}",
+            "a file that Python runs to its end",
+            "correct the file",
         ) from error
     if not hasattr(module, name):
         known = [key for key, value in vars(module).items() if not key.startswith("_") and callable(value)]

@@ -1,18 +1,19 @@
-"""``dehyst reproduce``: the chapter's tables and figures, computed anew."""
+"""``dehyst reproduce``: compute the chapter's tables and figures."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
+from service.cli.options import add_epilog, add_shared, progress_printer
+
 EPILOG = """\
-Writes DIR/report.md (the chapter's numbers beside ours), DIR/tables.json, and one PNG a figure in a folder for each
-stage. Displacements are in µm, voltages in V, errors in percent of the motion range. Measured data are looked for
-in the folder that the environment variable DEHYST_DATA names; where they are missing, that part is left out.
+Writes DIR/report.md (the chapter's numbers beside ours), DIR/tables.json, and one PNG for each figure in a folder for
+each stage. Displacements are in µm, voltages in V, errors in percent of the motion range. Measured data come from the
+folder in the environment variable DEHYST_DATA; where they are missing, that part is left out.
 
   dehyst reproduce --out out/reproduce
   dehyst reproduce --out out/quick --quick --preset rich --no-pso
@@ -21,24 +22,25 @@ in the folder that the environment variable DEHYST_DATA names; where they are mi
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst reproduce``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results, made if missing"
-    )
+    add_epilog(parser, EPILOG)
+    add_shared(parser, out={"required": True, "help": "folder for the results"})
     parser.add_argument(
         "--preset", choices=["rich", "bouc_wen", "both"], default="both", help="which simulated stage (both)"
     )
-    parser.add_argument("--quick", action="store_true", help="shorter records and 100 epochs: a minute, not several")
-    parser.add_argument("--no-pso", action="store_true", help="leave the swarms out; they need torch")
-    parser.add_argument("--seed", type=int, default=0, help="of the stages' noise (0)")
+    parser.add_argument("--no-pso", action="store_true", help="leave out the swarms, which need torch")
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of measured data (DEHYST_DATA)")
-    parser.add_argument("--no-measured", action="store_true", help="leave the measured data out")
-    parser.add_argument("--json", action="store_true", help="print tables.json in place of the summary")
+    parser.add_argument("--no-measured", action="store_true", help="leave out the measured data")
+    add_shared(
+        parser,
+        "quiet",
+        quick={"help": "shorter records and 100 epochs: one minute instead of several"},
+        seed={"help": "seed of the stages' noise (%(default)s)"},
+        json={"help": "print tables.json in place of the summary"},
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study and write it; targets that were missed are said, and are no failure of the program."""
+    """Run the study and write it. Returns 0, also where a target is missed: the summary says so."""
     from threadpoolctl import threadpool_limits
 
     from lab.reproduce.report import prepare, write_study
@@ -50,8 +52,10 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--data", str(args.data), "a folder with the measured data")
     begin = time.perf_counter()
 
+    show = progress_printer(args.quiet)
+
     def say(text: str) -> None:
-        print(f"{time.perf_counter() - begin:6.1f} s  {text}", file=sys.stderr, flush=True)
+        show(f"{time.perf_counter() - begin:6.1f} s  {text}")
 
     config = StudyConfig(
         presets=("rich", "bouc_wen") if args.preset == "both" else (args.preset,),
@@ -62,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         data=args.data,
         measured=not args.no_measured,
     )
-    # Times are those of one thread: two make a solve of 1 ms stall for much longer now and then.
+    # One BLAS thread: with two, a solve of 1 ms now and then takes much longer.
     with threadpool_limits(limits=1):
         numbers = write_study(run_study(config, say), out, say)
     print(json.dumps(numbers, ensure_ascii=False) if args.json else summary(numbers, out))
@@ -70,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def summary(numbers: dict[str, Any], out: Path) -> str:
-    """What was reached, for people."""
+    """The targets and what was reached, as text."""
     width = max(len(target["what"]) for target in numbers["targets"])
     lines = [f"{'':{width}}   {'at most':>9} {'found':>9}"]
     for target in numbers["targets"]:

@@ -1,4 +1,4 @@
-"""``dehyst scenarios``: drift of every kind, adapting against not adapting, and which of the two was the worse."""
+"""``dehyst scenarios``: compare adapting with not adapting in every kind of drift."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ import argparse
 import json
 import multiprocessing
 import os
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared, make_folder, progress_printer
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
     from lab.scenarios.judgement import Verdict
 
 EPILOG = """\
-Twin stages with the same noise and the same reference, one steered by the model that learns, one by the same model
-as it was identified. Displacement in µm, time in s, errors in percent of the commanded range (76 µm). In every 0.5 s
-the adaptive error may be at most 1.1 times the frozen model's plus three noise floors. Exit status 1 where it is not.
+Two twin stages have the same noise and the same reference. The learning model steers one, the same model as identified
+the other. Displacement in µm, time in s, errors in percent of the commanded range (76 µm). In every 0.5 s the adaptive
+error may be at most 1.1 times that of the frozen model plus three noise floors; if it is larger, the exit status is 1.
 
   dehyst scenarios --out out/scenarios
   dehyst scenarios --only glitches --seeds 10 --out out/glitches
@@ -31,23 +30,21 @@ the adaptive error may be at most 1.1 times the frozen model's plus three noise 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
-    add("--out", type=Path, required=True, metavar="DIR", help="where table, JSON and pictures go")
+    add_shared(parser, out={"required": True, "help": "folder for table, JSON and pictures"})
     add("--seeds", type=int, default=2, metavar="N", help="scenarios of each kind, seeds 1 to N (2)")
-    add("--only", action="append", default=[], metavar="NAME", help="a kind, or kind/seed; as often as needed (all)")
+    add("--only", action="append", default=[], metavar="NAME", help="a kind, or kind/seed; repeatable (all)")
     add("--rest", type=float, default=600.0, metavar="S", help="length of the rest of a dwell, s (600)")
     add("--config", type=Path, metavar="FILE", help="settings of the learner: a TOML file, or a service's")
     add("--jobs", type=int, default=1, metavar="N", help="scenarios at a time, one processor each (1)")
-    add("--no-pictures", action="store_true", help="draw nothing")
     add("--markdown", action="store_true", help="print the table as Markdown")
-    add("--json", action="store_true", help="print JSON in place of the table")
+    add_shared(parser, "no-pictures", "quiet", "json")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, judge, draw. Returns 0 where all held, else 1."""
+    """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
     from lab.scenarios.judgement import table
     from lab.scenarios.pictures import draw_overview
     from service.config.learner import read_learner_settings
@@ -60,21 +57,17 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--rest", args.rest, "a time above 0 s, up to a day (86400 s)")
     settings = read_learner_settings(args.config).settings if args.config is not None else {}
     chosen = _chosen(args.only, args.seeds)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out: got {args.out}, expected a folder that can be written to: {error}") from error
+    make_folder(args.out)
+    show = progress_printer(args.quiet)
     start = time.perf_counter()
     tasks = [(kind, seed, args.rest, settings, None if args.no_pictures else args.out) for kind, seed in chosen]
     verdicts: list[Verdict] = []
     for verdict in _all(tasks, args.jobs):
         verdicts.append(verdict)
         held = "held" if verdict.held else "NOT held"
-        print(
+        show(
             f"[{len(verdicts)}/{len(tasks)}] {verdict.name}: {verdict.text}: worst window {verdict.worst_ratio:.2f} of "
-            f"what is allowed, {held} ({time.perf_counter() - start:.0f} s)",
-            file=sys.stderr,
-            flush=True,
+            f"what is allowed, {held} ({time.perf_counter() - start:.0f} s)"
         )
     summary: dict[str, Any] = {
         "schema": 1,
@@ -91,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(summary))
     else:
         print(table(verdicts, args.markdown))
-        print(f"pictures, scenarios.json and scenarios.md are in {args.out}/", file=sys.stderr)
+        show(f"pictures, scenarios.json and scenarios.md are in {args.out}/")
     return 0 if summary["held"] else 1
 
 
@@ -114,7 +107,7 @@ def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs:
     if jobs == 1:
         yield from map(_one, tasks)
         return
-    # One thread each: the processes share the processors among them.
+    # One BLAS thread for each process, as the processes share the processors.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:

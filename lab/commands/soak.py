@@ -1,4 +1,4 @@
-"""``dehyst soak``: everything as processes under a seeded plan of faults, watched by invariants, with a verdict."""
+"""``dehyst soak``: run all processes under a seeded schedule of faults, check invariants, and judge."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import argparse
 import json
 import math
 import re
-import sys
 from pathlib import Path
 
 from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared, check_seed, progress_printer
 
 EPILOG = """\
-What runs in real time: a router, two services (one a hot standby), a simulated stage, a controller, a second client
-that measures, a bare echo, and the viewer's stream; each a process of its own, on this machine's loopback. --fast runs
-what can happen to samples in one process. Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results: soak.json, report.md,
-pictures, plan.json with every fault as it happened; soak.json is there every minute, with what has been judged by then.
+In real time the soak runs these processes on loopback: a router, two services (one a hot standby), a simulated stage, a
+controller, a second client that measures, a bare echo, and the viewer's stream. --fast runs the faults of samples in
+one process. Times are in s, min, h or d: 90s, 30m, 2h, 3d. Results: soak.json (renewed every minute), report.md,
+pictures, and plan.json with every fault as it happened.
 
   dehyst soak --duration 5m
   dehyst soak --duration 40s --faults kill_primary,nan,gap --out out/short
@@ -26,22 +26,28 @@ LEAST_S, MOST_S = 15.0, 90 * 86400.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
-    add("--duration", default="30m", metavar="T", help="how long: 90s, 30m, 2h, 3d (default: %(default)s)")
-    add("--seed", type=int, default=1, metavar="N", help="of the plan, the reference and the stage's noise (1)")
-    add("--out", type=Path, default=Path("out/soak"), metavar="DIR", help="where the results go (default: %(default)s)")
+    add_shared(
+        parser,
+        duration={"type": str, "default": "30m", "metavar": "T", "help": "length: 90s, 30m, 2h, 3d (%(default)s)"},
+        seed={"default": 1, "help": "seed of the plan, the reference and the stage's noise (%(default)s)"},
+        out={"default": Path("out/soak"), "help": "folder for the results (%(default)s)"},
+    )
     add("--fast", action="store_true", help="one process, as fast as possible; faults of processes are left out")
-    add("--faults", default="", metavar="A,B", help="only these kinds (default: all; --list names them), or none")
-    add("--stage", type=Path, metavar="FILE", help="a stage file in place of the one that stands in for hardware")
-    add("--list", action="store_true", help="list the kinds of faults, and end")
-    add("--json", action="store_true", help="print soak.json in place of the report")
+    add("--faults", default="", metavar="A,B", help="only these kinds, or none (all; --list prints them)")
+    add("--list", action="store_true", help="list the kinds of faults, and exit")
+    add_shared(
+        parser,
+        "quiet",
+        stage={"type": Path, "default": None, "metavar": "FILE", "help": "a stage file in place of the preset"},
+        json={"help": "print soak.json in place of the report"},
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the soak. Returns 0 where every invariant held, 1 where one did not, 130 where it was interrupted."""
+    """Run the soak. Returns 0 if every invariant held, 1 if one did not, 130 if interrupted."""
     from lab.soak.fault_plan import FAULT_KINDS, make_plan, select_kinds
     from service.runtime.stopping import StopSignal
 
@@ -50,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
             print(f"{name:<16}{kind.what}{'' if kind.fast else ' (not with --fast)'}")
         return 0
     duration_s = seconds(args.duration)
-    if args.seed < 0:
-        raise InputError(f"--seed: got {args.seed}, expected an integer from 0 on")
+    check_seed(args.seed)
+    say = progress_printer(args.quiet)
     kinds = select_kinds([name.strip() for name in args.faults.split(",") if name.strip()])
     if args.fast:
         kinds = tuple(name for name in kinds if FAULT_KINDS[name].fast)
@@ -65,9 +71,9 @@ def run(args: argparse.Namespace) -> int:
         fast=args.fast,
         stage_file=args.stage,
         stopped=lambda: bool(stop.reason),
-        say=_say,
+        say=say,
     )
-    _say(f"      {verdict_line(done.found)}")
+    say(f"      {verdict_line(done.found)}")
     print(json.dumps(done.found) if args.json else (args.out / "report.md").read_text(encoding="utf-8"))
     if done.interrupted:
         return 130
@@ -86,7 +92,3 @@ def seconds(text: str) -> float:
             f"--duration: got {text!r}, expected {LEAST_S:g}s to {MOST_S / 86400:g}d, such as 90s, 30m, 2h, 3d"
         )
     return value
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

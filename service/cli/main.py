@@ -1,4 +1,4 @@
-"""The command line of the service: one table of commands. A command's module is imported only when it is asked for."""
+"""The command line: a table of commands, in groups. The module of a command is imported only when it is asked for."""
 
 from __future__ import annotations
 
@@ -6,63 +6,82 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 from adaptive.errors import DehystError
 
+SERVING: Final = "serving"
+OPERATING: Final = "operating"
+IDENTIFICATION: Final = "identification and diagnosis"
+EXPERIMENTS: Final = "experiments"
+OTHER: Final = "other"
+GROUPS: Final = (SERVING, OPERATING, IDENTIFICATION, EXPERIMENTS, OTHER)
+
+_EPILOG: Final = """\
+dehyst COMMAND --help lists the options of a command. Exit status: 0 done, 1 failed on the way, 2 usage error,
+130 interrupted.
+"""
+
 
 class Command(NamedTuple):
-    """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, and one line of help."""
+    """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, its group, one line of help."""
 
     module: str
+    group: str
     help: str
 
 
-def _command(module: str, help_line: str) -> Command:
-    return Command(f"service.cli.commands.{module}", help_line)
+def _command(module: str, group: str, help_line: str) -> Command:
+    return Command(f"service.cli.commands.{module}", group, help_line)
 
 
-#: The commands that need nothing but the service. `lab.cli` adds those that experiment on it.
+#: The commands that need nothing but the service. `lab.cli` adds the experiments.
 COMMANDS: Final[dict[str, Command]] = {
-    "identify": _command("identify", "identify the inverse models of a stage from a recording"),
-    "serve": _command("serve", "serve and keep learning the inverse models of a stage over zenoh"),
-    "diagnose": _command("diagnose", "name what a recording holds that the simulation lacks, and measure the gain"),
-    "stage": _command("stage", "run a simulated stage as a process on zenoh"),
-    "query": _command("query", "ask a running service for voltages"),
-    "replay": _command("replay", "run the learner over a recording, offline, and see what its gates and its errors do"),
-    "status": _command("status", "a live table of all axes and instances that serve"),
-    "freeze": _command("operate", "stop an axis from learning, until it is thawed"),
-    "thaw": _command("operate", "let a frozen axis learn again"),
-    "rollback": _command("operate", "set the model of an axis back to a checkpoint"),
-    "checkpoints": _command("operate", "list the checkpoints of an axis"),
-    "select": _command("operate", "choose the model that answers where a query names none"),
-    "retune": _command("operate", "search the learning model's settings anew, in the background"),
-    "ask-diagnosis": _command("operate", "let a running service diagnose its recent samples, in the background"),
-    "access": _command("access", "make the certificates, passwords and rules for more than one machine"),
-    "router": _command("router", "pass messages on between stages, services and clients on several hosts"),
-    "view": _command("view", "stream a running service to the Rerun viewer or into an .rrd file"),
+    "serve": _command("serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning"),
+    "query": _command("query", SERVING, "ask a running service for voltages"),
+    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh"),
+    "router": _command("router", SERVING, "forward messages between stages, services and clients on several hosts"),
+    "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file"),
+    "status": _command("status", OPERATING, "show a live table of all axes and instances that serve"),
+    "freeze": _command("operate", OPERATING, "stop an axis from learning, until it is thawed"),
+    "thaw": _command("operate", OPERATING, "let a frozen axis learn again"),
+    "rollback": _command("operate", OPERATING, "set the model of an axis back to a checkpoint"),
+    "checkpoints": _command("operate", OPERATING, "list the checkpoints of an axis"),
+    "select": _command("operate", OPERATING, "choose the model that answers where a query names none"),
+    "retune": _command("operate", OPERATING, "tune the learning model's hyper-parameters anew, in the background"),
+    "ask-diagnosis": _command(
+        "operate", OPERATING, "let a running service diagnose its recent samples, in the background"
+    ),
+    "access": _command(
+        "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
+    ),
+    "identify": _command("identify", IDENTIFICATION, "identify the inverse models of a stage from a recording"),
+    "replay": _command(
+        "replay", IDENTIFICATION, "run the learner over a recording offline, with its decisions and errors"
+    ),
+    "diagnose": _command(
+        "diagnose", IDENTIFICATION, "name the effects in a recording that the simulation lacks, and what each explains"
+    ),
+    "completion": _command("completion", OTHER, "print the completion script of a shell"),
 }
 
 
 def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = COMMANDS) -> int:
-    """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 asked wrongly, 130 interrupted."""
+    """Run one command. Returns its exit status: 0 done, 1 failed on the way, 2 usage error, 130 interrupted."""
     args = sys.argv[1:] if argv is None else list(argv)
-    # Before numpy is imported: a second BLAS thread makes a solve of 1 ms stall for 65 ms now and then.
+    # Before numpy is imported: a second BLAS thread now and then makes a solve of 1 ms wait for 65 ms.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    parser = argparse.ArgumentParser(
-        prog="dehyst", description="Takes the hysteresis out of piezo stages, and keeps it out."
-    )
-    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     chosen = next((a for a in args if not a.startswith("-")), None)
-    for name, (module_name, line) in commands.items():
-        command = sub.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
-        if name == chosen:
-            module = importlib.import_module(module_name)
-            module.add_arguments(command)
-            command.set_defaults(run=module.run)
+    known = chosen is not None and chosen in commands
+    parser = build_parser(commands, [chosen] if chosen is not None and known else [])
+    if chosen is not None and not known:
+        parser.error(f"COMMAND: got {chosen!r}, expected one of {', '.join(commands)}; options follow the command")
     parsed = parser.parse_args(args)
+    from service.runtime.logging_setup import set_up_logging
+
+    set_up_logging(parsed.log_level)
     try:
         return int(parsed.run(parsed))
     except DehystError as error:
@@ -71,6 +90,57 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     except KeyboardInterrupt:
         print(f"dehyst {parsed.command}: interrupted", file=sys.stderr)
         return 130
+
+
+def build_parser(commands: Mapping[str, Command], loaded: Collection[str]) -> argparse.ArgumentParser:
+    """The parser of the commands in ``loaded``, whose modules it imports; its help lists all ``commands``."""
+    parser = argparse.ArgumentParser(
+        prog="dehyst",
+        usage="dehyst [-h] [--version] COMMAND ...",
+        description="Takes the hysteresis out of piezo stages, and keeps it out.\n\n" + _listed(commands),
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    # The description lists the commands. With all of them loaded, for `dehyst completion`, nothing is hidden.
+    hidden = argparse.SUPPRESS if len(loaded) < len(commands) else None
+    sub = parser.add_subparsers(dest="command", required=True, prog="dehyst", metavar="COMMAND", help=hidden)
+    for name in loaded:
+        line = commands[name].help
+        command = sub.add_parser(name, help=line, description=line[0].upper() + line[1:] + ".")
+        _load(commands[name], command, commands)
+    return parser
+
+
+def _load(entry: Command, parser: argparse.ArgumentParser, commands: Mapping[str, Command]) -> None:
+    from service.cli.options import add_shared
+
+    module = importlib.import_module(entry.module)
+    module.add_arguments(parser)
+    add_shared(parser, "log-level")
+    parser.set_defaults(run=module.run, commands=commands)
+
+
+def _listed(commands: Mapping[str, Command]) -> str:
+    lines = []
+    for group in GROUPS:
+        entries = [f"  {name:<15}{entry.help}" for name, entry in commands.items() if entry.group == group]
+        if entries:
+            lines += [f"{group}:", *entries, ""]
+    return "\n".join(lines).rstrip()
+
+
+class _Version(argparse.Action):
+    """Print the installed version and exit; looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(f"dehyst {version('dehyst')}")
+        except PackageNotFoundError:
+            print("dehyst, not installed: run from its sources")
+        parser.exit()
 
 
 if __name__ == "__main__":

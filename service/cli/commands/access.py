@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
+from service.cli.options import add_epilog, add_shared
 from service.protocol.errors import FieldError
 from service.security.files import DEFAULT_HOSTS, Plan, add, create, read_plan, remove
 from service.security.rules import CLIENT, CONTROLLER, OPERATOR, ROLES, ROUTER, SERVICE, STAGE
@@ -26,10 +27,9 @@ docs/access.md.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG.format(roles="\n".join(f"  {name:<11} {line}" for name, line in ROLES.items()))
+    add_epilog(parser, EPILOG.format(roles="\n".join(f"  {name:<11} {line}" for name, line in ROLES.items())))
     parser.add_argument("what", choices=("init", "add", "remove", "list"), help="make a folder, change it, or show it")
-    parser.add_argument("--out", type=Path, default=Path("access"), metavar="DIR", help="the folder (access)")
+    add_shared(parser, out={"default": Path("access"), "help": "the folder (%(default)s)"})
     parser.add_argument(
         "--host",
         action="append",
@@ -39,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for role in ROLES:
         stage = ", or NAME=STAGE to bind it to one stage" if role == STAGE else ""
         parser.add_argument(f"--{role}", action="append", default=[], metavar="NAME", help=f"a {role}{stage}")
-    parser.add_argument("--name", action="append", default=[], metavar="NAME", help="remove: who is to be shut out")
+    parser.add_argument("--name", action="append", default=[], metavar="NAME", help="remove: whose access ends")
     parser.add_argument("--days", type=int, default=825, metavar="DAYS", help="validity of certificates, days (825)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_shared(parser, json={"help": "print JSON"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do it and print what was written. Returns 0."""
+    """Write or list the files. Returns 0."""
     if not 1 <= args.days <= 36_500:
         raise FieldError("--days", args.days, "1 to 36500 days")
     users, stages = _named(args)
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     for path in written:
         print(f"wrote {path}")
     if args.what in ("add", "remove"):
-        print("give services and routers their new files and start them again")
+        print("copy the new files to services and routers, and restart them")
     return 0
 
 

@@ -1,14 +1,14 @@
-"""``dehyst diagnose``: what a recording holds that the simulation lacks, named, fitted and measured."""
+"""``dehyst diagnose``: name the effects in a recording that the simulation lacks, fit them, measure each gain."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
+from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 
@@ -26,29 +26,25 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst diagnose``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    add_epilog(parser, EPILOG)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the report")
-    parser.add_argument("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    add_shared(parser, "range", out={"required": True, "help": "folder for the report"})
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--stage", type=Path, metavar="STAGE.toml", help="the simulation to judge: a stage file of yours")
+    what.add_argument("--stage", type=Path, metavar="STAGE.toml", help="the simulation to compare with: a stage file")
     what.add_argument(
         "--nominal",
         default="bouc_wen",
         metavar="NAME",
-        help="or one by name: bouc_wen, the chapter's stage (default), or linear, one mode of second order",
+        help="or by name: bouc_wen, the chapter's stage (default), or linear, one mode of second order",
     )
-    parser.add_argument(
-        "--test",
-        type=Path,
-        metavar="FILE",
-        help="another recording of the same stage, same columns: nothing is fitted on it, held-out errors are its own",
+    add_shared(
+        parser,
+        "test-range",
+        test={"help": "another recording of the same stage, same columns: only the held-out errors come from it"},
+        seed={"help": "seed of the null distribution (%(default)s)"},
     )
-    parser.add_argument("--test-range", metavar="START:STOP", help="the part of it to use, s")
-    parser.add_argument("--seed", type=int, default=0, help="of the null distribution (0)")
-    parser.add_argument("--no-rrd", action="store_true", help="leave out diagnosis.rrd")
-    parser.add_argument("--json", action="store_true", help="print report.json in place of the summary")
+    parser.add_argument("--no-rrd", action="store_true", help="write no diagnosis.rrd")
+    add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser)
 
 
@@ -59,11 +55,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.diagnosis.prepare import prepare
     from sim.stage.file import load_stage
 
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
+    say = progress_printer(args.quiet)
     if args.test_range is not None and args.test is None:
-        raise FieldError("--test-range", args.test_range, "a recording to cut", "name it by --test")
+        raise FieldError("--test-range", args.test_range, "a test recording", "give it by --test")
     start = time.perf_counter()
     nominal = load_stage(args.stage) if args.stage is not None else args.nominal
     recording = load(args.data, args, args.range)
@@ -95,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def summary(data: dict[str, Any], out: Path) -> str:
-    """The verdict for people."""
+    """The verdict as text."""
     lines = [
         f"verdict: {data['verdict']}",
         f"held-out free-run error: nominal {data['nominal']['heldout_rmse_um']:.4g} µm, extended "

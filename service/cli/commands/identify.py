@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
+import logging
 import time
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 from service.protocol.keys import check_name
 
+log = logging.getLogger("dehyst.identify")
+
 EPILOG = """\
-Errors are of the inverse: the model is given the measured motion of data it has not seen, and its voltage is
-compared with the one applied; the same in µm is that voltage error times the mean gain of the stage.
+Errors are of the inverse: the model gets the measured motion of data it has not seen, and its voltage is compared with
+the applied one. The error in µm is that voltage error times the mean gain of the stage.
 
   dehyst identify recording.csv --out stage.npz
   dehyst identify scope.csv --column t=Time --unit t=ms --column u=CH1 --unit u=V --column y=CH2 --scale y=10 \\
@@ -29,27 +32,27 @@ compared with the one applied; the same in µm is that voltage error times the m
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst identify``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    add_epilog(parser, EPILOG)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
-    parser.add_argument("--out", type=Path, required=True, metavar="MODEL.npz", help="where the models go")
-    parser.add_argument("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    add_shared(parser, "range", out={"required": True, "metavar": "MODEL.npz", "help": "file for the models"})
     judged = parser.add_mutually_exclusive_group()
-    judged.add_argument("--holdout", type=float, default=0.25, help="share of the end held out for judging (0.25)")
-    judged.add_argument("--test", type=Path, metavar="FILE", help="judge on this recording instead")
-    parser.add_argument("--test-range", metavar="START:STOP", help="the part of the test recording to use, s")
+    judged.add_argument("--holdout", type=float, default=0.25, help="share at the end held out for judging (0.25)")
+    add_shared(judged, test={"help": "judge on this recording instead"})
+    add_shared(parser, "test-range")
     parser.add_argument(
         "--keep-apart",
         action="store_true",
-        help="write the models that never saw the held-out part (default: identified anew from all of it)",
+        help="write the models that never saw the held-out part (default: identify again from all of the recording)",
     )
     parser.add_argument("--models", metavar="A,B", help="which models (all five)")
     parser.add_argument("--support", type=int, default=500, metavar="N", help="support vectors of the LSSVMs (500)")
-    parser.add_argument("--stage", default="demo", help="name of the stage on the wire (demo)")
-    parser.add_argument("--axis", default="x", help="name of its axis on the wire (x)")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="where the picture goes (beside the models)")
-    parser.add_argument("--no-picture", action="store_true", help="draw nothing")
-    parser.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    add_shared(
+        parser,
+        stage={"help": "name of the stage on the wire (%(default)s)"},
+        axis={"help": "name of its axis on the wire (%(default)s)"},
+    )
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="file for the picture (beside the models)")
+    add_shared(parser, "no-pictures", "quiet", "json")
     add_mapping_arguments(parser)
 
 
@@ -69,10 +72,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.out.parent.is_dir():
         raise FieldError("--out", str(args.out), "a file in a folder that exists", f"make {args.out.parent} first")
 
-    def say(text: str) -> None:
-        # Progress and findings go beside the result, so that --json leaves nothing but JSON on standard output.
-        print(text, file=sys.stderr, flush=True)
-
+    # Progress and findings go to stderr: with --json, stdout has nothing but JSON.
+    say = progress_printer(args.quiet)
     start = time.perf_counter()
     recording = load(args.data, args, args.range)
     findings = check(recording)
@@ -111,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         if result.failed:
             say(f"  {result.name}: not identified: {result.failed}")
     if not models:
-        print("dehyst identify: no model could be identified", file=sys.stderr)
+        log.error("no model could be identified")
         return 1
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     meta = BundleMeta(
@@ -132,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
     )
     write_bundle(args.out, models, meta)
     picture: Path | None = None
-    if not args.no_picture:
+    if not args.no_pictures:
         from service.identification.pictures import draw_identification
 
         picture = args.picture or args.out.with_suffix(".png")
@@ -159,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """The held-out errors for people."""
+    """The held-out errors as text."""
     lines = [
         f"Free-run error of the inverse on {summary['judged_on']}, {summary['range_um']:.4g} µm range, "
         f"{summary['gain_um_per_V']:.4g} µm/V",

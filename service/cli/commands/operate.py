@@ -1,4 +1,4 @@
-"""The operator's verbs, one command each: freeze, thaw, rollback, checkpoints, select, retune, ask-diagnosis."""
+"""The operator's commands: freeze, thaw, rollback, checkpoints, select, retune, ask-diagnosis."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import argparse
 import getpass
 import json
 import time
-from pathlib import Path
 from typing import Any
 
+from service.cli.options import add_connection, add_epilog, add_shared
 from service.operating.remote import operate
 from service.protocol.keys import Keys
-from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.session import open_client
 
 EPILOG = """\
-The service writes down who commanded what, when, and from which sample on it held. What an operator may do is decided
-by zenoh's access control where the service is open to other machines (docs/access.md, docs/operating.md).
+The service records who commanded what, when, and from which sample on it took effect. Where other machines can reach
+the service, zenoh's access control decides what an operator may do (docs/access.md, docs/operating.md).
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb that the parser is named after; units stand in the help."""
+    """Options of the command that the parser is named after, with units in the help."""
     verb = parser.prog.split()[-1]
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    add_epilog(parser, EPILOG)
     parser.set_defaults(verb=verb)
     add = parser.add_argument
     if verb == "rollback":
@@ -31,20 +30,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     elif verb == "select":
         add("model", help="name of a model of the axis, such as lssvm_adaptive or linear")
     elif verb == "ask-diagnosis":
-        add("--recent", type=float, metavar="S", help="how much of the newest samples to look at, s")
-        add("--report", action="store_true", help="write a report with pictures as well")
-    add("--stage", default="demo", help="stage on the wire (%(default)s)")
-    add("--axis", default="x", help="axis of the stage (%(default)s)")
-    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of the service or router (%(default)s)")
-    add("--who", help="who commands, for the journal (the login name)")
-    add("--timeout", type=float, default=5.0, metavar="S", help="longest wait for the answer, s (%(default)s)")
-    add("--wait", type=float, default=0.0, metavar="S", help="how long to wait for the service to come up, s (0)")
-    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
-    add("--json", action="store_true", help="print the answer as JSON")
+        add("--recent", type=float, metavar="S", help="length of the newest samples to diagnose, s")
+        add("--report", action="store_true", help="also write a report with pictures")
+    add_shared(parser, "stage", "axis")
+    add_connection(parser, timeout_s=5.0)
+    add("--who", metavar="NAME", help="operator, for the event log (the login name)")
+    add_shared(parser, json={"help": "print the answer as JSON"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Command, and print the answer. Returns 0; refusals are raised in the service's own words."""
+    """Send the command and print the answer. Returns 0. Raises RefusedError with the service's message."""
     keys = Keys(args.stage, args.axis)
     verb = {"ask-diagnosis": "diagnose"}.get(args.verb, args.verb)
     session = open_client(args.endpoint, args.wait, args.zenoh_config)
@@ -75,7 +70,7 @@ def _arguments(args: argparse.Namespace) -> dict[str, Any]:
 
 def _print_checkpoints(checkpoints: list[dict[str, Any]]) -> None:
     if not checkpoints:
-        print("no checkpoints: name a folder for them in the service's configuration, and give it a moment")
+        print("no checkpoints: set a folder for them in the service's configuration, and wait a moment")
         return
     print(f"{'checkpoint':>12} {'sample':>12} {'learnt':>12} {'size kB':>9}  made")
     for entry in checkpoints:

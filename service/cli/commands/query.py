@@ -12,51 +12,36 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from service.client.client import Client
+from service.cli.options import add_connection, add_shared
 from service.protocol.errors import FieldError
-from service.protocol.query import NEWEST
 from service.protocol.reply import Trajectory, flag_names
-from service.runtime.session import DEFAULT_ENDPOINT
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
+    """Options of the command, with units in the help."""
     add = parser.add_argument
     add("y_um", nargs="*", type=float, help="desired displacements, µm, one sample time apart")
     add(
         "--from",
         dest="source",
         metavar="FILE",
-        help="read them from a file instead: CSV columns y[,v[,a]], - for stdin",
+        help="read them from a CSV file with columns y[,v[,a]] instead, - for stdin",
     )
-    add("--v", dest="v_um_per_s", type=float, metavar="UM/S", help="velocity of a single point, µm/s (default: 0)")
-    add(
-        "--a",
-        dest="a_um_per_s2",
-        type=float,
-        metavar="UM/S2",
-        help="acceleration of a single point, µm/s² (default: 0)",
-    )
-    add("--model", default="", help="model to ask (default: the one that the service serves)")
-    add("--as-of", type=int, default=NEWEST, metavar="SEQ", help="snapshot that has seen no sample after this number")
+    add("--v", dest="v_um_per_s", type=float, metavar="UM/S", help="velocity of a single point, µm/s (0)")
+    add("--a", dest="a_um_per_s2", type=float, metavar="UM/S2", help="acceleration of a single point, µm/s² (0)")
+    add("--model", default="", metavar="NAME", help="model to ask (the one that the service serves)")
+    add("--as-of", type=int, metavar="SEQ", help="answer from the snapshot that has seen no sample after this number")
     add("--status", action="store_true", help="print the status of the axis instead")
-    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of the service (default: %(default)s)")
-    add("--stage", default="demo", help="stage on the wire (default: %(default)s)")
-    add("--axis", default="x", help="axis of the stage (default: %(default)s)")
-    add("--timeout", type=float, default=1.0, metavar="S", help="longest wait for an answer, s (default: %(default)s)")
-    add(
-        "--wait",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="how long to wait for the service to come up, s (default: 0)",
-    )
-    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
-    add("--json", action="store_true", help="print JSON")
+    add_shared(parser, "stage", "axis")
+    add_connection(parser)
+    add_shared(parser, json={"help": "print JSON"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask and print. Returns 0; errors, the service's own included, are raised."""
+    """Ask and print. Returns 0. Raises ServiceError where there is no answer or the service refuses."""
+    from service.client.client import Client
+    from service.protocol.query import NEWEST
+
     columns = _columns(args)
     with Client.connect(
         args.endpoint, args.stage, args.axis, args.timeout, args.wait, zenoh_config=args.zenoh_config
@@ -64,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         if args.status:
             print(json.dumps(client.status(), indent=None if args.json else 2))
             return 0
-        answer = client.trajectory(*columns, model=args.model, as_of=args.as_of)
+        answer = client.trajectory(*columns, model=args.model, as_of=NEWEST if args.as_of is None else args.as_of)
     if args.json:
         print(json.dumps(_as_json(columns[0], answer)))
         return 0
@@ -90,7 +75,7 @@ def _as_json(y_um: FloatArray, answer: Trajectory) -> dict[str, Any]:
 
 
 def _columns(args: argparse.Namespace) -> list[FloatArray]:
-    """y, and where given v and a, from the command line or the file."""
+    """y, and v and a where given, from the command line or the file."""
     if args.status:
         return []
     if bool(args.y_um) == bool(args.source):

@@ -1,16 +1,15 @@
-"""``dehyst replay``: the learner over a recording, offline; what it would have done, before it is trusted live."""
+"""``dehyst replay``: run the learner over a recording, offline, to see what it would do live."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptive.errors import InputError
+from service.cli.options import add_epilog, add_shared, make_folder, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 
@@ -18,9 +17,9 @@ if TYPE_CHECKING:
     from service.config.learner import LearnerSettings
 
 EPILOG = """\
-Every block of samples is first foretold by the model as a controller would have had it (--age s old), then learnt.
-Errors are of the voltage for the measured motion: in V, in percent of the voltage span the model was identified with,
-and seen as displacement in µm through the mean gain. The samples go the same way as live: the snapshots are the same.
+For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
+block. Errors are of the voltage for the measured motion: in V, in percent of the voltage span of identification, and in
+µm by the mean gain. The code is the same as live, and so are the snapshots.
 
 The configuration is that of 'dehyst serve', or the learner's settings alone (docs/learner.md):
 
@@ -35,26 +34,24 @@ The configuration is that of 'dehyst serve', or the learner's settings alone (do
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst replay``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("data", type=Path, metavar="RECORDING", help="the recording: a file, or a folder of segments")
     add("--config", type=Path, required=True, metavar="FILE", help="TOML of 'dehyst serve', or of the learner alone")
-    add("--axis", metavar="NAME", help="which axis of the configuration (its only one)")
-    add("--model", type=Path, metavar="MODEL.npz", help="where learning starts (default: the configuration's model)")
+    add_shared(parser, axis={"default": None, "help": "axis of the configuration (its only one)"})
+    add("--model", type=Path, metavar="MODEL.npz", help="model to start from (the configuration's)")
     add("--learn", metavar="NAME", help="which model of the file learns (the configuration's, or lssvm_adaptive)")
-    add("--range", metavar="START:STOP", help="the part of the recording to use, s")
+    add_shared(parser, "range")
     add("--age", type=float, metavar="S", help="age of the model when its answer takes effect, s (0.06)")
     add(
         "--window",
         type=float,
         default=0.5,
         metavar="S",
-        help="window of the running mean error in the picture, s (0.5)",
+        help="window of the mean error in the picture, s (0.5)",
     )
-    add("--out", type=Path, required=True, metavar="DIR", help="where JSON, every decision, pictures and the model go")
-    add("--no-pictures", action="store_true", help="draw nothing")
-    add("--json", action="store_true", help="print JSON in place of the table")
+    add_shared(parser, "no-pictures", "quiet", "json")
+    add_shared(parser, out={"required": True, "help": "folder for JSON, every decision, pictures and the model"})
     add_mapping_arguments(parser)
 
 
@@ -68,9 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from service.server.models import load_axis
     from service.storage.model_file import read_bundle, write_bundle
 
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
+    say = progress_printer(args.quiet)
     if not args.window > 0.0:
         raise FieldError("--window", args.window, "a time above 0 s")
     found: LearnerSettings = read_learner_settings(args.config, args.axis)
@@ -79,20 +74,17 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--model", "nothing", f"a model file, as {args.config} names none", "see 'dehyst identify'")
     bundle = read_bundle(path)
     config = axis_config(found, path, bundle, args.learn)
-    # A replay is of one's own choosing: whose recording and whose model it is, is not checked again here.
+    # The user chooses recording and model: names of stage and axis need not match.
     axis = load_axis("replay", config, bundle=replace(bundle, meta=replace(bundle.meta, stage="", axis="")))
     recording = load(args.data, args, args.range)
     say(describe(recording, []))
     if args.data.is_dir():
-        # What was tuned in the background while this was recorded takes effect at the same samples.
+        # Re-tunings of the time of the recording take effect at the same samples.
         adopted = read_adoptions(args.data)
         axis.adoptions.add(*adopted)
         if adopted:
             say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out: got {args.out}, expected a folder that can be written to: {error}") from error
+    make_folder(args.out)
     start = time.perf_counter()
     shown = start
 
@@ -131,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(numbers: dict[str, Any], out: Path) -> str:
-    """The result for people."""
+    """The result as text."""
     lines = [
         f"{numbers['recording']}: {numbers['duration_s']:.4g} s replayed in {numbers['seconds']:.3g} s, "
         f"{numbers['scored']} samples scored; {numbers['learn']} of {numbers['model']} learnt",

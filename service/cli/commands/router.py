@@ -1,10 +1,11 @@
-"""``dehyst router``: passes messages on between stages, services and clients on several hosts (docs/scale.md)."""
+"""``dehyst router``: forward messages between stages, services and clients on several hosts (docs/scale.md)."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
+
+from service.cli.options import add_shared
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -12,18 +13,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--listen", action="append", metavar="ENDPOINT", help="listen here; repeatable (tcp/127.0.0.1:7447)")
     add("--connect", action="append", default=[], metavar="ENDPOINT", help="another router; repeatable")
-    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration: TLS, passwords, access control")
-    add(
-        "--insecure-beyond-loopback",
-        action="store_true",
-        help="let everybody in who reaches an address beyond this machine",
-    )
-    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
-    add("--json", action="store_true", help="print JSON")
+    add_shared(parser, "insecure-beyond-loopback", "duration")
+    add_shared(parser, zenoh_config={"help": "zenoh's own configuration: TLS, passwords, access control"})
+    add_shared(parser, json={"help": "print JSON"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Route until interrupted. Returns 0; endpoints that cannot be had or may not be used are raised."""
+    """Route until interrupted. Returns 0. Raises DehystError where an endpoint is in use or not allowed."""
     from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_router
     from service.runtime.stopping import StopSignal
     from service.security.check import check_reach, has_access_control

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from service.cli.options import add_epilog, add_shared
 from service.config.config import ServeConfig, read_config
 from service.protocol.errors import FieldError
 from service.runtime.memory import starting
@@ -18,38 +18,30 @@ from service.security.refusals import count_refusals
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
+    """Options of the command, with units in the help."""
     add = parser.add_argument
     add("--config", type=Path, metavar="FILE", help="TOML file: stage, axes, model files, limits in V, V/s and µm")
-    add("--example", action="store_true", help="print a configuration with comments, and end")
+    add("--example", action="store_true", help="print an example configuration, with every key and default, and exit")
     add("--listen", action="append", metavar="ENDPOINT", help="listen here instead, on this machine only; repeatable")
     add(
-        "--insecure-beyond-loopback",
-        action="store_true",
-        help="let everybody in who reaches an address of the configuration beyond this machine",
+        "--standby", action="store_true", help="run as hot standby: learn the same, and take over when the service dies"
     )
-    add(
-        "--standby",
-        action="store_true",
-        help="stand by for the one that serves: learn what it learns, and take over when it goes",
-    )
-    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
-    add("--json", action="store_true", help="print the ready line and the last status as JSON")
+    add_shared(parser, "insecure-beyond-loopback", "duration")
+    add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
+    add_epilog(parser, "All keys of the configuration: docs/configuration.md.")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until interrupted. Returns 0; errors of configuration, model file or port are raised."""
+    """Serve until interrupted. Returns 0. Raises DehystError where configuration, model file or port is wrong."""
     if args.example:
         from service.config.reference import example
 
         print(example(), end="")
         return 0
     if args.config is None:
-        raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints one to begin with")
+        raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints an example")
     with starting() as started:
         config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
-        # Read by BLAS when numpy is first imported in a process; what is loaded already is limited by tune_process.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from service.runtime.stopping import StopSignal
         from service.server.process import Service, tune_process
 
@@ -59,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             count_refusals()
         with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
             started()
-            _say_ready(service.ready(), args.json)
+            _print_ready(service.ready(), args.json)
             reason = stop.wait(args.duration)
             statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
@@ -69,19 +61,19 @@ def run(args: argparse.Namespace) -> int:
             samples, queries = status["samples"], status["queries"]
             print(
                 f"{name}: {samples['received']} samples received, {samples['learnt']} learnt, {samples['lost']} lost "
-                f"on the way, {samples['dropped']} dropped; {queries['count']} queries, {queries['errors']} refused"
+                f"in transit, {samples['dropped']} dropped; {queries['count']} queries, {queries['errors']} refused"
             )
         print(f"stopped: {reason}", flush=True)
     return 0
 
 
-def _say_ready(ready: dict[str, Any], as_json: bool) -> None:
+def _print_ready(ready: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(ready), flush=True)
         return
     where = ", ".join((*ready["listen"], *ready["connect"]))
     axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
-    role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the one that serves")
+    role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the primary")
     print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
 
 
@@ -90,5 +82,5 @@ def _with_listen(config: ServeConfig, listen: list[str] | None, standby: bool) -
         return config
     for endpoint in listen:
         if not is_loopback(check_endpoint("--listen", endpoint)):
-            raise FieldError("--listen", endpoint, "an endpoint of this machine", "name others in the configuration")
+            raise FieldError("--listen", endpoint, "an endpoint of this machine", "put others into the configuration")
     return replace(config, standby_listen=tuple(listen)) if standby else replace(config, listen=tuple(listen))

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from service.cli.options import add_epilog, add_shared
 from service.protocol.errors import FieldError
 from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from service.runtime.stopping import StopSignal
@@ -16,8 +17,8 @@ from sim.stage.config import ParameterChange, StageConfig
 
 EPILOG = """\
 The clock starts when the first commands (sequence number 0) of every axis have arrived, or at once with --free-run.
-A voltage that has not come in time is replaced by the last one and counted. The last line printed is JSON: ticks,
-late ticks, and per axis the samples published and the commands received, late, missing and refused.
+Where a voltage is late, the stage repeats the last one and counts it. The last line printed is JSON: ticks, late
+ticks, and per axis the samples published and the commands received, late, missing and refused.
 
   dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
   dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
@@ -26,8 +27,7 @@ late ticks, and per axis the samples published and the commands received, late, 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst stage``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EPILOG
+    add_epilog(parser, EPILOG)
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--preset", default="rich", help="rich (default: stands in for hardware) or bouc_wen")
     what.add_argument("--file", type=Path, metavar="STAGE.toml", help="a stage file in place of a preset")
@@ -36,36 +36,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--endpoint", metavar="ENDPOINT", help=f"connect to a service or router (default {DEFAULT_ENDPOINT})"
     )
     where.add_argument("--listen", metavar="ENDPOINT", help="listen there instead, for controllers without a service")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help="wait this long for the endpoint, s (10)")
-    parser.add_argument("--name", default="demo", help="name of the stage on the wire (demo)")
-    parser.add_argument("--axis", default="x", help="name of its axis on the wire (x)")
-    parser.add_argument(
-        "--axis2", default="", metavar="NAME", help="drive the second axis of the stage too, under this name (at 0 V)"
-    )
-    parser.add_argument("--twins", default="", metavar="A,B", help="further axes: equal stages with their own commands")
-    parser.add_argument("--rate", type=float, metavar="HZ", help="sample rate, Hz (the stage's own, 1000 in presets)")
-    parser.add_argument("--duration", type=float, metavar="S", help="stop after this time, s (until Ctrl-C)")
-    parser.add_argument(
-        "--batch", type=int, default=1, metavar="N", help="samples a message; more if the wire is slow (1)"
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="of its noise and drift (the stage's own)")
-    parser.add_argument("--free-run", action="store_true", help="start at once, at 0 V until commands come")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--name", default="demo", help="name of the stage on the wire (%(default)s)")
+    add_shared(parser, axis={"help": "name of its axis on the wire (%(default)s)"})
+    add("--axis2", default="", metavar="NAME", help="also drive the second axis of the stage, under this name (at 0 V)")
+    add("--twins", default="", metavar="A,B", help="further axes: equal stages with their own commands")
+    add("--rate", type=float, metavar="HZ", help="sample rate, Hz (the stage's own, 1000 in presets)")
+    add("--batch", type=int, default=1, metavar="N", help="samples in a message; more for a slow network (%(default)s)")
+    add_shared(parser, "duration", seed={"default": None, "help": "seed of its noise and drift (the stage's own)"})
+    add("--free-run", action="store_true", help="start at once, at 0 V until commands come")
+    add(
         "--change",
         action="append",
         default=[],
         metavar="T:NAME=VALUE[,...]",
-        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; may be repeated",
+        help="change parameters T s after the start, such as 30:gain_drift.gain=-0.06; repeatable",
     )
-    parser.add_argument("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (0)")
-    parser.add_argument(
-        "--slew", type=float, default=math.inf, metavar="V/S", help="follow commands at most so fast, V/s (no limit)"
-    )
-    parser.add_argument(
-        "--inject", action="store_true", help="take faults by command, for tests of what listens (docs/stage.md)"
-    )
-    parser.add_argument("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own, for TLS and passwords")
-    parser.add_argument("--json", action="store_true", help="the ready line is JSON too")
+    add("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (%(default)s)")
+    add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
+    add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
+    add_shared(parser, "zenoh-config", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
 
 
 def parse_change(text: str) -> ParameterChange:
@@ -131,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     endpoint = check_endpoint(
         "--listen" if args.listen else "--endpoint", args.listen or args.endpoint or DEFAULT_ENDPOINT
     )
-    # A little more often than zenoh's callbacks need: the loop must not wait 5 ms for the interpreter.
+    # Switch threads more often than the default 5 ms: the loop must not wait that long for the interpreter.
     sys.setswitchinterval(5e-4)
     if args.listen:
         check_reach("stage", [endpoint], [], args.zenoh_config)
@@ -140,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
         session = open_client(endpoint, args.wait, args.zenoh_config)
     try:
         node = StageNode(node_config, session)
-        # Before it is said to be ready, nothing has been moved: the run ends without its words.
+        # Before the ready line nothing has been moved: a signal until now ends the run without a summary.
         stop.look()
         stop.then(node.stop)
         names = [name for name in (*node_config.units, args.axis2) if name]

@@ -7,43 +7,39 @@ import json
 import sys
 import time
 from collections import deque
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from service.cli.options import add_connection, add_shared
 from service.operating.remote import Standbys, in_order, statuses
 from service.operating.table import screen, table
 from service.protocol.errors import FieldError
 from service.protocol.json_message import fields_of
 from service.protocol.keys import ROOT, check_name
-from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 
-#: A standby tells of itself this often, and a little more, s.
+#: A little more than the period at which a standby publishes its status, s.
 _STANDBY_PERIOD_S = 1.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
+    """Options of the command, with units in the help."""
     add = parser.add_argument
-    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of a service or router (%(default)s)")
-    add("--stage", default="*", help="only this stage (all)")
-    add("--axis", default="*", help="only this axis (all)")
-    add("--once", action="store_true", help="print the table once, and end")
-    add("--period", type=float, default=1.0, metavar="S", help="how often the table is drawn, s (%(default)s)")
-    add("--duration", type=float, metavar="S", help="end by itself after this time, s")
-    add("--timeout", type=float, default=1.0, metavar="S", help="longest wait for those that answer, s (%(default)s)")
-    add("--wait", type=float, default=0.0, metavar="S", help="how long to wait for the endpoint to come up, s (0)")
-    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
-    add("--json", action="store_true", help="print JSON: once an object, live one a line")
+    add_connection(parser)
+    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
+    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+    add("--once", action="store_true", help="print the table once, and exit")
+    add("--period", type=float, default=1.0, metavar="S", help="period of the live table, s (%(default)s)")
+    add_shared(parser, "duration", json={"help": "print JSON: once an object, live one a line"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show it. Returns 0, or 1 where --once finds nobody; Ctrl-C ends the live table with 0."""
-    for name in ("stage", "axis"):
-        if getattr(args, name) != "*":
-            check_name(f"--{name}", getattr(args, name))
+    """Show the table. Returns 0, or 1 where --once finds no service; Ctrl-C ends the live table with 0."""
+    for name, given in (("--stage", args.stage), ("--axis", args.axis)):
+        if given != "*":
+            check_name(name, given)
     if not 0.1 <= args.period <= 3600.0:
         raise FieldError("--period", args.period, "0.1 to 3600 s")
     session = open_client(args.endpoint, args.wait, args.zenoh_config)
@@ -52,9 +48,9 @@ def run(args: argparse.Namespace) -> int:
         try:
             if not args.once:
                 return _live(session, standbys, args)
-            heard_all = time.monotonic() + _STANDBY_PERIOD_S
+            all_answered = time.monotonic() + _STANDBY_PERIOD_S
             found = _settled(session, args)
-            time.sleep(max(0.0, heard_all - time.monotonic()))
+            time.sleep(max(0.0, all_answered - time.monotonic()))
             found = in_order([*found, *standbys.statuses()])
             print(json.dumps({"schema": 1, "axes": found}) if args.json else table(found))
             return 0 if found else 1
@@ -69,18 +65,18 @@ def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) 
     subscriber = session.declare_subscriber(
         f"{ROOT}/{args.stage}/{args.axis}/event", lambda sample: events.append(_event(sample))
     )
-    alone = sys.stdout.isatty() and not args.json
+    on_screen = sys.stdout.isatty() and not args.json
     until = None if args.duration is None else time.monotonic() + args.duration
-    # Not an exception in the middle of anything: one that is raised where an object is cleaned up is lost.
+    # A flag, no exception: an exception that a signal raises inside a finalizer is lost.
     stop = StopSignal()
     try:
-        if alone:
-            print("\x1b[?1049h\x1b[?25l", end="")  # a screen of its own, without a cursor
+        if on_screen:
+            print("\x1b[?1049h\x1b[?25l", end="")  # the terminal's alternate screen, without a cursor
         found = in_order([*_settled(session, args), *standbys.statuses()])
         while not stop.reason and (until is None or time.monotonic() < until):
             if args.json:
                 print(json.dumps({"schema": 1, "time_unix_s": time.time(), "axes": found}), flush=True)
-            elif alone:
+            elif on_screen:
                 print(screen(found, args.endpoint, list(events)), end="", flush=True)
             else:
                 print(f"{table(found)}\n", flush=True)
@@ -90,16 +86,16 @@ def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) 
             answers = statuses(session, args.stage, args.axis, args.timeout)
             found = in_order([*answers, *standbys.statuses()])
     except BrokenPipeError:
-        sys.stdout = None  # whoever read has gone; nothing is left to be flushed to
+        sys.stdout = None  # the reader has closed the pipe; there is nothing to flush to
     finally:
         subscriber.undeclare()  # type: ignore[no-untyped-call]
-        if alone:
+        if on_screen:
             print("\x1b[?25h\x1b[?1049l", end="", flush=True)
     return 0
 
 
 def _settled(session: zenoh.Session, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """The first answer, asked for again for half a second: a new session knows nobody yet."""
+    """The first answer. Asks for half a second: a new session does not know the services at once."""
     until = time.monotonic() + 0.5
     while not (found := statuses(session, args.stage, args.axis, args.timeout)) and time.monotonic() < until:
         time.sleep(0.05)

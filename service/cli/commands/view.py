@@ -4,40 +4,40 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import subprocess
-import sys
 import time
 import uuid
 from pathlib import Path
 
 from adaptive.errors import InputError
+from service.cli.options import add_connection, add_shared
 from service.protocol.errors import ServiceError
-from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 from service.viewer.consumer import Consumer, ConsumerConfig
 from service.viewer.output import Output, OutputConfig
 from service.viewer.records import SceneConfig
 
+log = logging.getLogger("dehyst.view")
+
 DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
-#: What the live plots show unless told otherwise, s; a file shows all of it.
+#: Past that live plots show by default, s; a file shows all.
 LIVE_HISTORY_S = 30.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command; units stand in the help."""
+    """Options of the command, with units in the help."""
     add = parser.add_argument
-    add("--endpoint", default=DEFAULT_ENDPOINT, help="zenoh endpoint of stage or service (default: %(default)s)")
-    add("--wait", type=float, default=10.0, metavar="S", help="how long to wait for it, s (default: %(default)s)")
-    add("--zenoh-config", type=Path, metavar="FILE", help="zenoh's own configuration, for TLS and passwords")
-    add("--stage", default="demo", help="stage on the wire (default: %(default)s)")
-    add("--axis", default="x", help="axis that the service serves and learns from (default: %(default)s)")
-    add("--model", default="lssvm_adaptive", help="model that steers it; names its curves (default: %(default)s)")
+    add_connection(parser, wait_s=10.0, timeout_s=None)
+    add_shared(parser, "stage", axis={"help": "axis that the service serves and learns from (%(default)s)"})
+    add("--model", default="lssvm_adaptive", help="model that steers the axis; names its curves (%(default)s)")
     add(
         "--twin",
         action="append",
         default=[],
         metavar="NAME=MODEL",
-        help="another axis of the stage, steered by MODEL, to compare with; as often as needed",
+        help="another axis of the stage, steered by MODEL, to compare with; repeatable",
     )
     add(
         "--change-at",
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="S",
-        help="the stage changes then, s of its time",
+        help="mark a change of the stage at this time of the stage, s; repeatable",
     )
     add("--rrd", type=Path, metavar="FILE", help="write an .rrd, overwriting FILE")
     add(
@@ -53,32 +53,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=DEFAULT_URL,
         metavar="URL",
-        help=f"stream to a viewer that runs already (default: {DEFAULT_URL})",
+        help=f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)",
     )
-    add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays when we stop")
-    add("--port", type=int, default=9876, help="port of the spawned viewer, loopback only (default: %(default)s)")
-    add(
-        "--range-um", type=float, metavar="UM", help="range for percentages, µm (default: span of the reference so far)"
-    )
+    add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays open")
+    add("--port", type=int, default=9876, help="port of the spawned viewer, loopback only (%(default)s)")
+    add("--range-um", type=float, metavar="UM", help="range for percentages, µm (span of the reference so far)")
     add(
         "--history",
         type=float,
         metavar="S",
-        help=f"past that the plots show, s; 0 for all (default: all in a file, {LIVE_HISTORY_S:g} live)",
+        help=f"past that the plots show, s; 0 for all (all in a file, {LIVE_HISTORY_S:g} live)",
     )
-    add(
-        "--batch",
-        type=float,
-        default=0.2,
-        metavar="S",
-        help="how often to send on, s, 0.05 to 5 (default: %(default)s)",
-    )
-    add("--duration", type=float, metavar="S", help="stop by itself after this time, s")
-    add("--json", action="store_true", help="print the counts at the end as JSON")
+    add("--batch", type=float, default=0.2, metavar="S", help="period of sending, s, 0.05 to 5 (%(default)s)")
+    add_shared(parser, "duration", json={"help": "print the counts at the end as JSON"})
 
 
 def run(args: argparse.Namespace) -> int:
-    """Stream until interrupted, ended, or the duration is over. Returns 0; 1 if the file is not complete."""
+    """Stream until a signal, the end of the viewer or of the duration. Returns 0, or 1 if the file is incomplete."""
     if not (args.rrd or args.connect or args.spawn):
         raise InputError("rrd, connect, spawn: got none of them, expected at least one; --rrd FILE writes a file")
     if args.connect and args.spawn:
@@ -86,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     config = ConsumerConfig(
         args.stage, args.axis, args.model, twins(args.twin), changes_s=tuple(args.change_at), batch_s=args.batch
     )
-    # Before anything slow: whoever starts us may end us at once.
+    # Before anything slow: a signal may come at once.
     stop = StopSignal()
     outputs: list[Output] = []
     viewer: subprocess.Popen[bytes] | None = None
@@ -112,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
                 consumer.close()
         counts = dict(consumer.counts)
     finally:
-        # A file gets all the time that a slow disk may need, a viewer does not: it may be gone.
+        # A file gets all the time that a slow disk may need; a viewer may be gone.
         finished = [(output.config, output.close(60.0 if output.config.rrd else 5.0)) for output in outputs]
     lost_file = any(c.rrd and not ok for c, ok in finished)
     drawn = all(ok for _, ok in finished)
@@ -125,12 +116,12 @@ def run(args: argparse.Namespace) -> int:
             print(f"open it with: rerun {args.rrd}", flush=True)
     for output_config, ok in finished:
         if not ok:
-            print(f"dehyst view: {output_config.name} did not take everything before the end", file=sys.stderr)
+            log.warning("%s is incomplete: it did not take everything before the end", output_config.name)
     return 1 if lost_file else 0
 
 
 def twins(given: list[str]) -> tuple[tuple[str, str], ...]:
-    """``NAME=MODEL`` pairs. Raises InputError naming the one that is none."""
+    """``NAME=MODEL`` pairs. Raises InputError naming the one that is not a pair."""
     pairs = []
     for text in given:
         axis, sign, model = text.partition("=")
@@ -147,7 +138,7 @@ def _scene(args: argparse.Namespace, config: ConsumerConfig, history_s: float | 
 
 
 def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[bytes] | None, alone: bool) -> None:
-    """Until asked to stop, the time is over, or the viewer that we started has been closed and was ``alone``."""
+    """Wait for a signal, the end of the time, or the end of the spawned viewer where there is no file (``alone``)."""
     until = time.monotonic() + duration_s if duration_s is not None else float("inf")
     while not stop.reason and time.monotonic() < until:
         stop.wait(0.1)

@@ -1,0 +1,31 @@
+"""``dehyst completion``: the completion script of a shell, which then completes without starting Python."""
+
+from __future__ import annotations
+
+import argparse
+
+from service.cli.main import build_parser
+from service.cli.options import add_epilog
+
+EPILOG = """\
+  bash   dehyst completion bash > ~/.local/share/bash-completion/completions/dehyst
+  zsh    dehyst completion zsh > DIR/_dehyst, where DIR is one of $fpath
+  fish   dehyst completion fish > ~/.config/fish/completions/dehyst.fish
+  tcsh   dehyst completion tcsh > ~/.dehyst.tcsh, and source it from ~/.tcshrc
+
+The script holds commands and options of this version: print it again after an update.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    add_epilog(parser, EPILOG)
+    parser.add_argument("shell", choices=("bash", "zsh", "fish", "tcsh"), help="the shell")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the script. Returns 0."""
+    import shtab
+
+    print(shtab.complete(build_parser(args.commands, args.commands), args.shell))
+    return 0

@@ -1,0 +1,100 @@
+"""Options that several commands share, defined once, and what they mean to a command."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from service.protocol.errors import FieldError
+
+_SHARED: Final[dict[str, dict[str, Any]]] = {
+    "stage": {"default": "demo", "metavar": "NAME", "help": "stage on the wire (%(default)s)"},
+    "axis": {"default": "x", "metavar": "NAME", "help": "axis of the stage (%(default)s)"},
+    "timeout": {
+        "type": float, "default": 1.0, "metavar": "S", "help": "longest wait for an answer, s (%(default)s)",
+    },
+    "wait": {
+        "type": float, "default": 0.0, "metavar": "S",
+        "help": "how long to wait for the endpoint to come up, s (%(default)s)",
+    },
+    "zenoh-config": {"type": Path, "metavar": "FILE", "help": "zenoh's own configuration, for TLS and passwords"},
+    "insecure-beyond-loopback": {
+        "action": "store_true", "help": "let everybody in who reaches an address on another machine",
+    },
+    "out": {"type": Path, "metavar": "DIR", "help": "folder for the results"},
+    "seed": {"type": int, "default": 0, "metavar": "N", "help": "seed of the noise (%(default)s)"},
+    "duration": {"type": float, "metavar": "S", "help": "end after this time, s"},
+    "range": {"metavar": "START:STOP", "help": "the part of the recording to use, s"},
+    "test": {"type": Path, "metavar": "FILE", "help": "another recording of the same stage"},
+    "test-range": {"metavar": "START:STOP", "help": "the part of the test recording to use, s"},
+    "quick": {"action": "store_true", "help": "fewer repetitions, rougher numbers"},
+    "no-pictures": {"action": "store_true", "help": "draw nothing"},
+    "json": {"action": "store_true", "help": "print JSON in place of the table"},
+    "log-level": {
+        "choices": ("debug", "info", "warning", "error"), "default": "warning",
+        "help": "messages to stderr from this level on (%(default)s)",
+    },
+    "quiet": {"action": "store_true", "help": "print no progress"},
+}  # fmt: skip
+#: Further spellings of an option.
+_ALSO: Final = {"no-pictures": ("--no-picture",)}
+
+
+def add_shared(parser: Any, *names: str, **changes: Mapping[str, Any]) -> None:
+    """Add the shared options ``names`` to a parser or a group of it.
+
+    ``changes`` adds an option too, with other settings: ``axis={"default": "*"}``; an underscore stands for a hyphen.
+    """
+    for name in (*names, *(name.replace("_", "-") for name in changes)):
+        settings = {**_SHARED[name], **changes.get(name.replace("-", "_"), {})}
+        parser.add_argument(f"--{name}", *_ALSO.get(name, ()), **settings)
+
+
+def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1.0) -> None:
+    """The options of a client: ``--endpoint --wait --zenoh-config``, and ``--timeout`` unless it is None."""
+    from service.runtime.session import DEFAULT_ENDPOINT
+
+    parser.add_argument(
+        "--endpoint",
+        default=DEFAULT_ENDPOINT,
+        metavar="ENDPOINT",
+        help="zenoh endpoint of the service or router (%(default)s)",
+    )
+    if timeout_s is not None:
+        add_shared(parser, timeout={"default": timeout_s})
+    add_shared(parser, "zenoh-config", wait={"default": wait_s})
+
+
+def add_epilog(parser: argparse.ArgumentParser, text: str) -> None:
+    """Show ``text``, line by line as it is, below the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = text
+
+
+def progress_printer(quiet: bool) -> Callable[[str], None]:
+    """Prints a line of progress to stderr at once, so that stdout holds the result only; nothing if ``quiet``."""
+    return (lambda _: None) if quiet else functools.partial(_print_progress)
+
+
+def _print_progress(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def check_seed(seed: int) -> int:
+    """``seed``. Raises FieldError where it is negative."""
+    if seed < 0:
+        raise FieldError("--seed", seed, "an integer from 0 on")
+    return seed
+
+
+def make_folder(path: Path) -> Path:
+    """The folder ``path`` of ``--out``, made where it is missing. Raises FieldError where it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FieldError("--out", f"{path} ({error})", "a folder that can be written to") from error
+    return path
