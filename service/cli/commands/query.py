@@ -7,14 +7,16 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from service.cli.options import add_connection, add_shared
 from service.protocol.errors import FieldError
-from service.protocol.reply import Trajectory, flag_names
+
+if TYPE_CHECKING:
+    from service.protocol.reply import Trajectory
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Ask and print. Returns 0. Raises ServiceError where there is no answer or the service refuses."""
     from service.client.client import Client
     from service.protocol.query import NEWEST
+    from service.protocol.reply import flag_names
 
     columns = _columns(args)
     with Client.connect(
@@ -50,17 +53,18 @@ def run(args: argparse.Namespace) -> int:
             print(json.dumps(client.status(), indent=None if args.json else 2))
             return 0
         answer = client.trajectory(*columns, model=args.model, as_of=NEWEST if args.as_of is None else args.as_of)
+    flags = [flag_names(bits) for bits in answer.flags.tolist()]
     if args.json:
-        print(json.dumps(_as_json(columns[0], answer)))
+        print(json.dumps(_as_json(columns[0], answer, flags)))
         return 0
     print(f"# model {answer.model}, snapshot {answer.snapshot_seq}{', fallback' if answer.fallback else ''}")
     print(f"# {'y_um':>10} {'u_V':>10} {'std_V':>9}  flags")
-    for y, u, std, bits in zip(columns[0], answer.u_V, answer.std_V, answer.flags, strict=True):
-        print(f"{y:12.4f} {u:10.5f} {std:9.5f}  {' '.join(flag_names(int(bits)))}".rstrip())
+    for y, u, std, names in zip(columns[0], answer.u_V, answer.std_V, flags, strict=True):
+        print(f"{y:12.4f} {u:10.5f} {std:9.5f}  {' '.join(names)}".rstrip())
     return 0
 
 
-def _as_json(y_um: FloatArray, answer: Trajectory) -> dict[str, Any]:
+def _as_json(y_um: FloatArray, answer: Trajectory, flags: list[list[str]]) -> dict[str, Any]:
     return {
         "schema": 1,
         "model": answer.model,
@@ -69,7 +73,7 @@ def _as_json(y_um: FloatArray, answer: Trajectory) -> dict[str, Any]:
         "y_um": y_um.tolist(),
         "u_V": answer.u_V.tolist(),
         "std_V": [None if math.isnan(value) else value for value in answer.std_V.tolist()],
-        "flags": [flag_names(bits) for bits in answer.flags.tolist()],
+        "flags": flags,
         "memory": answer.memory.tolist(),
     }
 
