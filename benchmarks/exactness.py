@@ -25,7 +25,7 @@ from service.failover.state_transfer import fetch_state
 from service.protocol.errors import ServiceError
 from service.protocol.samples import joined
 from service.server.axis import Axis
-from service.server.axis_state import fingerprint
+from service.server.learner_state import fingerprint
 from service.server.models import load_axis
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 

@@ -116,7 +116,7 @@ def run_adaptive(
         if first < n:
             begin = first + count.offset
             # The block before is pending; the newest sample that can have come is that of the block before it.
-            axis.age_s = max(0, first - block - 1 - newest) * dt_s
+            axis.update_age(max(0, first - block - 1 - newest) * dt_s)
             y_um, v_um_per_s, a_um_per_s2 = (values[part] for values in wanted)
             query = FeedforwardQuery(
                 y_um, v_um_per_s, a_um_per_s2, u_before_V=before_V, pending=commanded.before(begin)

@@ -12,7 +12,6 @@ from typing import Final
 
 from adaptive.errors import ModelFileError
 from service.server.axis import Axis
-from service.server.axis_state import restore_axis
 from service.storage.checkpoint import CheckpointFolder
 from service.storage.checkpoint_keeper import learn_again
 from service.storage.segments import rows_behind
@@ -51,7 +50,7 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
             last_seq = meta.seq if rows is None else int(rows.seq[-1])
             if not _further((last_seq, meta.samples + (0 if rows is None else len(rows))), axis, newest_seq):
                 return ""
-            restore_axis(axis, state)
+            axis.restore(state)
         except (ModelFileError, OSError) as error:
             axis.note("checkpoint_refused", f"checkpoint {number} of the other instance: {error}")
             continue

@@ -18,7 +18,7 @@ from service.failover.reachability import Reachability
 from service.failover.standby_model import StandbyModel
 from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state
 from service.protocol.json_message import fields_of
-from service.server.endpoints import PRIMARY, STANDBY, AxisServer
+from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 #: Events of the serving instance after which its model no longer follows from the samples alone.
 MODEL_EVENTS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
@@ -59,7 +59,7 @@ class RoleControl:
         self.server = server
         self.claims = Claims(server.keys, server.instance)
         self.model = StandbyModel(
-            server.axis, server.intake, on_restored=server.keeper.at_once, on_gap=self._refetch_state
+            server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
         self._peer_files = peer_files
         self._reachability = reachability
@@ -78,8 +78,8 @@ class RoleControl:
         self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=True)
         self.settled = threading.Event()
         self.ready = threading.Event()
-        server.synced = False
-        server.intake.gate = self.model.gate
+        server.set_synced(False)
+        server.loop.set_gate(self.model.gate)
 
     def start(self) -> None:
         """Look for other instances and take a role."""
@@ -181,7 +181,8 @@ class RoleControl:
     def _claim(self) -> None:
         """Declare a claim above all known ones, then withdraw the previous one."""
         server, before = self.server, self._token
-        server.epoch = self._epoch = max(self._epoch + 1, self.claims.next_epoch())
+        self._epoch = max(self._epoch + 1, self.claims.next_epoch())
+        server.set_epoch(self._epoch)
         self._token = self._session.liveliness().declare_token(server.keys.claim(self._epoch, server.instance))
         if before is not None:
             before.undeclare()
@@ -190,9 +191,9 @@ class RoleControl:
         server = self.server
         self._claim()
         server.serve()
-        server.intake.call(self._leave_standby, _CHANGE_S)
+        server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
-        server.synced = True
+        server.set_synced(True)
         self.settled.set()
         self.ready.set()
 
@@ -200,11 +201,11 @@ class RoleControl:
         server = self.server
         server.axis.note("stood_down", f"{other} serves: it took over while this instance was unreachable")
         # First: the status must not claim that this is the served model.
-        server.synced = False
+        server.set_synced(False)
         server.stand_down()
         self._drop_claim()
         self._rival_at = None
-        server.intake.call(self._enter_standby, _CHANGE_S)
+        server.loop.queue.call(self._enter_standby, _CHANGE_S)
         self._outdated = True
         self._take_state()
 
@@ -212,7 +213,7 @@ class RoleControl:
         axis = self.server.axis
         # The first instance takes over from nobody and continues from its own state.
         source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
-        self.server.intake.gate = None
+        self.server.loop.set_gate(None)
         if self._epoch > 1:
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"
             axis.note("took_over", f"as number {self._epoch}, {model}", synced=not source)
@@ -223,7 +224,7 @@ class RoleControl:
     def _enter_standby(self) -> None:
         self.model.stand_down()
         self.server.leave_tuning()
-        self.server.intake.gate = self.model.gate
+        self.server.loop.set_gate(self.model.gate)
 
     def _take_state(self) -> None:
         """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
@@ -242,7 +243,7 @@ class RoleControl:
         if data is None:
             return False
         try:
-            self.server.intake.call(lambda: self.model.take_state(data), _RESTORE_S)
+            self.server.loop.queue.call(lambda: self.model.take_state(data), _RESTORE_S)
         except DehystError as error:
             if str(error) != self._refusal:
                 self.server.axis.note("standby_refused", f"the state of the serving instance: {error}")
@@ -252,7 +253,7 @@ class RoleControl:
                 self.ready.set()
             return False
         self._refusal, self._pause_s = "", PAUSE_S
-        self.server.synced = True
+        self.server.set_synced(True)
         self.ready.set()
         return True
 

@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import ModelFileError
-from service.intake.intake import Intake
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.axis_state import restore_axis
+from service.server.axis_loop import SampleSink
 from service.storage.checkpoint import decode_checkpoint
 from service.storage.checkpoint_keeper import learn_again
 
@@ -28,7 +27,7 @@ NOT_SYNCED: Final = "not_synced"
 
 
 class StandbyModel:
-    """Stands between the intake of a standby and its axis. Call all methods in the thread that handles samples.
+    """Stands between the queue of a standby and its axis. Call all methods in the thread that handles samples.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ class StandbyModel:
     def __init__(
         self,
         axis: Axis,
-        intake: Intake,
+        sink: SampleSink | None,
         kept: int = KEPT_SAMPLES,
         on_restored: Callable[[], None] = lambda: None,
         on_gap: Callable[[], None] = lambda: None,
@@ -52,7 +51,7 @@ class StandbyModel:
         self.synced = False
         self.syncs = 0
         self._axis = axis
-        self._intake = intake
+        self._sink = sink
         self._kept = kept
         self._on_restored = on_restored
         self._on_gap = on_gap
@@ -64,7 +63,7 @@ class StandbyModel:
         self._overflowed = False
 
     def gate(self, batch: SampleBatch) -> SampleBatch | None:
-        """For ``Intake.gate``: keep the samples in memory; pass them on once the state has been received, else None."""
+        """For ``AxisLoop.set_gate``: keep the samples in memory; pass them on once the state has come, else None."""
         self._recent.append(batch)
         self._count += len(batch)
         while self._count > self._kept and len(self._recent) > 1:
@@ -73,9 +72,8 @@ class StandbyModel:
         if self.synced:
             self._check_gap([batch])
             return batch
-        sink = self._intake.sink
-        if sink is not None:
-            sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, NOT_SYNCED)
+        if self._sink is not None:
+            self._sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, NOT_SYNCED)
         return None
 
     def take_state(self, data: bytes) -> int:
@@ -88,7 +86,7 @@ class StandbyModel:
         meta.refuse_unless(meta.stage, axis.config.name, axis.dt_s)
         if meta.axis != axis.config.name:
             raise ModelFileError(f"axis is {meta.axis!r}, expected {axis.config.name!r}")
-        restore_axis(axis, state)
+        axis.restore(state)
         self.synced = True
         self._overflowed = False
         self.syncs += 1
@@ -143,9 +141,8 @@ class StandbyModel:
             self._on_gap()
 
     def _rebase(self) -> None:
-        rebase = getattr(self._intake.sink, "rebase", None)
-        if rebase is not None:
-            rebase(self._axis.sequence.received)
+        if self._sink is not None:
+            self._sink.rebase(self._axis.sequence.received)
         self._on_restored()
 
 

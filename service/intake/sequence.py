@@ -60,7 +60,7 @@ class SequenceTracker:
     last : highest number taken in order in the stage's present count, -1 before any.
     received, lost, late, restarts : samples that came; numbers that never came; samples that came twice, out of order
         or far ahead with nothing to bear them out; how often another count of the stage began.
-    refuted : number far ahead that other samples have just spoken against, -1 for none; set back by who tells of it.
+    refuted : number far ahead that other samples have just spoken against, -1 for none.
     """
 
     def __init__(self, dt_s: float) -> None:
@@ -103,6 +103,11 @@ class SequenceTracker:
         self.last, self._t_s = seq, t_s
         self._since += 1
         return IN_ORDER
+
+    def take_refuted(self) -> int:
+        """``refuted``, which is then -1."""
+        refuted, self.refuted = self.refuted, -1
+        return refuted
 
     def number(self, seq: int) -> int:
         """``seq``, in order in the present count, in the count that never goes back."""
@@ -200,27 +205,6 @@ class SequenceTracker:
     def counters(self) -> dict[str, int]:
         """For the status."""
         return {"received": self.received, "lost": self.lost, "late": self.late, "restarts": self.restarts}
-
-
-class Seldom:
-    """Says which events to tell: the first of a kind, and the next after a while without any.
-
-    A flood of what happens to the numbers is one event; the counters go on.
-
-    Parameters
-    ----------
-    calm : samples without one, after which the next is told again.
-    """
-
-    def __init__(self, calm: int) -> None:
-        self._calm = calm
-        self._last: dict[str, int] = {}
-
-    def tells(self, event: str, received: int) -> bool:
-        """Whether ``event``, which has happened again with the sample number ``received`` that came, is told."""
-        last = self._last.get(event)
-        self._last[event] = received
-        return last is None or received - last > self._calm
 
 
 def _between(least: int, wanted: float, most: int) -> int:

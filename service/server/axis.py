@@ -1,64 +1,81 @@
-"""One axis in the service: what learns, what is served, and the snapshots between the two.
+"""One axis in the service: samples in by `Axis.handle`, snapshots of its models, answers to queries by `Axis.answer`.
 
-No thread, no wire and no clock here: samples go in by :meth:`Axis.handle`, queries are answered by
-:meth:`Axis.answer`, and the same samples give the same answers to the last bit, live or replayed. One thread may
-handle samples while others answer queries: what they share is replaced whole, never changed. The operator's verbs
-belong to the thread that handles samples, between two batches.
+There is no thread, no wire and no clock here: the same samples give the same answers to the last bit, live or replayed.
+One thread may handle samples while others answer queries, because what they share is replaced as a whole and never
+changed. The operator's commands and the state belong to the thread that handles samples, between two batches.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
+import numpy as np
+
+from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
+from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
+from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits
 from service.answers.memory_tracking import MemoryTracker
-from service.background.retuning.adoption import Adoptions
+from service.background.retuning.adoption import Retuned
 from service.config.config import LEARN, AxisConfig
 from service.intake.clock import SampleClock
-from service.intake.sequence import ANEW, REFUSED, Seldom, SequenceTracker
+from service.intake.sequence import AHEAD, ANEW, REFUSED, RESTARTED, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
 from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import Trajectory
 from service.protocol.samples import SampleBatch
-from service.server.axis_counting import AxisCounting
-from service.server.model_watch import Watch, WatchConfig
+from service.server.competing import champion_of
+from service.server.events import EventLimiter, EventLog
+from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive
+from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
 
-__all__ = ["Axis", "Served"]
-
-#: The baselines that may stand in for the model that learns, the best first: the one with hysteresis and a form that
-#: bounds it far from its data, then the one that is always there.
+#: Baselines that may stand in for the model that learns, the best first: the one with hysteresis, whose form bounds it
+#: far from its data, then the one that is always there.
 STAND_INS: Final = ("mpi", "linear", "bouc_wen")
-_MAX_EVENTS: Final = 256
 
 
-class Tally(NamedTuple):
-    """Counts that belong together: of the last sample handled, of what came, and of what was made of it."""
+class Archive(Protocol):
+    """Where the checkpoints of an axis are kept."""
+
+    def entries(self) -> list[dict[str, Any]]:
+        """The checkpoints, newest first."""
+        ...
+
+    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
+        """The learner of a checkpoint. Raises FieldError if there is none with this number, or it does not fit."""
+        ...
+
+
+class SampleCounts(NamedTuple):
+    """Counts of one moment: number of the last sample handled, samples by order of arrival, samples by verdict."""
 
     seq: int
     samples: dict[str, int]
     gates: dict[str, int]
 
 
-class Axis(AxisCounting):
+class Axis:
     """The models of one axis.
 
     Parameters
     ----------
-    config : limits, snapshots, names; see :class:`service.config.config.AxisConfig`.
+    config : limits, snapshots, names; see `service.config.config.AxisConfig`.
     models : by name, all of one sample time.
-    learner : what learns; its snapshots are served as ``config.learn``. None for a service that does not learn.
+    learner : learns from the samples; its snapshots are served as ``config.learn``. None for no learning.
     limits : those of ``config``, with a displacement range filled in.
-    revive : makes what learns anew from a model, where the learner has failed; None: it stays dead.
+    revive : starts another learner from a model, some time after a learner has failed; None: it stays failed.
+    stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
+
+    Raises InputError if ``config`` names a model that is missing, or if the sample times differ.
     """
 
     def __init__(
@@ -67,10 +84,13 @@ class Axis(AxisCounting):
         models: dict[str, InverseModel],
         learner: OnlineModel | None,
         limits: Limits,
-        revive: Callable[[InverseModel], OnlineModel] | None = None,
+        revive: Revive | None = None,
+        *,
+        stage: str = "",
+        archive: Archive | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
-            config = replace(config, served=config.learn or LEARN)  # it is alone, or nothing learns
+            config = replace(config, served=config.learn or LEARN)  # without a competition
         if config.served not in models:
             raise FieldError("served", repr(config.served), f"one of the models in the file: {', '.join(models)}")
         if config.stand_in and config.stand_in not in models:
@@ -80,37 +100,35 @@ class Axis(AxisCounting):
             raise FieldError("dt_s", f"{sorted(steps)}", "one sample time for all models of an axis")
         self.config = config
         self.limits = limits
-        self.learner = learner
         self.dt_s = steps.pop()
         self.sequence = SequenceTracker(self.dt_s)
-        self._seldom = Seldom(calm=round(1.0 / self.dt_s))
-        self.tracker = MemoryTracker(self.dt_s)
-        self.watch = Watch(WatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
-        self._revive = revive
-        self.adoptions = Adoptions()
-        self._learner_dead = False
-        self._frozen_by = ""
-        self._events: deque[dict[str, Any]] = deque(maxlen=_MAX_EVENTS)
-        # Time goes on where a restarted stage begins anew; what learns sees one clock and one count.
         self.clock = SampleClock(self.dt_s)
+        self.tracker = MemoryTracker(self.dt_s)
+        watch = ModelWatch(ModelWatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
+        self.supervisor = LearnerSupervisor(config.learn, learner, watch, self.dt_s, self.note, revive)
+        #: Number of the last sample whose snapshot, if it has one, is available.
+        self.handled_seq = -1
+        self._archive = archive
+        self._events = EventLog(stage, config.name)
+        self._limiter = EventLimiter(calm=round(1.0 / self.dt_s))
         self._gates: dict[str, int] = {}
         # Newest last. A tuple, replaced at each snapshot, so that a query never waits for the learner.
-        self._ring: tuple[Served, ...] = (self._first(dict(models)),)
-        # States of the learner, the older one first, and the count of samples at the newer one.
-        self._marks: tuple[StateDict, StateDict] = ({}, {})
-        self._marked = 0
-        #: The last sequence number whose snapshot, if it has one, is in the ring.
-        self.handled_seq = -1
-        #: What has been counted up to the last message; replaced whole, for whoever tells of it meanwhile.
-        self.tally = Tally(-1, self.sequence.counters(), {})
-        #: Time since the newest sample that was handled came, s, where samples are expected; set by who has a clock.
-        self.age_s = 0.0
-        #: Called once, right after the next snapshot, by the thread that handles samples; then None again.
-        self.at_snapshot: Callable[[], None] | None = None
+        self._snapshots: tuple[Served, ...] = (self._first_snapshot(dict(models)),)
+        #: Counts up to the last message; replaced as a whole, for readers in other threads.
+        self.counts = SampleCounts(-1, self.sequence.counters(), {})
+        self._age_s = 0.0
+
+    # ---- what other threads read
 
     @property
     def newest(self) -> Served:
-        return self._ring[-1]
+        """The newest snapshot."""
+        return self._snapshots[-1]
+
+    @property
+    def snapshots(self) -> tuple[Served, ...]:
+        """All snapshots that queries can ask for, the newest last."""
+        return self._snapshots
 
     @property
     def served(self) -> str:
@@ -118,66 +136,41 @@ class Axis(AxisCounting):
         return self.newest.default
 
     @property
+    def learner(self) -> OnlineModel | None:
+        """The model that learns; another object after it was replaced or restored."""
+        return self.supervisor.learner
+
+    @property
     def learning(self) -> bool:
         """Whether samples still change what is served."""
-        return self.learner is not None and not self._learner_dead
+        return self.supervisor.learning
+
+    @property
+    def frozen(self) -> bool:
+        """Whether an operator has stopped learning."""
+        return self.supervisor.frozen
 
     @property
     def gates(self) -> dict[str, int]:
-        """Samples by what the learner said of them, since the start."""
+        """Samples by verdict since the start."""
         return dict(self._gates)
+
+    def note(self, event: str, detail: str, **more: Any) -> None:
+        """Note an event at the last sample. From any thread."""
+        self._events.note(self.sequence.last, event, detail, **more)
 
     def take_events(self) -> list[dict[str, Any]]:
         """The events since the last call, oldest first; of a flood only the newest are kept."""
-        events = []
-        while self._events:
-            events.append(self._events.popleft())
-        return events
+        return self._events.take()
 
-    def note(self, event: str, detail: str, **more: Any) -> None:
-        """Keep an event, with the time that it is now, for whoever publishes them: a standby may much later."""
-        told = {"seq": self.sequence.last, "event": event, "detail": detail, "time_unix_s": time.time()}
-        self._events.append({**told, **more})
-
-    def handle(self, batch: SampleBatch) -> list[str]:
-        """Take the samples of a message; returns what was made of each: "learnt", or the reason why not."""
-        verdicts = []
-        every = self.config.snapshot_every
-        rows = zip(batch.seq.tolist(), batch.t_s.tolist(), batch.u_V.tolist(), batch.y_um.tolist(), strict=True)
-        for seq, t_s, u_V, y_um in rows:
-            before = self.sequence.last
-            order = self.sequence.take(seq, t_s)
-            if self.sequence.refuted >= 0:
-                self._tell_refuted(before)
-            if order in REFUSED:
-                verdicts.append(self._counted(self._refused(order, seq)))
-                continue
-            if order in ANEW:
-                self._begin_count(order, seq, before)
-            number = self.sequence.number(seq)
-            verdict = self._counted(self._taught(Sample(number, self._time(number, t_s, order in ANEW), u_V, y_um)))
-            verdicts.append(verdict)
-            if self.adoptions:
-                self.adopt_due(number)
-            self.watch.take(u_V, y_um, verdict)
-            self.tracker.add(seq, u_V, y_um)
-            if seq // every > self.newest.seq // every:
-                self._publish(seq, t_s, u_V)
-            self.handled_seq = seq
-            if self.at_snapshot is not None and self.newest.seq == seq:
-                call, self.at_snapshot = self.at_snapshot, None
-                call()
-        self.count()
-        return verdicts
-
-    def count(self) -> None:
-        """Bring the tally up to date; in the thread that handles samples."""
-        self.tally = Tally(self.handled_seq, self.sequence.counters(), self.gates)
+    def update_age(self, age_s: float) -> None:
+        """Set the time, s, since the newest sample that was handled came; 0 before any. From the publishing thread."""
+        self._age_s = age_s
 
     def answer(self, query: FeedforwardQuery) -> Trajectory:
-        """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for."""
-        handled = self.handled_seq  # read before the ring: what is missing then is really not there yet
-        return answer(query, self._ring, handled, self.config, self.limits, self.age_s)
+        """Voltages for a query, safe to apply. Raises InputError on a query that cannot be answered."""
+        handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
+        return answer(query, self._snapshots, handled, self.config, self.limits, self._age_s)
 
     def model(self, name: str) -> tuple[InverseModel, int, FloatArray]:
         """(model, snapshot_seq, tracked memory) of the newest snapshot. Raises InputError on an unknown name."""
@@ -187,7 +180,7 @@ class Axis(AxisCounting):
         return served.models[name], served.seq, served.memories[name]
 
     def safety(self, name: str) -> Safety:
-        """By what rules the model called ``name`` gives way to another, for who evaluates it elsewhere."""
+        """The rules by which the model ``name`` gives way to its stand-in, for evaluation in another process."""
         served, config = self.newest, self.config
         return Safety(
             blends(name, served.default, config),
@@ -198,26 +191,244 @@ class Axis(AxisCounting):
             served.standing_in_for(name),
         )
 
-    def _first(self, models: dict[str, InverseModel]) -> Served:
+    def differs(self, seq: int, theirs: str) -> bool:
+        """Whether the learning model of the snapshot at ``seq`` has another fingerprint than ``theirs``."""
+        mine = next((served for served in reversed(self._snapshots) if served.seq == seq), None)
+        return bool(self.config.learn) and mine is not None and fingerprint(mine.models[self.config.learn]) != theirs
+
+    def checkpoints(self) -> list[dict[str, Any]]:
+        """The checkpoints, newest first: checkpoint, seq, samples, time_unix_s, bytes."""
+        return [] if self._archive is None else self._archive.entries()
+
+    def adopt_at(self, *retuned: Retuned) -> None:
+        """Let the learner adopt hyper-parameters, each right after its sample."""
+        self.supervisor.adoptions.add(*retuned)
+
+    # ---- samples, in the thread that handles them
+
+    def handle(self, batch: SampleBatch, on_snapshot: Callable[[], None] | None = None) -> list[str]:
+        """Take the samples of a message. Returns the verdict on each: "learnt", or the reason why not.
+
+        ``on_snapshot`` : called after each new snapshot, when the state is that of its sample.
+        """
+        verdicts = []
+        every = self.config.snapshot_every
+        rows = zip(batch.seq.tolist(), batch.t_s.tolist(), batch.u_V.tolist(), batch.y_um.tolist(), strict=True)
+        for seq, t_s, u_V, y_um in rows:
+            before = self.sequence.last
+            order = self.sequence.take(seq, t_s)
+            if self.sequence.refuted >= 0:
+                self._note_refuted(self.sequence.take_refuted(), before)
+            if order in REFUSED:
+                verdicts.append(self._counted(self._refusal(order, seq)))
+                continue
+            if order in ANEW:
+                self._begin_count(order, seq, before)
+            number = self.sequence.number(seq)
+            sample = Sample(number, self._time_s(number, t_s, order in ANEW), u_V, y_um)
+            verdict = self._counted(self._teach(sample))
+            verdicts.append(verdict)
+            if self.supervisor.adoptions:
+                self.supervisor.adopt_due(number)
+            self.supervisor.watch.take(u_V, y_um, verdict)
+            self.tracker.add(seq, u_V, y_um)
+            due = seq // every > self.newest.seq // every
+            if due:
+                self._take_snapshot(seq, t_s, u_V)
+            self.handled_seq = seq
+            if due and on_snapshot is not None:
+                on_snapshot()
+        self._update_counts()
+        return verdicts
+
+    def _counted(self, verdict: str) -> str:
+        self._gates[verdict] = self._gates.get(verdict, 0) + 1
+        return verdict
+
+    def _update_counts(self) -> None:
+        self.counts = SampleCounts(self.handled_seq, self.sequence.counters(), self.gates)
+
+    def _refusal(self, order: str, seq: int) -> str:
+        """The verdict on a sample that is refused for its number."""
+        if order == AHEAD:
+            return AHEAD
+        if not self.learning:
+            return NOT_LEARNING
+        return DUPLICATE if seq == self.sequence.last else OUT_OF_ORDER
+
+    def _time_s(self, number: int, t_s: float, anew: bool) -> float:
+        """The time of a sample, s, for the learner: without the steps of the stage's clock."""
+        sets = self.clock.sets
+        continuous_s = self.clock.take(number, t_s, anew)
+        if self.clock.sets != sets:
+            self._note_limited(
+                "stage_clock_set", "the stage's clock has been set; time goes on by the numbers of the samples"
+            )
+        return continuous_s
+
+    def _teach(self, sample: Sample) -> str:
+        """The learner's verdict on a sample in order; one with a doubtful time is refused before."""
+        if self.clock.in_doubt and self.learning:
+            return TIMING
+        verdict = self.supervisor.handle(sample)
+        if self.clock.unheard(verdict) and self.learner is not None:
+            self._note_limited(
+                "learner_resynced", f"it refused samples in order as {verdict}: its own count and time begin anew"
+            )
+            self.learner.resync()
+        return verdict
+
+    def _begin_count(self, order: str, seq: int, before: int) -> None:
+        """The stage has begun another count: its number after ``before`` is ``seq``."""
+        self.tracker.forget()
+        if order == RESTARTED:
+            # Snapshots of the old count can no longer be named.
+            self._snapshots = (replace(self.newest, seq=-1),)
+            self._note_limited("stage_restarted", f"the stage's numbers went back to {seq}; the model is kept")
+        else:
+            self._note_limited(
+                "numbers_jumped",
+                f"the stage's numbers went from {before} to {seq}, which its times do not explain; the model is kept",
+            )
+
+    def _note_refuted(self, refuted: int, before: int) -> None:
+        detail = f"number {refuted} after {before} was refused: the next ones did not go on from there"
+        self._note_limited("numbers_ahead", detail)
+
+    def _note_limited(self, event: str, detail: str) -> None:
+        if self._limiter.allows(event, self.sequence.received):
+            self.note(event, detail)
+
+    # ---- snapshots
+
+    def _first_snapshot(self, models: dict[str, InverseModel]) -> Served:
         config = self.config
         if self.learner is not None:
             models[config.learn] = self.learner.snapshot()
-        # Before the first sample the stage is taken to be at rest, where it was when it was identified.
-        places = (model.features.y_rest_um for model in models.values() if isinstance(model, LssvmInverse))
-        rest_um = next(places, 0.0)
+        # Before the first sample the stage is assumed at rest, at the position where it was when it was identified.
+        positions = (model.features.y_rest_um for model in models.values() if isinstance(model, LssvmInverse))
+        rest_um = next(positions, 0.0)
         memories = {name: model.rest_memory(rest_um) for name, model in models.items()}
         # A model of the learner's own form is no stand-in for it.
-        known = (name for name in STAND_INS if name in models and name not in (config.learn, config.served))
-        return Served(-1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(known, ""))
+        usable = (name for name in STAND_INS if name in models and name not in (config.learn, config.served))
+        return Served(-1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(usable, ""))
 
-    def _publish(self, seq: int, t_s: float, u_V: float) -> None:
-        last = self.newest
+    def _take_snapshot(self, seq: int, t_s: float, u_V: float) -> None:
+        last, supervisor = self.newest, self.supervisor
         models = last.models
-        if self.learner is not None:
-            models = models | self._judged(last)
-        memories = self._own_memory(models, self.tracker.advance(models, last.memories))
+        if supervisor.learner is not None:
+            models = models | supervisor.models(last, self.sequence.received)
+        memories = supervisor.memories(models, self.tracker.advance(models, last.memories))
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
-            trust=self.watch.trust, trouble=self.watch.trouble,
+            trust=supervisor.watch.trust, trouble=supervisor.watch.trouble,
         )  # fmt: skip
-        self._ring = (*self._ring, served)[-self.config.snapshots_kept :]
+        self._snapshots = (*self._snapshots, served)[-self.config.snapshots_kept :]
+
+    # ---- operator's commands; each returns the number of the sample after which it holds
+
+    def freeze(self, by: str = "") -> int:
+        """Stop learning: samples are still tracked, judged and recorded."""
+        self.supervisor.freeze(by or "operator")
+        self.note("frozen", "learning is stopped", by=by)
+        return self.handled_seq
+
+    def thaw(self, by: str = "") -> int:
+        """Resume learning."""
+        self.supervisor.thaw()
+        self.note("thawed", "learning goes on", by=by)
+        return self.handled_seq
+
+    def select(self, model: str, by: str = "") -> int:
+        """Let ``model`` answer where a query names none. Raises FieldError if it is not served."""
+        newest = self.newest
+        if model not in newest.models:
+            raise FieldError("model", repr(model), f"one of {', '.join(newest.models)}")
+        self._snapshots = (*self._snapshots[:-1], replace(newest, default=model))
+        self.note("selected", f"{model} answers instead of {newest.default}", by=by, model=model)
+        return self.handled_seq
+
+    def rollback(self, checkpoint: int, by: str = "") -> int:
+        """Restore the learner of a checkpoint; numbers, memories and recording continue.
+
+        Raises FieldError if there is no such checkpoint or it does not fit.
+        """
+        if self._archive is None or self.learner is None:
+            raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
+        learner = self._archive.learner_of(checkpoint, self.learner)
+        self.supervisor.replace(learner)
+        newest = self.newest
+        changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}
+        memories = {
+            name: newest.memories[name] if newest.memories[name].size == new.memory_size else new.rest_memory(0.0)
+            for name, new in changed.items()
+        }
+        served = replace(newest, models=newest.models | changed, memories=newest.memories | memories)
+        self._snapshots = (*self._snapshots[:-1], served)
+        self.note("rolled_back", f"to checkpoint {checkpoint}", by=by, checkpoint=checkpoint)
+        return self.handled_seq
+
+    # ---- state, for checkpoints and for a standby
+
+    def state_dict(self) -> StateDict:
+        """All that samples and operators have changed, flat; copies.
+
+        Models of the model file are not included. The learner is, with the model that it started from, so that a state
+        of another identification can be refused.
+        """
+        served = self.newest
+        state: StateDict = {
+            "seq": self.handled_seq,
+            "served.seq": served.seq,
+            "served.t_s": served.t_s,
+            "served.u_V": served.u_V,
+            "served.default": served.default,
+            "served.trust": served.trust,
+            "served.trouble": served.trouble,
+        }
+        state |= prefixed("sequence.", self.sequence.state_dict())
+        state |= prefixed("clock.", self.clock.state_dict())
+        state |= prefixed("tracker.", self.tracker.state_dict())
+        state |= prefixed("gates.", self._gates)
+        state |= prefixed("memory.", served.memories)
+        state |= self.supervisor.state_dict(served.trouble in POISON)
+        return state
+
+    def restore(self, state: StateDict) -> None:
+        """Continue from ``state``. Raises ModelFileError if it does not fit; the axis is then unchanged."""
+        try:
+            sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)
+            sequence.restore(under("sequence.", state))
+            clock.restore(under("clock.", state))
+            tracker.restore(under("tracker.", state))
+            supervisor = self.supervisor.restored(state, sequence.received)
+            served = self._restored_snapshot(state, supervisor)
+            gates = {name: int(count) for name, count in under("gates.", state).items()}
+            seq = int(state["seq"])
+        except (KeyError, TypeError, ValueError, InputError) as error:
+            raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
+        self.sequence, self.clock, self.tracker, self.supervisor = sequence, clock, tracker, supervisor
+        self._gates = gates
+        self._snapshots = (served,)
+        self.handled_seq = seq
+        self._update_counts()
+
+    def _restored_snapshot(self, state: StateDict, supervisor: LearnerSupervisor) -> Served:
+        now = self.newest
+        models = dict(now.models)
+        if supervisor.learner is not None:
+            good = supervisor.watch.good
+            models[self.config.learn] = supervisor.learner.snapshot() if good is None else good
+            models |= champion_of(supervisor.learner)
+        memories: dict[str, FloatArray] = {}
+        for name, model in models.items():
+            memory = np.array(state.get(f"memory.{name}", model.rest_memory(0.0)), dtype=np.float64)
+            if memory.shape != (model.memory_size,) or not np.isfinite(memory).all():
+                raise FieldError(f"memory.{name}", memory.shape, f"({model.memory_size},) finite numbers")
+            memories[name] = memory
+        default = str(state["served.default"])
+        return replace(
+            now, seq=int(state["served.seq"]), t_s=float(state["served.t_s"]), u_V=float(state["served.u_V"]),
+            models=models, memories=memories, default=default if default in models else now.default,
+            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]),
+        )  # fmt: skip

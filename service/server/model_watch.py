@@ -43,10 +43,12 @@ POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
 #: Refusals that speak of the values themselves; a stage at rest or out of sequence is no poison.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
 _PROBES: Final = 9
+#: Models that the watch keeps: the last good one, and two from before, the older and the newer.
+ROLES: Final = ("good", "mark", "next_mark")
 
 
 @dataclass(frozen=True, slots=True)
-class WatchConfig:
+class ModelWatchConfig:
     """When to call it trouble.
 
     Attributes
@@ -72,7 +74,7 @@ class WatchConfig:
     revive_s: float = 5.0
 
 
-class Watch:
+class ModelWatch:
     """State of the watch over one axis. One thread calls it.
 
     Attributes
@@ -80,7 +82,7 @@ class Watch:
     trouble : name of what is wrong, empty while all is well. trust : weight of the served model, 1 while all is well.
     """
 
-    def __init__(self, config: WatchConfig, dt_s: float, limits: Limits) -> None:
+    def __init__(self, config: ModelWatchConfig, dt_s: float, limits: Limits) -> None:
         self.config = config
         self.trouble = ""
         self.trust = 1.0
@@ -177,6 +179,11 @@ class Watch:
         return True
 
     @property
+    def good(self) -> InverseModel | None:
+        """The model that was judged fit to be served; None before the first."""
+        return self._good
+
+    @property
     def teachable(self) -> bool:
         """Whether the samples are fit to teach."""
         return self.trouble not in POISON
@@ -201,19 +208,20 @@ class Watch:
 
     def models(self) -> dict[str, InverseModel]:
         """The good models by their part: those that :meth:`restore` wants back."""
-        known = {"good": self._good, "mark": self._mark, "next_mark": self._next_mark}
-        return {part: model for part, model in known.items() if model is not None}
+        known = zip(ROLES, (self._good, self._mark, self._next_mark), strict=True)
+        return {role: model for role, model in known if model is not None}
 
     def state_dict(self) -> dict[str, Any]:
         """Plain numbers and words; the models are not in it."""
         return {"trouble": self.trouble, "trust": self.trust, **self._n}
 
-    def restore(self, state: dict[str, Any], models: dict[str, InverseModel]) -> None:
-        """Go on from ``state_dict`` and ``models()``. Raises KeyError or ValueError, before anything changes."""
-        numbers = {name: float(state[name]) for name in self._n}
-        self.trouble, self.trust = str(state["trouble"]), float(state["trust"])
-        self._n = numbers
-        self._good, self._mark, self._next_mark = (models.get(part) for part in ("good", "mark", "next_mark"))
+    def restored(self, state: dict[str, Any], models: dict[str, InverseModel]) -> ModelWatch:
+        """A watch like this one that continues from ``state_dict`` and ``models``. Raises KeyError, ValueError."""
+        made = ModelWatch(self.config, self._dt_s, self._limits)
+        made._n = {name: float(state[name]) for name in self._n}
+        made.trouble, made.trust = str(state["trouble"]), float(state["trust"])
+        made._good, made._mark, made._next_mark = (models.get(role) for role in ROLES)
+        return made
 
 
 def _at_rest(model: InverseModel, y_um: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from service.config.schema import build_settings
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
 from service.server.competing import champion_of, compete
+from service.storage.checkpoint import CheckpointFolder
 from service.storage.model_file import Bundle, BundleMeta, read_bundle
 
 #: Share of the identified range by which a desired point may lie beyond it where the configuration sets no limit.
@@ -76,7 +77,10 @@ def load_axis(
         # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
         _warm_learner(begin(models[config.learn]), limits)
         models |= champion_of(learner)
-    axis = Axis(config, models, learner, limits, begin)
+    archive = None
+    if config.checkpoints is not None:
+        archive = CheckpointFolder(config.checkpoints, stage, config.name, bundle.meta.dt_s, config.checkpoints_kept)
+    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive)
     _warm_models(axis)
     return axis
 

@@ -18,13 +18,13 @@ from service.config.config import AxisConfig, ServeConfig
 from service.failover.peer_files import PeerFiles, standby_folder
 from service.failover.reachability import Reachability
 from service.failover.role_control import RoleControl
-from service.intake.sinks import SampleSink, SampleWatcher
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import open_service
 from service.server.axis import Axis
-from service.server.endpoints import PRIMARY, STANDBY, AxisServer
+from service.server.axis_loop import SampleSink, SampleWatcher
+from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.models import LearnerFactory, load_axis, make_learner
 from service.storage.checkpoint_keeper import learn_again, restore_newest
 
@@ -80,12 +80,11 @@ def as_standby(config: ServeConfig) -> ServeConfig:
 
 def _restore(server: AxisServer) -> None:
     """Go on from the newest checkpoint, and learn again what the journal holds behind it."""
-    axis, folder, sink = server.axis, server.keeper.folder, server.intake.sink
+    axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
     if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
         learn_again(axis, axis.config.recorder)
-    rebase = getattr(sink, "rebase", None)
-    if rebase is not None:
-        rebase(axis.sequence.received)
+    if sink is not None:
+        sink.rebase(axis.sequence.received)
 
 
 class Service:
@@ -190,8 +189,8 @@ class Service:
         self._role_controls = []
         for axis in self.axes:
             axis.undeclare()
-            if axis.intake.sink is not None:
-                axis.intake.sink.close()
+            if axis.loop.sink is not None:
+                axis.loop.sink.close()
         self.axes = []
         if self._session is not None:
             self._session.close()  # type: ignore[no-untyped-call]

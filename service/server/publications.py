@@ -1,4 +1,4 @@
-"""What an axis tells without being asked: its models as they change, diagnostics, status and events."""
+"""Publishes what changes on an axis: models, diagnostics, status and events."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from typing import Any, Final
 import zenoh
 
 from service.answers.latency import LatencyMeter
-from service.intake.intake import Intake
 from service.protocol.keys import AUTO, Keys
 from service.runtime.delivery import SURELY, is_followed
-from service.server.axis import Axis
-from service.server.axis_answers import JSON, Answers, plain
+from service.server.axis_loop import AxisLoop
+from service.server.query_answers import JSON, QueryAnswers, to_json
 
 STATUS_PERIOD_S: Final = 1.0
 
 
 class Publications:
-    """The publishers of one axis: all of them while it serves; one that stands by tells its status alone.
+    """The publishers of one axis: all of them while it serves; a standby publishes its status alone.
 
-    Not for two threads at once.
+    One thread at a time calls it.
 
     Parameters
     ----------
-    instance : whose events they are, and under what name it tells its status as a standby.
+    instance : sender of the events, and name under which a standby publishes its status.
     answers : encodes the models. status : makes the status.
     """
 
@@ -34,30 +33,29 @@ class Publications:
         session: zenoh.Session,
         keys: Keys,
         instance: str,
-        axis: Axis,
-        intake: Intake,
+        loop: AxisLoop,
         latency: LatencyMeter,
-        answers: Answers,
+        answers: QueryAnswers,
         status: Callable[[], dict[str, Any]],
     ) -> None:
         self._session, self._keys, self._instance = session, keys, instance
-        self._axis, self._intake, self._latency = axis, intake, latency
+        self._axis, self._loop, self._latency = loop.axis, loop, latency
         self._answers, self._status = answers, status
-        self._published = axis.newest
-        self._published_at = 0.0
-        self._told: dict[str, Any] = {}
-        self._status_at = 0.0
+        self._published = self._axis.newest
+        self._published_at_s = 0.0
+        self._diagnostics: dict[str, Any] = {}
+        self._status_at_s = 0.0
         self._publishers: dict[str, Any] = {}
         self._standby: Any = None
 
     def listen(self) -> None:
-        """Tell the status of a standby from now on."""
+        """Publish the status of a standby from now on."""
         self._standby = self._session.declare_publisher(
             self._keys.standby(self._instance), congestion_control=zenoh.CongestionControl.DROP, encoding=JSON
         )
 
     def serve(self) -> None:
-        """Tell everything from now on."""
+        """Publish everything from now on."""
         session, keys = self._session, self._keys
         drop = zenoh.CongestionControl.DROP
         self._publishers = {
@@ -69,54 +67,55 @@ class Publications:
         }
 
     def stand_down(self) -> None:
-        """Tell what has happened, and then only the status of a standby."""
-        self._tell_events()
+        """Publish the events that wait, and then only the status of a standby."""
+        self._publish_events()
         publishers, self._publishers = self._publishers, {}
         for publisher in publishers.values():
             publisher.undeclare()
 
     def close(self) -> None:
-        """The end of what `listen` began, after `stand_down`."""
+        """End what `listen` began; after `stand_down`."""
         if self._standby is not None:
             self._standby.undeclare()
             self._standby = None
 
     def tick(self, now_s: float) -> None:
-        """Tell what is due at ``now_s`` on a clock that never goes back."""
-        due = now_s - self._status_at >= STATUS_PERIOD_S
+        """Publish what is due at ``now_s`` (``time.monotonic``)."""
+        due = now_s - self._status_at_s >= STATUS_PERIOD_S
         if due:
-            self._status_at = now_s
+            self._status_at_s = now_s
         if self._publishers:
-            self._tell_models(now_s)
-            self._tell_diagnostics()
+            self._publish_models(now_s)
+            self._publish_diagnostics()
             if due:
-                self._intake.want_diagnostics = is_followed(self._publishers["diagnostics"])
-                self._publishers["status"].put(json.dumps(self._status(), default=plain))
-            self._tell_events()
+                self._loop.figures.follow(is_followed(self._publishers["diagnostics"]))
+                self._publishers["status"].put(to_json(self._status()))
+            self._publish_events()
         elif due and self._standby is not None:
-            self._standby.put(json.dumps(self._status(), default=plain))
+            self._standby.put(to_json(self._status()))
 
-    def _tell_models(self, now_s: float) -> None:
+    def _publish_models(self, now_s: float) -> None:
         newest, config, publishers = self._axis.newest, self._axis.config, self._publishers
-        if newest is self._published or now_s - self._published_at < 1.0 / config.model_hz:
+        if newest is self._published or now_s - self._published_at_s < 1.0 / config.model_hz:
             return
         if config.learn and is_followed(publishers["model"]):
             publishers["model"].put(self._answers.encoded(config.learn))
         if AUTO in newest.models and is_followed(publishers["champion"]):
             publishers["champion"].put(self._answers.encoded(AUTO))
-        self._published, self._published_at = newest, now_s
+        self._published, self._published_at_s = newest, now_s
 
-    def _tell_diagnostics(self) -> None:
-        told = self._intake.diagnostics
-        if told is self._told:
+    def _publish_diagnostics(self) -> None:
+        figures = self._loop.figures
+        diagnostics = figures.diagnostics
+        if diagnostics is self._diagnostics:
             return
-        self._told = told
+        self._diagnostics = diagnostics
         latency = self._latency.summary()
-        extra = {"counters": self._intake.counters, "query_us": {"p50": latency["p50_us"], "p99": latency["p99_us"]}}
-        self._publishers["diagnostics"].put(json.dumps({**told, **extra}, default=plain))
+        extra = {"counters": figures.counters, "query_us": {"p50": latency["p50_us"], "p99": latency["p99_us"]}}
+        self._publishers["diagnostics"].put(to_json({**diagnostics, **extra}))
 
-    def _tell_events(self) -> None:
-        # A standby keeps them until it serves, when they tell what has happened.
+    def _publish_events(self) -> None:
+        # A standby keeps its events until it serves.
         publisher = self._publishers.get("event")
         if publisher is None:
             return

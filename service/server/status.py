@@ -1,20 +1,21 @@
-"""The status of one axis, as JSON; docs/protocol.md tells the fields."""
+"""The status of one axis, as JSON; docs/protocol.md lists the fields."""
 
 from __future__ import annotations
 
+import time
 from typing import Any, Final
 
 from service.answers.latency import LatencyMeter
-from service.intake.intake import Intake
 from service.protocol.keys import Keys
 from service.protocol.model_classes import stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.security.refusals import refusal_counters
-from service.server.axis import Axis
+from service.server.axis_loop import AxisLoop
+from service.server.learner_state import fingerprint
 
 SCHEMA: Final = 1
-#: What of the learner's diagnostics a status repeats, once a second.
+#: Fields of the learner's diagnostics that a status repeats.
 _QUALITY: Final = (
     "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
     "window_residual_V", "window_cholesky",
@@ -22,10 +23,25 @@ _QUALITY: Final = (
 
 
 def axis_status(
-    keys: Keys, instance: str, axis: Axis, intake: Intake, latency: LatencyMeter, sample_age_s: float | None
+    keys: Keys,
+    instance: str,
+    loop: AxisLoop,
+    latency: LatencyMeter,
+    *,
+    role: str = "primary",
+    epoch: int = 0,
+    synced: bool = True,
+    stale: bool = False,
+    checkpoints: dict[str, Any] | None = None,
+    operations: dict[str, int] | None = None,
 ) -> dict[str, Any]:
-    """All that a client, an operator or a viewer wants to know of an axis; JSON values only."""
-    served, tally = axis.newest, axis.tally
+    """The fields for clients, operators and viewers; JSON values only. From any thread.
+
+    ``checkpoints``, ``operations`` : their counters.
+    """
+    axis, queue, figures = loop.axis, loop.queue, loop.figures
+    # One snapshot and one set of counts for all fields: others may come meanwhile.
+    served, counts, learn = axis.newest, axis.counts, axis.config.learn
     return {
         "schema": SCHEMA,
         "wire": VERSION,
@@ -33,33 +49,44 @@ def axis_status(
         "axis": keys.axis,
         "instance": instance,
         "dt_s": axis.dt_s,
-        "served": axis.served,
-        "learning": axis.config.learn if axis.learning else None,
+        "served": served.default,
+        "learning": learn if axis.learning else None,
         "models": {
             name: {"kind": stored_kind(model), "memory_size": model.memory_size}
             for name, model in served.models.items()
         },
         "limits": axis.limits.to_json(),
-        "seq": tally.seq,
+        "seq": counts.seq,
         "snapshot_seq": served.seq,
         "snapshot_every": axis.config.snapshot_every,
         "snapshots_kept": axis.config.snapshots_kept,
-        "sample_age_s": sample_age_s,
+        "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
-            **tally.samples,
-            "dropped": intake.dropped,
-            "malformed": intake.malformed,
-            "waiting": intake.waiting,
-            "learnt": tally.gates.get("learnt", 0),
-            "gates": tally.gates,
+            **counts.samples,
+            "dropped": queue.dropped,
+            "malformed": queue.malformed,
+            "waiting": queue.waiting,
+            "learnt": counts.gates.get("learnt", 0),
+            "gates": counts.gates,
         },
-        "learner": intake.counters,
-        "quality": {name: intake.diagnostics[name] for name in _QUALITY if name in intake.diagnostics},
-        "competition": intake.standing,
-        "retuning": None if axis.retuner is None else axis.retuner.status(),
-        "recorder": None if intake.sink is None else intake.sink.counters(),
+        "learner": figures.counters,
+        "quality": {name: figures.diagnostics[name] for name in _QUALITY if name in figures.diagnostics},
+        "competition": figures.standing,
+        "retuning": None if loop.tuner is None else loop.tuner.status(),
+        "recorder": None if loop.sink is None else loop.sink.counters(),
         "queries": latency.summary(),
-        "diagnosis": None if intake.watcher is None else intake.watcher.status(),
+        "diagnosis": None if loop.watcher is None else loop.watcher.status(),
         "refused": refusal_counters(),
         "memory": in_use(),
+        "role": role,
+        "epoch": epoch,
+        "synced": synced,
+        "stale": stale,
+        "trouble": served.trouble,
+        "trust": served.trust,
+        "stand_in": served.stand_in,
+        "frozen": axis.frozen,
+        "checkpoints": checkpoints,
+        "operations": operations,
+        "fingerprint": fingerprint(served.models[learn]) if learn else "",
     }

@@ -19,7 +19,7 @@ from adaptive.state_codec import under
 from adaptive.types import OnlineModel, StateDict
 from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_body, decode_header, encode_body, split_state
 from service.protocol.errors import FieldError
-from service.server.axis_state import STATE_SCHEMA, restored_learner
+from service.server.learner_state import STATE_SCHEMA, restored_learner
 from service.storage.atomic_write import atomic_write
 
 MAGIC: Final = b"DHCKPT01"

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.types import StateDict
-from service.intake.intake import Intake
+from service.intake.sample_queue import SampleQueue
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.axis_state import restore_axis
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
 from service.storage.segments import rows_behind
 
@@ -22,43 +22,53 @@ _MOST_AGAIN = 60_000
 _PORTION = 100
 
 
-class Keeper:
+class CheckpointKeeper:
     """Writes the checkpoints of one axis. A disk that fails costs checkpoints, which are counted, and nothing else."""
 
-    def __init__(self, axis: Axis, intake: Intake, stage: str, instance: str, folder: CheckpointFolder | None) -> None:
+    def __init__(
+        self,
+        axis: Axis,
+        queue: SampleQueue,
+        stage: str,
+        instance: str,
+        folder: CheckpointFolder | None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.folder = folder
         self._axis = axis
-        self._intake = intake
+        self._queue = queue
+        self._clock = clock
         self._names = (stage, axis.config.name, instance)
         self._copied: tuple[CheckpointMeta, StateDict] | None = None
         self._ready = threading.Condition()
         self._closing = False
-        self._due_at = 0.0
+        self._due_at_s = 0.0
         self._written_at_s: float | None = None
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
-        self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
             self._thread.start()
 
-    def tick(self, now_s: float) -> None:
-        """Ask for a checkpoint where one is due; called often, on a clock that never goes back."""
-        if self.folder is not None and now_s >= self._due_at and self._axis.at_snapshot is None:
-            self._due_at = now_s + self._axis.config.checkpoint_s
-            self._axis.at_snapshot = self._copy
+    def on_snapshot(self) -> None:
+        """Copy the state if a checkpoint is due; from the thread of the axis, right after a snapshot."""
+        now_s = self._clock()
+        if self.folder is not None and now_s >= self._due_at_s:
+            self._due_at_s = now_s + self._axis.config.checkpoint_s
+            self._copy()
 
-    def now(self, timeout_s: float = 2.0) -> None:
+    def write_now(self, timeout_s: float = 2.0) -> None:
         """Have a checkpoint written of the state as it is. Raises ServiceError where the learner is too far behind."""
         if self.folder is not None:
-            self._intake.call(self._copy, timeout_s)
+            self._queue.call(self._copy, timeout_s)
 
-    def at_once(self) -> None:
+    def copy_now(self) -> None:
         """The same, from the thread that handles samples."""
         if self.folder is not None:
             self._copy()
 
     def state(self, timeout_s: float = 2.0) -> tuple[CheckpointMeta, StateDict]:
         """(meta, copy of the state), for a standby. Raises ServiceError where the learner is too far behind."""
-        return self._intake.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
+        return self._queue.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
 
     def counters(self) -> dict[str, Any] | None:
         """Checkpoints written, age of the newest, and failures of the disk; None where none are kept."""
@@ -71,7 +81,6 @@ class Keeper:
         """Write the last state and end; after the thread that handles samples has ended."""
         if self.folder is None:
             return
-        self._axis.at_snapshot = None
         self._copy()
         with self._ready:
             self._closing = True
@@ -106,7 +115,7 @@ class Keeper:
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
                 self._written_at_s = time.monotonic()
             except (OSError, DehystError, ValueError) as error:
-                words = getattr(error, "strerror", None) or str(error)
+                words = (isinstance(error, OSError) and error.strerror) or str(error)
                 if not self._counts["degraded"]:
                     self._axis.note("checkpoint_failed", f"{words}; tried again")
                 self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
@@ -120,7 +129,7 @@ def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
     for number in folder.numbers():
         try:
             meta, state = folder.read(number)
-            restore_axis(axis, state)
+            axis.restore(state)
         except ModelFileError as error:
             axis.note("checkpoint_refused", f"checkpoint {number}: {error}")
             continue

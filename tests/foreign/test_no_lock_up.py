@@ -41,7 +41,6 @@ from service.client.pending import PendingCommands
 from service.config.config import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.server.axis_state import axis_state, restore_axis
 from service.server.models import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.plants import StageFactory, issue_plant, random_plant, with_traits
@@ -93,12 +92,12 @@ class Bench:
         # It settles in what is to come; then every run begins from here.
         self.run(8.0)
         self.before = np.concatenate(self.errors)[-2 * PERIOD :].reshape(2, PERIOD).mean(axis=0)
-        self.saved = axis_state(self.axis), copy.deepcopy(self.now)
+        self.saved = self.axis.state_dict(), copy.deepcopy(self.now)
 
     def begin(self) -> None:
         """Go back to the settled loop."""
         state, now = self.saved
-        restore_axis(self.axis, state)
+        self.axis.restore(state)
         self.axis.take_events()
         self.now, self.errors, self.troubles = copy.deepcopy(now), [], []
 
@@ -129,7 +128,7 @@ class Bench:
             first = now["tick"]
             y_um, v, a = (reference or self)((first + np.arange(BLOCK)) * DT_S)
             y_um = np.clip(y_um, limits.y_min_um, limits.y_max_um)
-            axis.age_s = max(0, first - BLOCK - 1 - now["newest"]) * DT_S
+            axis.update_age(max(0, first - BLOCK - 1 - now["newest"]) * DT_S)
             begin = first + now["count"]
             pending = now["commanded"].before(begin)
             reply = axis.answer(FeedforwardQuery(y_um, v, a, u_before_V=now["before_V"], pending=pending))

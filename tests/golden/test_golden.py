@@ -64,7 +64,6 @@ from service.protocol.samples import (
 )
 from service.replay.replay import covered, replay
 from service.server.axis import Axis
-from service.server.axis_state import axis_state
 from service.server.models import load_axis
 from service.stage_node.faults import CHANGE, DELIVERY, READING, Fault, Injector
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
@@ -148,7 +147,7 @@ def new_axis(bundle: Bundle, limits_V: tuple[float, float, float], learner: dict
 def write_checkpoint(axis: Axis, folder: Path) -> None:
     """Write the axis' state as the service does."""
     meta = CheckpointMeta("demo", "x", axis.dt_s, axis.handled_seq, axis.sequence.received)
-    CheckpointFolder(folder, "demo", "x", axis.dt_s, 4).write(meta, axis_state(axis))
+    CheckpointFolder(folder, "demo", "x", axis.dt_s, 4).write(meta, axis.state_dict())
 
 
 def read_checkpoint(axis: Axis, folder: Path) -> bool:

@@ -32,7 +32,9 @@ class TunedAxis(Protocol):
     """What is needed of an axis."""
 
     dt_s: float
-    learner: OnlineModel | None
+
+    @property
+    def learner(self) -> OnlineModel | None: ...
 
     @property
     def learning(self) -> bool: ...
@@ -42,7 +44,7 @@ class TunedAxis(Protocol):
 
     def note(self, event: str, detail: str, **more: Any) -> None: ...
 
-    def adopt_at(self, retuned: Retuned) -> None: ...
+    def adopt_at(self, *retuned: Retuned) -> None: ...
 
 
 class Retuner:

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     if args.data.is_dir():
         # Re-tunings of the time of the recording take effect at the same samples.
         adopted = read_adoptions(args.data)
-        axis.adoptions.add(*adopted)
+        axis.adopt_at(*adopted)
         if adopted:
             say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
     make_folder(args.out)

@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from adaptive.errors import ModelFileError
 from service.failover.peer_files import PeerFiles, restore_from_peer, standby_folder
 from service.failover.standby_model import NOT_SYNCED, StandbyModel, newer_than
-from service.intake.intake import Intake
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
+from service.server.axis_loop import AxisLoop
 from service.storage.checkpoint import encode_checkpoint
 from service.storage.checkpoint_keeper import restore_newest
 from service.storage.recorder import Recorder, RecorderConfig
+from tests.service.axes import loop_of
 from tests.service.storage.test_checkpoint import folder, make_axis, meta, recording, same
 
 
@@ -36,6 +37,9 @@ class Sink:
         self.rows += zip(seq.tolist(), words, strict=True)
         return True
 
+    def put_aside(self, seq: Any, t_s: Any, u_V: Any, y_um: Any, reason: str | list[str]) -> bool:
+        return True
+
     def rebase(self, index: int) -> None:
         self.index = index
 
@@ -46,20 +50,12 @@ class Sink:
         return True
 
 
-def standby(kept: int = 30_000, on_gap: Callable[[], None] = lambda: None) -> tuple[Axis, StandbyModel, Sink, Intake]:
+def standby(kept: int = 30_000, on_gap: Callable[[], None] = lambda: None) -> tuple[Axis, StandbyModel, Sink, AxisLoop]:
     axis, sink = make_axis(), Sink()
-    intake = Intake(axis, lambda: None, sink)
-    model = StandbyModel(axis, intake, kept, on_gap=on_gap)
-    intake.gate = model.gate
-    return axis, model, sink, intake
-
-
-def arrive(intake: Intake, batch: SampleBatch) -> None:
-    """As the intake's own thread does it."""
-    assert intake.gate is not None
-    passed = intake.gate(batch)
-    if passed is not None:
-        intake.handle(passed)
+    loop = loop_of(axis, sink)
+    model = StandbyModel(axis, sink, kept, on_gap=on_gap)
+    loop.set_gate(model.gate)
+    return axis, model, sink, loop
 
 
 def state_of(of: Axis, **changes: Any) -> bytes:
@@ -68,10 +64,10 @@ def state_of(of: Axis, **changes: Any) -> bytes:
 
 def test_every_sample_is_recorded_once_and_the_model_is_the_same_to_the_last_bit() -> None:
     serving = make_axis()
-    axis, model, sink, intake = standby()
+    axis, model, sink, loop = standby()
     serving.handle(recording(0, 400))
     for first in range(300, 500, 5):
-        arrive(intake, recording(first, 5))
+        loop.handle(recording(first, 5))
     assert [seq for seq, _ in sink.rows] == list(range(300, 500))
     assert {word for _, word in sink.rows} == {NOT_SYNCED}
     assert (axis.handled_seq, model.synced) == (-1, False)
@@ -83,7 +79,7 @@ def test_every_sample_is_recorded_once_and_the_model_is_the_same_to_the_last_bit
     assert sink.index == axis.sequence.received == 500
     for first in range(500, 600, 5):
         serving.handle(recording(first, 5))
-        arrive(intake, recording(first, 5))
+        loop.handle(recording(first, 5))
     assert same(serving, axis)
     assert [seq for seq, _ in sink.rows] == list(range(300, 600))
     assert NOT_SYNCED not in {word for seq, word in sink.rows if seq >= 500}
@@ -92,10 +88,10 @@ def test_every_sample_is_recorded_once_and_the_model_is_the_same_to_the_last_bit
 def test_a_stage_that_began_anew_while_samples_were_held_back_does_not_confuse_them() -> None:
     """Its numbers are lower than before: what came before the state is told by the order, not by the number."""
     serving = make_axis()
-    axis, model, _, intake = standby()
+    axis, model, _, loop = standby()
     serving.handle(recording(10_000, 300))
     for first in (*range(10_200, 10_300, 5), *range(0, 400, 5)):
-        arrive(intake, recording(first, 5))
+        loop.handle(recording(first, 5))
     for first in range(0, 300, 5):
         serving.handle(recording(first, 5))
     assert serving.sequence.restarts == 1
@@ -120,28 +116,28 @@ def test_a_sample_that_is_neither_in_the_state_nor_behind_it_is_noticed(first: i
     gaps: list[int] = []
     serving = make_axis()
     serving.handle(recording(0, 400))
-    _, model, _, intake = standby(on_gap=lambda: gaps.append(1))
+    _, model, _, loop = standby(on_gap=lambda: gaps.append(1))
     model.take_state(state_of(serving))
-    arrive(intake, recording(first, 5))
-    arrive(intake, recording(first + 50, 5))  # a gap later on is the stage's own
+    loop.handle(recording(first, 5))
+    loop.handle(recording(first + 50, 5))  # a gap later on is the stage's own
     assert len(gaps) == expected
 
 
 def test_a_state_of_another_axis_is_refused_and_the_samples_are_still_recorded() -> None:
     serving = make_axis()
     serving.handle(recording(0, 100))
-    _, model, sink, intake = standby()
+    _, model, sink, loop = standby()
     with pytest.raises(ModelFileError, match="axis is 'y'"):
         model.take_state(state_of(serving, axis="y"))
-    arrive(intake, recording(100, 5))
+    loop.handle(recording(100, 5))
     assert not model.synced
     assert len(sink.rows) == 5
 
 
 def test_without_a_state_it_learns_all_that_was_held_back() -> None:
-    axis, model, sink, intake = standby()
+    axis, model, sink, loop = standby()
     for first in range(0, 300, 5):
-        arrive(intake, recording(first, 5))
+        loop.handle(recording(first, 5))
     told = model.take_over()
     assert "its own state of sample -1, then 300 samples" in told
     assert model.take_over() == ""
@@ -155,11 +151,11 @@ def test_what_is_no_longer_remembered_is_learnt_from_the_journal(tmp_path: Path)
     axis = make_axis()
     axis.config = replace(axis.config, recorder=tmp_path)
     with Recorder(RecorderConfig(tmp_path, flush_s=0.005)) as recorder:
-        intake = Intake(axis, lambda: None, recorder)
-        model = StandbyModel(axis, intake, kept=50)
-        intake.gate = model.gate
+        loop = loop_of(axis, recorder)
+        model = StandbyModel(axis, recorder, kept=50)
+        loop.set_gate(model.gate)
         for first in range(0, 600, 5):
-            arrive(intake, recording(first, 5))
+            loop.handle(recording(first, 5))
         while recorder.counters()["written"] < 600:
             pass
         model.take_over()
@@ -176,9 +172,9 @@ def left_behind(place: Path, samples: int, kept_at: int) -> tuple[Axis, PeerFile
     assert files.checkpoints is not None
     assert files.recordings is not None
     recorder = Recorder(RecorderConfig(files.recordings, flush_s=0.005))
-    intake = Intake(axis, lambda: None, recorder)
+    loop = loop_of(axis, recorder)
     for first in range(0, samples, 20):
-        intake.handle(recording(first, 20))
+        loop.handle(recording(first, 20))
         if first + 20 == kept_at:
             folder(files.checkpoints).write(meta(axis), axis.state_dict())
     recorder.close()
@@ -187,10 +183,10 @@ def left_behind(place: Path, samples: int, kept_at: int) -> tuple[Axis, PeerFile
 
 def test_who_takes_over_without_a_state_goes_on_from_what_the_other_left_behind(tmp_path: Path) -> None:
     gone, files = left_behind(tmp_path, 800, kept_at=600)
-    axis, model, _, intake = standby()
+    axis, model, _, loop = standby()
     axis.handle(recording(0, 100))  # its own state is old
     for first in range(700, 900, 20):
-        arrive(intake, recording(first, 20))
+        loop.handle(recording(first, 20))
     told = model.take_over(lambda newest: restore_from_peer(axis, files, "demo", newest))
     assert told.startswith("checkpoint 1 of the other instance, sample 599, and 200 samples of its journal, then 100")
     gone.handle(recording(800, 100))

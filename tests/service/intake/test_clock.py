@@ -13,7 +13,6 @@ from adaptive.online.learner import Learner
 from adaptive.types import InverseModel
 from service.intake.clock import SET_AFTER, UNHEARD, SampleClock
 from service.protocol.samples import SampleBatch
-from service.server.axis_state import axis_state, restore_axis
 from tests.service.server.test_axis import make_axis, recording
 
 DT_S = 1e-3
@@ -178,7 +177,7 @@ def test_an_axis_goes_on_learning_when_the_clock_of_its_stage_was_set(
     assert verdicts.count("learnt") > 700
     assert [e["event"] for e in axis.take_events()] == ["stage_clock_set"]
     again = make_axis(models)
-    restore_axis(again, axis_state(axis))
+    again.restore(axis.state_dict())
     more = recording(500, first=4000)
     batch = SampleBatch(more.seq, more.t_s + off_s, more.u_V, more.y_um)
     assert again.handle(batch) == axis.handle(batch)

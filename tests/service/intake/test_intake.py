@@ -6,15 +6,15 @@ import time
 from typing import Any
 
 from adaptive.types import InverseModel
-from service.intake.intake import Intake
 from service.protocol.samples import SampleBatch
+from service.server.axis_loop import AxisLoop
+from tests.service.axes import loop_of
 from tests.service.server.test_axis import make_axis, parts, recording
 
 
 def test_messages_that_wait_are_handled_together_and_work_in_its_place(models: dict[str, InverseModel]) -> None:
     """Forty messages of a sample each, and something to be done behind the twentieth."""
     axis = make_axis(models)
-    intake = Intake(axis, lambda: None)
     sizes: list[int] = []
 
     class Watcher:
@@ -30,78 +30,78 @@ def test_messages_that_wait_are_handled_together_and_work_in_its_place(models: d
 
         def close(self) -> None: ...
 
-    intake.watcher = Watcher()
+    loop = loop_of(axis, watcher=Watcher())
     messages = parts(recording(40), 1)
     for part in messages[:20]:
-        assert intake.offer(part)
-    intake.start()
+        assert loop.offer(part)
+    loop.start()
     try:
-        seen = intake.call(lambda: axis.handled_seq)
+        seen = loop.queue.call(lambda: axis.handled_seq)
         for part in messages[20:]:
-            assert intake.offer(part)
+            assert loop.offer(part)
     finally:
-        intake.close()
+        loop.close()
     assert seen == 19, "what came before the work was handled before it"
     assert axis.handled_seq == 39
     assert sum(sizes) == 40
     assert len(sizes) < 20, "several messages at a time"
-    assert intake.waiting == 0
+    assert loop.queue.waiting == 0
 
 
 def test_a_full_queue_drops_and_counts(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models, queue_samples=100)
-    intake = Intake(axis, lambda: None)  # not started: nobody takes
-    offered = [intake.offer(part) for part in parts(recording(150), 30)]
+    loop = loop_of(axis)  # not started: nobody takes
+    offered = [loop.offer(part) for part in parts(recording(150), 30)]
     assert offered == [True, True, True, False, False]
-    assert (intake.dropped, intake.waiting) == (60, 90)
+    assert (loop.queue.dropped, loop.queue.waiting) == (60, 90)
     assert [e["event"] for e in axis.take_events()] == ["samples_dropped"]
-    intake.start()
-    intake.close()
+    loop.start()
+    loop.close()
     assert axis.handled_seq == 89
 
 
-def offered_twice(intake: Intake) -> float:
+def offered_twice(loop: AxisLoop) -> float:
     """Two messages that came 10 ms apart, before anybody takes them; when the first one did, s."""
-    assert intake.handled_at_s is None
+    assert loop.queue.handled_at_s is None
     first, second = parts(recording(40), 20)
-    intake.offer(first)
-    came_s = intake.handled_at_s
+    loop.offer(first)
+    came_s = loop.queue.handled_at_s
     assert came_s is not None
     time.sleep(0.01)
-    intake.offer(second)
-    assert intake.handled_at_s == came_s
+    loop.offer(second)
+    assert loop.queue.handled_at_s == came_s
     return came_s
 
 
 def test_what_has_come_is_no_newer_before_it_is_handled(models: dict[str, InverseModel]) -> None:
-    intake = Intake(make_axis(models), lambda: None)
-    came_s, before_s = offered_twice(intake), time.monotonic()
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s is not None
-    assert came_s + 0.01 <= intake.handled_at_s <= before_s, "when the last one came, not when it was handled"
+    loop = loop_of(make_axis(models))
+    came_s, before_s = offered_twice(loop), time.monotonic()
+    loop.start()
+    loop.close()
+    assert loop.queue.handled_at_s is not None
+    assert came_s + 0.01 <= loop.queue.handled_at_s <= before_s, "when the last one came, not when it was handled"
 
 
 def test_what_a_standby_holds_back_is_as_new_as_what_is_learnt(models: dict[str, InverseModel]) -> None:
-    intake = Intake(make_axis(models), lambda: None)
-    intake.gate = lambda batch: None
-    came_s = offered_twice(intake)
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s is not None
-    assert intake.handled_at_s >= came_s + 0.01
+    loop = loop_of(make_axis(models))
+    loop.set_gate(lambda batch: None)
+    came_s = offered_twice(loop)
+    loop.start()
+    loop.close()
+    assert loop.queue.handled_at_s is not None
+    assert loop.queue.handled_at_s >= came_s + 0.01
 
 
 def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models)
 
-    def broken(batch: SampleBatch) -> list[str]:
+    def broken(batch: SampleBatch, on_snapshot: Any) -> list[str]:
         raise RuntimeError("for once")
 
     axis.handle = broken  # type: ignore[method-assign]
-    intake = Intake(axis, lambda: None)
-    came_s = offered_twice(intake)
-    intake.start()
-    intake.close()
-    assert intake.handled_at_s == came_s
+    loop = loop_of(axis)
+    came_s = offered_twice(loop)
+    loop.start()
+    loop.close()
+    assert loop.queue.handled_at_s == came_s
     assert [event["event"] for event in axis.take_events()] == ["internal_error"]

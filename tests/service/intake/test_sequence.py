@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from adaptive.types import InverseModel
-from service.intake.intake import Intake
 from service.intake.sequence import (
     AHEAD,
     ANEW,
@@ -22,15 +21,15 @@ from service.intake.sequence import (
     RESTART_AFTER,
     RESTARTED,
     WITNESSES,
-    Seldom,
     SequenceTracker,
 )
 from service.protocol.samples import MAX_SEQ, SampleBatch
 from service.replay.replay import sequence
 from service.server.axis import Axis
-from service.server.axis_state import axis_state, fingerprint, restore_axis
+from service.server.learner_state import fingerprint
 from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
 from sim.recordings import Recording
+from tests.service.axes import loop_of
 from tests.service.server.test_axis import make_axis, recording
 from tests.service.storage.test_checkpoint import make_axis as make_competing
 from tests.service.storage.test_checkpoint import meta
@@ -187,15 +186,6 @@ def test_a_state_that_was_locked_up_leads_back(last: int) -> None:
     assert said.index(RESTARTED) == RESTART_AFTER - 1
     assert said[-1] == IN_ORDER
     assert last < number(tracker) < 2**63 - 2**61
-
-
-def test_of_a_flood_one_event_is_told() -> None:
-    seldom = Seldom(calm=100)
-    told = [k for k in range(1000) if k % 50 == 0 and seldom.tells("a", k)]
-    assert told == [0]
-    assert seldom.tells("b", 1000)
-    assert not seldom.tells("a", 1050)
-    assert seldom.tells("a", 1151)
 
 
 # ---- whatever happens
@@ -369,7 +359,7 @@ def test_learning_goes_on_at_once_as_if_nothing_had_happened_and_an_event_tells(
     (event,) = axis.take_events()
     assert (event["event"], event["seq"]) == ("numbers_ahead", 999)
     assert "101000 after 999" in event["detail"]
-    assert axis.gates[AHEAD] == axis.tally.samples["late"] == 2
+    assert axis.gates[AHEAD] == axis.counts.samples["late"] == 2
     np.testing.assert_array_equal(axis.newest.memories["lssvm_adaptive"], plain.newest.memories["lssvm_adaptive"])
     # A second of quiet later it is told again.
     axis.handle(with_rows(recording(10, first=3000), 5, (2**62, 0.0, 4.0, 45.0)))
@@ -405,7 +395,7 @@ def test_a_checkpoint_that_was_locked_up_heals(
     """As an earlier version left it behind: 2^62 taken in order, with its snapshot, and all that followed late."""
     axis = make(models)
     axis.handle(recording(2000))
-    state = axis_state(axis)
+    state = axis.state_dict()
     for name in (*(f"sequence.{name}" for name in OLD), "clock.anew", "clock.unheard"):
         del state[name]
     state |= {"sequence.last": MAX_SEQ, "sequence.gaps": np.array([[2000, MAX_SEQ - 1]]), "seq": MAX_SEQ}
@@ -417,7 +407,7 @@ def test_a_checkpoint_that_was_locked_up_heals(
         assert len(gates) == 2
         state |= {name: MAX_SEQ if name.endswith("seq") else MAX_SEQ * DT_S for name in gates}
     again = make(models)
-    restore_axis(again, decode_checkpoint(b"".join(encode_checkpoint(meta(again), state)))[1])
+    again.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(again), state)))[1])
     verdicts = again.handle(recording(1000, first=2000))
     assert sum(verdict in ("learnt", "passed") for verdict in verdicts[RESTART_AFTER + 100 :]) > 600
     assert (again.handled_seq, again.newest.seq) == (2999, 2980)
@@ -425,7 +415,7 @@ def test_a_checkpoint_that_was_locked_up_heals(
     assert events == ["stage_restarted", "learner_resynced"]
     # It goes on from there as any does, to the last bit.
     other = make(models)
-    restore_axis(other, decode_checkpoint(b"".join(encode_checkpoint(meta(again), axis_state(again))))[1])
+    other.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(again), again.state_dict())))[1])
     more = recording(1000, first=3000)
     assert again.handle(more) == other.handle(more)
     assert model_of(again) == model_of(other)
@@ -436,7 +426,7 @@ def test_an_outage_is_no_event(models: dict[str, InverseModel]) -> None:
     axis.handle(recording(1000))
     axis.handle(recording(1000, first=31_000))
     assert axis.take_events() == []
-    assert (axis.handled_seq, axis.tally.samples["lost"], axis.gates[AHEAD]) == (31_999, 30_000, WITNESSES - 1)
+    assert (axis.handled_seq, axis.counts.samples["lost"], axis.gates[AHEAD]) == (31_999, 30_000, WITNESSES - 1)
 
 
 def test_a_standby_and_a_replay_make_the_same_of_it(models: dict[str, InverseModel]) -> None:
@@ -448,7 +438,7 @@ def test_a_standby_and_a_replay_make_the_same_of_it(models: dict[str, InverseMod
     assert told == said
     first = make_axis(models)
     first.handle(batch.where(np.arange(len(batch)) < 2010))
-    restore_axis(standby, axis_state(first))
+    standby.restore(first.state_dict())
     assert standby.handle(batch.where(np.arange(len(batch)) >= 2010)) == said[2010:]
     assert model_of(live) == model_of(pieces) == model_of(standby)
     assert live.handled_seq == pieces.handled_seq == standby.handled_seq
@@ -464,10 +454,10 @@ def test_who_watches_does_not_see_numbers_far_ahead(models: dict[str, InverseMod
             self.seen += batch.seq.tolist()
 
     axis = make_axis(models)
-    intake, watcher = Intake(axis, lambda: None), Watcher()
-    intake.watcher = watcher  # type: ignore[assignment]
-    intake.handle(with_rows(recording(100), 50, (2**62, 0.05, 4.0, 45.0)))
-    intake.handle(with_rows(recording(0), 0, (2**62, 0.05, 4.0, 45.0)))
+    watcher = Watcher()
+    loop = loop_of(axis, watcher=watcher)
+    loop.handle(with_rows(recording(100), 50, (2**62, 0.05, 4.0, 45.0)))
+    loop.handle(with_rows(recording(0), 0, (2**62, 0.05, 4.0, 45.0)))
     assert watcher.seen == list(range(100))
 
 

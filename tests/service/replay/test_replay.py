@@ -89,7 +89,7 @@ def in_messages(axis: Axis, recording: Recording, size: int) -> dict[int, Invers
     for start in range(0, len(recording), size):
         part = slice(start, start + size)
         axis.handle(SampleBatch(seq[part], recording.t_s[part], recording.u_V[part], recording.y_um[part]))
-        for served in axis._ring:
+        for served in axis.snapshots:
             published[served.seq] = served.models["lssvm_adaptive"]
     return published
 

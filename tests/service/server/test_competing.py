@@ -30,7 +30,6 @@ from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server import competing, models
 from service.server.axis import Axis
-from service.server.axis_state import restore_axis
 from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.voltages import training_input
 from sim.stage.presets import preset
@@ -71,14 +70,16 @@ def axis_of(bundle: Bundle, **more: Any) -> Axis:
     return models.load_axis("demo", config, bundle=bundle)
 
 
-def give(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: int, stop: int, size: int = 20) -> None:
+def give(
+    axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: int, stop: int, retuner: Retuner | None = None
+) -> None:
     u_V, y_um = recorded
-    for k in range(start, stop, size):
-        seq = np.arange(k, min(stop, k + size))
+    for k in range(start, stop, 20):
+        seq = np.arange(k, min(stop, k + 20))
         t_s: FloatArray = (seq * DT_S).astype(np.float64)
         axis.handle(SampleBatch(seq, t_s, u_V[seq], y_um[seq]))
-        if axis.retuner is not None:
-            axis.retuner.step(axis)
+        if retuner is not None:
+            retuner.step(axis)
 
 
 def ask(axis: Axis, name: str = "") -> Any:
@@ -155,7 +156,7 @@ def test_a_state_goes_on_to_the_last_bit_with_adoptions_to_come(
     one.adopt_at(Retuned(2800, hyper.gamma, hyper.widths))
     state = one.state_dict()
     two = axis_of(bundle)
-    restore_axis(two, state)
+    two.restore(state)
     for axis in (one, two):
         give(axis, recorded, 2500, 4000)
     assert [e["event"] for e in one.take_events() if e["event"].startswith("retun")] == [
@@ -207,12 +208,11 @@ def hyper_of(axis: Axis) -> Hyperparameters:
 
 def retuned_from_7500(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner) -> list[dict[str, Any]]:
     """Ask at sample 7500, go on to 12500; the events."""
-    axis.retuner = retuner
-    give(axis, recorded, 6000, 7500)
+    give(axis, recorded, 6000, 7500, retuner)
     assert retuner.request({}) == {"started": True, "job": 1}
     assert retuner.request({})["started"] is False
     for k in range(7500, 12500, 100):
-        give(axis, recorded, k, k + 100)
+        give(axis, recorded, k, k + 100, retuner)
         wait_for(retuner)
     return axis.take_events()
 
@@ -326,10 +326,9 @@ def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
     told = Told(PROPOSED, OPEN, OPEN, OPEN)
     monkeypatch.setattr("service.background.retuning.retuner.Job", told)
     axis = tunable(bundle)
-    axis.retuner = retuner
-    give(axis, recorded, 6000, 8000)
+    give(axis, recorded, 6000, 8000, retuner)
     retuner.request({})
-    give(axis, recorded, 8000, 13000)
+    give(axis, recorded, 8000, 13000, retuner)
     first, second, third = told.fresh
     assert 20 <= first < second < third
     assert second >= 40
@@ -342,12 +341,11 @@ def test_what_takes_too_long_is_ended_and_counted(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
     axis = axis_of(bundle, compete=())
-    axis.retuner = retuner
-    give(axis, recorded, 0, 1000)
+    give(axis, recorded, 0, 1000, retuner)
     retuner.request({})
-    give(axis, recorded, 1000, 1020)
+    give(axis, recorded, 1000, 1020, retuner)
     wait_for(retuner)
-    give(axis, recorded, 1020, 1040)
+    give(axis, recorded, 1020, 1040, retuner)
     status = retuner.status()
     assert (status["timeouts"], status["state"]) == (1, "idle")
     assert "timeout_s" in status["last"]["detail"]
@@ -358,12 +356,11 @@ def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
     axis = axis_of(bundle, compete=())
-    axis.retuner = retuner
     u_V, y_um = recorded
     rest = np.full(3000, u_V[0]), y_um[0] + 0.003 * np.random.default_rng(1).normal(size=3000)
-    give(axis, rest, 0, 3000)
+    give(axis, rest, 0, 3000, retuner)
     assert retuner.status()["started"] == 0
-    give(axis, (np.concatenate([rest[0], u_V]), np.concatenate([rest[1], y_um])), 3000, 6000)
+    give(axis, (np.concatenate([rest[0], u_V]), np.concatenate([rest[1], y_um])), 3000, 6000, retuner)
     assert retuner.status()["started"] == 1
 
 
@@ -371,11 +368,10 @@ def test_a_frozen_learner_is_left_alone(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
     axis = axis_of(bundle, compete=())
-    axis.retuner = retuner
-    give(axis, recorded, 0, 1000)
+    give(axis, recorded, 0, 1000, retuner)
     axis.freeze("test")
     retuner.request({})
-    give(axis, recorded, 1000, 2000)
+    give(axis, recorded, 1000, 2000, retuner)
     assert retuner.status()["started"] == 0
     with pytest.raises(FieldError):
         retuner.request({"hurry": True})
@@ -388,7 +384,7 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
         "sys.meta_path.insert(0, Blocked())\n"
-        "import service.server.endpoints, service.server.models, service.background.retuning.retuner\n"
+        "import service.server.axis_server, service.server.models, service.background.retuning.retuner\n"
         "from service.background.retuning.worker import _search\n"
         "assert 'baselines.swarm.evidence' not in sys.modules\n"
         "print(_search(True)[1])"

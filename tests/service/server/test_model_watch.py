@@ -19,7 +19,7 @@ from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import STAND_IN
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.axis_state import axis_state, fingerprint, restore_axis
+from service.server.learner_state import fingerprint
 from service.server.models import load_axis, make_learner
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
@@ -221,7 +221,7 @@ def test_a_standby_that_begins_in_the_middle_of_it_decides_alike() -> None:
     one, other = Bench(make_axis()), Bench(make_axis())
     one.run(2200)
     one.run(300, frozen)
-    restore_axis(other.axis, axis_state(one.axis))
+    other.axis.restore(one.axis.state_dict())
     other.k = one.k
     for lie in (frozen, lambda k, y: y):
         for _ in range(30):
@@ -238,7 +238,7 @@ def test_a_standby_goes_back_to_the_same_state(at: int) -> None:
     """Whenever it took the state over: else it would differ after each lie, and take the state over once more."""
     one, other = Bench(make_axis()), Bench(make_axis())
     one.run(at)
-    restore_axis(other.axis, axis_state(one.axis))
+    other.axis.restore(one.axis.state_dict())
     other.k = one.k
     for bench in (one, other):
         bench.run(3511)

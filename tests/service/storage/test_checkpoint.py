@@ -16,14 +16,15 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
 from service.answers.guard import Limits
 from service.config.config import AxisConfig
-from service.intake.intake import Intake
+from service.intake.sample_queue import SampleQueue
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.axis_state import axis_state, fingerprint, restore_axis
+from service.server.axis_loop import AxisLoop
+from service.server.learner_state import fingerprint
 from service.server.models import load_axis, make_learner
 from service.storage import checkpoint
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, decode_checkpoint, encode_checkpoint, is_kept
-from service.storage.checkpoint_keeper import Keeper, restore_newest
+from service.storage.checkpoint_keeper import CheckpointKeeper, restore_newest
 from service.storage.model_file import UNITS, Bundle, BundleMeta
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually
@@ -61,7 +62,7 @@ def same(a: Axis, b: Axis) -> bool:
 def test_an_axis_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> None:
     straight = make_axis()
     straight.handle(recording(0, 1503))
-    folder(tmp_path).write(meta(straight), axis_state(straight))
+    folder(tmp_path).write(meta(straight), straight.state_dict())
     other = make_axis()
     assert restore_newest(other, folder(tmp_path)) == 1
     assert [e["event"] for e in other.take_events()] == ["restored"]
@@ -82,7 +83,7 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
 ) -> None:
     axis, kept = make_axis(), folder(tmp_path)
     axis.handle(recording(0, 500))
-    state = axis_state(axis)
+    state = axis.state_dict()
     kept.write(meta(axis), state)
     for changes, words in (
         ({"stage": "other"}, "stage is 'other', expected 'demo'"),
@@ -120,7 +121,7 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
     ):
         before = fingerprint(other.newest.models["lssvm_adaptive"])
         with pytest.raises(ModelFileError, match=words):
-            restore_axis(other, decode_checkpoint(b"".join(encode_checkpoint(meta(axis), state)))[1])
+            other.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(axis), state)))[1])
         assert fingerprint(other.newest.models["lssvm_adaptive"]) == before
         assert other.handled_seq == -1
 
@@ -152,10 +153,9 @@ def test_a_few_dozen_checkpoints_reach_back_for_months(tmp_path: Path) -> None:
 
 
 def test_the_operator_freezes_selects_and_goes_back(tmp_path: Path) -> None:
-    axis = make_axis()
-    axis.archive = folder(tmp_path)
+    axis = make_axis(checkpoints=tmp_path)
     axis.handle(recording(0, 1001))
-    folder(tmp_path).write(meta(axis), axis_state(axis))
+    folder(tmp_path).write(meta(axis), axis.state_dict())
     good = fingerprint(axis.newest.models["lssvm_adaptive"])
     assert axis.freeze("alice") == 1000
     axis.handle(recording(1001, 999))
@@ -182,9 +182,11 @@ def test_the_operator_freezes_selects_and_goes_back(tmp_path: Path) -> None:
 
 def test_a_full_disk_costs_checkpoints_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     axis = make_axis(checkpoints=tmp_path / "kept", checkpoint_s=0.05)
-    intake = Intake(axis, lambda: None)
-    keeper = Keeper(axis, intake, "demo", "i-1", folder(tmp_path / "kept"))
-    intake.start()
+    queue = SampleQueue("x", 1000)
+    now_s = [0.0]
+    keeper = CheckpointKeeper(axis, queue, "demo", "i-1", folder(tmp_path / "kept"), lambda: now_s[0])
+    loop = AxisLoop(axis, queue, lambda: None, on_snapshot=keeper.on_snapshot)
+    loop.start()
     full = False
     sync = os.fsync
 
@@ -196,15 +198,15 @@ def test_a_full_disk_costs_checkpoints_and_nothing_else(tmp_path: Path, monkeypa
     monkeypatch.setattr(os, "fsync", fsync)
     try:
         for k in range(30):
-            keeper.tick(0.1 * k)
-            intake.offer(recording(40 * k, 40))
-            eventually(lambda: not intake.waiting)
+            now_s[0] = 0.1 * k
+            loop.offer(recording(40 * k, 40))
+            eventually(lambda: not queue.waiting)
             if k in (10, 20):
                 eventually(lambda: (c := keeper.counters()) is not None and c["written"] > 0)
                 full = k == 10
         eventually(lambda: not (keeper.counters() or {})["degraded"])
     finally:
-        intake.close()
+        loop.close()
         keeper.close()
     counters = keeper.counters()
     assert counters is not None

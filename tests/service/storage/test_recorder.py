@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from service.intake.intake import Intake
 from service.storage import segments as recorder_files
 from service.storage.journal import Journal, Rows, read_journal
 from service.storage.recorder import ASIDE, Recorder, RecorderConfig
 from service.storage.segments import segments
 from sim.recordings import check, read
+from tests.service.axes import loop_of
 from tests.service.storage.test_checkpoint import make_axis
 from tests.service.storage.test_checkpoint import recording as arriving
 
@@ -357,11 +357,11 @@ def test_bad_configuration_and_bad_rows(tmp_path: Path) -> None:
 def test_what_was_dropped_before_it_was_handled_is_recorded_apart(tmp_path: Path) -> None:
     axis = make_axis(queue_samples=100)
     with Recorder(config(tmp_path)) as recorder:
-        intake = Intake(axis, lambda: None, recorder)  # not started yet: nobody takes
-        offered = [intake.offer(arriving(first, 30)) for first in range(0, 150, 30)]
+        loop = loop_of(axis, recorder)  # not started yet: nobody takes
+        offered = [loop.offer(arriving(first, 30)) for first in range(0, 150, 30)]
         assert offered == [True, True, True, False, False]
-        intake.start()
-        intake.close()
+        loop.start()
+        loop.close()
         wait_for(lambda: recorder.counters()["written"] == 90 and recorder.counters()["aside"] == 60)
         # They count for nothing by which a restart goes on.
         assert recorder.index == axis.sequence.received == 90

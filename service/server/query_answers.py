@@ -1,4 +1,4 @@
-"""The answers of one axis to queries: voltages, model, status, and its state for a standby."""
+"""Answers the queries to one axis: voltages, model, status, and its state for a standby."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
@@ -20,33 +21,37 @@ from service.protocol.query import decode_query
 from service.protocol.reply import encode_reply
 from service.server.axis import Axis
 from service.storage.checkpoint import encode_checkpoint
-from service.storage.checkpoint_keeper import Keeper
+from service.storage.checkpoint_keeper import CheckpointKeeper
 
 JSON: Final = "application/json"
-#: Longest time that a sample takes from being passed on to others to the queue of this instance, s.
-_PASSED_ON_S: Final = 0.02
+#: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
+_ROUTING_S: Final = 0.02
 
 
-class Answers:
-    """Every callback answers: an exception on the way to an answer becomes an error reply, because a callback that
-    raises leaves its caller without any.
+class QueryAnswers:
+    """Every query gets a reply: an exception becomes an error reply, because a callback that raises sends none.
 
     Parameters
     ----------
-    latency : takes the time of every feedforward query. status : as it is published.
+    latency : takes the time of every feedforward query. status : makes the status.
     """
 
     def __init__(
-        self, keys: Keys, axis: Axis, keeper: Keeper, latency: LatencyMeter, status: Callable[[], dict[str, Any]]
+        self,
+        keys: Keys,
+        axis: Axis,
+        checkpoints: CheckpointKeeper,
+        latency: LatencyMeter,
+        status: Callable[[], dict[str, Any]],
     ) -> None:
         self._keys = keys
         self._axis = axis
-        self._keeper = keeper
+        self._checkpoints = checkpoints
         self._latency = latency
         self._status = status
 
     def declare(self, session: zenoh.Session) -> list[Any]:
-        """Answer from now on; what is to be undeclared."""
+        """Answer from now on; returns what is to be undeclared."""
         keys = self._keys
         return [
             session.declare_queryable(
@@ -57,6 +62,11 @@ class Answers:
             session.declare_queryable(keys.state, self._on_state),
         ]
 
+    def encoded(self, name: str) -> bytes:
+        """The payload of the model called ``name``."""
+        model, seq, memory = self._axis.model(name)
+        return encode_model(name, model, seq, memory, self._axis.safety(name))
+
     def _feedforward(self, query: zenoh.Query) -> bytes:
         if query.payload is None:
             raise FieldError("payload", "none", "a feedforward query")
@@ -66,26 +76,21 @@ class Answers:
         return self.encoded(str(query.parameters.get("name") or self._axis.served))
 
     def _status_reply(self, query: zenoh.Query) -> bytes:
-        return json.dumps(self._status(), default=plain).encode()
+        return to_json(self._status())
 
     def _on_state(self, query: zenoh.Query) -> None:
-        """Answered from a thread of its own: the copy waits for the learner, and the wire must not."""
+        """Reply from a thread of its own: the copy of the state waits for the learner, and a callback must not."""
 
         def reply() -> None:
-            # A sample that was passed on before whoever asks was known must be among those that the state has seen.
-            time.sleep(_PASSED_ON_S)
+            # The state must contain each sample that was routed before whoever asks was known.
+            time.sleep(_ROUTING_S)
             with query:
                 try:
-                    send_state(query, self._keys.state, encode_checkpoint(*self._keeper.state()))
+                    send_state(query, self._keys.state, encode_checkpoint(*self._checkpoints.state()))
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
 
-        threading.Thread(target=reply, name="state", daemon=True).start()
-
-    def encoded(self, name: str) -> bytes:
-        """The payload of the model called ``name``."""
-        model, seq, memory = self._axis.model(name)
-        return encode_model(name, model, seq, memory, self._axis.safety(name))
+        threading.Thread(target=reply, name=f"state-{self._keys.axis}", daemon=True).start()
 
     def _guarded(
         self, key: str, answer: Callable[[zenoh.Query], bytes], meter: LatencyMeter | None = None
@@ -93,7 +98,7 @@ class Answers:
         def callback(query: zenoh.Query) -> None:
             start = time.perf_counter()
             failed = False
-            # Leaving the context finishes the query; without that the caller waits until its time is over.
+            # Leaving the context finishes the query; otherwise the caller waits until its time is over.
             with query:
                 try:
                     query.reply(key, answer(query))
@@ -108,6 +113,10 @@ class Answers:
         return callback
 
 
-def plain(value: Any) -> Any:
-    """numpy's numbers and arrays for JSON."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+def to_json(value: Any) -> bytes:
+    """JSON of ``value``, in which numpy's numbers and arrays may be, and anything else by its text."""
+    return json.dumps(value, default=_plain).encode()
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -1,0 +1,165 @@
+"""The bounded queue between the wire and the thread of an axis: samples, and jobs that run between two batches."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from typing import Any, Final, NamedTuple, TypeVar
+
+from service.protocol.errors import ServiceError
+from service.protocol.samples import SampleBatch, joined
+
+T = TypeVar("T")
+
+#: Time to wait after the first message for others to handle with it, s. Waking the thread costs as much as learning
+#: from two samples, and fewer wake-ups disturb fewer queries.
+GATHER_S: Final = 0.005
+
+
+class Arrived(NamedTuple):
+    """Samples of one or more messages, and the time of arrival of the last one by ``time.monotonic``, s."""
+
+    batch: SampleBatch
+    at_s: float
+
+
+class Job(NamedTuple):
+    """Work for the thread of the axis, and where its result goes."""
+
+    work: Callable[[], Any]
+    done: Future[Any]
+
+    def run(self) -> None:
+        """Do the work and hand over what it returns or raises."""
+        if not self.done.set_running_or_notify_cancel():
+            return
+        try:
+            self.done.set_result(self.work())
+        except Exception as error:
+            self.done.set_exception(error)
+            # The exception refers to this frame: a state of megabytes that was refused would wait for the collector.
+            del self
+
+
+class SampleQueue:
+    """Samples and jobs of one axis in order of arrival. Any thread puts; the thread of the axis takes.
+
+    Parameters
+    ----------
+    name : of the axis, for messages. capacity : samples that may wait.
+
+    Attributes
+    ----------
+    waiting : samples that wait or are being handled. dropped, malformed : samples refused for lack of space, messages
+    that could not be decoded.
+    handled_at_s : time of arrival, by ``time.monotonic``, of the last sample that was handled; of the first one until
+    it has been; None before any. A learner that is behind does not make it newer.
+    """
+
+    def __init__(self, name: str, capacity: int) -> None:
+        self.waiting = 0
+        self.dropped = 0
+        self.malformed = 0
+        self.handled_at_s: float | None = None
+        self._name = name
+        self._capacity = capacity
+        self._items: deque[Arrived | Job] = deque()
+        self._changed = threading.Condition()
+        self._taker: threading.Thread | None = None
+        self._closing = False
+
+    # ---- putting, from any thread
+
+    def put(self, batch: SampleBatch) -> bool:
+        """Queue samples; False if they were dropped because too many wait or the queue is closed."""
+        at_s = time.monotonic()
+        with self._changed:
+            if self.handled_at_s is None:
+                self.handled_at_s = at_s
+            if self._closing or self.waiting + len(batch) > self._capacity:
+                self.dropped += len(batch)
+                return False
+            self._items.append(Arrived(batch, at_s))
+            self.waiting += len(batch)
+            self._changed.notify()
+        return True
+
+    def count_malformed(self) -> int:
+        """Count a message that could not be decoded; returns how many there were."""
+        self.malformed += 1
+        return self.malformed
+
+    def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
+        """Run ``work`` in the thread of the axis, after the samples that have come; what it returns or raises.
+
+        Not from that thread itself. Raises ServiceError if the thread does not run, or did not reach the work within
+        ``timeout_s``.
+        """
+        done: Future[T] = Future()
+        with self._changed:
+            if self._closing or self._taker is None or not self._taker.is_alive():
+                raise ServiceError(f"axis {self._name}: no samples are handled; the service begins or ends")
+            self._items.append(Job(work, done))
+            self._changed.notify()
+        try:
+            return done.result(timeout_s)
+        except FutureTimeout:
+            if done.done():  # the work itself raised it
+                raise
+            done.cancel()
+            raise ServiceError(
+                f"axis {self._name}: timed out after {timeout_s:g} s; the command may still be applied"
+            ) from None
+        finally:
+            # An exception in it refers to this frame: without this, both would wait for the garbage collector.
+            del done
+
+    def age_s(self, now_s: float) -> float | None:
+        """Time from the arrival of the last sample handled to ``now_s`` (``time.monotonic``), s; None: none came."""
+        at_s = self.handled_at_s
+        return None if at_s is None else max(0.0, now_s - at_s)
+
+    def close(self) -> None:
+        """Take no more; what is queued is still handed out."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+
+    # ---- taking, from the thread of the axis
+
+    def serve(self, taker: threading.Thread) -> None:
+        """``taker`` takes from now on."""
+        self._taker = taker
+
+    def take(self) -> Arrived | Job | None:
+        """Wait for the next job, or for samples: all up to the next job, as one batch. None: closed and empty."""
+        with self._changed:
+            while not self._items and not self._closing:
+                self._changed.wait()
+            if not self._items:
+                return None
+            first = self._items[0]
+            if isinstance(first, Job):
+                self._items.popleft()
+                return first
+        if not self._closing:
+            time.sleep(GATHER_S)
+        batches, at_s = [], 0.0
+        with self._changed:
+            while self._items and isinstance(self._items[0], Arrived):
+                arrived = self._items[0]
+                self._items.popleft()
+                batches.append(arrived.batch)
+                at_s = arrived.at_s
+        return Arrived(batches[0] if len(batches) == 1 else joined(batches), at_s)
+
+    def finish(self, arrived: Arrived, handled: bool) -> None:
+        """The samples of `take` no longer wait. ``handled`` : without an exception."""
+        if handled:
+            self.handled_at_s = arrived.at_s
+        with self._changed:
+            self.waiting -= len(arrived.batch)

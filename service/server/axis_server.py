@@ -1,0 +1,226 @@
+"""One axis on the wire: its subscriber, and what comes and goes with serving, down to the liveliness token."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from service.answers.answering import trust_by_age
+from service.answers.latency import LatencyMeter
+from service.background.retuning.retuner import Retuner
+from service.intake.sample_queue import SampleQueue
+from service.operating.journal import Journal
+from service.operating.server import OperationsServer
+from service.operating.verbs import Background, Verbs
+from service.protocol.keys import Keys
+from service.protocol.samples import decode_samples
+from service.server.axis import Axis
+from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from service.server.publications import Publications
+from service.server.query_answers import QueryAnswers
+from service.server.status import axis_status
+from service.storage.checkpoint import CheckpointFolder
+from service.storage.checkpoint_keeper import CheckpointKeeper
+
+PRIMARY: Final = "primary"
+STANDBY: Final = "standby"
+
+
+class AxisServer:
+    """Puts one axis on the wire.
+
+    Samples are taken from `listen` on. Queries are answered, and anything but the status of a standby is published,
+    between `serve` and `stand_down`.
+
+    Parameters
+    ----------
+    instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
+    sink : records samples, or None. watcher : the background diagnosis, or None.
+
+    Attributes
+    ----------
+    role : "primary" while it serves, else "standby". epoch : number of its take-over, see `service.failover.claims`.
+    synced : whether the model is the one to be served: its own, or, of a standby, that of the serving instance.
+    loop : the thread of the axis. checkpoints : writes them.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        axis: Axis,
+        instance: str,
+        wake: Callable[[], None],
+        sink: SampleSink | None = None,
+        watcher: SampleWatcher | None = None,
+    ) -> None:
+        self.keys = keys
+        self.axis = axis
+        self.instance = instance
+        self.role = STANDBY
+        self.synced = True
+        self.epoch = 0
+        config = axis.config
+        queue = SampleQueue(config.name, config.queue_samples)
+        folder = None
+        if config.checkpoints is not None:
+            folder = CheckpointFolder(config.checkpoints, keys.stage, keys.axis, axis.dt_s, config.checkpoints_kept)
+        self.checkpoints = CheckpointKeeper(axis, queue, keys.stage, instance, folder)
+        tuned = config.retuning.enabled and axis.learner is not None
+        retuner = Retuner(config.retuning, config.recorder) if tuned else None
+        self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
+        self._latency = LatencyMeter()
+        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status)
+        self._operations = self._operations_server()
+        self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
+        self._session = session
+        self._stale = False
+        self._inputs: list[Any] = []
+        self._queryables: list[Any] = []
+        self._token: Any = None
+        self._changing = threading.RLock()
+
+    # ---- roles
+
+    def listen(self) -> None:
+        """Take samples from now on."""
+        self.loop.start()
+        self._inputs = [self._session.declare_subscriber(self.keys.sample, self._on_sample)]
+        self._publications.listen()
+
+    def serve(self) -> None:
+        """Answer and publish from now on; the liveliness token comes last, because alive means callable."""
+        session = self._session
+        with self._changing:
+            self.role = PRIMARY
+            self.loop.set_tuning(True)
+            self._queryables = self._answers.declare(session)
+            self._publications.serve()
+            self._queryables += self._operations.declare(session)
+            self._token = session.liveliness().declare_token(self.keys.alive(self.instance))
+
+    def stand_down(self) -> None:
+        """First no longer alive, then no longer callable; samples are still taken."""
+        with self._changing:
+            self.role = STANDBY
+            self.loop.set_tuning(False)
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+            for entity in self._queryables:
+                entity.undeclare()
+            self._queryables = []
+            self._publications.stand_down()
+
+    def leave_tuning(self) -> None:
+        """Drop the tuning under way, because another instance serves. From the thread of the axis."""
+        if self.loop.retuner is not None:
+            self.loop.retuner.leave()
+
+    def set_synced(self, synced: bool) -> None:
+        """Whether the model is the one to be served."""
+        self.synced = synced
+
+    def set_epoch(self, epoch: int) -> None:
+        """The number of this instance's take-over."""
+        self.epoch = epoch
+
+    def declare(self) -> None:
+        """Take samples and serve."""
+        self.listen()
+        self.serve()
+
+    def undeclare(self) -> None:
+        """First no longer callable; what is queued is handled and kept, then the rest ends."""
+        with self._changing:
+            if self._token is not None:
+                self._token.undeclare()
+                self._token = None
+            for entity in (*self._queryables, *self._inputs):
+                entity.undeclare()
+            self._queryables, self._inputs = [], []
+        self.loop.close()
+        if self.loop.retuner is not None:
+            self.loop.retuner.close()
+        self.checkpoints.close()
+        if self.loop.watcher is not None:
+            self.loop.watcher.close()
+        self.stand_down()
+        self._publications.close()
+
+    # ---- operator's commands
+
+    def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
+        """Run an operator's command between two batches of samples and keep a checkpoint of the outcome.
+
+        Returns what ``work`` returns. Not from a callback of the wire, because it waits for the learner.
+        """
+        seq = self.loop.queue.call(lambda: work(self.axis), timeout_s)
+        self.checkpoints.write_now(timeout_s)
+        return seq
+
+    def _operations_server(self) -> OperationsServer:
+        def diagnose() -> Background | None:
+            return None if self.loop.watcher is None else self.loop.watcher.request
+
+        def retune() -> Background | None:
+            return None if self.loop.tuner is None else self.loop.tuner.request
+
+        config = self.axis.config
+        verbs = Verbs(self.axis, self.operate, {"diagnose": diagnose, "retune": retune})
+        journal = Journal(config.recorder or config.checkpoints)
+        return OperationsServer(self.keys, self.instance, verbs, journal, self.axis.note, lambda: self.role)
+
+    # ---- the publishing thread
+
+    def tick(self, now_s: float) -> None:
+        """Publish what is due at ``now_s`` (``time.monotonic``). One thread calls it."""
+        if self.loop.watcher is not None:
+            self.loop.watcher.tick(now_s)
+        self._update_age(now_s)
+        with self._changing:
+            self._publications.tick(now_s)
+
+    def _update_age(self, now_s: float) -> None:
+        """Tell the axis the age of its samples, and note when they become stale."""
+        age_s = self.loop.queue.age_s(now_s) or 0.0
+        self.axis.update_age(age_s)
+        config = self.axis.config
+        stale = trust_by_age(age_s, config.stale_s, config.last_good_s)[1]
+        if stale == self._stale:
+            return
+        self._stale = stale
+        if stale:
+            waiting = self.loop.queue.waiting
+            why = f"{waiting} samples wait to be learnt" if waiting else "no samples come"
+            detail = f"nothing is known of the last {age_s:.1f} s: {why}; answers are flagged as stale"
+            self.axis.note("stale", detail)
+        else:
+            self.axis.note("fresh", "samples come and are learnt again")
+
+    def status(self) -> dict[str, Any]:
+        """The status as it is published."""
+        return axis_status(
+            self.keys,
+            self.instance,
+            self.loop,
+            self._latency,
+            role=self.role,
+            epoch=self.epoch,
+            synced=self.synced,
+            stale=self._stale,
+            checkpoints=self.checkpoints.counters(),
+            operations=self._operations.counters(),
+        )
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        try:
+            batch = decode_samples(sample.payload.to_bytes())
+        except Exception as error:
+            if self.loop.queue.count_malformed() == 1:
+                self.axis.note("malformed_samples", f"{error}; later ones are only counted")
+            return
+        self.loop.offer(batch)
