@@ -162,7 +162,7 @@ class FixedLagSmoother:
         state.count += 1
         if state.count <= self.config.lag:
             return None
-        return float(out[0]), float(out[1] * self.scale[1]), float(out[2] * self.scale[2])
+        return out.item(0), out.item(1) * self.scale.item(1), out.item(2) * self.scale.item(2)
 
     def skip(self, state: SmootherState) -> tuple[float, float, float] | None:
         """A sample that never came: the filter runs on, on its own prediction."""

@@ -67,6 +67,15 @@ def innovation_of(
 
 
 @compiled
+def walk_and_innovation(
+    x: FloatArray, P: FloatArray, walks: FloatArray, gain_variance: float, h: FloatArray, z: float, towards: FloatArray
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """:func:`walk`, then :func:`innovation_of`, in one call."""
+    walk(x, P, walks, gain_variance)
+    return innovation_of(x, P, h, z, towards)
+
+
+@compiled
 def joseph(
     x: FloatArray, P: FloatArray, h: FloatArray, z: float, noise: float, k: FloatArray, row: FloatArray
 ) -> None:  # pragma: no cover - compiled
@@ -74,8 +83,23 @@ def joseph(
 
     ``k`` and ``row`` are (p,) of scratch.
     """
-    p = x.shape[0]
     innovation, variance = innovation_of(x, P, h, z, row)
+    take_in(x, P, h, innovation, variance, noise, k, row)
+
+
+@compiled
+def take_in(
+    x: FloatArray,
+    P: FloatArray,
+    h: FloatArray,
+    innovation: float,
+    variance: float,
+    noise: float,
+    k: FloatArray,
+    row: FloatArray,
+) -> None:  # pragma: no cover - compiled
+    """:func:`joseph` of a measurement whose :func:`innovation_of` is known; that call filled ``row`` (p,) with P h."""
+    p = x.shape[0]
     for i in range(p):
         k[i] = row[i] / (variance + noise)
     for i in range(p):
@@ -242,13 +266,13 @@ class DriftFilter:
         """
         c, s, x, P = self.config, self.state, self._x, self._P
         if moving:
-            walk(x, P, self._walk, c.gain_walk**2 * self.step_s)
+            gain_V2 = c.gain_walk**2 * self.step_s
+            innovation, variance = walk_and_innovation(x, P, self._walk, gain_V2, basis, target_V, self._row)
         else:
             P[0, 0] += self._walk[0]
-        innovation, variance = innovation_of(x, P, basis, target_V, self._row)
+            innovation, variance = innovation_of(x, P, basis, target_V, self._row)
         noise_V2 = self._noise_V2 / weight
-        variance += noise_V2
-        if innovation * innovation > c.gate_sigma**2 * variance and s.rejected < c.gate_persistence:
+        if innovation * innovation > c.gate_sigma**2 * (variance + noise_V2) and s.rejected < c.gate_persistence:
             s.rejected += 1
             return "outlier"
         s.rejected = 0
@@ -262,10 +286,12 @@ class DriftFilter:
             outcome = "burst"
         # The long-term level must not learn the change itself, or a second change would hide behind the first.
         s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
-        # A burst has opened the covariance since: both begin with its product anew.
         if moving and self._library is not None:
             self._take_in(self._library, basis, target_V, noise_V2)
+        elif moving and outcome == "updated":
+            take_in(x, P, basis, innovation, variance, noise_V2, self._k, self._row)
         elif moving:
+            # The burst has opened the covariance since.
             joseph(x, P, basis, target_V, noise_V2, self._k, self._row)
         else:
             update_constant(x, P, basis, target_V, noise_V2, self._row)

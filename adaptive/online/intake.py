@@ -529,7 +529,7 @@ class Front:
         self.gates.since_glitch = 0
         taken = self._restart(sample, admission.SETTLING)
         track.remember(trial.reckoning.memory)
-        return replace(taken, jump_um=away_um, renamed=True)
+        return taken._replace(jump_um=away_um, renamed=True)
 
     def reckon_by(self, model: LssvmInverse) -> None:
         """From now on ``model`` is served while readings are on trial: the place is reckoned by the same.

@@ -143,7 +143,9 @@ class ResidualWindow:
         window, n = self._window, len(self._window)
         slot, value = -1, 0.0
         if n:
-            column = kernels.column(window.arrays.scaled[:, :n].T, kernel * window.arrays.inverse_widths, ONE)
+            # ``kernels.column`` of inputs that are divided by the widths already.
+            away = window.arrays.scaled[:, :n].T - kernel * window.arrays.inverse_widths
+            column = np.exp(-np.sum(away**2, axis=1))
             slot = int(np.argmax(column))
             value = float(column[slot])
         self._clock += 1
@@ -285,6 +287,3 @@ class ResidualWindow:
         self._clock = int(values["clock"])
         self._changed, self._next = int(values["changed"]), int(values["next"])
         self.kernel_variance = float(values["kernel_variance"])
-
-
-ONE = np.ones(1)

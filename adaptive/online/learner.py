@@ -8,6 +8,7 @@ minus the other's part as its target, so a change is taken up once, and the wind
 
 from __future__ import annotations
 
+from math import isfinite, sqrt
 from typing import Any
 
 import numpy as np
@@ -142,7 +143,7 @@ class Learner:
 
     def _handle(self, sample: Sample) -> str:
         parts, front = self.parts, self.parts.front
-        front.doubt_V = float(np.sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2)))
+        front.doubt_V = sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2))
         taken = front.take(sample, self.snapshot)
         if taken.distrusted:
             self._go_on_without_readings(taken.undone)
@@ -188,11 +189,11 @@ class Learner:
         if filter_due:
             target = pair.u_V - parts.window.mean(parts.point)
             beta = parts.filter.beta
-            if not np.isfinite(target):
+            if not isfinite(target):
                 return admission.NUMERICS
             self.base.features.fill(*motion, track.frozen_memory, self._frozen_basis, self._frozen_kernel)
             frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
-            served_V = float(self._basis @ parts.delay.push(beta))
+            served_V = float(self._basis.dot(parts.delay.push(beta)))
             parts.judge(target - served_V, pair.u_V - frozen_V)
             if pair.now % parts.check_every == 0:
                 found = self._check(pair, beta, target, frozen_V, bool(refused))
@@ -209,7 +210,7 @@ class Learner:
         if refused:
             return refused
         if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
-            outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis @ parts.filter.beta), weight)
+            outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
             parts.widen_domain(motion)
         self._cache = None
@@ -218,7 +219,7 @@ class Learner:
     def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
         """Now and then: is the model inside its envelope, does the sensor follow? Returns why nothing may be taught."""
         parts, front = self.parts, self.parts.front
-        parts.watch_shape(pair.u_V - target_V + float(self._basis @ beta) - float(self._basis @ self.base.beta))
+        parts.watch_shape(pair.u_V - target_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
         parts.watch_rail(saturated)
         if saturated or not front.follow(pair, frozen_V, parts.check_s):
             if front.confirmed:

@@ -238,9 +238,12 @@ class Parts:
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
         """Take a learnt instant (µm, µm/s, µm/s²) into the domain."""
+        ends = self.domain.tolist()
         for i, x in enumerate(motion):
-            self.domain[2 * i] = min(self.domain[2 * i], x)
-            self.domain[2 * i + 1] = max(self.domain[2 * i + 1], x)
+            if x < ends[2 * i]:
+                self.domain[2 * i] = x
+            if x > ends[2 * i + 1]:
+                self.domain[2 * i + 1] = x
 
     def shift_constant(self, by_V: float) -> None:
         """Add to the constant of the linear part, now, in its marks, and as it was served."""

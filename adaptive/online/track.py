@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adaptive.errors import InputError
-from adaptive.features import FeatureMap
+from adaptive.features import FeatureMap, advance_both
 from adaptive.inverse_model import track_memory
 from adaptive.smoothing import FixedLagSmoother, SmootherState
 from adaptive.state_codec import joined, under
@@ -45,8 +45,7 @@ class Pair(NamedTuple):
     near_bad: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Taken:
+class Taken(NamedTuple):
     """What a sample came to: the gate that refused it or "", and the steps to make.
 
     jump_um : by how much the frame has moved, µm. first : whether no other jump is open before this one. undone :
@@ -146,7 +145,7 @@ class Track:
     @property
     def predicted_um(self) -> float:
         """Where the smoother expects the next reading."""
-        return float(self.state.x[0])
+        return self.state.x.item(0)
 
     def copy(self) -> Track:
         """A track that goes its own way from here."""
@@ -177,12 +176,18 @@ class Track:
         switched = self.features is not self.served and state.count > self.switch
         if switched:
             self.features = self.served
-        self.features.advance(self.motion[0], self.memory)
-        self.base.advance(self.motion[0], self.frozen_memory)
+        if self.features is self.base:
+            # No jump yet: one call for both memories costs little more than one for the first.
+            advance_both(self.motion[0], self.memory, self.frozen_memory, self.base.arrays)
+        else:
+            self.features.advance(self.motion[0], self.memory)
+            self.base.advance(self.motion[0], self.frozen_memory)
         now = state.count - 1 - self.lag
         at, before = now % slots, (now - 1) % slots
-        good = bool(self.good[at] and self.good[before])
-        pair = Pair(now, *self.motion, float(self.u_V[at]), float(self.u_V[before]), good, not bool(self.good.all()))
+        # As bytes: numpy's own "all" of so few costs as much as a step of the smoother.
+        near_bad = 0 in self.good.tobytes()
+        good = not near_bad or bool(self.good[at] and self.good[before])
+        pair = Pair(now, *self.motion, self.u_V.item(at), self.u_V.item(before), good, near_bad)
         return pair, switched
 
     def remember(self, memory: FloatArray) -> None:
@@ -198,7 +203,8 @@ class Track:
         """By how much the voltage, V, and with a next reading ``y_um`` the readings, µm, have moved over the lag."""
         slots, last = self.u_V.shape[0], self.state.count - 1
         first = last - self.lag
-        return float(self.u_V[last % slots] - self.u_V[first % slots]), y_um - float(self.y_um[(first + 1) % slots])
+        du_V: float = self.u_V.item(last % slots) - self.u_V.item(first % slots)
+        return du_V, y_um - self.y_um.item((first + 1) % slots)
 
     def since_motion(self) -> tuple[Motion, float, FloatArray, FloatArray]:
         """The last smoothed motion, in the frame that is served, its voltage, and (lag,) voltages and readings since.

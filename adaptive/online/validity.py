@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -46,20 +47,21 @@ class Judgement:
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """One error of each."""
         squared = error_V * error_V
+        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
         if self.judged > 0 and squared <= self.variance_V2:
             self.inside += 1
         self.error_V = error_V
         self.judged += 1
-        self.long_V2 += (squared - self.long_V2) * min(1.0, step_s / LONG_S)
-        self.short_V2 += (squared - self.short_V2) * min(1.0, step_s / SHORT_S)
-        self.doubt_V2 *= 1.0 - min(1.0, step_s / SHORT_S)
+        self.long_V2 += (squared - self.long_V2) * slow
+        self.short_V2 += (squared - self.short_V2) * fast
+        self.doubt_V2 *= 1.0 - fast
         frozen = frozen_error_V * frozen_error_V
-        self.frozen_V2 += (frozen - self.frozen_V2) * min(1.0, step_s / LONG_S)
-        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * min(1.0, step_s / SHORT_S)
+        self.frozen_V2 += (frozen - self.frozen_V2) * slow
+        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
 
     def decide(self, enter_V: float, leave_V: float) -> bool:
         """Validity with hysteresis: left when the short-term rms exceeds ``leave_V``, entered below ``enter_V``."""
-        rms = float(np.sqrt(self.short_V2))
+        rms = sqrt(self.short_V2)
         if self.valid and rms > leave_V:
             self.valid = False
         elif not self.valid and rms < enter_V:
@@ -68,7 +70,7 @@ class Judgement:
 
     def choose(self, floor_V: float, step_s: float) -> bool:
         """Whether to serve the frozen model: it must win clearly to be taken, and lose to be left."""
-        learnt, frozen = float(np.sqrt(self.short_V2)), float(np.sqrt(self.frozen_short_V2))
+        learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
         if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
             self.fallback = True
         elif self.fallback and learnt < frozen:
