@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
-from service.protocol.query import Pending
+from service.protocol.query import MAX_PENDING, Pending
 from service.protocol.reply import Point, Trajectory
 
-#: Most samples under way. Only those after the newest snapshot matter, and that is some tens of samples old.
-MAX_UNDER_WAY: Final = 512
+#: Fewest samples under way that are kept. Only those after the newest snapshot matter, which is some tens of samples old.
+#: While no samples arrive, all since that snapshot are kept, up to MAX_PENDING, because the stage may have turned.
+UNDER_WAY: Final = 512
 
 
 def pending_before(after: Point | Trajectory | None, begin: int) -> Pending | None:
@@ -31,11 +32,12 @@ def pending_before(after: Point | Trajectory | None, begin: int) -> Pending | No
         return None
     first, y_um, u_V = after.pending
     wanted = begin - first
-    if wanted >= y_um.size + MAX_UNDER_WAY:
+    if wanted >= y_um.size + UNDER_WAY:
         return None
     held = max(wanted - y_um.size, 0)
     y_um, u_V = np.pad(y_um, (0, held), "edge")[:wanted], np.pad(u_V, (0, held), "edge")[:wanted]
-    return Pending(begin - min(wanted, MAX_UNDER_WAY), y_um[-MAX_UNDER_WAY:], u_V[-MAX_UNDER_WAY:])
+    kept = min(wanted, max(UNDER_WAY, min(begin - after.snapshot_seq, MAX_PENDING)))
+    return Pending(begin - kept, y_um[-kept:], u_V[-kept:])
 
 
 def extended(before: Pending | None, begin: int, y_um: FloatArray, u_V: FloatArray) -> Pending:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import FADE_S
 from service.client.client import Client
-from service.client.pending import MAX_UNDER_WAY, continued, pending_before, with_pending
+from service.client.pending import UNDER_WAY, continued, pending_before, with_pending
 from service.protocol.errors import FieldError
-from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
+from service.protocol.query import MAX_PENDING, FeedforwardQuery, Pending, decode_query, encode_query
 from service.protocol.reply import Answer, Trajectory
 from tests.service.server.test_axis import make_axis, parts, recording
 
@@ -123,8 +123,8 @@ def test_what_no_answer_can_have_been_is_refused(
     assert refused.value.field == field
 
 
-def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None) -> Trajectory:
-    reply = Answer(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, 0, "m", tracked_memory=True)
+def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None, seen: int = 0) -> Trajectory:
+    reply = Answer(0.1 * y, y, np.zeros(y.size, dtype=np.uint8), y, seen, "m", tracked_memory=True)
     return with_pending(reply, pending_before(before, begin), begin, y)
 
 
@@ -150,12 +150,21 @@ def test_answers_put_what_is_under_way_together() -> None:
         is pending_before(two, 10_000)
         is None
     )
-    long = one
-    for k in range(60):
-        long = answer_of(120 + 20 * k, np.full(20, float(k)), long)
-    kept = pending_before(long, 1320)
-    assert kept is not None
-    assert (kept.first, kept.y_um.size) == (1320 - MAX_UNDER_WAY, MAX_UNDER_WAY)
+
+
+@pytest.mark.parametrize(
+    ("answers", "last_seen", "kept"),
+    [(60, None, UNDER_WAY), (60, 400, 920), (300, 400, MAX_PENDING), (3, 60, 80)],
+    ids=["samples come", "none since 400", "none for longer than a query holds", "not so many were commanded"],
+)
+def test_all_that_no_sample_was_seen_of_is_kept(answers: int, last_seen: int | None, kept: int) -> None:
+    long, begin = answer_of(100, np.arange(20.0)), 120
+    for k in range(answers):
+        long = answer_of(begin, np.full(20, float(k)), long, begin - 40 if last_seen is None else last_seen)
+        begin += 20
+    under = pending_before(long, begin)
+    assert under is not None
+    assert (under.first, under.y_um.size, under.u_V.size) == (begin - kept, kept, kept)
 
 
 def test_a_query_with_a_beginning_takes_the_voltage_before_from_what_is_pending_before() -> None:
