@@ -17,7 +17,7 @@ from service.protocol.errors import FieldError
 from service.protocol.query import MAX_PENDING, Pending
 from service.protocol.reply import Point, Trajectory
 
-#: Fewest samples under way that are kept. Only those after the newest snapshot matter, which is some tens of samples old.
+#: Fewest samples under way that are kept. Only those after the newest snapshot matter, some tens of samples.
 #: While no samples arrive, all since that snapshot are kept, up to MAX_PENDING, because the stage may have turned.
 UNDER_WAY: Final = 512
 
