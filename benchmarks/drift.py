@@ -1,4 +1,4 @@
-"""How far the recursion drifts from the direct solver over very many updates, by condition number and form."""
+"""Drift of the recursion from the direct solver over very many updates, by condition number and form."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from adaptive.window.arrays import WindowArrays
 from adaptive.window.config import Form, WindowConfig
 from adaptive.window.window import Window
 
-#: gamma and width that give condition numbers from some 1e3 to 1e8 with windows of 100 samples in three dimensions.
+#: gamma and width for condition numbers from about 1e3 to 1e8 with windows of 100 samples in three dimensions.
 HARDNESS: tuple[tuple[float, float], ...] = ((1e2, 0.5), (1.5e3, 1.0), (1e4, 1.0), (1e5, 1.0), (1.2e6, 1.5))
-#: The same for some 1e5 and 1e8 with windows of 500, the learner's size.
+#: The same for about 1e5 and 1e8 with windows of 500, the size of the learner's.
 HARDNESS_500: tuple[tuple[float, float], ...] = ((4e2, 1.0), (4e5, 1.2))
 DIMENSION = 3
 FORMS: tuple[Form, ...] = ("inverse", "cholesky", "auto")
@@ -32,7 +32,7 @@ def _slide(A: WindowArrays, X: FloatArray, y: FloatArray, slots: NDArray[np.int6
 
 
 def _slide_and_heal(window: Window, X: FloatArray, y: FloatArray, slots: NDArray[np.int64]) -> int:
-    """All samples; where a step is refused the window is factored anew, as the learner does. Returns how often."""
+    """Learn all samples; if a step is refused, factor the window again, as the learner does. Returns how often."""
     refused, at = 0, _slide(window.arrays, X, y, slots, 0)
     while at < y.size:
         refused += 1
@@ -52,7 +52,7 @@ def _samples(rng: np.random.Generator, count: int, size: int) -> tuple[FloatArra
 def bench_drift(
     updates: int, size: int = 100, checks: int = 10, accuracy: float = 1e-8, forms: tuple[Form, ...] = FORMS
 ) -> list[dict[str, float | str]]:
-    """Worst relative error of alpha over ``checks`` looks at a stream of ``updates``, slots replaced at random."""
+    """Worst relative error of alpha over ``checks`` checks in a stream of ``updates``, slots replaced at random."""
     report: list[dict[str, float | str]] = []
     for gamma, width in HARDNESS if size < 500 else HARDNESS_500:
         for form in forms:

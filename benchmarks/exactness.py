@@ -1,7 +1,7 @@
-"""Whether a live service has learnt from its samples exactly what they teach: compared with an axis fed off line.
+"""Whether a live service has learnt exactly what its samples teach, compared with an axis that learns them offline.
 
-The learner is deterministic sample by sample, so the state of the live one must be that of the other to the last bit,
-however its samples were gathered on the way. One sample that was dropped, doubled or exchanged makes another state.
+The learner is deterministic sample by sample, so both states must agree to the last bit, however the samples were
+grouped on their way. A sample that was dropped, doubled or exchanged gives another state.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from service.server.learner_state import fingerprint
 from service.server.models import load_axis
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
-#: Messages that the axis off line is given at once: another number than a live service ever gathers.
+#: Messages that the offline axis gets at a time; a live service never groups them so.
 _PORTION: Final = 37
-#: Longest time for the queue of the service to be emptied, and for nothing more to come once it is, s.
+#: Longest time until the queue of the service is empty, and until nothing more arrives, s.
 _DRAIN_S: Final = 60.0
 _STILL_S: Final = 5.0
-#: So many of what differs are named.
+#: Number of differing entries that are named.
 _NAMED: Final = 8
 
 
 @dataclass(slots=True)
 class Adopted:
-    """The hyper-parameters that the live learner has adopted, each at a definite sample; heard from the events."""
+    """The hyper-parameters that the live learner has adopted, each at a definite sample, from its events."""
 
     session: zenoh.Session
     key: str
@@ -61,7 +61,7 @@ class Adopted:
 
 
 def exactness(running: RunningSetup, client: Client, adopted: Adopted) -> dict[str, Any]:
-    """End the stage, let the service handle what is queued, and compare its learner; counts and verdict for JSON."""
+    """Stop the stage, let the service handle its queue, and compare the learners; counts and verdict for JSON."""
     running.feed.stop()
     count = int(running.feed.last_json()["sent"])
     status = _drained(client, count)
@@ -86,11 +86,11 @@ def exactness(running: RunningSetup, client: Client, adopted: Adopted) -> dict[s
 
 
 def taught(setup: LatencySetup, count: int, retuned: list[Retuned]) -> Axis:
-    """An axis of the same configuration, given the first ``count`` samples of the stage here, off line."""
+    """An axis of the same configuration that learns the first ``count`` samples of the stage offline."""
     with np.load(setup.samples) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
     config: AxisConfig = read_config(setup.config).axes[0]
-    # One BLAS thread as in the service: several may sum in another order.
+    # One BLAS thread as in the service: more may sum in another order.
     with threadpool_limits(1):
         axis = load_axis(STAGE, config)
         for entry in retuned:
@@ -103,13 +103,13 @@ def taught(setup: LatencySetup, count: int, retuned: list[Retuned]) -> Axis:
 
 
 def offline_state(axis: Axis) -> StateDict:
-    """The state of an axis as it would arrive from a service: there and back through its bytes."""
+    """The state of an axis as a service would send it, through its bytes."""
     meta = CheckpointMeta(STAGE, AXIS, axis.dt_s, axis.handled_seq, axis.sequence.received)
     return decode_checkpoint(b"".join(encode_checkpoint(meta, axis.state_dict())))[1]
 
 
 def differing(live: StateDict, offline: StateDict) -> list[str]:
-    """Names of the entries that are not the same to the last bit, or not in both."""
+    """Names of the entries that are not identical to the last bit, or not in both."""
     return [name for name in sorted({*live, *offline}) if not _same(live.get(name), offline.get(name))]
 
 
@@ -120,7 +120,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _drained(client: Client, count: int) -> dict[str, Any]:
-    """The status once all ``count`` samples are handled, or once nothing moves any more."""
+    """The status when all ``count`` samples are handled, or when nothing changes any more."""
     until = time.monotonic() + _DRAIN_S
     seq, still_since = -2, time.monotonic()
     while True:
@@ -134,11 +134,11 @@ def _drained(client: Client, count: int) -> dict[str, Any]:
 
 
 def _live_state(client: Client) -> StateDict:
-    """The state of the service as it hands it to a standby. Raises ServiceError where it does not."""
+    """The state of the service as it sends it to a standby. Raises ServiceError if it does not."""
     until = time.monotonic() + CONNECT_S
     while time.monotonic() < until:
         data = fetch_state(client._session, client.keys.state, CONNECT_S)
         if data is not None:
             return decode_checkpoint(data)[1]
-        time.sleep(0.1)  # it refuses while its learner is busy for seconds
+        time.sleep(0.1)  # it refuses while its learner is busy
     raise ServiceError(f"{client.keys.state}: the service did not tell its state")

@@ -1,10 +1,10 @@
-"""How the service does on stages that it was not built with: stages, events and instants drawn at random, in lockstep.
+"""How the service does on stages that it was not built for: stages, events and times drawn at random, in lockstep.
 
-``python -m benchmarks.foreign --runs 500 --jobs 2 --json out/foreign.jsonl`` draws a stage, an event and its instant
-for each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), writes one line a run as it goes, and
-prints two tables: the goals with what the runs came to, and one row for each class of events. ``--table FILE`` prints
-the tables of runs that are done. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute
-errors in percent of the commanded range.
+``python -m benchmarks.foreign --runs 500 --jobs 2 --json out/foreign.jsonl`` draws a stage, an event and its time for
+each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), writes one line per run, and prints two
+tables: the goals with the results, and one row for each class of events. ``--table FILE`` prints the tables of
+finished runs. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute errors in percent of
+the commanded range.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ import numpy as np
 from lab.rehearsal.events import CLASSES, SENSOR, draw
 
 PRESETS = ("random", "issue")
-#: The event comes this long after the start of the closed loop, s, by the stages, and up to so much later.
+#: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.
 SETTLE_S, LATER_S = {"random": 4.0, "issue": 9.0}, 1.5
 #: Closed loop after the event, s.
 AFTER_S = 5.0
-#: Stages of the preset "issue" follow tones alone, as those did that the issue tells of.
+#: Share of the tones in the reference for the preset "issue", whose stages follow tones alone.
 ISSUE_TONES = 0.45
-#: Limits: time of motion within which a sensor fault is named, s; time above 5 % of the range, s.
+#: Limits: time of motion within which a sensor fault must be named, s; time above 5 % of the range, s.
 NAMED_S, LARGE_S = 0.5, 0.1
-#: Step of the gain that the goal is for, percent.
+#: Step of the gain that the goal refers to, percent.
 STEP_PCT = 6.0
-#: Runs of ``--line``, class and seed. From seed 900000 on, each is the first whose stage has 1 kHz or less, whose
-#: gain rises and falls in turn, and which has a mode to ring where it is knocked; no outcome was looked at.
+#: Runs of ``--line``, class and seed. From seed 900000 on, each is the first whose stage has 1 kHz or less, a gain
+#: that rises and falls in turn, and a mode that rings where it is knocked; chosen without looking at results.
 LINE = (
     ("none", 900_001), ("knock", 900_008), ("gain_at_once", 900_009), ("gain_at_once", 900_017),
     ("zero_at_once", 900_018), ("spikes", 900_019), ("gap", 900_021), ("losses", 900_022),
@@ -49,7 +49,7 @@ Record = dict[str, Any]
 
 
 def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
-    """One run of an event of the class ``name``, as JSON has it. A run that raises is a record with its traceback."""
+    """One run with an event of the class ``name``, as JSON values. If it raises, the record holds the traceback."""
     from lab.rehearsal import RandomReference, RehearsalConfig, identify, run_event
     from tests.foreign.plants import issue_plant, random_plant
 
@@ -78,7 +78,8 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
 def run_all(
     plan: Sequence[tuple[str, int]], jobs: int, preset: str = "random", after_s: float = AFTER_S
 ) -> Iterator[Record]:
-    """The runs of ``plan``, (class, seed) each, in the order in which they end. If a process dies, its run failed."""
+    """The runs of ``plan``, (class, seed) each, in the order in which they end. If a process dies, its run
+    has failed."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     if jobs == 1:
@@ -99,7 +100,7 @@ def run_all(
 
 
 def _numbers(values: Iterable[float | None]) -> np.ndarray:
-    """(n,) numbers; JSON says null for what is not finite."""
+    """(n,) numbers; JSON has null for values that are not finite."""
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
@@ -135,7 +136,7 @@ def _count(records: Sequence[Record], holds: Callable[[Record], bool]) -> str:
 
 
 def _parts(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
-    """(runs with a sound sensor, runs with a wrong one), without those that failed."""
+    """(runs with a working sensor, runs with a sensor fault), without those that failed."""
     done = [record for record in records if "failed" not in record]
     return [r for r in done if r["category"] != SENSOR], [r for r in done if r["category"] == SENSOR]
 
@@ -152,7 +153,7 @@ GOALS_HEAD = ("what is measured", "goal", "these runs")
 
 
 def goals(records: Sequence[Record]) -> str:
-    """Markdown: the goals of ``What it must come to``, each with what the runs came to and over which it was taken."""
+    """Markdown: the goals, each with the results and the runs that it was taken over."""
     intact, sensors = _parts(records)
     knocks = [record for record in intact if record["class"] == "knock"]
     steps = [record for record in intact if record["class"] == "gain_at_once"]
@@ -233,7 +234,7 @@ def row(name: str, all_records: Sequence[Record]) -> tuple[str, ...]:
 
 
 def by_class(records: Sequence[Record]) -> str:
-    """Markdown: a row for each class of events."""
+    """Markdown: one row for each class of events."""
     intact, sensors = _parts(records)
     classes = ((name, [record for record in records if record.get("class") == name]) for name in CLASSES)
     groups = (("**stage intact**", intact), ("**sensor faults**", sensors), ("**all**", list(records)))
@@ -241,13 +242,13 @@ def by_class(records: Sequence[Record]) -> str:
 
 
 def table(records: Sequence[Record]) -> str:
-    """Both tables, and how many runs they are of."""
+    """Both tables, and the number of runs."""
     failed = sum("failed" in record for record in records)
     return f"{goals(records)}\n\n{by_class(records)}\n\nruns: {len(records)}, of which {failed} failed"
 
 
 def line(records: Sequence[Record]) -> str:
-    """All runs in one line, for people. Settled: over the runs with a sound sensor."""
+    """All runs in one line. Settled: over the runs with a working sensor."""
     intact, sensors = _parts(records)
     done = [*intact, *sensors]
     failed = len(records) - len(done)
@@ -264,7 +265,7 @@ def line(records: Sequence[Record]) -> str:
 
 
 def told(record: Record) -> str:
-    """A run in a line."""
+    """A run in one line."""
     if "failed" in record:
         return f"seed {record['seed']} {record.get('class', '')}: FAILED: {record['failed'].strip().splitlines()[-1]}"
     adaptive, stage = record["adaptive"], record["stage"]
@@ -284,7 +285,7 @@ def told(record: Record) -> str:
 
 
 def read(paths: Iterable[Path]) -> list[Record]:
-    """The runs in files; a last line that was cut off is left out."""
+    """The runs in files; an incomplete last line is left out."""
     records = []
     for path in paths:
         for text in path.read_text().splitlines():

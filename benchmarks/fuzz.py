@@ -1,15 +1,15 @@
-"""Coverage-guided fuzzing of everything that reads bytes from others, and a live service under fire.
+"""Coverage-guided fuzzing of everything that decodes bytes of others, and of a live service.
 
 ::
 
     python -m benchmarks.fuzz --out out/fuzz                        # a million payloads, then 30 s against a service
     python -m benchmarks.fuzz --out out/fuzz --payloads 50000 --live 0
-    python -m benchmarks.fuzz --repeat out/fuzz/model-crash-1a2b    # one payload again, to see what it does
+    python -m benchmarks.fuzz --repeat out/fuzz/model-crash-1a2b    # run one payload again
 
-The engine is libFuzzer by way of atheris: it keeps each payload that reaches code no other has, and mutates those. A
-payload crashes the run where its target raises what is not documented, takes seconds, or asks for gigabytes; it is kept
-as a file. Each target runs in a process of its own. What was found new stays in DIR/corpus and begins the next run.
-Ends with 1 where anything crashed, memory grew, or honest clients were held up.
+The engine is libFuzzer through atheris: it keeps each payload that reaches new code, and mutates those. A payload
+crashes the run if its target raises an undocumented exception, takes seconds, or allocates gigabytes; it is then kept
+as a file. Each target runs in a process of its own. New payloads stay in DIR/corpus for the next run. Exit status 1 if
+anything crashed, memory grew, or honest clients were slowed down.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-#: Modules whose branches guide the mutations; everything else runs at full speed. None with compiled functions: numba
-#: cannot compile what the fuzzer has put into them.
+#: Modules whose branches guide the mutations; everything else runs at full speed. No modules with compiled functions:
+#: numba cannot compile what the fuzzer inserts.
 INSTRUMENTED = [
     "service.protocol.samples", "service.protocol.reply", "service.protocol.query", "service.protocol.model",
     "service.protocol.container", "service.storage.model_file", "service.operating.request", "service.protocol.errors",
@@ -34,12 +34,12 @@ INSTRUMENTED = [
 _MAX_BYTES = 4096
 _SLOW_S = 5
 _RSS_LIMIT_MB = 2048
-#: A target whose process ends with more than this above where it stood after its first thousandth has kept memory, MB.
+#: A target whose process ends with so much more memory than after its first tenth has leaked, MB.
 _GROWTH_MB = 64.0
 
 
 def main() -> int:
-    """Run it; returns the exit status."""
+    """Run the fuzzer; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__.split("\n", 1)[0])
     add = parser.add_argument
     add("--out", type=Path, default=Path("out/fuzz"), metavar="DIR", help="corpus, crashes and fuzz.json (%(default)s)")
@@ -116,7 +116,7 @@ def _fuzz(name: str, payloads: int, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _read_log(text: str) -> dict[str, Any]:
-    """What libFuzzer tells of a run: payloads, edges covered, payloads kept, and how much memory it came to hold."""
+    """What libFuzzer reports of a run: payloads, edges covered, payloads kept, and growth of memory."""
     lines = re.findall(r"#(\d+)\s+\w+\s+cov: (\d+) .*?corp: (\d+)/.*?rss: (\d+)Mb", text)
     done = re.search(r"stat::number_of_executed_units: (\d+)", text)
     rows = [tuple(map(int, line)) for line in lines]
@@ -135,7 +135,7 @@ def _child(name: str, args: argparse.Namespace) -> int:
     """The process that fuzzes one target; libFuzzer ends it."""
     import atheris
 
-    # What is imported under this is instrumented; the packages around it were not imported before.
+    # Modules that are imported here are instrumented, so they must not be imported yet.
     for module in [m for m in sys.modules if m.split(".")[0] in ("service", "adaptive", "baselines", "benchmarks")]:
         if module != "benchmarks.fuzz":
             del sys.modules[module]
@@ -146,7 +146,7 @@ def _child(name: str, args: argparse.Namespace) -> int:
     words.write_text("".join(f'"{word}"\n' for word in quoted), encoding="utf-8")
     target = TARGETS[name]()
     for payload in seeds(name):
-        target(payload)  # what is compiled at first use is no part of the run
+        target(payload)  # compile before the run
     atheris.Setup(
         [
             sys.argv[0], f"-runs={args.payloads}", f"-seed={args.seed}", f"-max_len={_MAX_BYTES}",

@@ -1,16 +1,14 @@
-"""A live service under fire: bad payloads from one process, an honest client in another, and what the fire costs it.
+"""A live service under malformed messages: what they cost an honest client, compared with honest load.
 
-The honest client asks for one point at a steady pace: in quiet, under as many honest queries from another process, and
-under malformed payloads. All three are reported. What must hold is that malformed fire costs no more than honest fire:
-the fire's content may cost nothing, while its rate costs what any traffic does, which the quiet figure tells.
+The honest client asks for one point at a steady rate in three phases: without load, under honest queries from another
+process, and under malformed payloads at the same rate. All three are reported. Malformed load must cost no more than
+honest load; the cost of the rate itself shows in the phase without load.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
+import signal
 import sys
 import time
 from pathlib import Path
@@ -22,7 +20,10 @@ import psutil
 from adaptive.errors import DehystError
 from benchmarks.fuzz_targets import models, seeds
 from benchmarks.mutations import mutated
+from lab.testbed.identified_stage import write_service_config
+from lab.testbed.rig import Rig
 from service.client.client import Client
+from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.delivery import SURELY
 from service.runtime.session import open_client
@@ -30,8 +31,8 @@ from service.storage.model_file import BundleMeta, write_bundle
 
 _STAGE, _AXIS = "fuzz", "x"
 _PACE_HZ: Final = 200.0
-#: How much slower the honest client's p99 may get under malformed payloads than under honest ones, and in absolute
-#: terms where both are within the machine's own noise, µs.
+#: Limit of the honest client's p99 under malformed payloads, as a multiple of its p99 under honest ones; or as a
+#: difference, µs, where both are within the machine's own noise.
 _P99_RATIO: Final = 1.5
 _P99_NOISE_US: Final = 300.0
 _GROWTH_MB: Final = 16.0
@@ -39,33 +40,22 @@ _OVERSIZED_EVERY: Final = 997
 
 
 def bombard(out: Path, duration_s: float, rate_hz: float, seed: int) -> dict[str, Any]:
-    """Fire at a service of our own on loopback for about ``duration_s``; returns the verdict and its numbers."""
+    """Send malformed payloads to a service on loopback for about ``duration_s``; returns the verdict and its
+    numbers."""
     out.mkdir(parents=True, exist_ok=True)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    endpoint = f"tcp/127.0.0.1:{port}"
-    write_bundle(out / "x.npz", models(), BundleMeta(_STAGE, _AXIS, 1e-3, y_min_um=0.0, y_max_um=90.0))
-    (out / "serve.toml").write_text(
-        f'stage = "{_STAGE}"\nlisten = ["{endpoint}"]\n[[axis]]\nname = "{_AXIS}"\nmodel = "x.npz"\n'
-        "u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n",
-        encoding="utf-8",
-    )
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    serving = subprocess.Popen(
-        [sys.executable, "-m", "lab.cli", "serve", "--config", str(out / "serve.toml"), "--json"],
-        stdout=subprocess.PIPE, text=True, env=environment,
-    )  # fmt: skip
-    assert serving.stdout is not None
-    if not serving.stdout.readline():
-        return {"held": False, "why": "the service did not come up"}
-    try:
-        with Client.connect(endpoint, _STAGE, _AXIS, timeout_s=5.0) as client:
-            told = _phases(client, endpoint, duration_s, rate_hz, seed, psutil.Process(serving.pid), environment)
-    finally:
-        serving.terminate()
-        serving.communicate(timeout=30)
-    told["exit"] = serving.returncode
+    model, config = out / "x.npz", out / "serve.toml"
+    write_bundle(model, models(), BundleMeta(_STAGE, _AXIS, 1e-3, y_min_um=0.0, y_max_um=90.0))
+    with Rig(out) as rig:
+        axis = {"name": _AXIS, "model": model, "u_min_V": 0.0, "u_max_V": 10.0, "slew_V_per_s": 2000.0}
+        write_service_config(config, _STAGE, axis, listen=[rig.endpoint])
+        try:
+            service = rig.start_service(config)
+        except ServiceError as error:
+            return {"held": False, "why": str(error)}
+        with Client.connect(rig.endpoint, _STAGE, _AXIS, timeout_s=5.0) as client:
+            told = _phases(client, rig, duration_s, rate_hz, seed, psutil.Process(service.pid))
+        service.send(signal.SIGTERM)
+        told["exit"] = service.wait(30.0)
     judged = told["p99"] = compared(told)
     told["checks"] = {
         "ends_well": told["exit"] == 0,
@@ -86,7 +76,7 @@ def bombard(out: Path, duration_s: float, rate_hz: float, seed: int) -> dict[str
 
 
 def compared(told: dict[str, Any]) -> dict[str, float]:
-    """The honest client's three p99, µs, their ratios, and the limit that is set by the one under honest fire."""
+    """The honest client's p99 in the three phases, µs, their ratios, and the limit, which follows from honest load."""
     quiet, honest, malformed = (told[phase]["p99_us"] for phase in ("quiet", "honest_fire", "malformed_fire"))
     return {
         "quiet_us": quiet,
@@ -100,29 +90,24 @@ def compared(told: dict[str, Any]) -> dict[str, float]:
 
 
 def _phases(
-    client: Client, endpoint: str, duration_s: float, rate_hz: float, seed: int,
-    service: psutil.Process, environment: dict[str, str],
-) -> dict[str, Any]:  # fmt: skip
+    client: Client, rig: Rig, duration_s: float, rate_hz: float, seed: int, service: psutil.Process
+) -> dict[str, Any]:
     share_s = duration_s / 4
-    _pace(client, min(2.0, share_s))  # until everything that is made at first use is made
+    _pace(client, min(2.0, share_s))  # until everything that is created at first use exists
     told: dict[str, Any] = {"quiet": _pace(client, share_s)}
     fired = unanswered = 0
     settled = 0
     for phase in ("honest_fire", "malformed_fire"):
         bad = phase == "malformed_fire"
         length_s = 2 * share_s if bad else share_s
-        firing = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.fuzz_live", endpoint, str(length_s + 1.0), str(rate_hz), str(seed),
-             "bad" if bad else "honest"],
-            stdout=subprocess.PIPE, text=True, env=environment,
-        )  # fmt: skip
-        assert firing.stdout is not None
-        firing.stdout.readline()
-        if bad:  # the first oversized payloads leave their buffers behind, once
+        order = [rig.endpoint, str(length_s + 1.0), str(rate_hz), str(seed), "bad" if bad else "honest"]
+        firing = rig.start("fire", ["-m", "benchmarks.fuzz_live", *order])
+        if bad:  # the first oversized payloads leave buffers behind, once
             _pace(client, 0.3 * length_s)
             settled = service.memory_info().rss
         told[phase] = _pace(client, 0.7 * length_s if bad else length_s)
-        counts = json.loads(firing.communicate(timeout=120)[0].splitlines()[-1])
+        firing.wait(120.0)
+        counts = firing.last_json()
         if bad:
             fired, unanswered = counts["fired"], counts["unanswered"]
             told["refused"] = counts["refused"]
@@ -137,7 +122,7 @@ def _phases(
 
 
 def _pace(client: Client, duration_s: float) -> dict[str, float]:
-    """The honest client: one point at a time, at a steady pace."""
+    """The honest client: one point at a time, at a steady rate."""
     taken_us = []
     failed = 0
     start = time.perf_counter()
@@ -160,7 +145,7 @@ def _pair(told: dict[str, float]) -> str:
 
 
 def fire(endpoint: str, duration_s: float, rate_hz: float, seed: int, bad: bool) -> int:
-    """Fire queries, commands and samples in turn at ``rate_hz``; every query is waited for."""
+    """Send queries, requests and samples in turns at ``rate_hz``; wait for the reply to every query."""
     rng = np.random.default_rng(seed)
     keys = Keys(_STAGE, _AXIS)
     aims = [("feedforward", "query"), ("operate", "operate"), ("sample", "samples"), ("feedforward", "query")]

@@ -1,7 +1,7 @@
-"""What is fuzzed: everything that reads bytes from others, and honest payloads to begin with.
+"""The targets of the fuzzer: everything that decodes bytes of others, with valid payloads as seeds.
 
-A target takes any bytes. It may raise what the project documents for malformed input, and nothing else; and it may not
-take long, nor keep memory.
+A target accepts any bytes. It may raise only the exceptions documented for malformed input, must be fast, and must not
+keep memory.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ EXPECTED = (InputError, ModelFileError)
 
 
 def models() -> dict[str, InverseModel]:
-    """A line and a small LSSVM with memory, of a stage of 11 µm/V that moves 90 µm."""
+    """A linear model and a small LSSVM with memory, of a stage of 11 µm/V that moves 90 µm."""
     features = FeatureMap(
         1e-3, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
         kernel_plays=(0,), asymmetric=True,
@@ -62,7 +62,7 @@ def _refusing(decode: Callable[[bytes], object]) -> Target:
 
 
 def _answering() -> Target:
-    """A query all the way: decoded, answered by a model, guarded, encoded, and decoded by the client."""
+    """A query through the whole service: decoded and answered by a model."""
     lssvm = models()["lssvm_adaptive"]
     memory = lssvm.rest_memory(0.0)
 
@@ -80,7 +80,7 @@ def _answering() -> Target:
 
 
 def _framed_model(data: bytes) -> None:
-    """A model of any JSON and any body, under a header that fits them: past the lengths, into what they are about."""
+    """A model with any JSON and any body, under a header that fits them, so that decoding gets past the lengths."""
     size = int.from_bytes(data[:2], "little")
     text, body = data[2 : 2 + size], data[2 + size :]
     count = 1
@@ -92,7 +92,8 @@ def _framed_model(data: bytes) -> None:
 
 
 def _framed_checkpoint(data: bytes) -> None:
-    """A checkpoint of any JSON and any body, under a head whose digest fits: a standby reads what a service sends."""
+    """A checkpoint with any JSON and any body, under a header whose digest fits: a standby decodes what a service
+    sends."""
     size = int.from_bytes(data[:2], "little")
     digest = hashlib.blake2b(data[2:], digest_size=16).digest()
     head = struct.pack("<8sQ16s", checkpoint.MAGIC, min(size, len(data[2:])), digest)
@@ -101,7 +102,7 @@ def _framed_checkpoint(data: bytes) -> None:
 
 
 def _parts(data: bytes) -> None:
-    """Parts of a state, each of up to three bytes behind its place: as many as the first says, or nothing."""
+    """Parts of a state, each of up to three bytes after its header: joined if complete, else nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
     whole = join_parts((piece[:8], piece[8:]) for piece in pieces)
     if whole is None:
@@ -111,7 +112,7 @@ def _parts(data: bytes) -> None:
         raise AssertionError("parts were taken for a whole that they do not make")
 
 
-#: Words that a mutation may put in: what the JSON of a payload is made of.
+#: Words that a mutation may insert, from the JSON of the payloads.
 WORDS = (
     '"name"', '"kind"', '"dt_s"', '"values"', '"arrays"', '"/memory"', '"lssvm"', '"linear"', '"<f8"', '"<i8"', '"|u1"',
     '"|b1"', "[]", "{}", "null", "true", "1e999", "-1", "NaN", '"verb"', '"who"', '"arguments"', '"freeze"', '"select"',
@@ -136,7 +137,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
 
 
 def seeds(target: str) -> list[bytes]:
-    """Honest payloads of a target."""
+    """Valid payloads of a target."""
     y, v, a = np.linspace(1.0, 80.0, 12).reshape(3, 4)
     query = [
         wire_query.encode_query(40.0, 0.0),

@@ -1,8 +1,9 @@
-"""Query round trips beside a bare zenoh echo of the same payloads, with learning on; and what a follower costs.
+"""Query round trips beside a bare zenoh echo of the same payloads, with learning on, and the cost of a follower.
 
-Service, echo, stage and asker are processes of their own over loopback. The asker takes echo and service in turns, so
-that whatever else the machine does meets both alike: the ratios travel, the times do not. At the end the stage is
-stopped, and what the service has learnt is compared with what the same samples teach off line (``exactness``).
+Service, echo, stage and client are processes of their own on loopback. The client queries echo and service in turns,
+so that other load on the machine affects both alike. Compare ratios across machines, not absolute times. At the end
+the stage is stopped, and the learner is compared with one that learns the same samples offline
+(`benchmarks.exactness`).
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ from service.protocol.reply import Answer, Trajectory, encode_reply
 from service.runtime.session import open_client
 
 TRAJECTORY = 100
-#: Of a query, s: on a machine with too much to do it is late, and that is to be measured.
+#: Timeout of a query, s: on a busy machine answers are late, and that is measured.
 _TIMEOUT_S = 10.0
 
 
 def latency(
     rate_hz: float = 1000.0, batch: int = 1, rounds: int = 4000, warm_s: float = 5.0, every_sample: bool = True
 ) -> dict[str, Any]:
-    """Round trips in µs with a stage at ``rate_hz``, ``batch`` samples a message.
+    """Round trips in µs with a stage at ``rate_hz``, ``batch`` samples per message.
 
-    ``every_sample``: each sample is learnt by filter and window; otherwise with the learner's own steps.
+    ``every_sample``: filter and window learn each sample; otherwise at the learner's own rates.
     """
     with (
         running_setup(rate_hz, batch, every_sample) as running,
@@ -88,7 +89,7 @@ def _ask(running: RunningSetup, client: Client, rounds: int) -> dict[str, Any]:
 
 
 def _follow(running: RunningSetup, points: int) -> dict[str, Any]:
-    """What a point costs in the caller's own process, and how old its model is."""
+    """Cost of a point in the client's own process, and the age of its model."""
     y, v, a = (column.tolist() for column in running.setup.motion)
     with _connected(running) as client:
         follower = client.follow()
@@ -112,7 +113,7 @@ def _follow(running: RunningSetup, points: int) -> dict[str, Any]:
 
 
 def _samples(running: RunningSetup, client: Client, seconds: float) -> dict[str, Any]:
-    """What the service made of the samples over some seconds, and what it cost it."""
+    """What the service did with the samples over some seconds, and its processor time."""
     process = psutil.Process(running.service.pid)
     first, before, begin = client.status(), sum(process.cpu_times()[:2]), time.monotonic()
     time.sleep(seconds)
@@ -133,7 +134,7 @@ def _reply(n: int, m: int, name: str) -> Trajectory:
 
 
 def _in_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, FloatArray]:
-    """Wall time of each call, µs, (rounds,) each; one of each in turn."""
+    """Wall time of each call, µs, (rounds,) each; the calls in turns."""
     taken = {name: np.empty(rounds) for name in calls}
     for i in range(-50, rounds):
         for name, call in calls.items():
@@ -159,7 +160,7 @@ def _percentiles(values: FloatArray) -> dict[str, float]:
 
 
 def page(report: dict[str, Any]) -> str:
-    """The report as tables to read."""
+    """The report as tables."""
     how = "every sample is learnt" if report["learn_every"] == 1 else f"a window step every {report['learn_every']}"
     lines = [
         f"Round trips in µs beside a stage at {report['rate_hz']:g} Hz, {report['batch']} samples a message, window of "

@@ -1,4 +1,4 @@
-"""How the benchmarks measure: the stream that all solvers see, and times of single calls, in µs."""
+"""What the solver benchmarks share: the stream of samples, and times of single calls, in µs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 
-#: Features of a stream: as many as displacement, velocity and three play operators make.
+#: Features of a sample: displacement, velocity and three play operators.
 DIMENSION = 5
 WIDTH = 1.0
 GAMMA = 100.0
@@ -44,7 +44,7 @@ class Times:
 
 
 def times(call: Callable[[], object], repeats: int, warm: int = 3) -> Times:
-    """Time ``repeats`` calls one by one after ``warm`` that don't count."""
+    """Time ``repeats`` calls one by one, after ``warm`` calls that do not count."""
     for _ in range(warm):
         call()
     taken = np.empty(repeats)
@@ -56,7 +56,7 @@ def times(call: Callable[[], object], repeats: int, warm: int = 3) -> Times:
 
 
 def interleaved(calls: dict[str, Callable[[], object]], repeats: int, block: int = 25) -> dict[str, Times]:
-    """Time several calls in turns of ``block``, so that a change of the machine's clock or load meets all alike."""
+    """Time several calls in turns of ``block``, so that changes of clock frequency or load affect all alike."""
     parts: dict[str, list[FloatArray]] = {name: [] for name in calls}
     for _ in range(max(1, repeats // block)):
         for name, call in calls.items():

@@ -1,4 +1,4 @@
-"""Malformed payloads made of honest ones, reproducibly, without a fuzzer: for tests and for firing at a service."""
+"""Malformed payloads from valid ones, reproducibly and without a fuzzer."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import struct
 
 import numpy as np
 
-#: Numbers at which lengths, counts and conversions break.
+#: Numbers at which lengths, counts and conversions tend to fail.
 _EDGES = (0, 1, -1, 2, 7, 255, 256, 4095, 4096, 4097, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1)
 _DOUBLES = (float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 5e-324, 0.0, -0.0)
 
 
 def mutated(payload: bytes, rng: np.random.Generator, most_bytes: int = 8192) -> bytes:
-    """``payload`` with one to four changes: bytes, edge numbers, cuts, doublings, noise."""
+    """``payload`` with one to four changes: bytes, extreme numbers, cuts, repetitions, noise."""
     data = bytearray(payload)
     for _ in range(int(rng.integers(1, 5))):
         at = int(rng.integers(0, len(data) + 1))

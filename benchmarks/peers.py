@@ -1,7 +1,7 @@
-"""What else is to be had: scikit-learn's refits and the sliding-window KRLS of PyPI's ``krls``, on the same stream.
+"""Other solvers on the same stream: scikit-learn's refits and the sliding-window KRLS of PyPI's ``krls``.
 
-Every solver predicts each sample before it learns it; the error beside the time is that of these predictions.
-Samples are centred on the first window's mean for those that have no bias.
+Every solver predicts each sample before it learns it; the report gives the error of these predictions and the time.
+Solvers without a bias get samples centred on the mean of the first window.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ Peer = tuple[Callable[[FloatArray], float], Callable[[int], object]]
 
 
 def bench_peers(n: int, steps: int) -> dict[str, dict[str, Any]]:
-    """Median time of learning one sample with a window of ``n``, and the error of predicting it, by solver.
+    """Median time to learn one sample with a window of ``n``, and the error of predicting it, by solver.
 
-    Of one that cannot be imported the reason stands under "missing"; ``pip install dehyst[peers]`` brings them all.
+    For a solver that cannot be imported the reason is under "missing"; ``pip install dehyst[peers]`` installs them
+    all.
     """
     X, y = stream(n + steps)
     y = y - y[:n].mean()

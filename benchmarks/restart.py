@@ -1,8 +1,7 @@
-"""What it takes to start a service again that was killed without a standby, and what is lost by it.
+"""How long a killed service without a standby needs to serve again, and what is lost.
 
-A stage sends samples; service and stage are killed in the middle of it, the service is started again and asked, then
-the stage. Beside each start, in turns, the same interpreter imports the libraries alone: the ratio travels, the times
-do not.
+A stage sends samples. Service and stage are killed, the service is started again and queried, then the stage. In turns
+with each start, the same interpreter imports only the libraries: compare that ratio across machines, not the times.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ from lab.testbed.rig import Rig
 from service.client.client import Client
 from sim.recordings import read
 
-#: What a service cannot do without, and what a start therefore costs at least.
+#: Libraries that a service needs: the lower bound of its start.
 LIBRARIES = "import numpy, numba, scipy.linalg.cython_lapack, pyarrow.parquet, zenoh"
 RATE_HZ, BATCH = 1000.0, 5
 
 
 def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
-    """Kill and start ``rounds`` times, after ``learn_s`` seconds of samples each.
+    """Kill and start ``rounds`` times, each after ``learn_s`` seconds of samples.
 
     Returns
     -------
-    ``ready_s``: from the start until it says that it is ready; ``answered_s``: from the kill until a client that asks
-    all the time has its answer; ``libraries_s``; ``ready_over_libraries``; each as a list. ``unlearnt_ms``: of the
-    samples that its status had told to be handled, how many milliseconds are not in what it goes on from.
-    ``records_lost``: of those, how many are in no recording.
+    ``ready_s``: from the start until the service is ready; ``answered_s``: from the kill until a client that keeps
+    asking has an answer; ``libraries_s``; ``ready_over_libraries``; each as a list. ``unlearnt_ms``: milliseconds of
+    samples that the last status counted as handled and that the restarted learner does not know. ``records_lost``: of
+    those, how many are in no recording.
     """
     rows: dict[str, list[float]] = {"ready_s": [], "answered_s": [], "libraries_s": [], "unlearnt_ms": []}
     told: list[tuple[int, int]] = []
@@ -63,7 +62,7 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
                 after = int(client.status()["seq"])
                 rows["unlearnt_ms"].append(1e3 * max(0, before - after) / RATE_HZ)
                 told.append((first, before))
-                # What was under way to it has numbers too; and messages begin at a multiple of their size.
+                # Samples on their way have numbers too; and messages begin at a multiple of their size.
                 first = (max(before, after) // BATCH + int(RATE_HZ)) * BATCH
         service.stop()
         recorded = read(Path(folder) / "rec").seq
@@ -80,7 +79,7 @@ def _libraries_s() -> float:
 
 
 def page(report: dict[str, Any]) -> str:
-    """The same to read."""
+    """The report as text."""
     lines = [f"A service killed and started again {report['rounds']} times, samples at {RATE_HZ:g} Hz", ""]
     for name, text in (
         ("ready_s", "from the start until it is ready, s"),

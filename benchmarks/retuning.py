@@ -1,9 +1,9 @@
-"""What re-tuning in the background costs those who ask: query round trips with and without its process at work.
+"""The cost of background tuning for queries: round trips with and without its process at work.
 
-``python -m benchmarks.retuning [--seconds S] [--pairs N] [--json]``. Service, stage and asker are processes of their
-own over loopback; the service learns. Phases without and with alternate, each pair the other way round than the one
-before, and while it is "with", one proposal on a full window follows another without a pause: far more than a service
-ever does. What is reported are ratios within a pair, so that whatever else the machine does meets both alike.
+``python -m benchmarks.retuning [--seconds S] [--pairs N] [--json]``. Service, stage and client are processes of their
+own on loopback; the service learns. Phases without and with tuning alternate, each pair in the opposite order of the
+one before. In a phase with tuning one proposal on a full window follows another without a pause: far more than in a
+service. The report gives ratios within a pair, so that other load on the machine affects both alike.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from service.background.retuning.settings import RetuningConfig
 from service.client.client import Client
 
 QUANTILES = {"p50": 50.0, "p99": 99.0}
-#: Between two questions, s: a controller asks block by block, and does not keep a core busy by itself.
+#: Pause between two queries, s: a controller asks block by block and does not keep a core busy.
 PAUSE_S = 0.002
-#: How long the working process takes to load its libraries; not measured.
+#: Time in which the tuning process loads its libraries, s; not measured.
 WARM_S = 3.0
 
 
 class Tuning:
-    """One proposal after the other, each by a process of its own, as the service runs them."""
+    """One proposal after the other, each in a process of its own, as in the service."""
 
     def __init__(self) -> None:
         X, y = stream(WINDOW)
@@ -46,7 +46,7 @@ class Tuning:
         self.done = 0
 
     def step(self) -> None:
-        """Begin the next where none is at work. Raises RuntimeError where one has failed."""
+        """Start the next proposal if none runs. Raises RuntimeError if one failed."""
         if self._job is not None and self._job.result is not None:
             if "error" in self._job.result:
                 raise RuntimeError(f"the working process failed: {self._job.result['error']}")
@@ -56,14 +56,15 @@ class Tuning:
             self._job = Job(order, self._arrays, 60.0)
 
     def stop(self) -> None:
-        """End what is at work."""
+        """Cancel the running proposal."""
         if self._job is not None:
             self._job.cancel()
             self._job = None
 
 
 def retuning(seconds: float = 30.0, pairs: int = 4) -> dict[str, Any]:
-    """Round trips of one point in µs, ``pairs`` times ``seconds`` without and with, and their ratios within a pair."""
+    """Round trips of one point in µs, ``pairs`` times ``seconds`` without and with tuning, and their ratios in each
+    pair."""
     load_before, rows = os.getloadavg()[0], []
     tuning = Tuning()
     with (
@@ -116,7 +117,7 @@ def _phase(setup: LatencySetup, client: Client, seconds: float, tuning: Tuning |
 
 
 def page(report: dict[str, Any]) -> str:
-    """The report as a table to read."""
+    """The report as a table."""
     lines = [
         f"Round trips of one point, µs, {report['seconds']:g} s a phase, re-tuning without a pause in every second one",
         f"({report['proposals']} proposals; {report['cores']} cores, load {report['load'][0]} to {report['load'][1]})",

@@ -1,4 +1,4 @@
-"""All benchmarks of the solver, as numbers and as a page of text."""
+"""All benchmarks of the solver, as numbers and as text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZES = (100, 250, 500, 1000, 2000)
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """Run everything with one BLAS thread: ``quick`` in under a minute, otherwise some minutes.
+    """Run everything with one BLAS thread: ``quick`` in under a minute, otherwise in some minutes.
 
     Returns
     -------
@@ -36,7 +36,7 @@ def run(quick: bool = False) -> dict[str, Any]:
 
 
 def page(report: dict[str, Any]) -> str:
-    """The same as tables to read."""
+    """The report as tables."""
     lines = ["One step of the window, medians in µs (one BLAS thread)", ""]
     columns = (
         ("update_us", "update"),

@@ -1,7 +1,7 @@
-"""How soon a sudden change is taken up, by the age of what is served: the demonstration's stage and reference.
+"""How soon the service adapts to a sudden change, by the age of its snapshot: the demonstration's stage and reference.
 
-``python -m benchmarks.step`` steers the demonstration's plan, without wire and clock, by snapshots of several ages and
-prints the mean absolute error in percent of the commanded range beside what is asked for.
+``python -m benchmarks.step`` runs the demonstration's plan without network and clock, from snapshots of several ages,
+and prints the mean absolute error in percent of the commanded range beside the target.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from adaptive.types import FloatArray, Sample
 from lab.demo.plan import TEACHER, Plan
 from sim.stage.stage import Stage
 
-#: What is asked for, percent of the commanded range: first second, 1 to 4 s, last ten seconds.
+#: Targets, percent of the commanded range: first second, 1 to 4 s, last ten seconds.
 GOALS = {"first": 0.25, "then": 0.10, "settled": 0.03}
-#: Ticks between the last sample that a snapshot has seen and the first point of its block; 0 is point by point.
+#: Ticks between the last sample that a snapshot has seen and the first point of its block; 0: point by point.
 AGES = (0, 20, 40, 80)
 SEEDS = tuple(range(20, 27))
 
 
 def errors(plan: Plan, model: LssvmInverse, age: int) -> dict[str, float]:
-    """One run at an age in ticks: percent of the range, of the parts named in ``GOALS`` and of what was "before"."""
+    """One run with an age in ticks: errors in percent of the range, for the parts in ``GOALS`` and for "before"."""
     (wanted_um, v_um_per_s, a_um_per_s2), y_um = plan.reference(), np.zeros(plan.ticks)
     stage, learner = Stage(plan.stage(changing=True)), Learner.from_model(model)
     state, block = stage.initial_state(), plan.block if age else 1
@@ -38,7 +38,7 @@ def errors(plan: Plan, model: LssvmInverse, age: int) -> dict[str, float]:
         while len(past) > 1 and past[1][0] <= first - max(age, 1):
             past.pop(0)
         seen, served, memory = past[0]
-        # As the service answers a caller that gives ``begin``: from its own memory on, over what is under way.
+        # As the service answers a query with ``begin``: from its own memory, along the pending commands.
         way = slice(seen + 1, first)
         memory = served.track(wanted_um[way], v_um_per_s[way], a_um_per_s2[way], np.zeros(first - seen - 1), memory)
         answer = served.feedforward(wanted_um[part], v_um_per_s[part], a_um_per_s2[part], memory)
@@ -64,14 +64,14 @@ def _parts(plan: Plan, error_pct: FloatArray) -> dict[str, float]:
 
 
 def identified(plan: Plan) -> LssvmInverse:
-    """The model of the rested stage, as the demonstration identifies it."""
+    """The model of the stage at rest, as the demonstration identifies it."""
     stage, u_V = Stage(plan.stage(changing=False)), plan.identification_voltage()
     y_um, _ = stage.run(stage.initial_state(), u_V)
     return identify_lssvm(u_V, y_um, plan.dt_s, inputs="memory", name=TEACHER)[0]
 
 
 def table(rows: dict[int, list[dict[str, float]]]) -> str:
-    """Markdown: a row an age, mean over the seeds and the worst of them."""
+    """Markdown: one row per age, mean over the seeds and the worst of them."""
     lines = ["| age | before | first second | 1 to 4 s | settled |", "|---|---|---|---|---|"]
     for age, runs in rows.items():
         when = f"{age} ms" if age else "none, point by point"
@@ -81,7 +81,7 @@ def table(rows: dict[int, list[dict[str, float]]]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run all ages and seeds; prints a line a run, then the table."""
+    """Run all ages and seeds; prints a line per run, then the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.step", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), metavar="N")
     parser.add_argument(

@@ -1,7 +1,7 @@
-"""The controller as a process: asks the service ahead of time, sends the voltages, keeps what the sensors read.
+"""The controller as a process: asks the service ahead of time, sends the voltages, and records the readings.
 
-``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: a block is asked
-for when the stage has published the tick that the plan says. Progress goes to standard output as lines of JSON.
+``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it asks for a block
+when the stage has published the tick that the plan gives. Progress goes to standard output as lines of JSON.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from service.protocol.reply import Trajectory
 from service.runtime.delivery import SURELY, wait_followed
 from service.runtime.session import open_client
 
-#: How long to wait for the stage's next samples, and for the service to have learnt far enough, s.
+#: How long to wait for the stage's next samples, and for the service to learn far enough, s.
 STALL_S, BEHIND_S = 10.0, 0.1
 
 
 class Twins:
-    """What the sensors of the twin stages have read so far, filled by the wire's thread."""
+    """The readings of the twin stages so far, filled by zenoh's thread."""
 
     def __init__(self, plan: Plan, session: zenoh.Session) -> None:
         self.y_um, self.u_V = empty(plan), empty(plan)
@@ -60,7 +60,7 @@ class Twins:
         return take
 
     def wait(self, ticks: int) -> bool:
-        """Until every twin has read ``ticks`` samples; False if they stopped coming."""
+        """Wait until every twin has published ``ticks`` samples; False if they stopped."""
         with self._moved:
             return self._moved.wait_for(lambda: min(self.seen.values()) >= ticks, STALL_S)
 
@@ -70,18 +70,19 @@ class Twins:
 
 
 def control(plan: Plan, endpoint: str, out: Path) -> int:
-    """Run the plan against the service and the stage behind ``endpoint``; writes ``out``. 1 if the stage stalled."""
+    """Run the plan against the service and the stage behind ``endpoint``; writes ``out``. Returns 1 if the stage
+    stalled."""
     wanted = plan.reference()
     n, size = plan.ticks, plan.block
     std_V = empty(plan)
     durations: list[float] = []
-    late = 0  # answers that came after their block was due, or not from the snapshot they should have come from
+    late = 0  # answers after their block was due, or from another snapshot than planned
     answers: dict[str, Trajectory | None] = dict.fromkeys(MODELS)
-    # Answers that are to know of no sample have no snapshot to name, and the first commands start the stage's clock:
-    # these wait until all such answers are there.
+    # The first answers precede all samples, and the first commands start the stage's clock: these commands are held
+    # until all such answers are there.
     blind = sum(plan.as_of(block) < 0 for block in range(n // size))
     held: list[tuple[zenoh.Publisher, bytes]] = []
-    # Two sessions, so that an answer never waits behind the samples of five twins.
+    # Two sessions, so that an answer does not wait behind the samples of five twins.
     with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
         commands = {
@@ -106,7 +107,8 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                 client.reference(part.start, wanted[0][part])
                 for name in MODELS:
                     begin = time.perf_counter()
-                    # The service tracks the teacher's stage; the memory of the others travels, over all of the way.
+                    # The service tracks the teacher's stage; the other models carry their memory in the query, without
+                    # gaps.
                     due = fresh * size if name == TEACHER else None
                     asked = slice(part.start if due is None else due, part.stop)
                     motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
@@ -122,7 +124,7 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                         held.clear()
                 late += twins.seen[TEACHER] > part.start
                 if part.start <= plan.change_tick < part.stop:
-                    # Told to the viewer only: the service has to find out by itself.
+                    # For the viewer only: the service must find out by itself.
                     event.put(
                         json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text})
                     )
@@ -140,10 +142,10 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
 
 
 def blocks_now(plan: Plan, block: int, seen: int) -> tuple[int, int]:
-    """(fresh, stop): what to ask for after ``seen`` samples in place of ``block``: the blocks before ``stop``.
+    """(fresh, stop) after ``seen`` samples: ask for the blocks before ``stop`` instead of only ``block``.
 
-    One, where it is in time. Else all up to the one that would be asked for now if it were, or a controller that was
-    late for once would be late until the end; what came before block ``fresh`` is due already and of no use.
+    In time this is one block. Otherwise all blocks up to the one that would be due now, or a controller that was late
+    once would stay late. What is before block ``fresh`` is past already and of no use.
     """
     size = plan.block
     if seen <= block * size:
@@ -162,8 +164,8 @@ def ask(
 ) -> tuple[Trajectory, bool]:
     """The voltages for a block, and whether they had to be asked for more than once.
 
-    A controller does not give up because the machine stalled: it asks again, and takes the newest snapshot where
-    the right one is not there in time. Raises what the client raises once ``STALL_S`` are over.
+    If the machine stalls, the controller asks again and accepts the newest snapshot if the planned one is not there in
+    time. Raises what the client raises after ``STALL_S``.
     """
     until = time.monotonic() + STALL_S
     wanted, waited = as_of, False
@@ -191,7 +193,7 @@ def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
 
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
-    # The wire's threads must not wait 5 ms for the interpreter.
+    # zenoh's threads must not wait 5 ms for the interpreter lock.
     sys.setswitchinterval(5e-5)
     plan = Plan(**json.loads(Path(argv[0]).read_text()))
     try:

@@ -1,4 +1,4 @@
-"""The run in one process and as fast as it goes: the same questions, the same answers, no wire in between."""
+"""The run in one process, as fast as possible: the same queries and answers, without a network."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from service.storage.recorder import Recorder
 from service.viewer.records import Diagnostics
 from sim.stage.stage import Stage
 
-#: Called with the number of ticks done and, by model, the mean absolute error of the last second in µm.
+#: Called with the number of ticks done and, by model, the mean absolute error of the last second, µm.
 Progress = Callable[[int, dict[str, float]], None]
 
 
 def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
-    """Run the plan on twin stages, the teacher's samples going into ``axis``."""
+    """Run the plan on twin stages; the teacher's samples go into ``axis``."""
     wanted = plan.reference()
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
     stage = Stage(plan.stage(changing=True))
@@ -58,7 +58,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
             continue
         part = slice(block * size, (block + 1) * size)
         for name in MODELS:
-            # The service tracks the teacher's stage; the memory of the others travels.
+            # The service tracks the teacher's stage; the other models carry their memory in the query.
             pending = commanded.before(part.start) if name == TEACHER else None
             query = FeedforwardQuery(
                 wanted[0][part], wanted[1][part], wanted[2][part], memory[name], name, plan.as_of(block), last_V[name],

@@ -1,4 +1,4 @@
-"""The demonstration on a stage of one's own: what of the plan depends on the stage, measured on the stage itself."""
+"""Fits the plan of the demonstration to a stage from a file, by measuring the stage."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from sim.stage.config import StageConfig
 from sim.stage.file import load_stage, save_stage
 from sim.stage.stage import Stage
 
-#: Share of the voltage limits that identification uses, and what the reference commands of the range found by it.
+#: Share of the voltage limits that identification uses, and range of the reference as shares of the range found by it.
 DRIVE_SHARE, LOW_SHARE, HIGH_SHARE = 0.8, 0.045, 0.9
-#: A stage that rises within this time, s, is asked for the usual reference; a slower one for a slower one.
+#: A stage with a rise time up to this, s, gets the usual reference; a slower one a slower reference.
 QUICK_S = 4e-3
 
 
 def plan_for(path: Path, folder: Path, run_s: float, seed: int) -> Plan:
-    """The plan for the stage in the file ``path``; what is run is written into ``folder``.
+    """The plan for the stage in the file ``path``; the stage that is run is written into ``folder``.
 
     Voltages stay within ``DRIVE_SHARE`` of the file's limits; the commanded range is a share of what they reach. The
-    sample time is the plan's own. Raises InputError where the stage does not move, or runs away.
+    sample time is the plan's own. Raises InputError if the stage does not move, or diverges.
     """
     base = Plan(run_s=run_s, seed=seed)
     config = replace(_able_to_drift(_from_zero(load_stage(path))), dt_s=base.dt_s, seed=seed)
     high = DRIVE_SHARE * config.u_max_V
-    # A stage that is driven one way only stays so; one of both signs is driven both ways.
+    # A stage of one polarity keeps it; a bipolar stage is driven both ways.
     low = DRIVE_SHARE * config.u_min_V if config.u_min_V < -0.5 * config.u_max_V else 0.0
     ours = folder / "stage.toml"
     save_stage(config, ours)
@@ -51,7 +51,7 @@ def plan_for(path: Path, folder: Path, run_s: float, seed: int) -> Plan:
 
 
 def _rise_s(stage: Stage, low_V: float, high_V: float) -> float:
-    """Time to 63 % of the response to a small step, s: a slow stage cannot follow what a quick one can."""
+    """Time to 63 % of the response to a small step, s."""
     dt_s, middle = stage.config.dt_s, 0.5 * (low_V + high_V)
     n = round(0.5 / dt_s)
     drive = np.concatenate([np.full(n, middle), np.full(n, middle + 0.1 * (high_V - low_V))])
@@ -62,9 +62,9 @@ def _rise_s(stage: Stage, low_V: float, high_V: float) -> float:
 
 
 def _from_zero(config: StageConfig) -> StageConfig:
-    """The stage without the offset that a diagnosis found in its sensor: a rested stage reads zero.
+    """The stage without the sensor offset that a diagnosis found, so that it reads zero at rest.
 
-    With it a change of the gain would move the rest position by its share of a number that means nothing.
+    With the offset a change of the gain would shift the rest position by a meaningless amount.
     """
     if OFFSET not in config.effects:
         return config
@@ -72,7 +72,7 @@ def _from_zero(config: StageConfig) -> StageConfig:
 
 
 def _able_to_drift(config: StageConfig) -> StageConfig:
-    """The stage with a gain that can change half way; a file that has none is given one that stands still."""
+    """The stage with a gain that can change half way; if the file has none, a constant one is added."""
     if any(e.label == "gain_drift" for e in config.effects):
         return config
     still = effect("gain_drift", ramp_per_min=0.0)
@@ -80,5 +80,5 @@ def _able_to_drift(config: StageConfig) -> StageConfig:
 
 
 def _payload(config: StageConfig) -> float:
-    """Mass to add over mass moved: none where no mode of the file could feel it."""
+    """Mass to add over mass moved; zero if no effect of the file depends on it."""
     return 1.0 if any(e.name in ("resonance", "mechanics") for e in config.effects) else 0.0

@@ -5,8 +5,8 @@ Time line of one run (ticks of ``dt_s``)::
     block j covers the ticks [jB, (j+1)B); it is asked for when the stage has published tick jB - lead - 1,
     and answered from the newest snapshot that has seen no sample after jB - lead - margin.
 
-The margin leaves the samples their way through the wire, so that a run in real time and a fast one ask the
-same questions of the same snapshots and get the same voltages.
+The margin gives the samples time to arrive, so that a run in real time and a fast one ask the same questions of the
+same snapshots and get the same voltages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sim.stage.config import StageConfig
 from sim.stage.file import load_stage
 from sim.stage.presets import preset
 
-#: Served models in the order of the table, with what the table calls them.
+#: Served models in the order of the table, with their titles there.
 MODELS: dict[str, str] = {
     "linear": "linear gain only",
     "bouc_wen": "Bouc-Wen, inverse",
@@ -31,10 +31,10 @@ MODELS: dict[str, str] = {
     "lssvm_frozen": "LSSVM as in the chapter, frozen",
     "lssvm_adaptive": "LSSVM with memory, adaptive",
 }
-#: The model whose stage teaches the service.
+#: The model from whose stage the service learns.
 TEACHER = "lssvm_adaptive"
 STAGE, AXIS = "demo", "x"
-#: Axis name on the wire of the twin that each model drives; the teacher has the axis itself.
+#: Axis name, in keys, of the twin that each model drives; the teacher has the axis itself.
 UNITS: dict[str, str] = {name: AXIS if name == TEACHER else f"{AXIS}_{name}" for name in MODELS}
 
 
@@ -45,14 +45,15 @@ class Plan:
     Attributes
     ----------
     dt_s : sample time, s. identify_s, run_s : lengths of the two parts, s.
-    change_s : when the stage changes, s after the start of the second part.
-    gain_change, payload_ratio : relative change of the stage's gain; mass added over mass moved.
-    low_um, high_um : the range that the reference commands, µm.
-    block, lead, margin : ticks per query, ticks asked ahead, ticks left for samples to arrive.
+    gain_change, payload_ratio : relative change of the stage's gain half way through; mass added over mass moved.
+    low_um, high_um : range of the reference, µm.
+    block, lead, margin : ticks per query, ticks that it is asked ahead, ticks left for samples to arrive.
     seed : of the stage's noise and of the reference.
-    drive_low_V, drive_high_V : voltages that identification spans, V.
+    drive_low_V, drive_high_V : range of the identification signal, V.
     slowness : factor by which the reference is slower than the usual one.
     stage_file : a stage file in place of the stage that stands in for hardware; see `lab.demo.own_stage`.
+
+    Raises InputError on a run that is too short or a lead that is no multiple of the block.
     """
 
     dt_s: float = 0.001
@@ -89,16 +90,16 @@ class Plan:
 
     @property
     def range_um(self) -> float:
-        """Commanded range, to which all percentages refer."""
+        """Commanded range, µm, to which all percentages refer."""
         return self.high_um - self.low_um
 
     def as_of(self, block: int) -> int:
-        """Last sequence number that the answer for ``block`` may have learnt from; -1: there is none to name, and the
-        newest snapshot answers. It knows of no sample only where none has been sent yet."""
+        """Last sequence number that the answer for ``block`` may have learnt from. -1: none, and the newest snapshot
+        answers, which has learnt nothing only before the first sample."""
         return max(-1, block * self.block - self.lead - self.margin)
 
     def phases(self) -> dict[str, slice]:
-        """The parts of the run that the table speaks of, as tick ranges."""
+        """The parts of the run in the table, as tick ranges."""
         second = round(1.0 / self.dt_s)
         quiet = min(10 * second, self.change_tick // 2)
         return {
@@ -108,26 +109,26 @@ class Plan:
         }
 
     def identification_voltage(self) -> FloatArray:
-        """The chapter's training input (2.37) at ``dt_s``, V, over the stage's own voltages."""
+        """The chapter's training input (2.37) at ``dt_s``, V, over the stage's voltage range."""
         wave_V = training_input(self.dt_s, self.identify_s)[1]
         if (self.drive_low_V, self.drive_high_V) == (0.0, 8.0):
             return wave_V
         return np.asarray(self.drive_low_V + (self.drive_high_V - self.drive_low_V) * wave_V / 8.0)
 
     def reference(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Displacement µm, velocity µm/s, acceleration µm/s² of the reference that no model has seen."""
+        """Displacement µm, velocity µm/s, acceleration µm/s² of the reference, which is not in the training data."""
         n, slow, limits = self.ticks, self.slowness, (self.low_um, self.high_um)
         motion = demo_reference(n * self.dt_s / slow, self.dt_s / slow, limits, self.seed)
         return motion.y_um[:n], motion.v_um_per_s[:n] / slow, motion.a_um_per_s2[:n] / slow**2
 
     @property
     def change_text(self) -> str:
-        """The change as a person would say it."""
+        """Description of the change."""
         text = f"gain {100.0 * self.gain_change:+.0f} %"
         return f"{text}, moved mass x {1.0 + self.payload_ratio:g} by a payload" if self.payload_ratio else text
 
     def stage(self, *, changing: bool) -> StageConfig:
-        """The stage, rested; with ``changing`` its gain drops and its payload grows at ``change_tick``."""
+        """The stage at rest; with ``changing`` its gain drops and its payload grows at ``change_tick``."""
         if self.stage_file:
             config = replace(load_stage(self.stage_file), dt_s=self.dt_s, seed=self.seed)
         else:

@@ -1,4 +1,4 @@
-"""What a run of the demonstration leaves behind, whichever way it was made."""
+"""The result of a demonstration, live or fast, and its table and ``summary.json``."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ import numpy as np
 from adaptive.types import FloatArray
 from lab.demo.plan import MODELS, Plan
 
-# --- From errors to the table and to ``summary.json``.
-
-
-#: Share of the ticks without their voltage above which the errors are those of the machine: with 0.016 the table was
-#: as with none, with 0.5 every model was off by a fifth of the range.
+#: Share of the ticks without their voltage above which the errors are those of the machine: at 0.016 the table did not
+#: change, at 0.5 every model was off by a fifth of the range.
 MOST_LATE = 0.02
 PHASE_TITLES = {"before": "before the change", "first_second": "first second after", "settled": "settled"}
 
 
 def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
-    """MAE (2.43), RMSE (2.44) and maximum of an error, in percent of the commanded range, phase by phase."""
+    """MAE (2.43), RMSE (2.44) and maximum of an error, in percent of the commanded range, by phase."""
     percent = 100.0 * error_um / plan.range_um
     return {
         name: {
@@ -33,7 +30,7 @@ def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
 
 
 def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
-    """Round trips of queries: how many, median and 99th percentile in µs, and how many came too late to be used."""
+    """Round trips of queries: count, median and 99th percentile in µs, and how many came too late."""
     if seconds.size == 0:
         return {"count": 0, "p50_us": None, "p99_us": None, "late": late}
     p50, p99 = np.percentile(seconds * 1e6, [50, 99])
@@ -41,19 +38,19 @@ def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
 
 
 def clock_missed(ticks: dict[str, int]) -> str:
-    """What to make of a run whose voltages often came too late, in words; "" where the machine kept up."""
+    """A warning if voltages often came too late; "" if the machine kept up."""
     share = ticks["late"] / max(1, ticks["count"])
     if share <= MOST_LATE:
         return ""
     return (
         f"THIS MACHINE DID NOT KEEP UP: {100.0 * share:.0f} % of the ticks went without their voltage, so the table "
-        "tells of that and not of the models. Close what else runs, or do without a clock: dehyst demo --fast is the "
+        "shows the delays and not the models. Close other programs, or run without a clock: dehyst demo --fast is the "
         "same run in one process"
     )
 
 
 def table(summary: dict[str, Any]) -> str:
-    """The result as a person reads it: a row a model, three numbers a phase."""
+    """The result as a table: one row per model, three numbers per phase."""
     width = max(len(title) for title in MODELS.values())
     head = " " * width + "".join(f" | {title:^23}" for title in PHASE_TITLES.values())
     units = f"{'% of ' + format(summary['range_um'], '.0f') + ' µm':<{width}}" + " |    MAE    RMSE     max" * 3
@@ -70,14 +67,14 @@ def table(summary: dict[str, Any]) -> str:
 
 @dataclass(slots=True)
 class DemoRun:
-    """Motion of the twin stages, by model, and what happened on the way.
+    """Motion of the twin stages, by model, and the counts of a run.
 
     Attributes
     ----------
-    y_um, u_V, std_V : by model, (ticks,); what the sensor read, what was applied, its standard deviation.
-    query_s : durations of the feedforward queries, s. late_queries : answers that came after their block was due.
-    samples : counts ``sent``, ``received``, ``learnt`` of the stage that teaches.
-    ticks : counts ``count``, ``late`` (a command was not there in time) and ``bare_late`` (the bare loop's).
+    y_um, u_V, std_V : by model, (ticks,); the reading, the voltage applied, its standard deviation.
+    query_s : durations of the feedforward queries, s. late_queries : answers after their block was due.
+    samples : counts ``sent``, ``received``, ``learnt`` of the stage that the service learns from.
+    ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
     notes : records for the viewer (events, diagnostics, status), in order.
     """
 
@@ -110,5 +107,5 @@ class DemoRun:
 
 
 def empty(plan: Plan) -> dict[str, FloatArray]:
-    """An array of ticks for each model, NaN where nothing is known yet."""
+    """An array of ticks for each model, filled with NaN."""
     return {name: np.full(plan.ticks, np.nan) for name in MODELS}

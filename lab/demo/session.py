@@ -1,4 +1,4 @@
-"""One demonstration from beginning to end: record, identify, run, score, draw, and leave the files behind."""
+"""One demonstration: record, identify, run, score, draw, and write the files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sim.recordings import read, repaired
 from sim.stage.stage import Stage
 
 Say = Callable[[str], None]
-#: Files and folders that a run writes; an older run's are removed first, nothing else is touched.
+#: Files and folders of a run. Those of an older run are removed first; other files stay.
 OURS = ("summary.json", "tracking.png", "loops.png", "demo.rrd", "recording", "identification", "model.npz", "logs")
 
 
@@ -47,9 +47,9 @@ class Done:
 def run(
     out: Path, *, fast: bool, duration_s: float, seed: int, view: list[str], say: Say, stage: Path | None = None
 ) -> Done:
-    """Run it all and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
+    """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
 
-    Raises InputError on a folder that cannot be used, ServiceError where a process failed.
+    Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
     own = stage.resolve() if stage is not None else None
     clear_output(out, OURS)
@@ -89,7 +89,7 @@ def run(
 
 
 class _Bar:
-    """A line of progress every five seconds of the run, and at its end."""
+    """Prints a line of progress every five seconds of the run, and at its end."""
 
     def __init__(self, total_s: float, say: Say) -> None:
         self._total_s, self._say, self._next_s = total_s, say, 5.0
