@@ -1,4 +1,4 @@
-"""Compile every compiled loop of the simulation once, so that no process pays for it at start."""
+"""Compiles the loops of the simulation once, so that no process waits for it at start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim.stage.stage import Stage
 
 
 def warm() -> None:
-    """Run every effect and every preset over two samples, and the diagnosis' loops."""
+    """Run every effect and every preset over two samples, and the loops of the diagnosis."""
     u_V = np.zeros(2)
     for kind in EFFECTS.values():
         if kind.block is not None:

@@ -1,8 +1,8 @@
-"""What has changed between a stretch in which a model was good and a recent one: causes, by what they explain.
+"""What has changed in a stage between a stretch in which a model was good and a recent one.
 
-Both stretches are explained jointly: what the frozen model never held (common columns, over both) and what has come
-since (the causes' columns, over the recent one alone). A cause is named where blocks of data that were not used
-for its numbers become clearly better with it. The model is frozen: nothing that has learnt the change away hides it.
+Both stretches are explained together: by columns that act in both (what the frozen model always lacked) and by columns
+of possible causes that act in the recent one alone. A cause is named where it clearly improves the prediction of
+blocks that were not used for its numbers. The model is frozen, so no learning can hide the change.
 """
 
 from __future__ import annotations
@@ -14,18 +14,15 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, InverseModel
-from sim.changes.columns import OFFSET, Scales, Stretch
-from sim.changes.regression import Problem, enough, problem_of, solve_scaled
-
-# --- What a comparison of two stretches has found: the causes with their numbers, and the words for them.
-
+from sim.changes.regression import ChangeRegression, regression_of, require_enough, solve_scaled
+from sim.changes.signatures import OFFSET, Scales, Stretch
 
 SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Change:
-    """One cause: its numbers with 95 % intervals, and the share of the held-out squared error that it removed."""
+class FoundChange:
+    """A cause with its numbers, their 95 % intervals, and the share of the held-out squared error that it removes."""
 
     name: str
     alternatives: tuple[str, ...]
@@ -37,14 +34,19 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What has changed. Errors are rms of the frozen model, as displacement, µm.
+    """Result of a comparison.
 
-    ``verdict``: ``unchanged``; ``changed``, by ``changes``; ``unexplained``: grown, and no cause known explains it.
-    ``gain_t_s``, ``gain``: the stage's relative gain over time, stretch by stretch, against the reference.
+    Attributes
+    ----------
+    verdict : ``unchanged``; ``changed``; or ``unexplained``, where the error grew and no known cause explains it.
+    changes : the causes, the most important one first.
+    before_um, recent_um, left_um : rms error of the frozen model as displacement, µm, in the reference, in the recent
+        stretch, and there after the causes.
+    text : the result in words.
     """
 
     verdict: str
-    changes: tuple[Change, ...]
+    changes: tuple[FoundChange, ...]
     before_um: float
     recent_um: float
     left_um: float
@@ -74,7 +76,7 @@ class Comparison:
 
 
 def phrase(name: str, values: FloatArray, scales: Scales) -> str:
-    """A cause as a person would say it, with its size."""
+    """A cause and its size in words."""
     first = float(values[0])
     match name:
         case "gain_drift":
@@ -94,30 +96,30 @@ def phrase(name: str, values: FloatArray, scales: Scales) -> str:
     return name
 
 
-#: A cause must remove this share of the held-out squared error, by so many standard errors.
+#: Least share of the held-out squared error that a cause must remove, and by how many standard errors.
 LEAST_GAIN, LEAST_SIGMAS = 0.1, 3.0
-#: One that does as well within this share of the gain, or within so many standard errors, is an alternative.
+#: A cause that does as well within this share of the gain, or within so many standard errors, is an alternative.
 CLOSE_SHARE, CLOSE_SIGMAS = 0.05, 2.0
-#: The error has grown where it is this much larger than before (rms), and more than this share of the range.
+#: The rms error has grown where it exceeds this multiple of the former, and by more than this share of the range.
 GROWN, GROWN_SHARE = 1.3, 5e-4
 MOST_CAUSES = 3
 
 
 def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Comparison:
-    """What has changed from ``reference`` to ``recent``, seen by ``model`` frozen.
+    """What has changed from ``reference`` to ``recent``, measured with the frozen ``model``.
 
-    Raises TooFewSamples where a stretch is too short, InputError where the reference does not move.
+    Raises TooFewSamples where a stretch is too short, InputError where the stage does not move in the reference.
     """
     for name, stretch in (("reference", reference), ("recent", recent)):
-        enough(name, int(stretch.scored.sum()), stretch.dt_s)
+        require_enough(name, int(stretch.scored.sum()), stretch.dt_s)
     scales = Scales.of(reference)
     if not (np.isfinite(scales.slope_V_per_um) and scales.slope_V_per_um != 0.0 and scales.range_um > 0.0):
-        raise InputError("reference: got a stretch that does not move, expected motion: move the stage")
-    problem, common = problem_of(model, reference, recent, scales)
+        raise InputError("reference: got a stretch without motion, expected a moving stage: move it")
+    problem, common = regression_of(model, reference, recent, scales)
     chosen, gains = _search(problem)
     after = problem.errors(chosen)
     now = problem.recent
-    # What the error was and has become: with the common part as the reference alone knows it.
+    # Errors before and now, without the common part as the reference alone determines it.
     first = solve_scaled(common[~now], problem.r[~now])
     flat = (problem.r - common @ first) / scales.slope_V_per_um
     before_um, recent_um = _rms(flat[~now]), _rms(flat[now])
@@ -126,7 +128,7 @@ def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Compari
     grown = recent_um > GROWN * before_um and recent_um - before_um > GROWN_SHARE * scales.range_um
     more = left_um > GROWN * before_um and left_um - before_um > max(GROWN_SHARE * scales.range_um, 0.1 * recent_um)
     if not grown:
-        # Small numbers that only trade places with one another are no news.
+        # Without a larger error, causes with small numbers only compensate one another.
         verdict, text, changes = "unchanged", "nothing has changed that this motion shows", ()
     elif changes:
         verdict, text = "changed", f"the model's error grew: {'; '.join(c.text for c in changes)}"
@@ -134,15 +136,15 @@ def compare(model: InverseModel, reference: Stretch, recent: Stretch) -> Compari
     elif more:
         verdict, text = "unexplained", "the model's error grew, and no known cause explains it"
     else:
-        verdict, text = "unchanged", "no more has changed than an offset too small for a name"
+        verdict, text = "unchanged", "only an offset has changed, by too little to name it"
     return Comparison(verdict, changes, before_um, recent_um, left_um, text)
 
 
-def _search(problem: Problem) -> tuple[tuple[int, ...], dict[int, float]]:
-    """Causes one after the other, the one that removes most first; and the share that each removed.
+def _search(problem: ChangeRegression) -> tuple[tuple[int, ...], dict[int, float]]:
+    """Choose causes one by one, the one that removes most first. Returns them, and the share that each removes.
 
-    An offset is in from the start, because creep and warmth always move one a little; whether it is worth a name
-    is asked at the end. ``gains`` has an entry for each cause that is.
+    An offset is included from the start, because creep and temperature always move it a little. Whether it counts as a
+    change is decided at the end; the shares have an entry only for causes that do.
     """
     offset = next(i for i, c in enumerate(problem.causes) if c.name == OFFSET)
     chosen: tuple[int, ...] = (offset,)
@@ -154,48 +156,48 @@ def _search(problem: Problem) -> tuple[tuple[int, ...], dict[int, float]]:
             if i in chosen or not _large(problem, (*chosen, i)):
                 continue
             errors = problem.errors((*chosen, i))
-            share, sigmas = _won(problem, now, errors)
+            share, sigmas = _improvement(problem, now, errors)
             if share > LEAST_GAIN and sigmas > LEAST_SIGMAS and (best is None or share > best[0]):
                 best = share, i, errors
         if best is None:
             break
         gains[best[1]] = best[0]
         chosen, now = (*chosen, best[1]), best[2]
-    share, sigmas = _won(problem, problem.errors(chosen[1:]), now)
+    share, sigmas = _improvement(problem, problem.errors(chosen[1:]), now)
     if share > LEAST_GAIN and sigmas > LEAST_SIGMAS and _large(problem, (*chosen[1:], offset)):
         gains[offset] = share
     return (chosen, gains) if gains else _alone(problem, chosen)
 
 
-def _alone(problem: Problem, otherwise: tuple[int, ...]) -> tuple[tuple[int, ...], dict[int, float]]:
-    """The one cause that explains most without an offset beside it, where a short or narrow motion mixes the two up."""
+def _alone(problem: ChangeRegression, otherwise: tuple[int, ...]) -> tuple[tuple[int, ...], dict[int, float]]:
+    """The single cause that explains most without an offset, for motion too short or narrow to separate the two."""
     none = problem.errors(())
     best: tuple[float, int] | None = None
     for i in range(len(problem.causes)):
-        share, sigmas = _won(problem, none, problem.errors((i,)))
+        share, sigmas = _improvement(problem, none, problem.errors((i,)))
         good = share > LEAST_GAIN and sigmas > LEAST_SIGMAS and _large(problem, (i,))
         if good and (best is None or share > best[0]):
             best = share, i
     return ((best[1],), {best[1]: best[0]}) if best is not None else (otherwise, {})
 
 
-def _won(problem: Problem, before: FloatArray, after: FloatArray) -> tuple[float, float]:
-    """Share of the held-out squared error that is gone, and by how many standard errors."""
+def _improvement(problem: ChangeRegression, before: FloatArray, after: FloatArray) -> tuple[float, float]:
+    """Removed share of the held-out squared error, and by how many standard errors."""
     base = problem.by_block(before)
     won = base - problem.by_block(after)
     share = float(won.sum() / max(float(base.sum()), 1e-30))
     return share, float(won.sum() / max(float(np.std(won)) * np.sqrt(won.size), 1e-30))
 
 
-def _large(problem: Problem, chosen: tuple[int, ...]) -> bool:
-    """Whether the last of ``chosen`` has a number beyond the size below which nobody would call it a change."""
+def _large(problem: ChangeRegression, chosen: tuple[int, ...]) -> bool:
+    """Whether a number of the last of ``chosen`` exceeds the least size that counts as a change."""
     cause = problem.causes[chosen[-1]]
     beta, _, _ = problem.fit(chosen)
     return bool(np.max(np.abs(beta[-len(cause.numbers) :])) > cause.least)
 
 
-def _rivals(problem: Problem, chosen: tuple[int, ...], place: int) -> tuple[str, ...]:
-    """Causes that do as well in the place of ``chosen[place]``, within what these blocks can tell."""
+def _rivals(problem: ChangeRegression, chosen: tuple[int, ...], place: int) -> tuple[str, ...]:
+    """Causes that do as well as ``chosen[place]`` within the accuracy of these blocks."""
     rest = chosen[:place] + chosen[place + 1 :]
     mine, less = problem.by_block(problem.errors(chosen)), problem.by_block(problem.errors(rest))
     gain = float(less.sum() - mine.sum())
@@ -210,7 +212,9 @@ def _rivals(problem: Problem, chosen: tuple[int, ...], place: int) -> tuple[str,
     return tuple(names)
 
 
-def _named(problem: Problem, chosen: tuple[int, ...], gains: dict[int, float], scales: Scales) -> tuple[Change, ...]:
+def _named(
+    problem: ChangeRegression, chosen: tuple[int, ...], gains: dict[int, float], scales: Scales
+) -> tuple[FoundChange, ...]:
     beta, sigma, _ = problem.fit(chosen)
     at = problem.common.shape[1]
     out = []
@@ -227,7 +231,7 @@ def _named(problem: Problem, chosen: tuple[int, ...], gains: dict[int, float], s
         text = phrase(cause.name, values, scales)
         if others:
             text += f" (or {', '.join(others)})"
-        out.append(Change(cause.name, others, numbers, intervals, gains[i], text))
+        out.append(FoundChange(cause.name, others, numbers, intervals, gains[i], text))
     return tuple(sorted(out, key=lambda c: -c.heldout_gain))
 
 

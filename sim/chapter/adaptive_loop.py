@@ -1,8 +1,8 @@
-"""Control with a model that learns while it serves: feedforward in blocks, each from a snapshot of the past.
+"""Control and replay with a model that learns while it serves, in one process and without a clock.
 
-Block by block, the newest snapshot that has seen no sample of the last ``delay`` gives the voltages of the next block;
-the stage is run on them, feedback added sample by sample; then its samples teach. That is what the service does, in
-one process and without a clock.
+Block by block, a snapshot that has seen no sample of the last ``delay_blocks`` blocks gives the voltages of the next
+one. The stage runs on them, with feedback added sample by sample, and its samples then teach the model. That is what
+the service does.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ from sim.stage.stage import Stage, StageState
 
 @dataclass(frozen=True, slots=True)
 class BlockConfig:
-    """block : samples answered at once. delay_blocks : age of the snapshot that answers, blocks, at least 1."""
+    """block : samples answered at once, >= 1. delay_blocks : age of the answering snapshot, blocks, >= 1.
+
+    Raises InputError on smaller values.
+    """
 
     block: int = 20
     delay_blocks: int = 3
@@ -40,10 +43,10 @@ def track_learning(
     state: StageState | None = None,
     config: BlockConfig | None = None,
 ) -> Run:
-    """Follow ``reference`` with the feedforward of a model that learns on the way; ``online`` and ``state`` change.
+    """Follow ``reference`` with the feedforward of a model that learns; ``online`` and ``state`` are advanced.
 
-    Without ``state`` the stage is at rest. The memory begins at rest at 0 µm and travels from block to block.
-    Limits, and the feedback's integral at them, are handled as in ``sim.stage.closed_loop.track``.
+    Without ``state`` the stage starts at rest. The memory starts at rest at 0 µm and is passed from block to block.
+    Limits and the integral of the feedback are handled as in ``sim.stage.closed_loop.track``.
     """
     config = config or BlockConfig()
     state = state or stage.initial_state()
@@ -87,11 +90,11 @@ def replay(
     dt_s: float,
     config: BlockConfig | None = None,
 ) -> FloatArray:
-    """Voltages (n,) that a learning model would have given for a recorded motion, learning from it block by block.
+    """Voltages (n,) V that a learning model would have given for a recorded motion, learning from it block by block.
 
-    ``motion`` (n, 3): smoothed displacement, velocity, acceleration; ``u_V``, ``y_um`` (n,): what was applied and
-    read. A block is answered by a snapshot that has seen nothing of it, nor of the ``delay_blocks - 1`` before.
-    ``online`` changes. Raises InputError on shapes.
+    ``motion`` (n, 3) is smoothed displacement, velocity and acceleration; ``u_V``, ``y_um`` (n,) are the applied
+    voltages and the readings. A block is answered by a snapshot that has seen neither it nor the ``delay_blocks - 1``
+    blocks before. ``online`` is advanced. Raises InputError on bad shapes.
     """
     config = config or BlockConfig()
     n = u_V.size

@@ -1,4 +1,4 @@
-"""Figs. 2.2 and 2.3: how the loop widens with amplitude and with frequency, and what one axis does to the other."""
+"""Figs. 2.2 and 2.3: width of the loop over amplitude and frequency, and cross-talk between the axes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,14 @@ from sim.stage.stage import Stage
 
 AMPLITUDES_V = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 FREQUENCIES_HZ = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
-#: Peak of the sines, V; a cycle is watched once this many have passed.
+#: Peak of the sines, V, and number of cycles; the last one is evaluated.
 _SINE_V = 8.0
 _CYCLES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Width:
-    """One loop: its input's amplitude V and frequency Hz, its stroke µm, and its largest width at one voltage.
-
-    ``frequency_Hz`` is that of the whole wave; a triangle's follows from its rate.
-    """
+    """One loop: amplitude V and frequency Hz of the input, stroke µm, and largest width at one voltage µm."""
 
     amplitude_V: float
     frequency_Hz: float
@@ -33,13 +30,13 @@ class Width:
 
     @property
     def width_pct(self) -> float:
-        """Width in percent of the loop's own stroke."""
+        """Width in percent of the stroke."""
         return 100.0 * self.width_um / self.stroke_um
 
 
 @dataclass(frozen=True, slots=True)
 class Characterisation:
-    """Data of Fig. 2.2 (both axes in turn) and Fig. 2.3. ``second_axis`` and cross-talks are None on one axis."""
+    """Data of Fig. 2.2 (each axis in turn) and Fig. 2.3; ``second_axis`` and cross-talks are None for a single axis."""
 
     triangles: Record
     second_axis: Record | None
@@ -51,9 +48,9 @@ class Characterisation:
 
 
 def loop_width(u_V: FloatArray, y_um: FloatArray) -> float:
-    """Largest distance in y (µm) between the rising and the falling half of one loop, (n,) each, from its bottom.
+    """Largest difference in y, µm, between the falling and the rising half of a loop (n,) that begins at its bottom.
 
-    The halves meet at the largest voltage; both are read at the same 400 voltages between 2 and 98 % of the range.
+    The halves meet at the largest voltage and are compared at 400 voltages between 2 and 98 % of the range.
     """
     top = int(np.argmax(u_V))
     low, high = float(np.min(u_V)), float(u_V[top])
@@ -88,6 +85,6 @@ def characterise(config: StageConfig) -> Characterisation:
 
 
 def _share(of_um: FloatArray, by_um: FloatArray) -> float:
-    """Displacement of the axis at rest against that of the driven one, by least squares, percent."""
+    """Displacement of the axis at rest relative to that of the driven one, by least squares, percent."""
     driven = by_um - by_um[0]
     return 100.0 * float(driven @ (of_um - of_um[0]) / (driven @ driven))

@@ -12,11 +12,8 @@ from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, OnlineModel
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.online import BoucWenOnline
+from baselines.competition.contestants import online_form
 from baselines.fit import fit_bouc_wen, fit_mpi
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Score
 from sim.chapter.references import control_references
@@ -37,21 +34,21 @@ FROZEN = {
     "lssvm": "LSSVM (y, dy/dt)",
     "lssvm_memory": "LSSVM with memory",
 }
-#: The same, learning: what each starts from.
+#: Learning models: label, and the frozen model that each starts from.
 LEARNING = {
     "bouc_wen_online": ("Bouc-Wen, tracking filter", "bouc_wen"),
     "mpi_online": ("MPI, recursive least squares", "mpi"),
     "mpi_lag_online": ("MPI with a lag, recursive", "mpi_lag"),
     "lssvm_adaptive": ("LSSVM with memory, adaptive", "lssvm_memory"),
 }
-#: The change of the stage that the adapting test makes, and when.
+#: Relative change of the gain in the test of adaptation, and its time, s.
 GAIN_CHANGE = -0.06
 CHANGE_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Inverse:
-    """An identified inverse model and the time its identification took, s."""
+    """An identified inverse model and the duration of its identification, s."""
 
     model: InverseModel
     seconds: float
@@ -70,10 +67,14 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """Everything of section 2.5.
+    """The results of section 2.5.
 
-    ``pid`` : the gains used, Ziegler-Nichols' PI from ``ultimate``. ``chapter_gains_stable`` : whether the chapter's
-    K_p is below the ultimate gain. ``loops`` : all runs. ``changed`` : runs on the stage whose gain drops.
+    Attributes
+    ----------
+    ultimate, pid : ultimate gain of the stage, and the Ziegler-Nichols PI gains from it, which the runs use.
+    chapter_gains_stable : whether the chapter's K_p is below the ultimate gain.
+    inverses : the frozen models. loops : all runs. changed : runs on the stage whose gain drops.
+    range_um : motion range, which percentages refer to.
     """
 
     ultimate: UltimateGain
@@ -114,18 +115,15 @@ def identify_inverses(
 
 
 def learner_of(model: InverseModel) -> OnlineModel:
-    """The learning form of a frozen model. Raises InputError for a model that has none here."""
-    if isinstance(model, LssvmInverse):
-        return Learner.from_model(model)
-    if isinstance(model, BoucWenInverse):
-        return BoucWenOnline(model)
-    if isinstance(model, MpiInverse):
-        return MpiOnline(model)
-    raise InputError(f"model: got {type(model).__name__}, expected an LSSVM, a Bouc-Wen or an MPI inverse")
+    """The learning form of a frozen model. Raises InputError for a model that has none."""
+    online = Learner.from_model(model) if isinstance(model, LssvmInverse) else online_form(model)
+    if online is None:
+        raise InputError(f"model: got {type(model).__name__}, expected an LSSVM, a linear, Bouc-Wen or MPI inverse")
+    return online
 
 
 def changing(config: StageConfig, at_s: float, gain: float = GAIN_CHANGE) -> StageConfig:
-    """The same stage, whose gain changes by ``gain`` (relative) at ``at_s``; adds the effect where it is missing."""
+    """The stage with a relative change of the gain by ``gain`` at ``at_s``, s."""
     if "gain_drift" not in config.effects:
         config = replace(config, effects=config.effects + effect("gain_drift", ramp_per_min=0.0))
     return replace(config, changes=((at_s, {"gain_drift.gain": gain}),))
@@ -134,9 +132,10 @@ def changing(config: StageConfig, at_s: float, gain: float = GAIN_CHANGE) -> Sta
 def run_control(
     data: Experiments, *, quick: bool = False, clock: Clock = lambda: 0.0, progress: Progress = lambda _: None
 ) -> Control:
-    """Identify the inverses, find the gains on the stage, and run every model with every controller.
+    """Identify the inverses, find the gains of the stage, and run every model with every controller.
 
-    ``quick`` : fewer and shorter references; learning models with feedback on the first of them only.
+    ``quick``: fewer and shorter references, and learning models with feedback on the first reference only. ``clock``
+    gives the time, s, with which identifications are measured.
     """
     stage = Stage(data.config)
     inverses = identify_inverses(data, clock, progress)
@@ -170,14 +169,14 @@ def run_control(
 
 
 def _learnt(stage: Stage, reference: Reference, model: InverseModel, pid: PID | None) -> Run:
-    """A run of a learning model that begins from rest with what identification alone gave it."""
+    """A run of a learning model that starts from rest with its identified parameters."""
     return track_learning(stage, reference, learner_of(model), pid=pid)
 
 
 def _changed(
     data: Experiments, inverses: dict[str, Inverse], named: tuple[str, Reference], progress: Progress
 ) -> tuple[Loop, ...]:
-    """Feedforward alone, frozen and learning, on the stage whose gain drops by 6 % while it runs."""
+    """Feedforward with frozen and with learning models on the stage whose gain drops during the run."""
     name, reference = named
     progress(f"following {name} while the gain drops by {-100 * GAIN_CHANGE:g} %")
     stage = Stage(changing(data.config, CHANGE_S))

@@ -1,7 +1,7 @@
-"""The recordings that every model of the reproduction is identified on and judged by.
+"""The records that every model of the reproduction is identified on and scored by.
 
-The stage runs at 1 ms. The chapter's 500 samples are every twentieth of them; the voltage between those samples is
-known, since it was commanded, and models with memory are run on it.
+The stage runs at 1 ms. The chapter's 500 samples are every twentieth of them. The commanded voltage is known between
+those samples, and models with memory run on it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from sim.stage.config import StageConfig
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 
-#: Control period of the chapter, s, and how many of them lie between two of its 500 samples.
+#: Control period of the chapter, s, and number of periods between two of its 500 samples.
 DT_S = 1e-3
 EVERY = 20
-#: A record that begins above 0 V is led in by a ramp of this length, s.
+#: Length of the ramp that precedes a record which begins above 0 V, s.
 _LEAD_S = 0.5
 
 
@@ -33,7 +33,7 @@ class Score:
 
     @staticmethod
     def of(error_um: FloatArray, range_um: float) -> Score:
-        """Of errors (n,) µm; samples that are not finite make all three NaN."""
+        """The score of errors (n,) µm; NaN where a sample is not finite."""
         size = np.abs(error_um)
         scale = 100.0 / range_um
         return Score(scale * float(np.mean(size)), scale * float(np.sqrt(np.mean(size**2))), float(np.max(size)))
@@ -56,17 +56,17 @@ class Record:
 
     @property
     def coarse_u_V(self) -> FloatArray:
-        """Voltages at those."""
+        """Voltages of the 0.02 s samples."""
         return np.ascontiguousarray(self.u_V[::EVERY])
 
     @property
     def coarse_y_um(self) -> FloatArray:
-        """Readings at those."""
+        """Readings of the 0.02 s samples."""
         return np.ascontiguousarray(self.y_um[::EVERY])
 
 
 def record(stage: Stage, name: str, u_V: FloatArray, u2_V: FloatArray | None = None) -> Record:
-    """Run ``u_V`` (n,) V on the first axis from rest; a ramp is put before where it does not begin near 0 V."""
+    """Run ``u_V`` (n,) V on the first axis from rest; a ramp precedes it unless it begins near 0 V."""
     u = np.asarray(u_V, dtype=np.float64)
     if abs(u[0]) > 0.05:
         n = round(_LEAD_S / stage.config.dt_s)
@@ -80,7 +80,7 @@ def record(stage: Stage, name: str, u_V: FloatArray, u2_V: FloatArray | None = N
 
 @dataclass(frozen=True, slots=True)
 class Experiments:
-    """The records of one stage: (2.37), (2.45), and the family that the chapter lacks."""
+    """The records of one stage: (2.37), (2.45), and a third family that the chapter lacks."""
 
     config: StageConfig
     training: Record
@@ -89,7 +89,7 @@ class Experiments:
 
     @property
     def range_um(self) -> float:
-        """Motion range that errors are given in percent of: that of the training record."""
+        """Motion range of the training record, µm, which percentages refer to."""
         return float(np.ptp(self.training.y_um))
 
 

@@ -25,13 +25,13 @@ from adaptive.tuning.search import InferenceConfig, infer
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, EVERY
 
-#: The chapter's start, one width for both inputs.
+#: The chapter's starting values, with one width for both inputs.
 CHAPTER_INFERENCE = InferenceConfig(method="three_level", ard=False, starts=((100.0, 1.0),))
-#: Memory of the forward model: more plays than the inverse is served with, for displacement is free of noise here.
+#: Memory of the forward model; it has more plays than the served inverse, because the commanded voltage has no noise.
 MEMORY = IdentifyConfig(plays=20, slow=4, kernel_plays=3, arcs=(0.03, 0.1, 0.3, 0.8))
-#: Its evidence: one width for all inputs, for the little that is left over would let single widths run to noise.
+#: Its inference: one width for all inputs, because the small residual would let single widths fit noise.
 MEMORY_INFERENCE = InferenceConfig(ard=False, width_range=(0.1, 50.0))
-#: Noise of the linear part that its prior reckons with, as a share of the range, and rounds to find it.
+#: Least noise of the linear part, as a share of the range, and rounds of its estimation.
 _FLOOR, _ROUNDS = 1e-4, 4
 
 
@@ -42,7 +42,7 @@ def two_inputs(u_V: FloatArray, dt_s: float = DT_S * EVERY) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class TwoInputLssvm:
-    """The chapter's forward model; ``evidence`` is that of its hyper-parameters, None where these were given."""
+    """The chapter's forward model. ``evidence``: that of its hyper-parameters, None where these were given."""
 
     model: LssvmModel
     inputs: MinMaxScaling
@@ -95,12 +95,12 @@ class MemoryLssvm:
         return np.asarray(basis @ self.beta + self.kernel.predict(kernel), dtype=np.float64)
 
     def linear_part(self, u_V: FloatArray) -> FloatArray:
-        """The same without the kernel, to see what each is worth."""
+        """The prediction without the kernel part, µm."""
         return np.asarray(self._inputs(u_V)[0] @ self.beta, dtype=np.float64)
 
 
 def _motion(u_V: FloatArray) -> FloatArray:
-    """(n, 3) voltage V, V/s, V/s² of a commanded voltage, which carries no noise."""
+    """(n, 3) voltage V and its derivatives V/s, V/s², of a commanded voltage without noise."""
     rate = np.gradient(u_V, DT_S)
     return np.column_stack([u_V, rate, np.gradient(rate, DT_S)])
 
@@ -112,9 +112,9 @@ def _features(features: FeatureMap, u_V: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def posterior_mean(basis: FloatArray, target: FloatArray, deviations: FloatArray, floor: float) -> FloatArray:
-    """(p,) mean of a linear model under a Gaussian prior (p,) deviations; the noise from its own residual.
+    """(p,) posterior mean of a linear model under a Gaussian prior with standard ``deviations`` (p,).
 
-    ``basis`` (n, p), ``target`` (n,); the noise is never taken below ``floor``.
+    ``basis`` (n, p), ``target`` (n,). The noise is estimated from the residual and is at least ``floor``.
     """
     gram, moment = basis.T @ basis, basis.T @ target
     variance = float(np.var(target)) * 1e-4
@@ -129,11 +129,11 @@ def posterior_mean(basis: FloatArray, target: FloatArray, deviations: FloatArray
 def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = MEMORY) -> MemoryLssvm:
     """From the commanded voltage (m,), 1 ms apart, and displacements (ceil(m/20),), 0.02 s apart.
 
-    Raises InputError where the lengths do not belong together.
+    Raises InputError where the lengths do not fit together.
     """
     if y_um.shape != u_fine_V[::EVERY].shape:
         raise InputError(f"y_um: got {y_um.shape}, expected {u_fine_V[::EVERY].shape}: one for {EVERY} of u_fine_V")
-    # Thresholds and scales from the voltage, which plays the part that displacement has in the inverse.
+    # Thresholds and scales come from the voltage, which has the role of the displacement in the inverse.
     features = replace(design_features(_motion(u_fine_V), DT_S, config, True), y_rest_um=0.0)
     basis, kernel = _features(features, u_fine_V)
     span = float(np.ptp(y_um))

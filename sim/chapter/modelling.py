@@ -1,7 +1,7 @@
-"""Tables 2.1 to 2.4, Figs. 2.8 to 2.15: every forward model identified on (2.37), judged on (2.45) and further.
+"""Tables 2.1 to 2.4, Figs. 2.8 to 2.15: every forward model identified on (2.37), scored on (2.45) and further records.
 
-All are identified from the chapter's 500 displacements at 0.02 s. Models with memory run on the voltage that was
-commanded at 1 ms; errors are compared at the 0.02 s samples.
+All are identified from the chapter's 500 displacements at 0.02 s. Models with memory run on the voltage commanded at
+1 ms. Errors are compared at the 0.02 s samples.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True, slots=True)
 class ForwardRun:
-    """One model: what it is, how long its identification took, and how it did.
+    """One identified model and its scores.
 
     Attributes
     ----------
-    key, label, route : short name, its name for people, and how it was identified.
-    parameters : numbers identified. seconds : identification alone, s, by the clock that was given.
+    key, label, route : short name, name for people, and method of identification.
+    parameters : number of identified parameters. seconds : duration of the identification, s.
     training, generalisation : scores on (2.37) and (2.45). third : by record of the third family.
     training_um, generalisation_um : model outputs at the 0.02 s samples, µm.
     """
@@ -68,7 +68,7 @@ def predict(model: Forward, u_V: FloatArray) -> FloatArray:
 def judge(
     key: str, label: str, route: str, model: Forward, parameters: int, seconds: float, data: Experiments
 ) -> ForwardRun:
-    """Run a model over all records and score it."""
+    """Score a model on all records."""
 
     def of(record: Record) -> tuple[Score, FloatArray]:
         out = predict(model, record.u_V)
@@ -100,9 +100,9 @@ def identify_forward(
     clock: Clock = lambda: 0.0,
     progress: Progress = lambda _: None,
 ) -> list[ForwardRun]:
-    """All forward models. ``pso`` adds the chapter's route of ``epochs`` epochs (it needs torch).
+    """All forward models. ``pso`` adds the chapter's swarms over ``epochs`` epochs, which need torch.
 
-    ``clock`` : gives the time in s that identifications are measured with; this package has none of its own.
+    ``clock`` gives the time, s, with which the durations are measured.
     """
     u, y, dt_s = data.training.coarse_u_V, data.training.coarse_y_um, DT_S * EVERY
     runs = []

@@ -1,4 +1,4 @@
-"""What the chapter prints: Tables 2.1 to 2.5 and the figures that its text gives for them. Errors in % of range."""
+"""Values printed in the chapter: Tables 2.1 to 2.5 and figures from its text. Errors are in percent of the range."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class PublishedModel:
-    """One column of Tables 2.4 and 2.5. ``max_um`` is the largest modelling error that the text names."""
+    """One column of Tables 2.4 and 2.5. ``max_um`` is the largest modelling error given in the text."""
 
     parameters: int
     identification_s: float
@@ -65,5 +65,3 @@ INVERSE_HYPER = (741.82, 7.69)
 GAINS = {"K_p": 0.0864, "K_i": 31.1040, "K_d": 0.0}
 #: Fig. 2.2: displacement of the other axis, percent.
 CROSS_TALK_PCT = 1.17
-#: Fig. 2.19 by its text: FF+FB is this share better than FB alone (MAE, RMSE), so that FB alone had these errors.
-FEEDBACK_ALONE_PCT = (0.015 / (1.0 - 0.937), 0.038 / (1.0 - 0.917))

@@ -1,4 +1,4 @@
-"""What the controllers are asked to follow: the answer to (2.45), the chapter's shapes, and a family it lacks."""
+"""References for the controllers: the response to (2.45), the chapter's shapes, and a family that it lacks."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, Experiments, Record
-from sim.signals.references import Reference, demo_reference
+from sim.signals.references import Reference, blend_step, demo_reference
 from sim.signals.sample_times import sample_times
 
 #: Step of the central differences that give velocity and acceleration of a formula, s.
 _STEP_S = 1e-4
-#: Top of the references as a share of the motion range; the feedforward must not ask beyond what was identified.
+#: Top of the references as a share of the motion range, so that they stay within the identified range.
 _TOP = 0.9
 
 
 def from_formula(formula: Callable[[FloatArray], FloatArray], duration_s: float, dt_s: float = DT_S) -> Reference:
-    """Reference of a smooth formula y(t), µm; its derivatives by central differences with 0.1 ms steps."""
+    """Reference of a smooth formula y(t), µm; derivatives by central differences with 0.1 ms steps."""
     t = sample_times(duration_s, dt_s)
     now, before, after = formula(t), formula(t - _STEP_S), formula(t + _STEP_S)
     return Reference(t, now, (after - before) / (2.0 * _STEP_S), (after - 2.0 * now + before) / _STEP_S**2)
@@ -37,7 +37,7 @@ def chapter_reference(range_um: float, duration_s: float = 10.0) -> Reference:
 
 
 def training_reference(range_um: float, duration_s: float = 10.0) -> Reference:
-    """(2.37) in displacement, scaled to 90 % of the range: what a model meets that is asked what it was taught."""
+    """(2.37) in displacement, scaled to 90 % of the range: the motion of the training record."""
     scale = _TOP * range_um / 2.0
 
     def formula(t: FloatArray) -> FloatArray:
@@ -48,18 +48,17 @@ def training_reference(range_um: float, duration_s: float = 10.0) -> Reference:
 
 
 def sine_reference(range_um: float, frequency_Hz: float = 5.0, duration_s: float = 4.0) -> Reference:
-    """A plain sine from 0 to 80 % of the range, whose size rises smoothly over the first half second."""
+    """A sine from 0 to 80 % of the range, whose amplitude rises smoothly over the first half second."""
 
     def formula(t: FloatArray) -> FloatArray:
-        rise = np.clip(t / 0.5, 0.0, 1.0)
-        size = rise**4 * (35.0 - 84.0 * rise + 70.0 * rise**2 - 20.0 * rise**3)
+        size = blend_step(np.clip(t / 0.5, 0.0, 1.0))[0]
         return np.asarray(0.4 * range_um * size * (1.0 - np.cos(2.0 * np.pi * frequency_Hz * t)), dtype=np.float64)
 
     return from_formula(formula, duration_s)
 
 
 def answered_reference(record: Record) -> Reference:
-    """The displacement that the stage made in a record, smoothed with zero phase: surely within its reach."""
+    """The displacement of the stage in a record, smoothed with zero phase, which is within its reach."""
     motion = smooth_recording(record.y_um, SmootherConfig.for_rate(DT_S))
     y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
     return Reference(record.t_s, y, v, a)
@@ -68,9 +67,9 @@ def answered_reference(record: Record) -> Reference:
 def control_references(data: Experiments, quick: bool = False) -> dict[str, Reference]:
     """References by name; the first is that of Table 2.5, the last two are the family that the chapter lacks.
 
-    The reference of Fig. 2.17a is only drawn in the chapter. The first here is what the stage answered to (2.45): it
-    leaves rest as the stage does, and comes back to where it comes back by itself. The second has the same shape but
-    goes back to 0 µm each time, where the training record never returns to. ``quick`` leaves out both shapes in µm.
+    The chapter only draws the reference of Fig. 2.17a. The first one here is the response of the stage to (2.45): it
+    leaves rest and returns as the stage does. The second has the same shape but returns to 0 µm each time, which the
+    training record never does. ``quick`` leaves out the two shapes in µm.
     """
     range_um = data.range_um
     found = {"answer to (2.45)": answered_reference(data.generalisation)}

@@ -1,8 +1,7 @@
-"""Bouc-Wen identified from 500 displacements with the voltage known between them.
+"""Bouc-Wen stage identified from 500 displacements with the voltage known between them.
 
-At 0.02 s the input's 3 Hz turns lie between samples, and a line through the sampled voltages cuts them off by up to
-0.07 V. Where the voltage is known at 1 ms, nothing need be cut off: the model is run on that, and compared where there
-are displacements.
+At 0.02 s the 3 Hz turns of the input lie between samples, and a line through the sampled voltages cuts them off by up
+to 0.07 V. Where the voltage is known at 1 ms, the model runs on that and is compared where there are displacements.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bouc_wen.model import BoucWenParameters
 
-#: m/k that is as good as none, s².
-_NO_INERTIA = 1e-9
-#: Fall of the cost, in units of its value an independent sample, that m/k must bring to be believed.
+#: A negligible m/k, s².
+_NEGLIGIBLE_INERTIA = 1e-9
+#: Least decrease of the cost, in units of its value per independent sample, for which m/k is kept.
 _SIGNIFICANT = 10.0
 
 
@@ -42,10 +41,10 @@ def _model(x: FloatArray, base: BoucWenParameters) -> BoucWenParameters:
 def refine_bouc_wen(
     start: BoucWenParameters, u_fine_V: FloatArray, y_um: FloatArray, dt_s: float, every: int
 ) -> tuple[BoucWenParameters, int]:
-    """Least squares from ``start`` on voltages (m,) ``dt_s`` apart and displacements at every ``every``-th of them.
+    """Least squares from ``start`` on voltages (m,) V, ``dt_s`` s apart, and displacements at each ``every``-th one.
 
-    Gain and offset are solved for within; m/k is set as good as none unless it shows. Returns the parameters and the
-    number of evaluations. Raises InputError on lengths that do not belong together.
+    Gain and offset are solved for within the cost; m/k is negligible unless the data show it. Returns the parameters
+    and the number of evaluations. Raises InputError on lengths that do not fit together.
     """
     if y_um.shape != u_fine_V[::every].shape:
         raise InputError(f"y_um: got {y_um.shape}, expected {u_fine_V[::every].shape}: one for {every} of u_fine_V")
@@ -65,7 +64,7 @@ def refine_bouc_wen(
     shape = [start.alpha, math.log(rate), start.beta_per_V / rate, math.log(start.lag_s)]
 
     def solve(inertia_s2: float, free: int) -> tuple[float, FloatArray]:
-        """Cost µm² and parameters; the last, m/k, rests where only four are ``free``."""
+        """Cost µm² and parameters; m/k, the last, is fixed where only four are ``free``."""
         first = np.clip(np.array([*shape, math.log(inertia_s2)]), low + 1e-9, high - 1e-9)
         # 2 alpha beta < beta + gamma keeps the model invertible
         first[0] = min(first[0], 0.49 / first[2])
@@ -86,13 +85,13 @@ def refine_bouc_wen(
         )
         return float(found.cost), whole(found.x)
 
-    plain = solve(_NO_INERTIA, 4)
-    full = min((solve(inertia, 5) for inertia in (start.inertia_s2, _NO_INERTIA)), key=lambda entry: entry[0])
-    centred = linear(full[1])[0]
+    fixed = solve(_NEGLIGIBLE_INERTIA, 4)
+    free = min((solve(inertia, 5) for inertia in (start.inertia_s2, _NEGLIGIBLE_INERTIA)), key=lambda entry: entry[0])
+    centred = linear(free[1])[0]
     centred = centred - centred.mean()
     correlation = float(centred[1:] @ centred[:-1] / (centred @ centred))
-    # what a model cannot follow is no white noise: so many of its samples count as one
+    # model errors are not white: number of independent samples in them
     independent = y_um.size * (1.0 - correlation) / (1.0 + max(correlation, -0.9))
-    best = plain[1] if (plain[0] - full[0]) * independent < _SIGNIFICANT * full[0] else full[1]
+    best = fixed[1] if (fixed[0] - free[0]) * independent < _SIGNIFICANT * free[0] else free[1]
     gain, offset = linear(best)[1]
     return _model(best, start).with_gain(float(gain), float(offset)), evaluations

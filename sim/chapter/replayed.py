@@ -1,7 +1,7 @@
-"""Table 2.4 for inverse models: voltages for the motion of every record, frozen, and learning along the record.
+"""Table 2.4 for inverse models: voltages for the motion of every record, from frozen and from learning models.
 
-The error is a voltage; times the mean gain of the training record it is seen as displacement, so that it stands beside
-the forward models' errors. A learning model answers each block from a snapshot of its past.
+The error is a voltage. Times the mean gain of the training record it is a displacement, comparable with the errors of
+the forward models. A learning model answers each block from a snapshot of its past.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim.chapter.experiments import DT_S, Experiments, Record, Score
 
 @dataclass(frozen=True, slots=True)
 class ReplayRun:
-    """Scores of one inverse model by record: (2.45), then the third family."""
+    """Scores of one inverse model by record: (2.45), then the records of the third family."""
 
     model: str
     scores: dict[str, Score]
@@ -38,7 +38,7 @@ def replay_records(
     quick: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[ReplayRun, ...]:
-    """Every frozen and every learning inverse model on all records but the training one; ``quick``: on two of them."""
+    """Scores of every frozen and learning model on all records except the training one; ``quick``: on two records."""
     gain = float(np.polyfit(data.training.u_V, data.training.y_um, 1)[0])
     records = (data.generalisation, *(data.third[:1] if quick else data.third))
     progress("replaying the records through the inverse models")

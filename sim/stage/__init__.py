@@ -1,1 +1,18 @@
-"""stage."""
+"""Simulated stages: configuration, presets, stage files, stepping, and control of a stage."""
+
+from sim.stage.config import ParameterChange, StageConfig
+from sim.stage.file import load_stage, save_stage
+from sim.stage.presets import PRESETS, preset
+from sim.stage.stage import Stage, StageState, Trace
+
+__all__ = [
+    "PRESETS",
+    "ParameterChange",
+    "Stage",
+    "StageConfig",
+    "StageState",
+    "Trace",
+    "load_stage",
+    "preset",
+    "save_stage",
+]

@@ -1,7 +1,7 @@
-"""Feedforward, feedback and both on a simulated stage, and the gains that Ziegler and Nichols would take.
+"""Feedforward, feedback and both on a simulated stage, and the Ziegler-Nichols gains of a stage.
 
-The controller reads ``y(t_k)``, computes ``u_k`` from the error at ``t_k`` and applies it until ``t_(k+1)``; nothing
-of a sample is used before it could be known.
+The controller reads ``y(t_k)``, computes ``u_k`` from the error at ``t_k`` and applies it until ``t_(k+1)``. Nothing of
+a sample is used before it could be known.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ class PID:
     """Incremental PID, (2.46), with continuous gains.
 
     ``u_FB(k) = u_FB(k-1) + k_p (e_k - e_(k-1)) + k_i T e_k + (k_d/T) (e_k - 2 e_(k-1) + e_(k-2))``.
-    The chapter's K_i = 31.104 is the continuous gain: taken per sample it would be unstable on 11 µm/V.
+    The chapter's K_i = 31.104 is the continuous gain; taken per sample it would be unstable at 11 µm/V.
 
     Attributes
     ----------
     k_p : V/µm. k_i : V/(µm s). k_d : V s/µm. dt_s : sample time T, s.
+
+    Raises InputError on a negative gain or a sample time that is not positive.
     """
 
     k_p: float
@@ -44,10 +46,11 @@ class PID:
             raise InputError(f"dt_s: got {self.dt_s!r}, expected a sample time above 0 s")
 
     def initial_state(self) -> PIDState:
+        """State before the first error."""
         return PIDState()
 
     def step(self, state: PIDState, error_um: float) -> float:
-        """The feedback's voltage u_FB(k) in V; changes ``state``."""
+        """Feedback voltage u_FB(k), V; advances ``state``."""
         e, e1, e2 = error_um, state.e1_um, state.e2_um
         state.u_V += self.k_p * (e - e1) + self.k_i * self.dt_s * e + self.k_d / self.dt_s * (e - 2.0 * e1 + e2)
         state.e1_um, state.e2_um = e, e1
@@ -60,7 +63,7 @@ CHAPTER_GAINS = PID(k_p=0.0864, k_i=31.1040)
 
 @dataclass
 class PIDState:
-    """What (2.46) remembers: its output and the last two errors."""
+    """State of (2.46): its output and the last two errors."""
 
     u_V: float = 0.0
     e1_um: float = 0.0
@@ -69,7 +72,7 @@ class PIDState:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A closed-loop run, arrays of (n,)."""
+    """A run under control; arrays (n,)."""
 
     t_s: FloatArray
     reference_um: FloatArray
@@ -80,6 +83,7 @@ class Run:
 
     @property
     def error_um(self) -> FloatArray:
+        """Reference minus reading (n,), µm."""
         return self.reference_um - self.y_um
 
     def errors_pct(self, range_um: float) -> dict[str, float]:
@@ -102,12 +106,12 @@ def track(
     memory: FloatArray | None = None,
     u2_V: FloatArray | None = None,
 ) -> Run:
-    """Let the stage follow a reference with feedforward (``model``), feedback (``pid``) or both.
+    """Follow a reference with feedforward (``model``), feedback (``pid``) or both.
 
-    The feedforward is computed for the whole reference at once: it depends on the reference alone. ``state`` and
-    ``memory`` continue an earlier run (``state`` is changed); without them the stage is at rest and the model's memory
-    that of a stage at rest at 0 µm. Where limits clamp the voltage, the feedback holds its integral (it is set back
-    by what was clamped), so that it does not wind up. Raises InputError where sample times differ or neither is given.
+    The feedforward is computed for the whole reference at once, because it depends on the reference alone. ``state``
+    and ``memory`` continue an earlier run (``state`` is advanced); by default stage and model start at rest at 0 µm.
+    Where limits clamp the voltage, the feedback is set back by the clamped part, so that it does not wind up. Raises
+    InputError where sample times differ, or neither model nor gains are given.
     """
     dt_s = stage.config.dt_s
     if model is None and pid is None:
@@ -147,30 +151,26 @@ def track(
 
 @dataclass(frozen=True, slots=True)
 class UltimateGain:
-    """Ziegler and Nichols' experiment: the proportional gain at the edge of stability, and the period there."""
+    """Result of the Ziegler-Nichols experiment: proportional gain at the stability limit, and the period there."""
 
     gain_V_per_um: float
     period_s: float
 
     def pi_gains(self, dt_s: float, share: float = 1.0) -> PID:
-        """Their table's PI gains: ``k_p = 0.45 K_u``, ``k_i = k_p/(T_u/1.2)``; ``share`` scales both down."""
+        """Ziegler-Nichols PI gains ``k_p = 0.45 K_u``, ``k_i = k_p/(T_u/1.2)``; ``share`` scales both."""
         k_p = 0.45 * self.gain_V_per_um * share
         return PID(k_p=k_p, k_i=1.2 * k_p / self.period_s, dt_s=dt_s)
-
-    def pid_gains(self, dt_s: float, share: float = 1.0) -> PID:
-        """Their table's PID gains: ``k_p = 0.6 K_u``, ``T_i = T_u/2``, ``T_d = T_u/8``."""
-        k_p = 0.6 * self.gain_V_per_um * share
-        return PID(k_p=k_p, k_i=2.0 * k_p / self.period_s, k_d=k_p * self.period_s / 8.0, dt_s=dt_s)
 
 
 def ultimate_gain(
     stage: Stage, *, level_um: float = 45.0, kick_um: float = 1.0, settle_s: float = 0.5, watch_s: float = 0.5
 ) -> UltimateGain:
-    """Search the proportional gain at which a kick neither grows nor decays, and the period of that oscillation.
+    """Find the proportional gain at which an oscillation neither grows nor decays, and its period.
 
-    The stage is brought near ``level_um`` by its mean gain and left to settle; then proportional feedback acts about
-    where it stands, with a set-point kick of ``kick_um``. Bisection on whether the oscillation of the second half of
-    ``watch_s`` exceeds that of the first. Raises NumericsError if no gain below 10 V/µm oscillates.
+    The stage is brought near ``level_um`` by its mean gain and settles for ``settle_s``. Then proportional feedback
+    acts about that position, excited by a set-point pulse of ``kick_um``. The gain is bisected on whether the
+    oscillation in the second half of ``watch_s`` exceeds that in the first. Raises NumericsError where no gain below
+    10 V/µm makes the stage oscillate.
     """
     dt_s = stage.config.dt_s
     state = stage.initial_state()
@@ -178,7 +178,7 @@ def ultimate_gain(
     settle = max(2, round(settle_s / dt_s))
     slope = stage.run_traced(state.copy(), np.full(settle, probe)).true_um[-1] / probe
     u0 = float(np.clip(level_um / slope, stage.config.u_min_V, stage.config.u_max_V))
-    # up by a ramp: a step would leave the mode ringing
+    # a ramp, because a step would leave the mode ringing
     stage.run(state, u0 * np.minimum(1.0, np.arange(2 * settle) / settle))
     n = max(40, round(watch_s / dt_s))
 
@@ -190,7 +190,7 @@ def ultimate_gain(
             y = stage.read(s)[0]
             error[k] = centre + (kick_um if k < 3 else 0.0) - y
             u = u0 + gain * float(error[k])
-            # linear oscillation is looked for, not that of the limits
+            # only linear oscillation counts, not that at the limits
             if not stage.config.u_min_V < u < stage.config.u_max_V or abs(error[k]) > 20.0 * kick_um:
                 return error[: k + 1]
             stage.step(s, u)
@@ -202,19 +202,19 @@ def ultimate_gain(
             return True
         first = float(np.std(np.diff(error[n // 8 : n // 2])))
         second = float(np.std(np.diff(error[n // 2 :])))
-        # by themselves noise and creep never grow: below a share of the kick nothing is an oscillation
+        # noise and creep stay below this share of the pulse
         return second > max(0.99 * first, 0.03 * kick_um)
 
     return _bisect(grows, response, dt_s)
 
 
 def _bisect(grows: Callable[[float], bool], response: Callable[[float], FloatArray], dt_s: float) -> UltimateGain:
-    """Between a gain that decays and one that grows, to 0.1 %; the period from the zero crossings there."""
+    """Bisect the gain to 0.1 %; the period comes from the zero crossings there."""
     low, high = 0.0, 1e-4
     while not grows(high):
         low, high = high, 1.5 * high
         if high > 10.0:
-            raise NumericsError("ultimate gain: none below 10 V/µm makes the stage oscillate; give gains by hand")
+            raise NumericsError("ultimate gain: none below 10 V/µm makes the stage oscillate; set the gains by hand")
     while high - low > 1e-3 * high:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if grows(middle) else (middle, high)
@@ -223,7 +223,7 @@ def _bisect(grows: Callable[[float], bool], response: Callable[[float], FloatArr
     wave = np.diff(wave) - np.mean(np.diff(wave))
     at = np.flatnonzero((wave[:-1] < 0.0) & (wave[1:] >= 0.0))
     if at.size < 2:
-        raise NumericsError("ultimate gain: no oscillation to take a period from; lengthen watch_s")
-    # crossings between samples, by straight lines
+        raise NumericsError("ultimate gain: no oscillation to measure a period of; increase watch_s")
+    # interpolated crossings
     exact = at + wave[at] / (wave[at] - wave[at + 1])
     return UltimateGain(high, float((exact[-1] - exact[0]) / (at.size - 1)) * dt_s)

@@ -1,4 +1,4 @@
-"""What a simulated stage is: its chains of effects, its sample time, its seed, its limits, and when it changes."""
+"""Configuration of a simulated stage: chains of effects, sample time, seed, limits, and parameter changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SECOND = "axis2/"
 
 @dataclass(frozen=True)
 class StageConfig:
-    """What a simulated stage is.
+    """Configuration of a simulated stage.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class StageConfig:
     second_axis : chain of the second axis, or None for a stage of one axis.
     dt_s : sample time, s.
     seed : of all its noise and drift.
-    u_min_V, u_max_V : commands are clamped to these limits before the D/A converter.
+    u_min_V, u_max_V : limits to which commands are clamped before the D/A converter.
     changes : parameter changes by time; the state is continuous, readings from ``t_s`` on are of the changed stage.
     """
 
@@ -49,7 +49,7 @@ class StageConfig:
             )
         if not self.u_min_V <= 0.0 <= self.u_max_V:
             raise InputError(
-                f"u_min_V, u_max_V: got {self.u_min_V!r}, {self.u_max_V!r}, expected 0 V, the rest, between"
+                f"u_min_V, u_max_V: got {self.u_min_V!r}, {self.u_max_V!r}, expected 0 V (rest) between them"
             )
         chains = self.chains
         for t_s, values in self.changes:
@@ -60,12 +60,12 @@ class StageConfig:
 
     @property
     def chains(self) -> tuple[Chain, ...]:
-        """The chains of its axes."""
+        """The chain of each axis."""
         return (self.effects,) if self.second_axis is None else (self.effects, self.second_axis)
 
 
 def changed(chains: tuple[Chain, ...], values: Mapping[str, float]) -> tuple[Chain, ...]:
-    """The chains with parameters changed by path. Raises InputError on names, axes and ranges."""
+    """The chains with parameters changed by path. Raises InputError on unknown names and values out of range."""
     first = {path: v for path, v in values.items() if not path.startswith(SECOND)}
     second = {path.removeprefix(SECOND): v for path, v in values.items() if path.startswith(SECOND)}
     if second and len(chains) < 2:

@@ -1,7 +1,7 @@
-"""Stage configurations as dictionaries and as files, TOML or JSON, schema 1.
+"""Stage configurations as dictionaries and as TOML or JSON files, schema 1.
 
-A file from a stranger is checked key by key: unknown keys, wrong types and values outside their physical range are
-`InputError` naming the key, what was got, what was expected; another schema is a `ModelFileError`.
+A file is checked key by key. Unknown keys, wrong types and values out of range raise InputError with the key, what was
+found and what was expected; another schema raises ModelFileError.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _KEYS = ("schema", "name", "dt_s", "seed", "u_min_V", "u_max_V", "effects", "sec
 
 
 def to_dict(config: StageConfig) -> dict[str, Any]:
-    """The configuration as JSON scalars, lists and dictionaries; `from_dict` makes an equal one of it."""
+    """The configuration as JSON values; `from_dict` makes an equal one from it."""
     result: dict[str, Any] = {
         "schema": SCHEMA,
         "name": config.name,
@@ -47,10 +47,10 @@ def _effects(chain: Chain) -> list[dict[str, Any]]:
 
 
 def from_dict(data: Any) -> StageConfig:
-    """The configuration in a dictionary. Raises InputError and ModelFileError, see above."""
+    """The configuration in a dictionary. Raises InputError and ModelFileError as the module says."""
     table = _table(data, "stage")
     if table.get("schema") != SCHEMA:
-        raise ModelFileError(f"schema: got {table.get('schema')!r}, expected {SCHEMA}; write the stage file anew")
+        raise ModelFileError(f"schema: got {table.get('schema')!r}, expected {SCHEMA}; write the stage file again")
     _only(table, _KEYS, "stage")
     if "effects" not in table:
         raise InputError("effects: missing, expected a list of effects")
@@ -80,7 +80,7 @@ def _chain(rows: Any, where: str) -> Chain:
         if not isinstance(name, str) or not isinstance(label, str) or "." in label or "/" in label:
             raise InputError(
                 f"{where}[{i}]: got effect {name!r}, label {label!r}, expected the name of an effect in 'effect' "
-                "and, if at all, a text without '.' and '/' in 'label'"
+                "and optionally a text without '.' and '/' in 'label'"
             )
         try:
             effects.append(effect(name, label=label, **table))
@@ -148,7 +148,7 @@ def load_stage(path: str | Path) -> StageConfig:
 
 
 def save_stage(config: StageConfig, path: str | Path) -> None:
-    """Write a stage file, ``.toml`` or ``.json``; `load_stage` reads an equal configuration from it."""
+    """Write a stage file, ``.toml`` or ``.json``, from which `load_stage` reads an equal configuration."""
     path = Path(path)
     if path.suffix == ".toml":
         text = to_toml(config)
@@ -160,7 +160,7 @@ def save_stage(config: StageConfig, path: str | Path) -> None:
 
 
 def to_toml(config: StageConfig) -> str:
-    """The configuration as TOML, one table an effect, with each parameter's unit and meaning as a comment."""
+    """The configuration as TOML, one table per effect, with unit and meaning of each parameter as a comment."""
     data = to_dict(config)
     lines = [f"{key} = {_scalar(data[key])}" for key in _KEYS[:6]]
     for key, chain in (("effects", config.effects), ("second_axis", config.second_axis)):

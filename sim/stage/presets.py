@@ -1,7 +1,7 @@
-"""Stages that are ready to use. `preset("rich")` stands in for hardware; `preset("bouc_wen")` is the chapter's.
+"""Stages that are ready to use: ``preset("rich")`` replaces hardware, ``preset("bouc_wen")`` is the chapter's stage.
 
-Sources: the chapter's section 2.2 (a P-734.2CL class stage of 100 µm, 16-bit converters, 88 to 90 µm for about 8 V,
-cross-talk 1.17 %), Table 2.1, and the magnitudes that each effect states with its parameters.
+Sources: section 2.2 of the chapter (a P-734.2CL class stage of 100 µm, 16-bit converters, 88 to 90 µm for about 8 V,
+cross-talk 1.17 %), Table 2.1, and the magnitudes stated by each effect.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from sim.stage.config import StageConfig
 
 
 def rich_chain() -> Chain:
-    """One axis of the stage that stands in for hardware; of no fitted model's own class.
+    """One axis of the stage that replaces hardware. It is outside the class of every model that is fitted to it.
 
-    Sixty generalised plays with uneven weights, asymmetric envelopes and rate-dependent thresholds, and a smooth
-    part without return-point memory: loop height about 12 % of a full stroke and 2 % small-signal (manufacturers'
-    tutorials: 10 to 15 % and 2 %). Creep 1.5 % a decade over four decades of time; one mode at 450 Hz, damping 0.05;
-    amplifier corner 2.5 kHz; sensor lag 0.3 ms; 5 nm noise of a reading; 16-bit converters; slow drift of offset and
-    gain.
+    Hysteresis: sixty generalised plays with uneven weights, asymmetric envelopes and rate-dependent thresholds, and a
+    smooth part without return-point memory; the loop height is about 12 % of a full stroke and 2 % small-signal
+    (manufacturers' tutorials: 10 to 15 % and 2 %). Creep: 1.5 % per decade over four decades of time. One mode at
+    450 Hz with damping 0.05, amplifier corner 2.5 kHz, sensor lag 0.3 ms, noise of a reading 5 nm, 16-bit converters,
+    slow drift of offset and gain.
     """
     return Chain(
         (
@@ -55,7 +55,7 @@ def rich_chain() -> Chain:
 
 
 def rich(*, seed: int = 0, dt_s: float = 1e-3) -> StageConfig:
-    """The default stage: two equal axes that differ in their noise, 0 to 8 V for about 89 µm."""
+    """The default stage: two axes that are equal except for their noise, about 89 µm for 0 to 8 V."""
     chain = rich_chain()
     return StageConfig("rich", chain, chain, dt_s=dt_s, seed=seed, u_min_V=-2.0, u_max_V=10.0)
 
@@ -63,8 +63,8 @@ def rich(*, seed: int = 0, dt_s: float = 1e-3) -> StageConfig:
 def bouc_wen(*, seed: int = 0, dt_s: float = 1e-3) -> StageConfig:
     """The chapter's identified stage, (2.1) and (2.2) with Table 2.1, noise of 5 nm and 16-bit converters.
 
-    Its voltages are held by the D/A converter and act without an amplifier between, so that ``u`` jumps at each
-    sample and ``h`` follows in closed form; the overdamped mechanics are exact for that.
+    The D/A converter holds the voltage and there is no amplifier, so ``u`` jumps at each sample. ``h`` and the
+    overdamped mechanics follow in closed form.
     """
     chain = Chain(
         (
@@ -82,7 +82,7 @@ PRESETS = {"rich": rich, "bouc_wen": bouc_wen}
 
 
 def preset(name: str, **changes: Any) -> StageConfig:
-    """A preset by name; ``changes`` are fields of `StageConfig`. Raises InputError for an unknown name or field."""
+    """A preset by name, with other values of `StageConfig` fields. Raises InputError on an unknown name or field."""
     if name not in PRESETS:
         raise InputError(f"preset: got {name!r}, expected one of: {', '.join(PRESETS)}")
     fields = {f.name for f in dataclasses.fields(StageConfig)}

@@ -1,11 +1,10 @@
-"""A simulated stage: chains of effects for one or two axes, limits, a seed, and changes that happen to it.
+"""A simulated stage: chains of effects for one or two axes, limits, a seed, and parameter changes over time.
 
-`StageConfig` is frozen and goes to and from a dictionary (`sim.stage.file` writes it to disk); `StageState` holds all
-that moves. ``step`` and ``run`` are bit-identical, and two stages of equal configuration that get the same commands
-give the same readings, noise included.
+`StageState` holds everything that moves. ``step`` and ``run`` give identical bits, and two stages of equal
+configuration that get the same commands give the same readings, noise included.
 
-Time: the sensor is read at ``t_k = k dt``; the command ``u_k`` is held from ``t_k`` until ``t_(k+1)``. A reading at
-``t_k`` therefore does not depend on ``u_k``, and a controller may read (`Stage.read`), decide, then step.
+Time: the sensor is read at ``t_k = k dt``, and the command ``u_k`` is held from ``t_k`` until ``t_(k+1)``. A reading at
+``t_k`` therefore does not depend on ``u_k``: a controller may read (`Stage.read`), decide, then step.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from sim.stage.config import StageConfig, changed
 
 @dataclass
 class StageState:
-    """All that moves in a stage. Made by `Stage.initial_state`; changed in place by ``step`` and ``run``.
+    """State of a stage. Made by `Stage.initial_state`, advanced in place by ``step`` and ``run``.
 
     Attributes
     ----------
@@ -34,8 +33,9 @@ class StageState:
     s : states of all effects.
     reading_um, true_um : the next reading (axes,) and the true displacement then (axes, 1).
     chains : parameters in force.
-    pending : index into the configuration's changes of the next one.
-    next_change : the first sample that it holds for.
+    pending : index of the next of the configuration's changes.
+    next_change : first sample of that change; -1: none.
+    x, v, w : work space of ``step``.
     """
 
     k: int
@@ -51,7 +51,7 @@ class StageState:
     w: FloatArray = field(repr=False)
 
     def copy(self) -> StageState:
-        """A state that goes its own way from here."""
+        """An independent copy."""
         arrays = {name: getattr(self, name).copy() for name in ("s", "reading_um", "true_um", "x", "v", "w")}
         return StageState(
             k=self.k, plan=self.plan, chains=self.chains, pending=self.pending, next_change=self.next_change, **arrays
@@ -60,7 +60,7 @@ class StageState:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """A run in full, arrays of (n,): readings, true displacements (before the sensor), voltage at the actuator."""
+    """A run in full, arrays (n,): readings and true displacements (before the sensor) µm, voltage at the actuator V."""
 
     t_s: FloatArray
     y_um: FloatArray
@@ -71,7 +71,7 @@ class Trace:
 
 
 class Stage:
-    """Steps a configuration through time; holds nothing that changes."""
+    """Steps a configuration through time. Immutable; all that moves is in a `StageState`."""
 
     def __init__(self, config: StageConfig) -> None:
         self.config = config
@@ -79,7 +79,7 @@ class Stage:
         self._change_at = [math.ceil(t_s / config.dt_s - 1e-9) for t_s, _ in config.changes]
 
     def initial_state(self) -> StageState:
-        """At rest at 0 V since long ago, before the reading at t = 0."""
+        """State of a stage that has always been at rest at 0 V, before the reading at t = 0."""
         axes = self._plan.n_axes
         state = StageState(
             k=-1,
@@ -98,7 +98,7 @@ class Stage:
         return state
 
     def _advance(self, state: StageState, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Apply commands ``x`` (axes, m), which become the readings at the ends of the steps. No change between."""
+        """Run the commands ``x`` (axes, m), which become the readings at the ends of the steps; no change between."""
         true, drive = state.plan.run(state.s, x, state.k + 1)
         state.k += x.shape[1]
         state.reading_um[:] = x[:, -1]
@@ -106,7 +106,7 @@ class Stage:
         return true, drive
 
     def _apply_due(self, state: StageState) -> None:
-        """Put the changes in force that hold from the reading after ``state.k`` on."""
+        """Apply the changes that hold from the reading after ``state.k`` on."""
         while state.pending < len(self._change_at) and self._change_at[state.pending] <= state.k + 1:
             self._set(state, self.config.changes[state.pending][1])
             state.pending += 1
@@ -117,28 +117,28 @@ class Stage:
         state.plan = plan(state.chains, self.config.dt_s, self.config.seed)
 
     def with_changes(self, state: StageState, values: Mapping[str, float]) -> StageState:
-        """A copy of ``state`` whose parameters are changed from the next step on; its motion is continuous.
+        """A copy of ``state`` with other parameters from the next step on; the motion is continuous.
 
-        Raises InputError on names, axes and ranges.
+        Raises InputError on unknown names and axes, and values out of range.
         """
         new = state.copy()
         self._set(new, values)
         return new
 
     def read(self, state: StageState) -> tuple[float, float]:
-        """The readings (y, y2) in µm at the present instant, before any command; y2 is 0 for one axis."""
+        """The present readings (y, y2), µm, before any command; y2 is 0 for one axis."""
         y = state.reading_um
         return float(y[0]), float(y[1]) if y.size == 2 else 0.0
 
     def true(self, state: StageState) -> tuple[float, float]:
-        """The displacements in µm at the present instant, free of sensor, noise and quantisation."""
+        """The present displacements, µm, without sensor, noise and quantisation."""
         y = state.true_um[:, 0]
         return float(y[0]), float(y[1]) if y.size == 2 else 0.0
 
     def step(self, state: StageState, u_V: float, u2_V: float = 0.0) -> tuple[float, float]:
-        """Read (y, y2) in µm at ``t_k``, then hold the commands in V until ``t_(k+1)``. Changes ``state``.
+        """Read (y, y2) µm at ``t_k``, then hold the commands, V, until ``t_(k+1)``. Advances ``state``.
 
-        Commands are clamped to the limits. Raises InputError if one is not finite; the state is then as before.
+        Commands are clamped to the limits. Raises InputError where one is not finite, without changing the state.
         """
         c = self.config
         if not (math.isfinite(u_V) and math.isfinite(u2_V)):
@@ -159,16 +159,16 @@ class Stage:
         return now
 
     def run(self, state: StageState, u_V: FloatArray, u2_V: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Readings (y, y2), each (n,) in µm, of n steps with commands (n,) in V. Changes ``state``.
+        """Readings (y, y2), (n,) µm each, of n steps with commands (n,) V. Advances ``state``.
 
-        ``y[k]`` is read when ``u_V[k]`` begins to be held. The same to the last bit as n calls of ``step``.
-        Raises InputError on shapes and non-finite values, with the state as before.
+        ``y[k]`` is read when ``u_V[k]`` begins to be held. Identical to n calls of ``step``. Raises InputError on bad
+        shapes and values that are not finite, without changing the state.
         """
         trace = self.run_traced(state, u_V, u2_V)
         return trace.y_um, trace.y2_um
 
     def run_traced(self, state: StageState, u_V: FloatArray, u2_V: FloatArray | None = None) -> Trace:
-        """As `run`, with the true displacements and the voltage at the actuator beside the readings."""
+        """As `run`, with the true displacements and the voltage at the actuator."""
         commands = self._commands(u_V, u2_V)
         axes, n = self._plan.n_axes, commands.shape[1]
         y, true = np.zeros((2, n + 1)), np.zeros((2, n + 1))

@@ -11,8 +11,8 @@ from adaptive.errors import InputError
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel
 from baselines.fit import fit_mpi
-from sim.changes.columns import Scales, Stretch, base_of
 from sim.changes.compare import Comparison, compare
+from sim.changes.signatures import Scales, Stretch, frozen_answer
 from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.presets import preset
@@ -104,7 +104,7 @@ def test_something_of_no_known_kind_is_called_that(model: InverseModel) -> None:
 
 def test_memory_that_nobody_knows_is_not_relied_on(model: InverseModel) -> None:
     before, _ = stretches(preset("rich", dt_s=DT_S, seed=2))
-    sure = base_of(model, before, Scales.of(before)).sure
+    sure = frozen_answer(model, before, Scales.of(before)).certain
     assert not sure[:20].any()
     assert sure[-4000:].mean() > 0.9
 
@@ -115,5 +115,5 @@ def test_too_little_is_refused_by_name(model: InverseModel) -> None:
     with pytest.raises(InputError, match="recent"):
         compare(model, before, none)
     still = replace(before, motion=np.zeros_like(before.motion))
-    with pytest.raises(InputError, match="does not move"):
+    with pytest.raises(InputError, match="without motion"):
         compare(model, still, after)

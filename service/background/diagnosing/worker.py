@@ -58,7 +58,7 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
     A stage that said nothing for long cuts them: then the part with most of what is from ``from_seq`` on.
     """
     from adaptive.smoothing import SmootherConfig, smooth_recording
-    from sim.changes.columns import Stretch
+    from sim.changes.signatures import Stretch
 
     first = int(np.searchsorted(samples[0], from_seq))
     whole, valid = _repaired(samples, dt_s, first)

@@ -1,9 +1,9 @@
-"""How the causes of a change show in a frozen inverse model's error.
+"""How the causes of a change show in the error of a frozen inverse model.
 
-The frozen model answers the measured motion with the voltage that the stage *as it was* would have needed. What is
-applied differs from that by what has changed since. Each cause has a way to undo it in the motion (divide by the new
-gain, look ahead by the new lag, ...), so its signature is the model's answer to the motion undone, less its answer to
-the motion as measured, for a unit of the cause: hysteresis, lags and all, with no second model.
+The frozen model answers the measured motion with the voltage that the unchanged stage would have needed. The applied
+voltage differs from it by what has changed since. Each cause can be undone in the motion (divide by the new gain, look
+ahead by the new lag, ...). Its signature is the model's answer to the undone motion minus its answer to the measured
+one, per unit of the cause. It includes hysteresis and lags and needs no second model.
 """
 
 from __future__ import annotations
@@ -17,23 +17,28 @@ from scipy.signal import lfilter
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from baselines.prandtl_ishlinskii.operators import play_run, play_start
 
-#: Time constants of the slow poles that creep is made of, s.
+#: Time constants of the slow poles that represent creep, s.
 SLOW_S = (1.0, 10.0)
-#: The cause whose column is a mere offset, which creep and the weather always move a little.
+#: The cause whose column is an offset, which creep and temperature always move a little.
 OFFSET = "thermal_drift"
-#: Half-widths of the plays that the loop's shape is made of, shares of the range.
+#: Half-widths of the plays that represent the shape of the loop, as shares of the range.
 PLAY_SHARES = (0.02, 0.1)
-#: Two histories of the loop are the same where the model's answers differ by less than this share of the range.
-SURE_SHARE = 5e-4
-#: Mains frequencies that are looked for, Hz.
+#: The history of the loop has no influence where the answers from two histories differ by less than this share of the
+#: range.
+CERTAIN_SHARE = 5e-4
+#: Mains frequencies to search for, Hz.
 MAINS_HZ = (50.0, 60.0)
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive samples ``dt_s`` apart: voltages V, readings µm, smoothed motion (n, 3) of y, v, a.
+    """Consecutive samples of a stage.
 
-    ``scored`` (n,) is False where a sample was filled in, and at the start, which only settles the memory.
+    Attributes
+    ----------
+    dt_s : sample time, s. t_s, u_V : (n,) times s and voltages V.
+    motion : (n, 3) smoothed displacement µm, velocity µm/s, acceleration µm/s².
+    scored : (n,) False where a sample was filled in, and at the start, which only settles the memory.
     """
 
     dt_s: float
@@ -45,7 +50,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Scales:
-    """What sizes are measured by: range and middle of the displacement, µm; slope V/µm; where 0 V would rest, µm."""
+    """Units of size: range and middle of the displacement µm, slope V/µm, displacement at 0 V µm."""
 
     range_um: float
     middle_um: float
@@ -54,6 +59,7 @@ class Scales:
 
     @staticmethod
     def of(stretch: Stretch) -> Scales:
+        """The scales of a stretch."""
         y, u = stretch.motion[:, 0], stretch.u_V
         low, high = np.quantile(y, [0.001, 0.999])
         d = y - y.mean()
@@ -63,10 +69,15 @@ class Scales:
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A cause that may have come: its columns (n, k) in V, for one unit of each of its numbers.
+class ChangeCause:
+    """A possible cause of a change.
 
-    ``numbers`` names them with their units; ``least`` is the size below which nobody would call it a change.
+    Attributes
+    ----------
+    name, alternatives : the cause, and other causes with the same signature.
+    numbers : names of its k numbers, with units.
+    least : smallest size that counts as a change.
+    columns : (n, k) V, its signature for one unit of each number.
     """
 
     name: str
@@ -77,25 +88,25 @@ class Candidate:
 
 
 def answer(model: InverseModel, motion: FloatArray, memory: FloatArray) -> FloatArray:
-    """(n,) V: the frozen model's voltages for ``motion`` (n, 3), from ``memory`` on."""
+    """Voltages (n,) V of the frozen model for ``motion`` (n, 3), starting from ``memory``."""
     y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
     return model.feedforward(y, v, a, memory).u_V
 
 
 @dataclass(frozen=True)
-class Base:
-    """The frozen model over a stretch: memory at its start, voltages (n,) V, and where they can be relied on (n,)."""
+class FrozenAnswer:
+    """The frozen model over a stretch: memory at its start, voltages (n,) V, and where these are certain (n,)."""
 
     memory: FloatArray
     u_V: FloatArray
-    sure: BoolArray
+    certain: BoolArray
 
 
-def base_of(model: InverseModel, stretch: Stretch, scales: Scales) -> Base:
-    """The frozen model's answer to the motion as measured.
+def frozen_answer(model: InverseModel, stretch: Stretch, scales: Scales) -> FrozenAnswer:
+    """The answer of the frozen model to the measured motion.
 
-    Nobody knows the loop's memory where a stretch begins. So it is answered from two histories that lie as far apart as
-    they can, and what the motion has not yet wiped out of them is not relied on; nor what lies outside the domain.
+    The memory at the start of a stretch is unknown. The model therefore answers from two extreme histories. Samples at
+    which their difference has not yet been wiped out are not certain, nor are those outside the model's domain.
     """
     y, v, a = (np.ascontiguousarray(stretch.motion[:, i]) for i in range(3))
     ends = []
@@ -106,12 +117,12 @@ def base_of(model: InverseModel, stretch: Stretch, scales: Scales) -> Base:
         ends.append(model.track(way, still, still, volts, model.rest_memory(float(way[0]))))
     one, other = (model.feedforward(y, v, a, memory) for memory in ends)
     apart = np.abs(one.u_V - other.u_V)
-    sure = (apart < SURE_SHARE * abs(scales.slope_V_per_um) * scales.range_um) & one.inside & np.isfinite(one.u_V)
-    return Base(ends[0], one.u_V, np.asarray(sure, dtype=np.bool_))
+    certain = (apart < CERTAIN_SHARE * abs(scales.slope_V_per_um) * scales.range_um) & one.inside & np.isfinite(one.u_V)
+    return FrozenAnswer(ends[0], one.u_V, np.asarray(certain, dtype=np.bool_))
 
 
-def candidates(model: InverseModel, stretch: Stretch, scales: Scales, base: Base) -> list[Candidate]:
-    """The causes that a frozen model's error can tell, with their columns over ``stretch``."""
+def causes_of(model: InverseModel, stretch: Stretch, scales: Scales, base: FrozenAnswer) -> list[ChangeCause]:
+    """The causes that can be recognised in the error of a frozen model, with their columns over ``stretch``."""
     y, v, a = stretch.motion.T
     half, rest = 0.5 * scales.range_um, scales.rest_um
 
@@ -130,30 +141,30 @@ def candidates(model: InverseModel, stretch: Stretch, scales: Scales, base: Base
         return np.column_stack([y - share * half * (x * x - 1.0), v * (1.0 - 2.0 * share * x), a])
 
     dt, span = stretch.dt_s, scales.range_um
-    # A hundredth of the range is moved for each difference: large beside rounding, small beside the loop.
+    # Differences use a hundredth of the range: large against round-off, small against the loop.
     a_top = max(float(np.quantile(np.abs(a), 0.99)), 1e-12)
     step_s2 = min(1e-3 * span / a_top, (20.0 * dt) ** 2)
     found = [
-        Candidate("gain_drift", (), ("gain",), 0.002, shown(gain, 0.01)),
-        Candidate(
+        ChangeCause("gain_drift", (), ("gain",), 0.002, shown(gain, 0.01)),
+        ChangeCause(
             OFFSET,
             ("creep",),
             ("offset_um",),
             0.005 * span,
             shown(lambda o: np.column_stack([y - o, v, a]), 0.01 * span),
         ),
-        Candidate(
+        ChangeCause(
             "sensor_lag", ("amplifier_lag", "delay"), ("tau_s",), max(2e-5, 0.05 * dt), shown(lag, min(0.2 * dt, 2e-4))
         ),
-        Candidate(
+        ChangeCause(
             "payload_change",
             ("resonance",),
             ("inverse_square_frequency_s2",),
             5e-9,
             shown(lambda k: np.column_stack([y + k * a, v, a]), step_s2),
         ),
-        Candidate("sensor_nonlinearity", ("asymmetry",), ("bend",), 0.001, shown(bend, 0.005)),
-        Candidate(
+        ChangeCause("sensor_nonlinearity", ("asymmetry",), ("bend",), 0.001, shown(bend, 0.005)),
+        ChangeCause(
             "hysteresis_shape",
             ("rate_dependence", "asymmetry"),
             tuple(f"play_{100 * s:g}_pct" for s in PLAY_SHARES),
@@ -165,14 +176,14 @@ def candidates(model: InverseModel, stretch: Stretch, scales: Scales, base: Base
 
 
 def loops(y_um: FloatArray, scales: Scales) -> FloatArray:
-    """(n, 2) V: what a loop of the displacement, lagging by a play, adds for each width."""
+    """(n, 2) V: the part of a loop that lags the displacement by a play, for each width."""
     r = np.array(PLAY_SHARES) * scales.range_um
     plays = play_run(np.ascontiguousarray(y_um), r, play_start(float(y_um[0]), r, float(y_um[0])))
     return np.asarray(scales.slope_V_per_um * (y_um[:, None] - plays))
 
 
 def slow(y_um: FloatArray, dt_s: float, scales: Scales) -> FloatArray:
-    """(n, 2) V: the slow poles of the displacement: creep, which no frozen model holds in full."""
+    """(n, 2) V: the displacement through slow poles, which represent the creep that a frozen model lacks."""
     rows = []
     for tau in SLOW_S:
         k = dt_s / (tau + dt_s)
@@ -182,8 +193,8 @@ def slow(y_um: FloatArray, dt_s: float, scales: Scales) -> FloatArray:
     return np.column_stack(rows)
 
 
-def hum(stretch: Stretch, left_V: FloatArray) -> Candidate | None:
-    """A line at the mains frequency in ``left_V``, as a cause; None where the sample rate cannot show one."""
+def hum(stretch: Stretch, left_V: FloatArray) -> ChangeCause | None:
+    """A mains line in the residual ``left_V`` (n,), as a cause; None where the sample rate is too low for one."""
     t = stretch.t_s - stretch.t_s[0]
     window = np.hanning(t.size) * stretch.scored
     best, peak = 0.0, -1.0
@@ -197,4 +208,4 @@ def hum(stretch: Stretch, left_V: FloatArray) -> Candidate | None:
     if best == 0.0:
         return None
     phase = 2.0 * np.pi * best * t
-    return Candidate("mains_hum", (), ("sine_V", "cosine_V"), 0.0, np.column_stack([np.sin(phase), np.cos(phase)]))
+    return ChangeCause("mains_hum", (), ("sine_V", "cosine_V"), 0.0, np.column_stack([np.sin(phase), np.cos(phase)]))
