@@ -1,1 +1,84 @@
-"""The mathematics that learns: kernels, features, LSSVM, window, evidence, drift, the learner."""
+"""The adaptive inverse model of a piezo stage: an LSSVM that is identified from a recording and learns online.
+
+Identify the inverse of a stage, and follow the stage when its gain has dropped by 10 %:
+
+>>> import numpy as np
+>>> from adaptive import IdentifyConfig, Learner, Sample, identify_lssvm
+>>> dt_s = 1e-3
+>>> t_s = np.arange(4000) * dt_s
+>>> u_V = 5.0 - 2.0 * np.cos(2.0 * np.pi * t_s) - 2.0 * np.cos(2.0 * np.pi * 2.3 * t_s)
+>>> y_um = 10.0 * u_V + 3.0 * np.sin(u_V)
+>>> model, report = identify_lssvm(u_V, y_um, dt_s, config=IdentifyConfig(n=100, tune=False))
+>>> learner = Learner.from_model(model)
+>>> for k in range(4000):
+...     gate = learner.handle(Sample(seq=k, t_s=k * dt_s, u_V=u_V[k], y_um=0.9 * y_um[k]))
+>>> errors = learner.diagnostics()
+>>> errors["rms_error_pct"] < 0.3 * errors["frozen_rms_error_pct"]  # the learnt and the identified model
+True
+>>> still = np.zeros(1)
+>>> answer = learner.snapshot().feedforward(np.array([30.0]), still, still, learner.memory())
+>>> answer.u_V.shape, bool(answer.inside[0])  # the voltage for 30 µm at rest, inside the range that was learnt
+((1,), True)
+
+`identify_lssvm` returns an `LssvmInverse` and a report of its errors on held-out samples. A `Learner` takes one
+`Sample` at a time and offers immutable snapshots, again `LssvmInverse`. The parts are in `adaptive.window` (the sliding
+LSSVM), `adaptive.online` (gates, drift filter, learner) and `adaptive.tuning` (the evidence of hyper-parameters).
+
+Names are imported on first use: numba and scipy take seconds, which a process that needs neither should not wait for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from adaptive.errors import DehystError, InputError, ModelFileError, NumericsError
+    from adaptive.features import FeatureMap
+    from adaptive.identification import IdentificationReport, IdentifyConfig, identify_lssvm
+    from adaptive.inverse_model import LssvmInverse
+    from adaptive.online.config import LearnerConfig
+    from adaptive.online.learner import Learner
+    from adaptive.types import Feedforward, InverseModel, OnlineModel, Sample
+
+_MODULES = {
+    "DehystError": "errors",
+    "FeatureMap": "features",
+    "Feedforward": "types",
+    "IdentificationReport": "identification",
+    "IdentifyConfig": "identification",
+    "InputError": "errors",
+    "InverseModel": "types",
+    "Learner": "online.learner",
+    "LearnerConfig": "online.config",
+    "LssvmInverse": "inverse_model",
+    "ModelFileError": "errors",
+    "NumericsError": "errors",
+    "OnlineModel": "types",
+    "Sample": "types",
+    "identify_lssvm": "identification",
+}
+
+__all__ = [
+    "DehystError",
+    "FeatureMap",
+    "Feedforward",
+    "IdentificationReport",
+    "IdentifyConfig",
+    "InputError",
+    "InverseModel",
+    "Learner",
+    "LearnerConfig",
+    "LssvmInverse",
+    "ModelFileError",
+    "NumericsError",
+    "OnlineModel",
+    "Sample",
+    "identify_lssvm",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -191,7 +191,7 @@ def evidence_search(kernel: FloatArray, target: FloatArray) -> tuple[float, Floa
     """
     step = max(1, -(-target.size // EVIDENCE_ROWS))
     spread = float(np.std(target)) or 1.0
-    data = evidence.problem(kernel[::step], (target[::step] - float(np.mean(target))) / spread)
+    data = evidence.evidence_samples(kernel[::step], (target[::step] - float(np.mean(target))) / spread)
     best = infer(data, SEARCH).best
     return float(best.gamma), np.array(best.widths, dtype=np.float64)
 

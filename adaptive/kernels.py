@@ -42,11 +42,6 @@ def as_widths(widths: object, dimension: int) -> FloatArray:
     return given.copy()
 
 
-def evaluate(x: FloatArray, other: FloatArray, widths: FloatArray) -> float:
-    """K of one pair of points; ``x``, ``other`` and ``widths`` are (d,). Equation (2.31)."""
-    return float(np.exp(-np.sum(((x - other) / widths) ** 2)))
-
-
 def column(X: FloatArray, x: FloatArray, widths: FloatArray) -> FloatArray:
     """K of every row of ``X`` (N, d) with ``x`` (d,): (N,)."""
     return np.asarray(np.exp(-np.sum(((X - x) / widths) ** 2, axis=1)), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""How far hyper-parameters are searched, and when they are better. Light: a configuration is read by it."""
+"""Settings of re-tuning. Imports neither scipy nor numba, because every configuration file is read with it."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from adaptive.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class RetuneConfig:
-    """How far and how long is searched, and when a proposal is better.
+    """Settings of `adaptive.tuning.retuning`: how far to search, and when a proposal is better.
 
     Attributes
     ----------
-    starts : descents on a part of the samples; the first begins at what is at work. rows : size of that part.
-    iterations : of each descent, at most. least : samples below which nothing is tuned.
-    gamma_reach, width_reach : how far from the present, as factors; gamma_range, width_range : never beyond these.
+    starts : number of descents on a part of the samples; the first begins at the present values. rows : its size.
+    iterations : of each descent, at most. least : fewest samples to tune on.
+    gamma_reach, width_reach : largest factors from the present values; gamma_range, width_range : absolute limits.
     gain : share by which the rms error on fresh samples must fall. sigmas : by how many of its own standard
-    deviations the mean difference of the errors' sizes must lie above zero. looks : how often that may be asked, each
-    time with twice the samples. Three looks with 2.29 are wrong no oftener than one with 2 (Pocock 1977).
+    deviations the mean difference of the errors' sizes must lie above zero. looks : number of comparisons, each with
+    twice the samples. Three looks with 2.29 have the false-positive rate of one with 2 (Pocock 1977).
     """
 
     starts: int = 8

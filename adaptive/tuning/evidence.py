@@ -25,8 +25,8 @@ from adaptive.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
-    """The samples that hyper-parameters are inferred from; made by `problem`."""
+class EvidenceSamples:
+    """The samples that hyper-parameters are inferred from; made by `evidence_samples`."""
 
     X: FloatArray
     y: FloatArray
@@ -43,12 +43,14 @@ class Problem:
         """d."""
         return int(self.X.shape[1])
 
-    def subset(self, rows: NDArray[np.int64]) -> Problem:
-        """The same problem on some of its rows."""
-        return Problem(self.X[rows], self.y[rows], self.H[rows], self.weights[rows])
+    def subset(self, rows: NDArray[np.int64]) -> EvidenceSamples:
+        """Some of the rows."""
+        return EvidenceSamples(self.X[rows], self.y[rows], self.H[rows], self.weights[rows])
 
 
-def problem(X: FloatArray, y: FloatArray, weights: FloatArray | None = None, linear: tuple[int, ...] = ()) -> Problem:
+def evidence_samples(
+    X: FloatArray, y: FloatArray, weights: FloatArray | None = None, linear: tuple[int, ...] = ()
+) -> EvidenceSamples:
     """Check and collect normalised samples; arguments as those of `lssvm.fit`. Raises InputError."""
     X, y = np.ascontiguousarray(X, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
     if X.ndim != 2 or y.shape != (X.shape[0],):
@@ -62,17 +64,17 @@ def problem(X: FloatArray, y: FloatArray, weights: FloatArray | None = None, lin
         raise InputError("X, y, weights: got values that are not finite, or weights not positive; drop those rows")
     if np.ptp(y) == 0:
         raise InputError("y: all targets are equal, nothing can be inferred from them; excite the stage")
-    return Problem(X, y, lssvm.design(X, linear), w)
+    return EvidenceSamples(X, y, lssvm.design(X, linear), w)
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one pair of gamma and widths is worth; names as in the module's formulas.
+    """Evidence of one pair of gamma and widths; names as in the formulas at the top.
 
     Attributes
     ----------
     gamma : regularisation.  widths : (d,).
-    E_W, E_D, effective, mu, zeta, J2, J3 : see the module; ``effective`` is Geff.
+    E_W, E_D, effective, mu, zeta, J2, J3 : see the top; ``effective`` is Geff.
     J2_gradient : (1 + d,) by log gamma, then by each log width.
     J3_gradient : (d,) of J3 by each log width *along the optimum of J2 in gamma*; NaN where not asked for.
     J2_curvature : second derivative of J2 by log gamma; NaN where not asked for.
@@ -92,7 +94,7 @@ class Evidence:
     J2_curvature: float
 
 
-def evaluate(data: Problem, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
+def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
     """Evidence at one pair of gamma and widths (d,), with its gradients.
 
     Raises

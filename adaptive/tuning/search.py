@@ -1,4 +1,6 @@
-"""Hyper-parameters from the evidence: level 2 for gamma, level 3 or the joint optimum for the kernel widths."""
+"""Search for the hyper-parameters with the best evidence: level 2, (2.35), for gamma; level 3, (2.36), or the joint
+optimum for the kernel widths.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from adaptive.errors import InputError, NumericsError
-from adaptive.tuning.evidence import Evidence, Problem, evaluate
+from adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
 from adaptive.types import FloatArray
 
 #: The chapter's start, first; the others because the evidence has several optima.
@@ -19,7 +21,7 @@ STARTS: tuple[tuple[float, float], ...] = ((100.0, 1.0), (1e4, 0.4), (1e5, 2.5),
 
 @dataclass(frozen=True, slots=True)
 class InferenceConfig:
-    """How hyper-parameters are searched.
+    """Settings of the search.
 
     Attributes
     ----------
@@ -52,34 +54,52 @@ class InferenceConfig:
 
 @dataclass(frozen=True, slots=True)
 class Inference:
-    """What was found: ``best`` with its gamma and widths, one entry of ``tried`` a start, and the cost."""
+    """Result: ``best`` with its gamma and widths, the optimum from each start in ``tried``, number of evaluations."""
 
     best: Evidence
     tried: tuple[Evidence, ...]
     evaluations: int
 
 
-class _Counted:
-    """`evaluate` with its calls counted, and a refusal in place of a factorisation that fails."""
+class CountedEvidence:
+    """`evaluate` on fixed samples: counts its calls, and gives no value where a factorisation fails."""
 
-    def __init__(self, data: Problem) -> None:
+    def __init__(self, data: EvidenceSamples) -> None:
         self.data = data
         self.calls = 0
 
     def __call__(self, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence | None:
+        """Evidence at one pair of gamma and widths (d,); None where it is not finite."""
         self.calls += 1
         try:
             found = evaluate(self.data, gamma, widths, third_level)
         except NumericsError:
             return None
-        return found if np.isfinite(found.J3) else None
+        return found if np.isfinite(found.J3) and np.isfinite(found.J2_gradient).all() else None
+
+    def J2(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """J2 with its gradient at (1 + d,) logarithms of gamma and all widths; REFUSED and 0 where it has no value."""
+        found = self(float(np.exp(theta[0])), np.exp(theta[1:]))
+        return (REFUSED, np.zeros(theta.size)) if found is None else (found.J2, found.J2_gradient)
 
 
-#: Value of a point that could not be evaluated: far above all others, finite for the line search.
-_REFUSED = 1e12
+#: Value of a point that cannot be evaluated: far above all others, finite for the line search.
+REFUSED = 1e12
+#: A function with its gradient.
+Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
-def infer(data: Problem, config: InferenceConfig | None = None) -> Inference:
+def descend(
+    objective: Objective, start: FloatArray, low: FloatArray, high: FloatArray, iterations: int, tolerance: float
+) -> FloatArray:
+    """Local minimum in a box, by L-BFGS-B from ``start``; all (k,). ``tolerance``: relative change of the last step."""
+    options = {"maxiter": iterations, "maxfun": 3 * iterations, "ftol": tolerance, "gtol": 1e-3}
+    box = list(zip(low, high, strict=True))
+    found = minimize(objective, np.clip(start, low, high), jac=True, method="L-BFGS-B", bounds=box, options=options)
+    return np.asarray(np.clip(found.x, low, high), dtype=np.float64)
+
+
+def infer(data: EvidenceSamples, config: InferenceConfig | None = None) -> Inference:
     """Find gamma and the kernel widths. Deterministic.
 
     Raises
@@ -88,7 +108,7 @@ def infer(data: Problem, config: InferenceConfig | None = None) -> Inference:
     """
     config = config or InferenceConfig()
     rows = np.unique(np.linspace(0, data.size - 1, min(config.search_rows, data.size)).round().astype(np.int64))
-    few, whole = _Counted(data.subset(rows)), _Counted(data)
+    few, whole = CountedEvidence(data.subset(rows)), CountedEvidence(data)
     count = data.dimension if config.ard else 1
     tried = []
     for gamma, sigma in config.starts:
@@ -102,25 +122,15 @@ def infer(data: Problem, config: InferenceConfig | None = None) -> Inference:
     best = tried[0]
     polished: Evidence | None = best
     for method in ("joint", config.method)[-1 if config.method == "joint" else 0 :]:
-        # The chapter's optimum lies close to the joint one, which costs a third of the evaluations to come near.
+        # The optimum of J3 lies close to the joint one, which takes a third of the evaluations to approach.
         if polished is not None:
             widths = polished.widths if config.ard else polished.widths[:1]
             polished = _descend(whole, np.log(np.concatenate([[polished.gamma], widths])), config, method)
     if polished is None:
         raise NumericsError(
-            "evidence: the optimum of a part of the samples can't be evaluated on all; lower gamma_range"
+            "evidence: the optimum of a part of the samples cannot be evaluated on all; lower gamma_range"
         )
     return Inference(polished, tuple(tried), few.calls + whole.calls)
-
-
-def level_two(
-    data: Problem, widths: FloatArray, gamma: float = 100.0, config: InferenceConfig | None = None
-) -> Evidence:
-    """Gamma at the optimum of J2 for given widths (d,), from one start. Raises NumericsError where none evaluates."""
-    found = _best_gamma(_Counted(data), gamma, widths, config or InferenceConfig(), False)
-    if found is None:
-        raise NumericsError("evidence: not to be evaluated at these widths; widen gamma_range or drop duplicates")
-    return found
 
 
 def _spread(widths: FloatArray, dimension: int) -> FloatArray:
@@ -131,8 +141,8 @@ def _collect(gradient: FloatArray, count: int) -> FloatArray:
     return gradient if gradient.size == count else np.array([np.sum(gradient)])
 
 
-def _descend(value: _Counted, start: FloatArray, config: InferenceConfig, method: str) -> Evidence | None:
-    """Local optimum from log [gamma, widths]."""
+def _descend(value: CountedEvidence, start: FloatArray, config: InferenceConfig, method: str) -> Evidence | None:
+    """Evidence of the local optimum from ``start``, logarithms of gamma and widths; None where none has a value."""
     best: list[Evidence] = []
     count, d = start.size - 1, value.data.dimension
     log_gamma, log_width = np.log(config.gamma_range), np.log(config.width_range)
@@ -141,36 +151,37 @@ def _descend(value: _Counted, start: FloatArray, config: InferenceConfig, method
     def joint(theta: FloatArray) -> tuple[float, FloatArray]:
         found = value(float(np.exp(theta[0])), _spread(np.exp(theta[1:]), d))
         if found is None:
-            return _REFUSED, np.zeros(theta.size)
+            return REFUSED, np.zeros(theta.size)
         if not best or found.J2 < best[0].J2:
             best[:] = [found]
         return found.J2, np.concatenate([found.J2_gradient[:1], _collect(found.J2_gradient[1:], count)])
 
     def third(theta: FloatArray) -> tuple[float, FloatArray]:
         nonlocal last_gamma
-        found = _best_gamma(value, last_gamma, _spread(np.exp(theta), d), config, True)
+        found = level_two(value, last_gamma, _spread(np.exp(theta), d), config, True)
         if found is None:
-            return _REFUSED, np.zeros(theta.size)
+            return REFUSED, np.zeros(theta.size)
         last_gamma = found.gamma
         if not best or found.J3 < best[0].J3:
             best[:] = [found]
         return found.J3, _collect(found.J3_gradient, count)
 
-    function: Callable[[FloatArray], tuple[float, FloatArray]] = joint if method == "joint" else third
-    bounds = [tuple(log_width)] * count
-    point = start[1:]
+    low, high = np.full(count, log_width[0]), np.full(count, log_width[1])
     if method == "joint":
-        bounds, point = [tuple(log_gamma), *bounds], start
-    point = np.clip(point, [low for low, _ in bounds], [high for _, high in bounds])
-    options = {"maxiter": config.iterations, "maxfun": 3 * config.iterations, "ftol": 1e-10, "gtol": 1e-3}
-    minimize(function, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        low, high = np.concatenate([log_gamma[:1], low]), np.concatenate([log_gamma[1:], high])
+        descend(joint, start, low, high, config.iterations, 1e-10)
+    else:
+        descend(third, start[1:], low, high, config.iterations, 1e-10)
     return best[0] if best else None
 
 
-def _best_gamma(
-    value: _Counted, gamma: float, widths: FloatArray, config: InferenceConfig, third_level: bool
+def level_two(
+    value: CountedEvidence, gamma: float, widths: FloatArray, config: InferenceConfig, third_level: bool
 ) -> Evidence | None:
-    """Root of dJ2/dlog gamma near ``gamma`` by safeguarded secant steps in log gamma; at a bound, the bound."""
+    """Level 2: gamma at the optimum of J2 for given widths (d,), or the bound of its range that is nearest to it.
+
+    Root of dJ2/dlog gamma near ``gamma`` by safeguarded secant steps in log gamma. None where it cannot be evaluated.
+    """
     low, high = np.log(config.gamma_range)
     at = float(np.clip(np.log(gamma), low, high))
     below: float | None = None  # slope negative here: the optimum lies above

@@ -1,7 +1,7 @@
 """Starts for re-tuning: the evidence of many hyper-parameters at once, as one batch in torch.
 
 All starts descend together (Adam on J2, with torch's gradient), on a GPU where there is one. The search finds basins;
-``adaptive.tuning.proposal`` refines the result. torch is imported only when a search starts.
+``adaptive.tuning.retuning`` refines the result. torch is imported only when a search starts.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import InputError
-from adaptive.tuning.evidence import Problem
-from adaptive.tuning.proposal import pattern
+from adaptive.tuning.evidence import EvidenceSamples
+from adaptive.tuning.retuning import pattern
 from adaptive.types import FloatArray
 from baselines.swarm.particle_swarm import torch_module
 
@@ -49,7 +49,7 @@ class EvidenceSearchConfig:
 
 
 class EvidenceSearch:
-    """Implements ``adaptive.tuning.proposal.Search``. Deterministic on one device.
+    """Implements ``adaptive.tuning.retuning.Search``. Deterministic on one device.
 
     Raises MissingTorchError where torch is not installed.
     """
@@ -61,7 +61,7 @@ class EvidenceSearch:
         if self.device == "auto":
             self.device = "cuda" if torch.cuda.is_available() else "cpu"
 
-    def __call__(self, data: Problem, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    def __call__(self, data: EvidenceSamples, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """(k, 1 + d) starts within the box from ``low`` to ``high``, best first; ``start`` is one of the seeds."""
         c, torch = self.config, torch_module()
         batch = _Batch(torch, data, self.device)
@@ -100,7 +100,7 @@ class _Batch:
     See ``adaptive.tuning.evidence``.
     """
 
-    def __init__(self, torch: Any, data: Problem, device: str) -> None:
+    def __init__(self, torch: Any, data: EvidenceSamples, device: str) -> None:
         self._torch = torch
 
         def on(values: FloatArray) -> Any:

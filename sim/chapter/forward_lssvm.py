@@ -20,7 +20,7 @@ from adaptive.identification import IdentifyConfig, design_features, prior_devia
 from adaptive.lssvm import LssvmModel
 from adaptive.scaling import MinMaxScaling
 from adaptive.smoothing import backward_difference
-from adaptive.tuning.evidence import Evidence, problem
+from adaptive.tuning.evidence import Evidence, evidence_samples
 from adaptive.tuning.search import InferenceConfig, infer
 from adaptive.types import FloatArray
 from sim.chapter.experiments import DT_S, EVERY
@@ -68,7 +68,7 @@ def fit_two_inputs(
     X, target = inputs.normalise(rows), output.normalise(y_um)
     found = None
     if hyper is None:
-        found = infer(problem(X, target), config or CHAPTER_INFERENCE).best
+        found = infer(evidence_samples(X, target), config or CHAPTER_INFERENCE).best
         gamma, widths = found.gamma, found.widths
     else:
         gamma, widths = hyper[0], np.full(2, hyper[1])
@@ -140,7 +140,7 @@ def fit_memory(u_fine_V: FloatArray, y_um: FloatArray, config: IdentifyConfig = 
     beta = posterior_mean(basis, y_um, prior_deviations(features, span), _FLOOR * span)
     rest = y_um - basis @ beta
     scale = max(float(np.std(rest)), 1e-12)
-    evidence = infer(problem(kernel, rest / scale), MEMORY_INFERENCE).best
+    evidence = infer(evidence_samples(kernel, rest / scale), MEMORY_INFERENCE).best
     fit = lssvm.fit(kernel, rest / scale, evidence.widths, evidence.gamma)
     rescaled = replace(
         fit.model, alpha=fit.model.alpha * scale, beta=fit.model.beta * scale, scale=fit.model.scale * scale**2

@@ -27,3 +27,13 @@ def recording() -> tuple[np.ndarray, np.ndarray]:
 def model(recording: tuple[np.ndarray, np.ndarray]) -> LssvmInverse:
     """What the adaptive model starts from."""
     return identify_lssvm(*recording, DT, config=IdentifyConfig(tune=False, n=300))[0]
+
+
+@pytest.fixture(scope="session")
+def all_strokes() -> tuple[np.ndarray, np.ndarray]:
+    """(u_V, y_um) of 8 s on the rich stage: strokes of all sizes up to 7.7 Hz, without a rest."""
+    stage = Stage(preset("rich", seed=6))
+    t_s = np.arange(8000) * DT
+    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
+    u = np.minimum(t_s / 0.5, 1.0) * (4.0 + sum(size * np.sin(2 * np.pi * hz * t_s + hz) for size, hz in tones))
+    return u, stage.run(stage.initial_state(), u)[0]

@@ -23,7 +23,8 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` of the arrays, or
     ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
     from adaptive.errors import DehystError
-    from adaptive.tuning.proposal import RetuneConfig, compare, propose
+    from adaptive.tuning.config import RetuneConfig
+    from adaptive.tuning.retuning import compare, propose
     from adaptive.types import Hyperparameters
     from service.background.retuning.job import unpack
 

@@ -38,16 +38,6 @@ def feed(learner: Learner, recording: Recording, start: int, stop: int) -> list[
 
 
 @pytest.fixture(scope="module")
-def strokes() -> Recording:
-    """(u_V, y_um) of 6 s on the rich stage: strokes of all sizes up to 7.7 Hz."""
-    stage = Stage(preset("rich", seed=6))
-    t_s = np.arange(6000) * DT_S
-    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
-    u = np.minimum(t_s / 0.5, 1.0) * (4.0 + sum(v * np.sin(2 * np.pi * hz * t_s + hz) for v, hz in tones))
-    return u, stage.run(stage.initial_state(), u)[0]
-
-
-@pytest.fixture(scope="module")
 def railed() -> Recording:
     """(u_V, y_um) of 6 s: strokes, a second at the upper limit of the drive, and strokes again."""
     stage = Stage(preset("rich", seed=5))
@@ -60,9 +50,9 @@ def railed() -> Recording:
 
 
 @pytest.fixture(scope="module")
-def warm(model: LssvmInverse, strokes: Recording) -> StateDict:
+def warm(model: LssvmInverse, all_strokes: Recording) -> StateDict:
     learner = Learner.from_model(model)
-    feed(learner, strokes, 0, AT)
+    feed(learner, all_strokes, 0, AT)
     return learner.state_dict()
 
 
@@ -124,10 +114,10 @@ def test_a_gain_of_readings_is_allowed_by_the_same_factor_both_ways() -> None:
 
 @pytest.mark.parametrize("shift", [0.4, -0.4])
 def test_a_zero_that_has_moved_further_than_a_stage_can_is_not_believed(
-    model: LssvmInverse, strokes: Recording, warm: StateDict, shift: float
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, shift: float
 ) -> None:
     """By 40 % of the range: it has its name within half a second, no frame moves, and what is served stays."""
-    u, y = strokes[0], strokes[1].copy()
+    u, y = all_strokes[0], all_strokes[1].copy()
     y[AT:] += shift * range_of(model)
     learner = Learner.from_state(warm)
     frame, beta = learner.features, learner.parts.filter.beta
@@ -140,17 +130,17 @@ def test_a_zero_that_has_moved_further_than_a_stage_can_is_not_believed(
     assert np.abs(learner.parts.filter.beta - beta).max() < 0.01 * np.abs(beta).max()
     assert not learner.snapshot().valid
     # The sensor is right again: so is the learner.
-    feed(learner, strokes, AT + 2500, AT + 3300)
+    feed(learner, all_strokes, AT + 2500, AT + 3300)
     assert learner.trouble == ""
     assert learner.features == frame
 
 
 @pytest.mark.parametrize(("shift", "offset"), [(0.4, 0.5), (-0.25, 0.3)])
 def test_a_zero_that_has_moved_as_far_as_a_stage_can_is_believed_after_motion(
-    model: LssvmInverse, strokes: Recording, shift: float, offset: float
+    model: LssvmInverse, all_strokes: Recording, shift: float, offset: float
 ) -> None:
     """The same, in an envelope that is wide enough."""
-    u, y = strokes[0], strokes[1].copy()
+    u, y = all_strokes[0], all_strokes[1].copy()
     y[AT:] += shift * range_of(model)
     learner = Learner.from_model(model, LearnerConfig(envelope=EnvelopeConfig(offset=offset)))
     feed(learner, (u, y), 0, AT + 700)
@@ -162,9 +152,9 @@ def test_a_zero_that_has_moved_as_far_as_a_stage_can_is_believed_after_motion(
 
 @pytest.mark.parametrize(("gain", "name"), [(1.3, ""), (0.77, ""), (1.6, SENSOR_GAIN), (0.6, SENSOR_GAIN)])
 def test_a_gain_is_believed_as_far_as_a_stage_can_have_it(
-    model: LssvmInverse, strokes: Recording, warm: StateDict, gain: float, name: str
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, gain: float, name: str
 ) -> None:
-    u, y = strokes[0], strokes[1].copy()
+    u, y = all_strokes[0], all_strokes[1].copy()
     y[AT:] *= gain
     learner = Learner.from_state(warm)
     feed(learner, (u, y), AT, AT + 600)
@@ -175,9 +165,9 @@ def test_a_gain_is_believed_as_far_as_a_stage_can_have_it(
         assert learner.features.gain == pytest.approx(1.0, abs=0.02)
 
 
-def test_whatever_the_readings_claim_no_frame_is_outside(model: LssvmInverse, strokes: Recording) -> None:
+def test_whatever_the_readings_claim_no_frame_is_outside(model: LssvmInverse, all_strokes: Recording) -> None:
     """Jump after jump in the same direction, each small enough to be believed: the sum is not."""
-    u, y = strokes[0], strokes[1].copy()
+    u, y = all_strokes[0], all_strokes[1].copy()
     learner = Learner.from_model(model)
     for i in range(12):
         y[1500 + 350 * i :] += 0.06 * range_of(model)
@@ -188,10 +178,12 @@ def test_whatever_the_readings_claim_no_frame_is_outside(model: LssvmInverse, st
     assert learner.trouble
 
 
-def test_no_answer_is_further_from_the_identified_model_than_the_bound(model: LssvmInverse, strokes: Recording) -> None:
+def test_no_answer_is_further_from_the_identified_model_than_the_bound(
+    model: LssvmInverse, all_strokes: Recording
+) -> None:
     """Whatever the filter has come to: all over the range, in rest and in motion."""
     learner = Learner.from_model(model)
-    feed(learner, strokes, 0, 1500)
+    feed(learner, all_strokes, 0, 1500)
     memory = learner.memory()
     y_um = np.linspace(0.0, range_of(model), 60)
     motion = y_um, 50.0 * np.cos(y_um), 3000.0 * np.sin(y_um)
@@ -296,19 +288,19 @@ def test_a_voltage_at_a_limit_for_less_than_a_tenth_of_a_second_decides_nothing(
 
 @pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6), doubled])
 def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
-    model: LssvmInverse, strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
 ) -> None:
     """Within 0.3 s, and is told of for a second. The filter may learn meanwhile: from the identified model on."""
     learner = Learner.from_state(warm)
     # It would find its way by itself, slowly: held where it is.
     learner.freeze()
     spoil(learner)
-    feed(learner, strokes, AT, AT + 300)
+    feed(learner, all_strokes, AT, AT + 300)
     assert learner.trouble == MODEL_LEFT_ENVELOPE
     assert learner.counters()["begun_again"] == 1
     assert is_identified(learner)
     learner.thaw()
-    told = [learner.trouble for k in range(AT + 300, AT + 2000) if feed(learner, strokes, k, k + 1)]
+    told = [learner.trouble for k in range(AT + 300, AT + 2000) if feed(learner, all_strokes, k, k + 1)]
     assert 700 < told.count(MODEL_LEFT_ENVELOPE) < 1300
     assert set(told[1300:]) == {""}
     assert learner.counters()["begun_again"] == 1
@@ -317,10 +309,10 @@ def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
 
 @pytest.mark.parametrize(("gain", "shift"), [(0.2, 0.0), (-0.15, 0.0), (0.1, 0.1), (0.0, -0.2)])
 def test_what_is_learnt_of_a_stage_that_changes_much_is_no_trouble(
-    model: LssvmInverse, strokes: Recording, warm: StateDict, gain: float, shift: float
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, gain: float, shift: float
 ) -> None:
     """A gain that grows by a fifth within two seconds, a zero that moves by a fifth: inside, and learnt."""
-    u, clean = strokes
+    u, clean = all_strokes
     grown = np.clip((np.arange(clean.size) - AT) / 2000.0, 0.0, 1.0)
     y = clean * (1.0 + gain * grown) + shift * range_of(model) * grown
     learner = Learner.from_state(warm)
@@ -348,7 +340,7 @@ def test_configuration_and_envelope_go_there_and_back() -> None:
 
 
 def test_a_state_from_before_there_was_an_envelope_goes_on(
-    model: LssvmInverse, strokes: Recording, warm: StateDict
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict
 ) -> None:
     new = ("config.envelope.", "rail", "left", "confirmed", "front.trials", "front.following.", "front.past",
            "base.anchor", "base.allowed_V")  # fmt: skip
@@ -356,8 +348,8 @@ def test_a_state_from_before_there_was_an_envelope_goes_on(
     assert len(warm) - len(old) > 15
     learner, twin = Learner.from_state(old), Learner.from_state(warm)
     assert learner.config.envelope == EnvelopeConfig()
-    said = feed(learner, strokes, AT, AT + 1500)
-    feed(twin, strokes, AT, AT + 1500)
+    said = feed(learner, all_strokes, AT, AT + 1500)
+    feed(twin, all_strokes, AT, AT + 1500)
     assert learner.trouble == ""
     assert said.count("learnt") > 700
     np.testing.assert_array_equal(learner.parts.filter.beta, twin.parts.filter.beta)

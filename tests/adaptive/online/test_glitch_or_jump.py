@@ -183,16 +183,6 @@ def test_readings_at_another_level_that_do_not_follow_the_stage_are_no_jump(mode
 
 
 @pytest.fixture(scope="module")
-def fast() -> Recording:
-    """(u_V, y_um) of 8 s on the rich stage: strokes of all sizes up to 7.7 Hz, without a rest."""
-    stage = Stage(preset("rich", seed=6))
-    t_s = np.arange(8000) * DT_S
-    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
-    u = np.minimum(t_s / 0.5, 1.0) * (4.0 + sum(size * np.sin(2 * np.pi * hz * t_s + hz) for size, hz in tones))
-    return u, stage.run(stage.initial_state(), u)[0]
-
-
-@pytest.fixture(scope="module")
 def still() -> Recording:
     """(u_V, y_um) of 3 s of strokes, 2 s of rest and 3 s of strokes."""
     stage = Stage(preset("rich", seed=8))
@@ -225,8 +215,8 @@ def slow_states(model: LssvmInverse, recording: Recording) -> dict[int, StateDic
 
 
 @pytest.fixture(scope="module")
-def fast_states(model: LssvmInverse, fast: Recording) -> dict[int, StateDict]:
-    return states_of(model, fast)
+def fast_states(model: LssvmInverse, all_strokes: Recording) -> dict[int, StateDict]:
+    return states_of(model, all_strokes)
 
 
 def range_of(model: LssvmInverse) -> float:
@@ -306,7 +296,7 @@ def test_a_knock_at_any_time_leaves_the_model_as_it_was(
     The error of what is reckoned grows with the way gone: in strokes of up to 7.7 Hz some tenths of a percent of the
     range after 50 ms, and that is taken for a jump now and then.
     """
-    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "all_strokes")
     states = request.getfixturevalue(f"{strokes}_states")
     rng, happened, worst_V, moved_um = np.random.default_rng(7), Counter[str](), 0.0, 0.0
     twins = {at: Learner.from_state(state) for at, state in states.items()}
@@ -338,7 +328,7 @@ def test_a_gain_step_with_ringing_is_believed_once(
     model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, gain: float, ringing: float
 ) -> None:
     """Within 40 readings, and the frame shows the place within 1 % of the range."""
-    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "all_strokes")
     states = request.getfixturevalue(f"{strokes}_states")
     rng = np.random.default_rng(round(1e4 + 1e3 * gain + 10 * ringing))
     u, y = recording
@@ -373,7 +363,7 @@ def test_a_zero_step_with_ringing_is_found_and_kept(
     After half a second the model is off by less than 0.4 % of the voltage span, in the median. Hardly any goes
     on trial: at most one in 30 in slow strokes, one in 10 in fast ones that ring by the whole step.
     """
-    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "all_strokes")
     states = request.getfixturevalue(f"{strokes}_states")
     rng = np.random.default_rng([9, round(10 * ringing)])
     u, y = recording
@@ -423,7 +413,7 @@ def test_a_sensor_that_sticks_with_noise_makes_no_jump(
     model: LssvmInverse, request: pytest.FixtureRequest, strokes: str, noise_share: float
 ) -> None:
     """From 1e-9 to 3e-4 of the range: for one second no frame moves."""
-    recording = request.getfixturevalue("recording" if strokes == "slow" else "fast")
+    recording = request.getfixturevalue("recording" if strokes == "slow" else "all_strokes")
     states = request.getfixturevalue(f"{strokes}_states")
     u, clean = recording
     rng = np.random.default_rng(2)
@@ -465,10 +455,10 @@ def test_state_goes_on_to_the_last_bit_while_it_rings_about_a_new_level(
 
 @pytest.mark.parametrize("kind", ["stuck", "foreign"])
 def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
-    fast: Recording, fast_states: dict[int, StateDict], kind: str
+    all_strokes: Recording, fast_states: dict[int, StateDict], kind: str
 ) -> None:
     at = ATS[10]
-    u, y = fast[0], fast[1].copy()
+    u, y = all_strokes[0], all_strokes[1].copy()
     rng = np.random.default_rng(4)
     y[at : at + 600] = y[at] + 1e-4 * rng.standard_normal(600) if kind == "stuck" else y[1000:1600]
     one = Learner.from_state(fast_states[at])

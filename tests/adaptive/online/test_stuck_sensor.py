@@ -19,27 +19,16 @@ DT, SPAN_V = 1e-3, 8.0
 Recording = tuple[FloatArray, FloatArray]
 
 
-@pytest.fixture(scope="module")
-def moving() -> Recording:
-    """(u_V, y_um) of 8 s on the rich stage: strokes of all sizes without a rest."""
-    stage = Stage(preset("rich", seed=6))
-    t = np.arange(8000) * DT
-    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
-    u = np.minimum(t / 0.5, 1.0) * (4.0 + sum(size * np.sin(2 * np.pi * hz * t + hz) for size, hz in tones))
-    y, _ = stage.run(stage.initial_state(), u)
-    return u, y
-
-
 def feed(learner: Learner, u: FloatArray, y: FloatArray, start: int, stop: int) -> list[str]:
     return [learner.handle(Sample(k, k * DT, float(u[k]), float(y[k]))) for k in range(start, stop)]
 
 
 @pytest.fixture(scope="module")
-def warm(model: LssvmInverse, moving: Recording) -> dict[int, dict[str, object]]:
+def warm(model: LssvmInverse, all_strokes: Recording) -> dict[int, dict[str, object]]:
     """States of a learner at some instants."""
     learner, states, before = Learner.from_model(model), {}, 0
     for at in (4000, 4123, 4371, 4600):
-        feed(learner, *moving, before, at)
+        feed(learner, *all_strokes, before, at)
         states[at], before = learner.state_dict(), at
     return states
 
@@ -60,9 +49,9 @@ def wrong(kind: str, y: FloatArray, at: int, n: int) -> FloatArray:
 @pytest.mark.parametrize("kind", ["frozen", "at its end", "silent"])
 @pytest.mark.parametrize("n", [30, 300, 1500])
 def test_what_was_learnt_and_where_the_stage_is_stay_known(
-    warm: dict[int, dict[str, object]], moving: Recording, kind: str, n: int, at: int
+    warm: dict[int, dict[str, object]], all_strokes: Recording, kind: str, n: int, at: int
 ) -> None:
-    u, clean = moving
+    u, clean = all_strokes
     y = wrong(kind, clean, at, n)
     learner, twin = Learner.from_state(warm[at]), Learner.from_state(warm[at])
     before = learner.counters()
@@ -81,16 +70,16 @@ def test_what_was_learnt_and_where_the_stage_is_stay_known(
 
 
 def test_who_has_lost_the_place_still_knows_the_turning_points(
-    warm: dict[int, dict[str, object]], moving: Recording
+    warm: dict[int, dict[str, object]], all_strokes: Recording
 ) -> None:
     """A sensor that comes back with another zero, after strokes that nobody has read."""
     at, n = 4123, 1000
-    y = wrong("silent", moving[1], at, n)
+    y = wrong("silent", all_strokes[1], at, n)
     y[at + n :] += 6.0
     learner, twin = Learner.from_state(warm[at]), Learner.from_state(warm[at])
     before = learner.counters()["jumps"]
-    feed(learner, moving[0], y, at, at + n + 20)
-    feed(twin, *moving, at, at + n + 20)
+    feed(learner, all_strokes[0], y, at, at + n + 20)
+    feed(twin, *all_strokes, at, at + n + 20)
     assert learner.counters()["jumps"] == before + 1
     wide = np.array(learner.base.features.thresholds_um) > 8.0
     assert np.count_nonzero(wide) > 3
@@ -99,14 +88,14 @@ def test_who_has_lost_the_place_still_knows_the_turning_points(
 
 
 def test_state_goes_on_to_the_last_bit_while_the_sensor_is_stuck(
-    warm: dict[int, dict[str, object]], moving: Recording
+    warm: dict[int, dict[str, object]], all_strokes: Recording
 ) -> None:
     at = 4123
-    y = wrong("frozen", moving[1], at, 400)
+    y = wrong("frozen", all_strokes[1], at, 400)
     one = Learner.from_state(warm[at])
-    feed(one, moving[0], y, at, at + 200)
+    feed(one, all_strokes[0], y, at, at + 200)
     two = Learner.from_state(one.state_dict())
-    assert feed(one, moving[0], y, at + 200, at + 900) == feed(two, moving[0], y, at + 200, at + 900)
+    assert feed(one, all_strokes[0], y, at + 200, at + 900) == feed(two, all_strokes[0], y, at + 200, at + 900)
     np.testing.assert_array_equal(one.memory(), two.memory())
     np.testing.assert_array_equal(one.snapshot().beta, two.snapshot().beta)
 
@@ -132,26 +121,26 @@ def test_what_a_sensor_repeats_counts_only_while_the_voltage_moves() -> None:
 
 
 def test_a_jump_that_never_was_is_taken_back_when_the_model_of_the_beginning_is_right(
-    warm: dict[int, dict[str, object]], moving: Recording
+    warm: dict[int, dict[str, object]], all_strokes: Recording
 ) -> None:
     """As where a gap hides the way back from the gates: the frame must not stay wrong for good."""
     at = 4123
     learner = Learner.from_state(warm[at])
-    lied = moving[1].copy()
+    lied = all_strokes[1].copy()
     lied[at : at + 150] += 8.0
-    feed(learner, moving[0], lied, at, at + 150)
+    feed(learner, all_strokes[0], lied, at, at + 150)
     assert learner.counters()["jumps"] == 1
-    feed(learner, *moving, at + 200, at + 2800)
+    feed(learner, *all_strokes, at + 200, at + 2800)
     assert learner.features == learner.base.features
     assert learner.diagnostics()["valid"]
 
 
 def test_the_memory_to_serve_with_is_the_one_that_was_learnt_with(
-    warm: dict[int, dict[str, object]], moving: Recording
+    warm: dict[int, dict[str, object]], all_strokes: Recording
 ) -> None:
     """It is the learner's own, carried along the readings since the smoother's instant: also over a jump and a hold."""
     at = 4123
-    u, clean = moving
+    u, clean = all_strokes
     y = clean.copy()
     y[at + 100 :] += 2.0
     learner = Learner.from_state(warm[at])

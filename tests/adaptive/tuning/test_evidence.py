@@ -18,16 +18,22 @@ DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).parents[4] / "shared" /
 needs_reference = pytest.mark.skipif(not DATA.is_dir(), reason=f"reference values not found at {DATA}; set DEHYST_DATA")
 
 
-def reference_problem() -> evidence.Problem:
+def reference_problem() -> evidence.EvidenceSamples:
     table = np.genfromtxt(DATA / "bw500.csv", delimiter=",", names=True)
-    return evidence.problem(np.column_stack([table["u_n"], table["udot_n"]]), table["y_n"])
+    return evidence.evidence_samples(np.column_stack([table["u_n"], table["udot_n"]]), table["y_n"])
 
 
-def small_problem(linear: tuple[int, ...] = (), n: int = 70) -> evidence.Problem:
+def small_problem(linear: tuple[int, ...] = (), n: int = 70) -> evidence.EvidenceSamples:
     rng = np.random.default_rng(3)
     X = rng.random((n, 3))
     y = np.sin(6 * X[:, 0]) + 0.5 * X[:, 1] + 0.05 * rng.standard_normal(n)
-    return evidence.problem(X, y, rng.random(n) + 0.5, linear)
+    return evidence.evidence_samples(X, y, rng.random(n) + 0.5, linear)
+
+
+def level_two(data: evidence.EvidenceSamples, widths: np.ndarray) -> evidence.Evidence:
+    found = inference.level_two(inference.CountedEvidence(data), 100.0, widths, InferenceConfig(), False)
+    assert found is not None
+    return found
 
 
 @needs_reference
@@ -42,7 +48,7 @@ def test_level_one_and_two_reference_values() -> None:
 
 @needs_reference
 def test_level_two_optimum_reference_values() -> None:
-    found = inference.level_two(reference_problem(), np.array([0.4, 0.4]))
+    found = level_two(reference_problem(), np.array([0.4, 0.4]))
     assert found.gamma == pytest.approx(2899.888, rel=1e-5)
     assert found.effective == pytest.approx(37.9146, rel=1e-5)
     assert pytest.approx(-1799.74692, rel=1e-8) == found.J2
@@ -51,7 +57,7 @@ def test_level_two_optimum_reference_values() -> None:
 
 
 def test_at_the_optimum_of_gamma_it_is_the_ratio_of_zeta_and_mu() -> None:
-    found = inference.level_two(small_problem(), np.array([0.5, 1.0, 2.0]))
+    found = level_two(small_problem(), np.array([0.5, 1.0, 2.0]))
     assert found.zeta / found.mu == pytest.approx(found.gamma, rel=1e-4)
 
 
@@ -72,7 +78,7 @@ def test_third_level_gradient_follows_the_optimum_of_gamma(linear: tuple[int, ..
     data, theta, h = small_problem(linear), np.log([0.4, 0.9, 1.7]), 1e-3
 
     def at_optimum(at: np.ndarray) -> evidence.Evidence:
-        gamma = inference.level_two(data, np.exp(at)).gamma
+        gamma = level_two(data, np.exp(at)).gamma
         return evidence.evaluate(data, gamma, np.exp(at), third_level=True)
 
     numeric = [(at_optimum(theta + h * e).J3 - at_optimum(theta - h * e).J3) / (2 * h) for e in np.eye(3)]
@@ -80,7 +86,7 @@ def test_third_level_gradient_follows_the_optimum_of_gamma(linear: tuple[int, ..
 
 
 def test_effective_parameters_by_eigenvalues() -> None:
-    data = evidence.problem(*_unweighted())
+    data = evidence.evidence_samples(*_unweighted())
     widths = np.array([0.5, 0.5, 0.5])
     found = evidence.evaluate(data, 30.0, widths)
     centre = np.eye(data.size) - 1.0 / data.size
@@ -128,10 +134,10 @@ def test_the_search_is_deterministic() -> None:
 def test_bad_input() -> None:
     X, y = _unweighted()
     with pytest.raises(InputError, match="equal"):
-        evidence.problem(X, np.ones(y.size))
+        evidence.evidence_samples(X, np.ones(y.size))
     with pytest.raises(InputError, match="samples"):
-        evidence.problem(X[:3], y[:3])
+        evidence.evidence_samples(X[:3], y[:3])
     with pytest.raises(InputError, match="starts"):
         InferenceConfig(starts=())
     with pytest.raises(NumericsError):
-        evidence.evaluate(evidence.problem(np.ones((20, 2)), np.arange(20.0)), 1e19, np.ones(2))
+        evidence.evaluate(evidence.evidence_samples(np.ones((20, 2)), np.arange(20.0)), 1e19, np.ones(2))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from adaptive.tuning.evidence import evaluate, problem
-from adaptive.tuning.proposal import Proposal, RetuneConfig, bounds_of, compare, fresh_rows, pattern, propose
-from adaptive.tuning.trial import significance
+from adaptive.tuning.config import RetuneConfig
+from adaptive.tuning.evidence import evaluate, evidence_samples
+from adaptive.tuning.retuning import Proposal, bounds_of, compare, fresh_rows, pattern, propose, significance
 from adaptive.types import FloatArray, Hyperparameters, WindowData
 
 NARROW = Hyperparameters(1e5, (0.12, 0.12))
@@ -61,7 +61,7 @@ def test_the_proposal_has_more_evidence_and_predicts_better(before: WindowData, 
 
 def test_the_proposal_is_an_optimum_of_the_evidence(before: WindowData, proposal: Proposal) -> None:
     y = (before.targets_V - before.targets_V.mean()) / before.targets_V.std()
-    found = evaluate(problem(before.kernel, y), proposal.hyper.gamma, np.array(proposal.hyper.widths))
+    found = evaluate(evidence_samples(before.kernel, y), proposal.hyper.gamma, np.array(proposal.hyper.widths))
     assert np.max(np.abs(found.J2_gradient)) < 0.3
     assert pytest.approx(proposal.J2, abs=1e-6) == found.J2
 
