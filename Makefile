@@ -4,10 +4,18 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
-# Tests that only compute, which may share the cores; the others time real processes and have them for themselves.
-PURE   := tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
-          tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/service/identification \
-          $(addprefix tests/service/,reports server/test_model_watch.py test_warm.py)
+# Tests that only compute, which may share all cores.
+PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
+          tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/benchmarks/test_house_bench.py \
+          $(addprefix tests/lab/soak/,test_interim.py test_judge.py test_schedule.py test_voltages.py) \
+          $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
+          background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
+          protocol/test_container.py protocol/test_keys.py protocol/test_payloads.py runtime/test_logging_setup.py \
+          server/test_axis.py server/test_competing.py server/test_model_watch.py server/test_status_counters.py \
+          storage/test_atomic_write.py storage/test_checkpoint.py storage/test_model_file.py viewer/test_scene.py)
+# Tests of real processes that mostly wait and have no tight limits of time: two at a time. The rest time something.
+PAIRS  := $(addprefix tests/service/,background/test_diagnosing.py failover/test_restart.py failover/test_standby.py \
+          operating security server/test_process.py storage/test_recorder.py viewer/test_live.py viewer/test_sink.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
 
@@ -47,7 +55,8 @@ test: ## lint, types, import contract, and all tests
 	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
 	@$(MAKE) --no-print-directory -j2 setup-test check
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PURE)
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE))
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(PAIRS)
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE) $(PAIRS))
 
 check: .setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff check .

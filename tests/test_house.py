@@ -1,4 +1,4 @@
-"""The house rules that a file can break: addresses, paths, imports that must not happen."""
+"""The house rules: no addresses or machine paths, no forbidden imports, and the measures of structure."""
 
 from __future__ import annotations
 
@@ -6,14 +6,46 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from benchmarks import house
 
 ROOT = Path(__file__).resolve().parents[1]
 TRACKED = [
     ROOT / name
     for name in subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
 ]
+
+
+#: Abilities that are still found by name. A library's object or any exception may lack the attribute; nothing of ours.
+ATTRIBUTES_BY_NAME_AT_MOST = 12
+IMPORT_CIRCLES_AT_MOST = 1
+
+
+@pytest.fixture(scope="module")
+def measures() -> dict[str, Any]:
+    return house.static_measures(ROOT)
+
+
+def test_no_folder_has_more_than_15_modules(measures: dict[str, Any]) -> None:
+    """A library of alike things is the exception."""
+    assert set(measures["large folders"]) <= {"sim/effects"}
+
+
+def test_no_modules_import_each_other(measures: dict[str, Any]) -> None:
+    """Imports for type checking only count as well."""
+    assert len(measures["import circles"]) <= IMPORT_CIRCLES_AT_MOST, measures["import circles"]
+
+
+def test_an_ability_is_a_protocol_not_a_string(measures: dict[str, Any]) -> None:
+    found = measures["getattr/hasattr by name"]
+    assert len(found) <= ATTRIBUTES_BY_NAME_AT_MOST, "\n".join(found)
+
+
+def test_nothing_frozen_is_changed(measures: dict[str, Any]) -> None:
+    assert not measures["frozen changed"]
 
 
 @pytest.mark.parametrize("name", ["requirements.txt", "requirements-test.txt"])
