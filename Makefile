@@ -14,7 +14,7 @@ PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/for
           server/test_axis.py server/test_competing.py server/test_model_watch.py server/test_status_counters.py \
           storage/test_atomic_write.py storage/test_checkpoint.py storage/test_model_file.py viewer/test_scene.py)
 # Tests of real processes that mostly wait and have no tight limits of time: two at a time. The rest time something.
-PAIRS  := $(addprefix tests/service/,background/test_diagnosing.py failover/test_restart.py failover/test_standby.py \
+PAIRS  := $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
           operating security server/test_process.py storage/test_recorder.py viewer/test_live.py viewer/test_sink.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
