@@ -1,1 +1,1 @@
-"""The operator's hands: verbs over zenoh, their journal, and the table of what is alive (docs/operating.md)."""
+"""Operator's commands: requests over zenoh, their journal, and the table of statuses (docs/operating.md)."""

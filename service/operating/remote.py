@@ -1,4 +1,4 @@
-"""The operator's side: commands an axis, and asks all that serve how they are."""
+"""The operator's side of the wire: sends commands to an axis, and collects the statuses of all instances."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from service.protocol.errors import FieldError, NoReplyError, ReplyTimeoutError,
 from service.protocol.json_message import fields_of
 from service.protocol.keys import ROOT, Keys
 
-#: A session is open before it has heard what is declared at its other end; until then queries get no reply, s.
+#: Time, s, until a new session knows what the other end has declared; before, queries get no reply.
 _SETTLE_S: Final = 0.5
 _PAUSE_S: Final = 0.05
-#: A standby is no longer shown after this long without a word, s; and no more of them than these are kept.
+#: Time without a status after which a standby is no longer shown, s, and the most standbys that are kept.
 _SILENT_S: Final = 3.5
 _MOST_STANDBYS: Final = 4096
 
@@ -32,9 +32,9 @@ def operate(
 ) -> dict[str, Any]:
     """Command the axis and return the service's answer (docs/operating.md), ``seq`` and ``result`` among it.
 
-    Raises RefusedError in the service's own words, NoReplyError where nobody answers (which is also how a refusal by
-    access control looks), ReplyTimeoutError after ``timeout_s``. A verb that was not answered may have been done:
-    ask the status before it is repeated.
+    Raises RefusedError with the service's message, NoReplyError if there is no reply (a refusal by access control
+    gives none either), ReplyTimeoutError after ``timeout_s``. A command without a reply may have been applied: read
+    the status before you repeat it.
     """
     payload = encode_request(Request(verb, who, arguments or {}))
     until = time.monotonic() + _SETTLE_S
@@ -49,7 +49,7 @@ def operate(
             elif reply.err is not None:
                 error = bytes(reply.err.payload.to_bytes())
         if error is not None:
-            raise _told(error_from_json(error), keys, timeout_s)
+            raise _with_advice(error_from_json(error), keys, timeout_s)
         if time.monotonic() >= until:
             raise NoReplyError(
                 f"{keys.operate}: nobody answers; does a service with this stage and axis run, and may you command it?"
@@ -60,7 +60,7 @@ def operate(
 def statuses(session: zenoh.Session, stage: str = "*", axis: str = "*", timeout_s: float = 1.0) -> list[dict[str, Any]]:
     """The status of every instance of every axis that answers, ordered by stage, axis and role; may be empty."""
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
-    # Two instances answer on one key: without consolidation both are heard.
+    # Two instances reply on one key; consolidation would drop one of them.
     for reply in session.get(
         f"{ROOT}/{stage}/{axis}/status",
         target=zenoh.QueryTarget.ALL,
@@ -81,28 +81,28 @@ def in_order(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 class Standbys:
-    """The statuses of instances that stand by: they answer no queries, but tell of themselves once a second."""
+    """The statuses of standbys, which answer no queries but publish their status once a second."""
 
     def __init__(self, session: zenoh.Session, stage: str = "*", axis: str = "*") -> None:
-        self._heard: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._received: dict[str, tuple[float, dict[str, Any]]] = {}
         self._subscriber = session.declare_subscriber(f"{ROOT}/{stage}/{axis}/standby/*", self._on_status)
 
     def statuses(self) -> list[dict[str, Any]]:
-        """Those that were heard of a moment ago."""
+        """The statuses received within the last seconds."""
         since = time.monotonic() - _SILENT_S
-        return [status for at, status in list(self._heard.values()) if at >= since]
+        return [status for at, status in list(self._received.values()) if at >= since]
 
     def undeclare(self) -> None:
-        """Hear no more."""
+        """End the subscription."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         status = fields_of(sample.payload.to_bytes())
-        if "instance" in status and len(self._heard) < _MOST_STANDBYS:
-            self._heard[str(sample.key_expr)] = (time.monotonic(), status)
+        if "instance" in status and len(self._received) < _MOST_STANDBYS:
+            self._received[str(sample.key_expr)] = (time.monotonic(), status)
 
 
-def _told(failure: ServiceError, keys: Keys, timeout_s: float) -> ServiceError:
+def _with_advice(failure: ServiceError, keys: Keys, timeout_s: float) -> ServiceError:
     if isinstance(failure, ReplyTimeoutError):
         return ReplyTimeoutError(
             f"{keys.operate}: no answer within {timeout_s:g} s; see the status before you repeat it"

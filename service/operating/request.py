@@ -1,4 +1,4 @@
-"""The request of an operator: JSON, read strictly."""
+"""The request of an operator: JSON, decoded strictly."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _FIELDS: Final = ("verb", "arguments", "who")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is asked, and by whom.
+    """A command and who sends it.
 
     Attributes
     ----------
     verb : such as ``freeze``. arguments : by name, JSON values.
-    who : what the caller says of itself; that it may ask at all is zenoh's access control to decide.
+    who : name that the caller gives; it is not verified. Zenoh's access control decides who may send commands.
     """
 
     verb: str
@@ -32,7 +32,7 @@ class Request:
 
 
 def encode_request(request: Request) -> bytes:
-    """The payload of a request. Raises InputError where the service would refuse to read it."""
+    """The payload of a request. Raises InputError if the service would refuse it."""
     data = {"verb": request.verb, "arguments": dict(request.arguments), "who": request.who}
     try:
         payload = json.dumps(data, allow_nan=False).encode()
@@ -43,7 +43,7 @@ def encode_request(request: Request) -> bytes:
 
 
 def decode_request(payload: bytes | None) -> Request:
-    """The request in a payload. Raises InputError naming the field, what was got and what was expected."""
+    """The request in a payload. Raises InputError with the field, what was got and what was expected."""
     if payload is None:
         raise FieldError("payload", "none", "JSON with verb, arguments and who")
     if len(payload) > MAX_BYTES:

@@ -1,4 +1,4 @@
-"""Takes the requests of operators from the wire, one after the other, and answers each."""
+"""Takes the requests of operators from the wire, one after the other, and replies to each."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from service.operating.journal import Journal
 from service.operating.request import MAX_BYTES, Request, decode_request
 from service.operating.verbs import Verbs
 from service.protocol.errors import FieldError, ServiceError, error_to_json
+from service.protocol.json_message import JSON, to_json
 from service.protocol.keys import Keys
 
 SCHEMA: Final = 1
-JSON: Final = "application/json"
-#: Requests that may wait; what comes on top is refused.
+#: Requests that may wait; further ones are refused.
 _WAITING: Final = 32
 _STOP: Final = None
 
@@ -27,13 +27,13 @@ _STOP: Final = None
 class OperationsServer:
     """The queryable ``.../operate`` of one axis and the thread behind it.
 
-    A thread of its own, because a verb waits for the learner to come to the end of its batch, and a callback of zenoh
-    that waits holds up every query.
+    It has a thread of its own, because a verb waits until the learner has finished its batch, and a callback of zenoh
+    that waits would delay every query.
 
     Parameters
     ----------
-    keys, instance : of the axis. verbs : what can be asked. journal : where it is written down.
-    note : tells an event: name, detail. role : what this instance is now; only a primary takes commands.
+    keys, instance : of the axis. verbs : the commands. journal : keeps a record of them.
+    note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class OperationsServer:
         self._thread: threading.Thread | None = None
 
     def counters(self) -> dict[str, int]:
-        """For the status: requests done and refused, and operations that the journal lost."""
+        """For the status: requests done, requests refused, and operations missing in the journal."""
         return {**self._counts, "unlogged": self._journal.lost}
 
     def declare(self, session: zenoh.Session) -> list[Any]:
-        """Begin to take requests; returns what is to be undeclared, in this order."""
+        """Take requests from now on; returns what is to be undeclared, in this order."""
         self._queue = queue.Queue(_WAITING)
         self._thread = threading.Thread(
             target=self._run, args=(self._queue,), name=f"operate-{self._keys.axis}", daemon=True
@@ -69,14 +69,14 @@ class OperationsServer:
         return [session.declare_queryable(self._keys.operate, self._on_query), self]
 
     def undeclare(self) -> None:
-        """End the thread after the requests that wait; the queryable is to be gone by then."""
+        """End the thread after the requests that wait; undeclare the queryable before."""
         if self._thread is not None:
             self._queue.put(_STOP)
             self._thread.join()
             self._thread = None
 
     def handle(self, payload: bytes | None) -> bytes:
-        """Do what a payload asks, write it down, and return the answer. Raises DehystError where it is refused."""
+        """Run the command in a payload and record it; returns the reply. Raises DehystError if it is refused."""
         request: Request | None = None
         try:
             request = decode_request(payload)
@@ -103,10 +103,10 @@ class OperationsServer:
             "seq": seq,
             "result": result,
         }
-        return json.dumps(answer, default=_plain).encode()
+        return to_json(answer)
 
     def _write(self, request: Request, seq: int | None = None, error: str = "") -> None:
-        """Into the journal; and an event where the verb itself tells none."""
+        """Write to the journal, and note an event if the verb itself does not."""
         entry: dict[str, Any] = {
             "who": request.who,
             "verb": request.verb,
@@ -144,16 +144,11 @@ class OperationsServer:
     def _run(self, waiting: queue.Queue[tuple[zenoh.Query, bytes | None] | None]) -> None:
         while (item := waiting.get()) is not _STOP:
             query, payload = item
-            # Leaving the context finishes the query; without that the caller waits until its time is over.
+            # Leaving the context finishes the query; otherwise the caller waits until its time is over.
             with query:
                 try:
                     query.reply(self._keys.operate, self.handle(payload), encoding=JSON)
                 except zenoh.ZError:
-                    continue  # who asked is gone
+                    continue  # the caller is gone
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
-
-
-def _plain(value: Any) -> Any:
-    """numpy's numbers and arrays for JSON."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)

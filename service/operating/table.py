@@ -1,4 +1,4 @@
-"""The status of all that serve as a table in a terminal; no terminal library, plain ANSI."""
+"""The statuses of all instances as a table for a terminal, in plain ANSI."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _age(seconds: Any) -> str:
 
 
 def _state(status: dict[str, Any]) -> str:
-    """What the axis does now, in a word; the first that holds."""
+    """The state of the axis in a word: the first condition that holds."""
     if status.get("trouble"):
         return str(status["trouble"])
     if status.get("stale"):
@@ -49,7 +49,7 @@ def _state(status: dict[str, Any]) -> str:
 
 
 def _gates(status: dict[str, Any]) -> str:
-    """Samples that were refused, by the commonest reasons."""
+    """The two most frequent reasons for refused samples."""
     gates = _get(status, "samples", "gates") or {}
     refused = sorted(((n, name) for name, n in gates.items() if name != "learnt"), reverse=True)
     return " ".join(f"{name}:{n}" for n, name in refused[:2]) or "-"
@@ -78,12 +78,12 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
 
 
 def is_healthy(status: dict[str, Any]) -> bool:
-    """Whether nothing in a status asks for an operator's eyes."""
+    """Whether a status needs no attention of an operator."""
     return _state(status) in ("ok", "not learning") and not _get(status, "samples", "dropped")
 
 
 def table(statuses: Sequence[dict[str, Any]], width: int = 0, colour: bool = False) -> str:
-    """The table as text, lines of at most ``width`` characters (0: as long as they are)."""
+    """The table as text, with lines of at most ``width`` characters (0: no limit)."""
     lines = [" ".join(f"{name:<{size}}" for name, size, _ in COLUMNS).rstrip()]
     for status in statuses:
         cells = [f"{_safe(show(status))[:size]:<{size}}" for _, size, show in COLUMNS]
@@ -97,12 +97,12 @@ def table(statuses: Sequence[dict[str, Any]], width: int = 0, colour: bool = Fal
             for i, (line, fine) in enumerate(zip(lines, healthy, strict=True))
         ]
     if not statuses:
-        lines.append("nobody serves here")
+        lines.append("no instance answers")
     return "\n".join(lines)
 
 
 def screen(statuses: Sequence[dict[str, Any]], endpoint: str, events: Sequence[str]) -> str:
-    """A whole screen: cleared, a line of when and where, the table, the newest events."""
+    """A whole screen: clear, a line with time and endpoint, the table, the newest events."""
     try:
         size = os.get_terminal_size()
         width, height = size.columns, size.lines
@@ -116,5 +116,5 @@ def screen(statuses: Sequence[dict[str, Any]], endpoint: str, events: Sequence[s
 
 
 def _safe(text: str) -> str:
-    """Nothing that would move a terminal's cursor: what is shown was said by others."""
+    """``text`` without control characters: it comes from other processes and must not move the cursor."""
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -1,4 +1,4 @@
-"""What an operator can ask of an axis, by name."""
+"""The commands (verbs) of an operator to an axis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.protocol.errors import FieldError, ServiceError
 
 
 class OperableAxis(Protocol):
-    """What the verbs need of an axis; each of the first four returns the sequence number from which it holds."""
+    """What the verbs need of an axis; each command returns the number of the sample after which it holds."""
 
     @property
     def handled_seq(self) -> int: ...
@@ -27,11 +27,11 @@ class OperableAxis(Protocol):
     def checkpoints(self) -> list[dict[str, Any]]: ...
 
 
-#: Runs work on an axis where it changes, between two batches of samples, and returns its result.
+#: Runs work on an axis between two batches of samples, in the thread of the axis; returns its result.
 Between = Callable[[Callable[[Any], int]], int]
-#: Something that starts work in the background: arguments in, what was started out.
+#: Starts background work: takes the arguments of the request, returns what was started.
 Background = Callable[[dict[str, Any]], dict[str, Any]]
-#: The axis' answer: (sequence number at which it took effect, what else there is to tell).
+#: (number of the sample after which the command holds, further fields of the reply).
 Outcome = tuple[int, dict[str, Any]]
 
 
@@ -40,8 +40,8 @@ class Verbs:
 
     Parameters
     ----------
-    axis : what they act on. between : runs work on it between two batches of samples.
-    background : name -> what starts long work; None where it is switched off in the configuration.
+    axis : the axis. between : runs work on it between two batches of samples.
+    background : by verb, returns what starts the work; None if the configuration switches it off.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Verbs:
 
     @property
     def background(self) -> tuple[str, ...]:
-        """Those that start something and do not wait for its end; the others tell an event of their own."""
+        """Verbs that start background work and do not wait for it; the others note their own events."""
         return tuple(self._background)
 
     @property
@@ -69,7 +69,7 @@ class Verbs:
         return tuple(self._verbs)
 
     def apply(self, request: Request) -> Outcome:
-        """Do what is asked. Raises InputError on what cannot be asked for, ServiceError on what cannot be done now."""
+        """Run a command. Raises InputError if it is not valid, ServiceError if it is not possible now."""
         verb = self._verbs.get(request.verb)
         if verb is None:
             raise FieldError("verb", repr(request.verb), f"one of {', '.join(self._verbs)}")

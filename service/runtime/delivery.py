@@ -16,8 +16,8 @@ _PAUSE_S: Final = 0.01
 def is_followed(publisher: Any) -> bool:
     """Whether anybody subscribes to what ``publisher`` puts, as far as its session has heard."""
     status = publisher.matching_status
-    # An object that is always true in this release, a plain truth value by its own type stub.
-    return bool(getattr(status, "matching", status))
+    # By its type stub a plain truth value; in this release an object that is always true.
+    return status if isinstance(status, bool) else bool(status.matching)
 
 
 def wait_followed(publisher: Any, within_s: float) -> bool:

@@ -271,7 +271,7 @@ class Axis:
         if self.clock.in_doubt and self.learning:
             return TIMING
         verdict = self.supervisor.handle(sample)
-        if self.clock.unheard(verdict) and self.learner is not None:
+        if self.clock.must_resync(verdict) and self.learner is not None:
             self._note_limited(
                 "learner_resynced", f"it refused samples in order as {verdict}: its own count and time begin anew"
             )

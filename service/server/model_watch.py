@@ -1,21 +1,21 @@
-"""Watches what the samples and the learner do, and says which model may be served: the newest, the last good one, none.
+"""Decides which model of an axis may be served: the newest, the last good one, or gradually the baseline.
 
-Deterministic: a function of the samples and the learner's snapshots alone, so that a standby and a replay decide alike.
-Trouble has a name, begins and ends with hysteresis, and ends by itself:
+Deterministic: a function of the samples and of the learner's snapshots, so that a standby and a replay decide alike.
+A trouble has a name, begins and ends with hysteresis, and ends by itself:
 
-- ``sensor_frozen``: the reading has not moved at all for a while in which the voltage has.
-- ``samples_poisoned``: most samples of the last while were refused for their values.
-- ``model_bad``: the newest model is not finite, or far from every other, at places all over the range.
-- ``learner_failed``: the learner raised; another is begun from the last good model after a while.
-- ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope``: the learner says that the
-  readings do not follow the drive as this stage's can (``adaptive.online.sensor_trial``).
-- ``rail``, ``model_left_envelope``: the voltage was at a limit because the model was wrong, or the model had left what
-  a stage can become; the learner has begun again from the identified one.
+- ``sensor_frozen`` : the reading has not changed for a while in which the voltage has.
+- ``samples_poisoned`` : most samples of the last while were refused for their values.
+- ``model_bad`` : the newest model is not finite, or far from every other, at positions all over the range.
+- ``learner_failed`` : the learner raised; another one is started from the last good model after a while.
+- ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope`` : the learner reports that
+  the readings do not follow the voltage as those of this stage can.
+- ``rail``, ``model_left_envelope`` : the voltage was at a limit because the model was wrong, or the model has left
+  the range in which a stage can be; the learner has restarted from the identified model.
 
-During the first two the learner is frozen and the model from before the trouble is served. Where the learner itself
-distrusts the sensor, what it goes on serving is: it has gone back to before the fault. Where it has begun again, that
-is the identified model; during the others it is the last that passed. What was served for too
-long without being renewed gives way, over a ramp, to the baseline.
+During the first two, and while the learner distrusts the sensor, nothing is learnt. Which model is served meanwhile:
+the last good one from before the trouble; the learner's own where it has itself gone back to before the fault; the
+identified one where the learner has restarted. A model that was not renewed for ``last_good_s`` gives way to the
+baseline over a ramp.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"
 MODEL_BAD: Final = "model_bad"
 LEARNER_FAILED: Final = "learner_failed"
-#: After these the learner has begun again: the model from before is what was wrong.
+#: After these the learner has restarted, because the model from before was wrong.
 BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
-#: During these the learner is not to be taught.
+#: During these nothing is learnt.
 POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
-#: Refusals that speak of the values themselves; a stage at rest or out of sequence is no poison.
+#: Refusals for the values of a sample. A stage at rest, or a sample out of sequence, is no trouble.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
 _PROBES: Final = 9
 #: Models that the watch keeps: the last good one, and two from before, the older and the newer.
@@ -49,17 +49,18 @@ ROLES: Final = ("good", "mark", "next_mark")
 
 @dataclass(frozen=True, slots=True)
 class ModelWatchConfig:
-    """When to call it trouble.
+    """Thresholds of the troubles.
 
     Attributes
     ----------
-    frozen_s, frozen_share : a reading that stands still for this long, s, while the voltage moves by this share of its
-    range, is frozen. poisoned_s, poisoned_share : that share of bad values over about that time, s.
-    insane_share : distance of a model from the baseline, as a share of the voltage range, that no drift explains.
+    frozen_s, frozen_share : the sensor is frozen if the reading does not change for this time, s, while the voltage
+    changes by this share of its range.
+    poisoned_s, poisoned_share : time constant, s, and share of bad values from which samples are poisoned.
+    insane_share : distance from the baseline, as a share of the voltage range, that no drift explains.
     recover_s : time without trouble, s, after which the newest model is served again.
-    mark_s : age that a model reaches, s, before it counts as one from before the trouble.
-    last_good_s, ramp_s : how long the last good model is served, s, and over what time, s, the baseline takes over.
-    revive_s : time after which a learner that failed is begun anew, s.
+    mark_s : age, s, from which a model counts as one from before the trouble.
+    last_good_s, ramp_s : times, s, for which the last good model is served, and in which the baseline takes over.
+    revive_s : time, s, after which a failed learner is replaced.
     """
 
     frozen_s: float = 0.1
@@ -75,11 +76,11 @@ class ModelWatchConfig:
 
 
 class ModelWatch:
-    """State of the watch over one axis. One thread calls it.
+    """The watch over one axis. One thread calls it.
 
     Attributes
     ----------
-    trouble : name of what is wrong, empty while all is well. trust : weight of the served model, 1 while all is well.
+    trouble : name of the present trouble, "" for none. trust : weight of the served model, 0 to 1; 1 without trouble.
     """
 
     def __init__(self, config: ModelWatchConfig, dt_s: float, limits: Limits) -> None:
@@ -93,14 +94,14 @@ class ModelWatch:
         self._good: InverseModel | None = None
         self._mark: InverseModel | None = None
         self._next_mark: InverseModel | None = None
-        #: Plain numbers only, so that the state can be written down.
+        #: Numbers only, so that they can be stored.
         self._n: dict[str, float] = {
             "count": 0, "still": 0, "y": math.nan, "u_low": math.inf, "u_high": -math.inf,
             "bad": 0.0, "marked": 0, "since": 0, "clean": 0, "seen": 0, "failed": 0,
         }  # fmt: skip
 
     def take(self, u_V: float, y_um: float, verdict: str) -> None:
-        """One sample in order, and what the learner said of it."""
+        """Take one sample in order, with the learner's verdict."""
         n, c = self._n, self.config
         n["count"] += 1
         if y_um == n["y"]:
@@ -108,13 +109,13 @@ class ModelWatch:
             n["u_low"], n["u_high"] = min(n["u_low"], u_V), max(n["u_high"], u_V)
         else:
             n["still"], n["y"], n["u_low"], n["u_high"] = 0, y_um, u_V, u_V
-        # A sensor that repeats itself has trouble of its own name.
+        # A repeated reading belongs to the trouble sensor_frozen.
         bad = 1.0 if verdict in _BAD_VALUES and not n["still"] else 0.0
         n["bad"] += (bad - n["bad"]) * self._dt_s / c.poisoned_s
 
-    def _samples_say(self) -> str:
+    def _trouble_of_samples(self) -> str:
         n, c = self._n, self.config
-        # Once in trouble it takes less to stay in it.
+        # Hysteresis: a lower share ends the trouble than begins it.
         share = c.poisoned_share * (0.2 if self.trouble == SAMPLES_POISONED else 1.0)
         if n["bad"] > share:
             return SAMPLES_POISONED
@@ -124,19 +125,19 @@ class ModelWatch:
         return ""
 
     def judge(
-        self, candidate: InverseModel | None, baseline: InverseModel | None, told: str = "", distrusts: bool = False
+        self, candidate: InverseModel | None, baseline: InverseModel | None, reported: str = "", distrusts: bool = False
     ) -> InverseModel | None:
-        """The model to serve, of ``candidate`` (None: the learner failed) and those before; None: nothing but what is.
+        """The model to serve: ``candidate`` or one from before; None: keep the present one. Once per snapshot.
 
-        ``told``: what the learner says is wrong. ``distrusts``: whether it has the readings on trial.
-        Call once per snapshot. Sets ``trouble`` and ``trust``.
+        ``candidate`` : the newest model, None if the learner has failed. ``reported`` : the trouble that the learner
+        reports. ``distrusts`` : whether it has the sensor on trial. Sets `trouble` and `trust`.
         """
         n, c = self._n, self.config
         now, elapsed = n["count"], n["count"] - n["seen"]
         n["seen"] = now
-        found = told or self._samples_say()
+        found = reported or self._trouble_of_samples()
         if found in SENSOR_FAULTS and self.trouble in (SENSOR_FROZEN, SAMPLES_POISONED):
-            found = self.trouble  # the same trouble, seen by another
+            found = self.trouble  # the same trouble, already named
         if not found and candidate is None:
             found = LEARNER_FAILED
         if not found and candidate is not None and candidate is not self._good and not self._sane(candidate, baseline):
@@ -147,7 +148,7 @@ class ModelWatch:
                 if not self.trouble:
                     n["since"] = now
                 if found in POISON and self._mark is not None:
-                    # What came in before the trouble had its name may have been learnt.
+                    # Bad samples from before the trouble had its name may have been learnt.
                     self._good = self._next_mark = self._mark
                 self.trouble = found
         elif self.trouble:
@@ -157,7 +158,7 @@ class ModelWatch:
         if self.trouble in BEGUN_AGAIN and candidate is not None:
             self._mark = self._next_mark = self._good = candidate
         elif self.trouble and distrusts and candidate is not None and self._sane(candidate, baseline):
-            # It has gone back to before the fault by itself, and knows more of before than one snapshot does.
+            # The learner has itself gone back to before the fault, which is better than an old snapshot.
             self._good = candidate
         if not self.trouble and candidate is not None:
             self._good = candidate
@@ -169,7 +170,7 @@ class ModelWatch:
         return self._good
 
     def failed_long(self) -> bool:
-        """Whether a learner that failed is to be begun anew; call once per snapshot while it is dead."""
+        """Whether to replace a failed learner now; call once per snapshot while it has failed."""
         n = self._n
         if not n["failed"]:
             n["failed"] = n["count"]
@@ -185,11 +186,11 @@ class ModelWatch:
 
     @property
     def teachable(self) -> bool:
-        """Whether the samples are fit to teach."""
+        """Whether the samples may be learnt."""
         return self.trouble not in POISON
 
     def _sane(self, model: InverseModel, baseline: InverseModel | None) -> bool:
-        """Finite all over the range, at rest, and not further from the baseline than any drift would bring it."""
+        """Whether the model at rest is finite over the range and no further from the baseline than drift explains."""
         low, high = self._limits.y_min_um, self._limits.y_max_um
         if not (math.isfinite(low) and math.isfinite(high)):
             low, high = 0.0, 1.0
@@ -207,12 +208,12 @@ class ModelWatch:
         return bool((np.abs(u - other)[inside] <= self.config.insane_share * self._span_V).all())
 
     def models(self) -> dict[str, InverseModel]:
-        """The good models by their part: those that :meth:`restore` wants back."""
+        """The models that the watch keeps, by role; `restored` takes them back."""
         known = zip(ROLES, (self._good, self._mark, self._next_mark), strict=True)
         return {role: model for role, model in known if model is not None}
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain numbers and words; the models are not in it."""
+        """Numbers and words, without the models."""
         return {"trouble": self.trouble, "trust": self.trust, **self._n}
 
     def restored(self, state: dict[str, Any], models: dict[str, InverseModel]) -> ModelWatch:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
 from service.answers.latency import LatencyMeter
 from service.failover.state_transfer import send_state
 from service.protocol.errors import FieldError, error_to_json
+from service.protocol.json_message import JSON, to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
 from service.protocol.query import decode_query
@@ -23,7 +22,6 @@ from service.server.axis import Axis
 from service.storage.checkpoint import encode_checkpoint
 from service.storage.checkpoint_keeper import CheckpointKeeper
 
-JSON: Final = "application/json"
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02
 
@@ -111,12 +109,3 @@ class QueryAnswers:
                 meter.add(time.perf_counter() - start, failed)
 
         return callback
-
-
-def to_json(value: Any) -> bytes:
-    """JSON of ``value``, in which numpy's numbers and arrays may be, and anything else by its text."""
-    return json.dumps(value, default=_plain).encode()
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from adaptive.online.learner import Learner
 from adaptive.types import InverseModel
-from service.intake.clock import SET_AFTER, UNHEARD, SampleClock
+from service.intake.clock import RESYNC_AFTER, SET_AFTER, SampleClock
 from service.protocol.samples import SampleBatch
 from tests.service.server.test_axis import make_axis, recording
 
@@ -118,12 +118,12 @@ def test_numbers_are_kept_exactly_and_a_poisoned_state_is_forgotten() -> None:
 
 def test_a_learner_that_refuses_what_is_in_order_forgets_its_own_count() -> None:
     clock = SampleClock(DT_S)
-    verdicts = ["timing", "out_of_order", "not_finite", "duplicate"] * UNHEARD
-    heard = verdicts[: [clock.unheard(verdict) for verdict in verdicts].index(True) + 1]
-    assert len(heard) - heard.count("not_finite") == UNHEARD
+    verdicts = ["timing", "out_of_order", "not_finite", "duplicate"] * RESYNC_AFTER
+    heard = verdicts[: [clock.must_resync(verdict) for verdict in verdicts].index(True) + 1]
+    assert len(heard) - heard.count("not_finite") == RESYNC_AFTER
     for _ in range(3):
-        assert not any([clock.unheard("timing") for _ in range(UNHEARD - 1)])
-        assert not clock.unheard("learnt")
+        assert not any([clock.must_resync("timing") for _ in range(RESYNC_AFTER - 1)])
+        assert not clock.must_resync("learnt")
 
 
 @pytest.mark.parametrize("t_s", [*ABSURD, -7.0, 1e6])
