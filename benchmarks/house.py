@@ -27,10 +27,10 @@ sample files : product files of which a function or method is called on the way 
     ``all steps``: the files that at least 2 of the 40 enter, the steps of filter and window included; diagnostics,
     due every 50th sample, are not. ``alone``: without the competing models. Lambdas, comprehensions and generated
     code (the ``__init__`` of a dataclass) are not counted.
-window walk : the files that a reader opens who follows the arrays through one `Window.replace` (one sample out, one in)
-    of a full window. He follows the calls that pass an array, or a tuple of arrays, into each function the first time
-    it is called, and comes back to the caller at its end. A stay is a stretch of reading in one file. A return is a
-    stay in a file that he has been in before: returns = stays - files. ``calls only``: without coming back.
+window walk : the files on the way of the arrays through one `Window.replace` (one sample out, one in) of a full window.
+    The walk enters each function that gets an array, or a tuple of arrays, at its first call, and comes back to the
+    caller at its end. A stay is a part of the walk in one file. A return is a stay in a file that was visited before:
+    returns = stays - files. ``calls only``: without coming back.
 """
 
 from __future__ import annotations
@@ -53,6 +53,9 @@ from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType, SimpleNamespace
 from typing import Any, Final
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 PACKAGES: Final = ("adaptive", "baselines", "sim", "service", "lab")
 FOLDER_LIMIT: Final = 15
@@ -167,32 +170,14 @@ def single_importers(known: dict[str, Module]) -> list[str]:
 
 
 def circles(known: dict[str, Module]) -> list[list[str]]:
-    """Groups of modules that import each other, by Tarjan's algorithm."""
-    edges = {name: sorted({t for t, _ in imports_of(module, known)} - {name}) for name, module in known.items()}
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(name: str) -> None:
-        index[name] = low[name] = len(index)
-        stack.append(name)
-        for target in edges[name]:
-            if target not in index:
-                visit(target)
-            if target in stack:
-                low[name] = min(low[name], low[target])
-        if low[name] == index[name]:
-            at = stack.index(name)
-            group = sorted(stack[at:])
-            del stack[at:]
-            if len(group) > 1:
-                found.append(group)
-
-    for name in edges:
-        if name not in index:
-            visit(name)
-    return sorted(found)
+    """Groups of modules that import each other: the strongly connected components of the imports."""
+    names = list(known)
+    imports = np.zeros((len(names), len(names)), dtype=bool)
+    for row, module in enumerate(known.values()):
+        imports[row, [names.index(target) for target, _ in imports_of(module, known)]] = True
+    count, group = connected_components(imports, connection="strong")
+    groups = [sorted(name for name, own in zip(names, group, strict=True) if own == k) for k in range(count)]
+    return sorted(group for group in groups if len(group) > 1)
 
 
 @dataclass
@@ -263,7 +248,7 @@ class Dynamic(ast.NodeVisitor):
 
 
 def _dotted(node: ast.expr) -> str:
-    """``a.b.c`` of names and attributes; what else it begins with is left out."""
+    """``a.b.c`` of names and attributes; any other beginning is left out."""
     parts = []
     while isinstance(node, ast.Attribute):
         parts.append(node.attr)
@@ -334,7 +319,7 @@ def places(known: dict[str, Module]) -> dict[str, tuple[str, str]]:
 
 
 class Trace:
-    """Calls of product functions while ``on``: the files, and the stays of a reader who follows the arrays."""
+    """Calls of product functions while ``on``: the files, and the walk that follows the arrays."""
 
     def __init__(self, root: Path) -> None:
         self.on = False
@@ -342,7 +327,7 @@ class Trace:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what was traced."""
+        """Drop the trace."""
         self.files: set[str] = set()
         self.stays: list[str] = []
         self.entered: list[str] = []
@@ -369,12 +354,12 @@ class Trace:
                 self._open[frame] = caller
 
     def walk(self) -> dict[str, Any]:
-        """What the window walk reports."""
-        told: dict[str, Any] = {}
+        """The result of the window walk."""
+        result: dict[str, Any] = {}
         for name, route in (("coming back", self.stays), ("calls only", self.entered)):
             files = len(set(route))
-            told[name] = {"stays": len(route), "files": files, "returns": len(route) - files}
-        return {**told, "route": self.stays}
+            result[name] = {"stays": len(route), "files": files, "returns": len(route) - files}
+        return {**result, "route": self.stays}
 
     def _file(self, frame: FrameType | None) -> str | None:
         name = frame.f_code.co_filename if frame else ""
@@ -394,8 +379,6 @@ def _arrays(value: object) -> bool:
 
 def trace_window(product: SimpleNamespace, trace: Trace) -> dict[str, Any]:
     """One sample out, one in, in a full window that has made such steps before."""
-    import numpy as np
-
     rng, size = np.random.default_rng(0), 20
     X, y = rng.random((size, 3)), rng.random(size)
     window = product.Window.from_samples(product.WindowConfig(size, (0.6, 0.9, 1.5), 200.0), X, y)
@@ -409,8 +392,6 @@ def trace_window(product: SimpleNamespace, trace: Trace) -> dict[str, Any]:
 def trace_sample(product: SimpleNamespace, trace: Trace, alone: bool) -> dict[str, Any]:
     """The files on the way of a sample from the subscriber's callback to the snapshot."""
     from unittest.mock import MagicMock
-
-    import numpy as np
 
     dt_s, warm, traced, n = 0.001, 300, 40, 1200
     t = np.arange(n + warm + traced) * dt_s
