@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from lab.demo.result import empty
+from lab.testbed.processes import run_client_process
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
@@ -193,16 +193,8 @@ def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
 
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
-    # zenoh's threads must not wait 5 ms for the interpreter lock.
-    sys.setswitchinterval(5e-5)
     plan = Plan(**json.loads(Path(argv[0]).read_text()))
-    try:
-        return control(plan, argv[1], Path(argv[2]))
-    except DehystError as error:
-        print(json.dumps({"error": str(error)}), flush=True)
-        return 2
-    except KeyboardInterrupt:
-        return 130
+    return run_client_process(lambda: control(plan, argv[1], Path(argv[2])))
 
 
 if __name__ == "__main__":

@@ -17,14 +17,16 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from adaptive.errors import DehystError, InputError
+from adaptive.errors import InputError
 from lab.soak.task import AXIS, STAGE, ControlTask, SoakReference, dwell_key
+from lab.testbed.processes import run_client_process
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.protocol.reply import Trajectory
 from service.runtime.delivery import SURELY
+from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 from service.stage_node.node import status_key
 
@@ -174,27 +176,18 @@ class Controller:
         return within and float(steps.max()) <= c.slew_V_per_s * c.dt_s * (1.0 + 1e-9)
 
 
-def main(argv: list[str]) -> int:
-    """Entry of the process. Returns its exit status."""
+def run(task: ControlTask, endpoint: str) -> int:
+    """Control the stage behind ``endpoint`` until stopped."""
     stop = StopSignal()
-    # zenoh's threads must not wait 5 ms for the interpreter lock.
-    sys.setswitchinterval(5e-5)
-    control = ControlTask(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
-    from service.runtime.session import open_client
-
-    try:
-        with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
-            client.status()
-            with open_client(argv[1], 10.0) as session:
-                controller = Controller(control, client, session)
-                print("ready", flush=True)
-                controller.run(stop)
-                print(json.dumps(controller.counts), flush=True)
-    except DehystError as error:
-        print(json.dumps({"fatal": str(error)}), flush=True)
-        return 2
+    with Client.connect(endpoint, STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
+        client.status()
+        with open_client(endpoint, 10.0) as session:
+            controller = Controller(task, client, session)
+            print("ready", flush=True)
+            controller.run(stop)
+            print(json.dumps(controller.counts), flush=True)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_client_process(lambda: run(ControlTask.read(Path(sys.argv[1])), sys.argv[2])))

@@ -24,6 +24,7 @@ import zenoh
 
 from adaptive.errors import DehystError, InputError
 from lab.soak.task import AXIS, STAGE, ControlTask
+from lab.testbed.processes import run_client_process
 from lab.testbed.side_processes import ECHO_KEY
 from service.client.client import Client
 from service.protocol.errors import NoReplyError
@@ -193,47 +194,39 @@ def _echo(querier: zenoh.Querier, payload: bytes) -> int:
     raise NoReplyError("soak: no echo")
 
 
-def main(argv: list[str]) -> int:
-    """Entry of the process. Returns its exit status."""
+def run(task: ControlTask, endpoint: str) -> int:
+    """Query the service behind ``endpoint`` until stopped."""
     stop = StopSignal()
-    sys.setswitchinterval(5e-5)
-    control = ControlTask(**json.loads(Path(argv[0]).read_text(encoding="utf-8")))
-    y_um = 0.5 * (control.low_um + control.high_um)
+    y_um = 0.5 * (task.low_um + task.high_um)
 
     def point(client: Client, before: Point | None) -> Point:
         return client.point(y_um, after=before)
 
-    try:
-        with Client.connect(argv[1], STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
-            first = client.point(y_um)
-            payload = encode_query([0.0], [0.0], [0.0], memory=first.memory, model=first.model)
-            nothing = Answer(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model)
-            key = f"{ECHO_KEY}/{len(encode_reply(nothing))}"
-            with open_client(argv[1], 10.0) as session, ExitStack() as stack:
-                # A client must not be used by several threads at once.
-                clients = [
-                    stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)
-                ]
-                queriers = [session.declare_querier(key, timeout=TIMEOUT_S, express=True) for _ in range(MOST)]
-                points = stack.enter_context(OverlappingQueries([partial(point, each) for each in clients], AGAIN_S))
-                echoes = stack.enter_context(OverlappingQueries([partial(_echo, each) for each in queriers], AGAIN_S))
-                prober = Prober(control, points, echoes)
-                follower = client.follow()
-                print("ready", flush=True)
-                next_s = time.monotonic() + 1.0
-                while not stop.reason:
-                    prober.ask()
-                    prober.echo(payload)
-                    time.sleep(PAUSE_S)
-                    prober.look(follower.age_s)
-                    if time.monotonic() >= next_s:
-                        next_s += 1.0
-                        print(prober.report(), flush=True)
-    except DehystError as error:
-        print(json.dumps({"fatal": str(error)}), flush=True)
-        return 2
+    with Client.connect(endpoint, STAGE, AXIS, timeout_s=TIMEOUT_S, retry_s=0.0, wait_s=30.0) as client:
+        first = client.point(y_um)
+        payload = encode_query([0.0], [0.0], [0.0], memory=first.memory, model=first.model)
+        reply = Answer(np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint8), first.memory, 0, first.model)
+        key = f"{ECHO_KEY}/{len(encode_reply(reply))}"
+        with open_client(endpoint, 10.0) as session, ExitStack() as stack:
+            # A client must not be used by several threads at once.
+            clients = [stack.enter_context(Client(session, client.keys, TIMEOUT_S, retry_s=0.0)) for _ in range(MOST)]
+            queriers = [session.declare_querier(key, timeout=TIMEOUT_S, express=True) for _ in range(MOST)]
+            points = stack.enter_context(OverlappingQueries([partial(point, each) for each in clients], AGAIN_S))
+            echoes = stack.enter_context(OverlappingQueries([partial(_echo, each) for each in queriers], AGAIN_S))
+            prober = Prober(task, points, echoes)
+            follower = client.follow()
+            print("ready", flush=True)
+            next_s = time.monotonic() + 1.0
+            while not stop.reason:
+                prober.ask()
+                prober.echo(payload)
+                time.sleep(PAUSE_S)
+                prober.look(follower.age_s)
+                if time.monotonic() >= next_s:
+                    next_s += 1.0
+                    print(prober.report(), flush=True)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_client_process(lambda: run(ControlTask.read(Path(sys.argv[1])), sys.argv[2])))

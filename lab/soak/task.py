@@ -52,6 +52,11 @@ class ControlTask:
         """Write the task for the processes of controller and prober."""
         path.write_text(json.dumps(asdict(self)), encoding="utf-8")
 
+    @classmethod
+    def read(cls, path: Path) -> ControlTask:
+        """The task that `write` has written."""
+        return cls(**json.loads(path.read_text(encoding="utf-8")))
+
 
 # --- The reference
 

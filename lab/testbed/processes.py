@@ -9,10 +9,12 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from adaptive.errors import DehystError
 from service.protocol.errors import ServiceError
 from service.runtime.stopping import unbroken
 
@@ -22,6 +24,22 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def run_client_process(work: Callable[[], int]) -> int:
+    """Entry of a process that queries a service: the exit status of ``work``.
+
+    A DehystError is printed as JSON {"error": text}, and the exit status is 2; after Ctrl-C it is 130.
+    """
+    # zenoh's threads must not wait 5 ms for the interpreter lock.
+    sys.setswitchinterval(5e-5)
+    try:
+        return work()
+    except DehystError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 2
+    except KeyboardInterrupt:
+        return 130
 
 
 class Child:
