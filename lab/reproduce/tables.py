@@ -21,12 +21,12 @@ from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm
 SCHEMA = 1
 
 
-def plain(value: Any) -> Any:
+def json_form(value: Any) -> Any:
     """JSON form: floats to seven digits, what is not finite to null, arrays and tuples to lists."""
     if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
+        return {str(key): json_form(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [plain(entry) for entry in value]
+        return [json_form(entry) for entry in value]
     if isinstance(value, float | np.floating):
         return float(f"{float(value):.7g}") if math.isfinite(value) else None
     if isinstance(value, np.integer | np.bool_):
@@ -214,5 +214,5 @@ def tables(study: Study) -> dict[str, Any]:
         "boucwen_benchmark": benchmark_tables(study.benchmark) if study.benchmark is not None else None,
         "targets": targets(study),
     }
-    done: dict[str, Any] = plain(whole)
+    done: dict[str, Any] = json_form(whole)
     return done

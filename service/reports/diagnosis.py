@@ -1,4 +1,4 @@
-"""What `dehyst diagnose` leaves on the disk: report.json, report.md, its pictures, the extended stage, and an .rrd."""
+"""The files of `dehyst diagnose`: report.json, report.md, its pictures, the extended stage, and an ``.rrd``."""
 
 from __future__ import annotations
 
@@ -6,24 +6,31 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adaptive.errors import InputError
-from service.reports.diagnosis_page import Source, page, picture_name
-from service.reports.diagnosis_pictures import draw_cause, draw_residual
+from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, picture
+from service.reports.diagnosis_page import Source, length, page, picture_name
+from service.reports.plot_style import figure, label, legend, line, save
+from service.viewer import colours
+from service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
 from sim.diagnosis.export import export_stage
-from sim.diagnosis.result import Diagnosis
+from sim.diagnosis.result import Diagnosis, NamedCause
 from sim.stage.file import save_stage
 
-__all__ = ["Source", "write_report"]
+__all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
+
+_ROLES = {MEASURED: colours.MEASURED, WITHOUT: BEFORE, WITH: AFTER}
 
 
 def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool = True) -> dict[str, Any]:
-    """Write everything into the folder ``out`` and return report.json's content.
+    """Write all files into the folder ``out`` and return the content of report.json.
 
-    ``rrd``: also ``diagnosis.rrd`` for the Rerun viewer. Raises InputError where the folder cannot be written.
+    ``rrd``: also ``diagnosis.rrd`` for the Rerun viewer. Raises InputError if the folder cannot be written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # What an earlier diagnosis left in this folder would be taken for this one's.
+        # Remove the pictures of an earlier diagnosis in this folder.
         for old in (*out.glob("[0-9]-*.png"), *out.glob("diagnosis.rrd")):
             old.unlink()
         data = diagnosis.as_dict()
@@ -42,3 +49,59 @@ def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool =
 
         write_viewer(out / "diagnosis.rrd", diagnosis, source.data, text)
     return data
+
+
+def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
+    """Voltage, and the residuals of the nominal and of the extended stage over time."""
+    data = diagnosis.nominal.model.data
+    drawn, grid = figure(3, 1, (9.0, 6.4), title, sharex=True)
+    axes = grid[:, 0]
+    line(axes[0], data.t_s, data.u_V, color=DRIVE, lw=0.7)
+    axes[0].set_ylabel("voltage / V")
+    pairs = (
+        (diagnosis.nominal.residual_um, BEFORE, f"nominal stage, held out {length(diagnosis.nominal_heldout_um)}"),
+        (diagnosis.extended.residual_um, AFTER, f"extended stage, held out {length(diagnosis.extended_heldout_um)}"),
+    )
+    size = float(np.quantile(np.abs(diagnosis.nominal.residual_um), 0.999))
+    scale, unit = (1e3, "nm") if size < 1.0 else (1.0, "µm")
+    for axis, (residual, colour, name) in zip(axes[1:], pairs, strict=True):
+        band = 2.0 * scale * diagnosis.noise_floor_um
+        axis.axhspan(-band, band, color=NOISE_BAND, alpha=0.5, lw=0)
+        line(axis, data.t_s, scale * residual, color=colour, lw=0.6, label=name)
+        # Both on one scale; the first samples, where the initial state shows, may be cut off.
+        axis.set_ylim(-1.3 * scale * max(size, 1e-6), 1.3 * scale * max(size, 1e-6))
+        axis.set_ylabel(f"residual / {unit}")
+        legend(axis, loc="upper right")
+    axes[-1].set_xlabel("time / s (grey: twice the noise floor)")
+    save(drawn, path)
+
+
+def draw_cause(path: Path, cause: NamedCause, diagnosis: Diagnosis) -> None:
+    """The picture of one cause: the residual without it and with it."""
+    shown = picture(cause, diagnosis.extended.model.data)
+    drawn, grid = figure(1, 1, (8.0, 3.6), cause.name.replace("_", " "))
+    axis = grid[0, 0]
+    named: set[str] = set()
+    for curve in shown.curves:
+        name = curve.label if curve.label not in named else None
+        named.add(curve.label)
+        axis.plot(
+            curve.x,
+            curve.y,
+            color=_ROLES[curve.role],
+            ls="--" if curve.dashed else "-",
+            marker="o" if curve.points and curve.x.size < 100 else None,
+            ms=3,
+            lw=1.8 if curve.role == MEASURED else 1.0,
+            alpha=0.5 if curve.role == MEASURED else 1.0,
+            label=name,
+        )
+    for mark in shown.marks:
+        axis.axvline(mark, color=DRIVE, lw=0.8, ls=":")
+    label(axis, shown.x_name, shown.y_name)
+    if shown.log_x:
+        axis.set_xscale("log")
+    if shown.log_y:
+        axis.set_yscale("log")
+    legend(axis, loc="best")
+    save(drawn, path)

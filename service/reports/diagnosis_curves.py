@@ -1,6 +1,6 @@
-"""Each cause's own picture, as curves: what is left of the readings without it and with it, over what shows it best.
+"""The picture of each cause as curves: the residual without it and with it, over the variable that shows it best.
 
-Curves are numbers here, drawn elsewhere: into a PNG by `service.reports.diagnosis_pictures`, for the viewer by
+Curves are numbers here, drawn as PNG by `service.reports.diagnosis` and for the viewer by
 `service.reports.diagnosis_viewer`.
 """
 
@@ -12,23 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
+from service.reports.plot_style import envelope
 from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.readings import standing
 from sim.diagnosis.result import NamedCause
 
-# --- What a picture of a cause is made of: curves as numbers, and the means and units that they share.
-#
-# Residuals are in nm, or in µm where they are large.
-
-
 MEASURED, WITHOUT, WITH = "measured", "without it", "with it"
-#: Points beyond which a curve over time is drawn by the extremes of equal stretches.
-MOST_POINTS = 6000
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve: ``role`` is MEASURED, WITHOUT or WITH; ``dashed`` tells a second one of the same role apart."""
+    """One curve. ``role`` is MEASURED, WITHOUT or WITH; a second curve of one role is ``dashed``."""
 
     role: str
     x: FloatArray
@@ -40,13 +34,13 @@ class Curve:
 
     @property
     def label(self) -> str:
-        """For the legend."""
+        """Text for the legend."""
         return self.name or (f"{self.role}, {self.note}" if self.note else self.role)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Curves over one pair of axes; ``marks`` are values of x worth a line."""
+    """Curves over one pair of axes; ``marks`` are values of x that get a vertical line."""
 
     x_name: str
     y_name: str
@@ -56,18 +50,8 @@ class Picture:
     marks: tuple[float, ...] = ()
 
 
-def envelope(t: FloatArray, y: FloatArray, most: int = MOST_POINTS) -> tuple[FloatArray, FloatArray]:
-    """A long line thinned to the lowest and highest value of each stretch, so that no spike is lost."""
-    if y.size <= most:
-        return t, y
-    width = -(-y.size // (most // 2))
-    starts = np.arange(0, y.size, width)
-    low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
-    return np.repeat(t[starts], 2), np.column_stack([low, high]).ravel()
-
-
 def binned(x: FloatArray, y: FloatArray, bins: int = 60) -> tuple[FloatArray, FloatArray]:
-    """Means of y in equal bins of x; bins of few samples are left out."""
+    """Means of ``y`` in equal bins of ``x``, without bins of few samples."""
     low, high = np.quantile(x, [0.001, 0.999])
     edges = np.linspace(low, high, bins + 1)
     place = np.clip(np.digitize(x, edges) - 1, 0, bins - 1)
@@ -77,18 +61,18 @@ def binned(x: FloatArray, y: FloatArray, bins: int = 60) -> tuple[FloatArray, Fl
     return 0.5 * (edges[1:] + edges[:-1])[good], mean[good]
 
 
-def unit(cause: NamedCause) -> tuple[float, str]:
-    """Factor from µm and name of the unit that suits this cause's residual."""
+def residual_unit(cause: NamedCause) -> tuple[float, str]:
+    """Factor from µm, and name, of the unit of this cause's residual: nm, or µm if it is large."""
     return (1.0, "µm") if float(np.quantile(np.abs(cause.before_um), 0.99)) > 3.0 else (1e3, "nm")
 
 
-def both(cause: NamedCause) -> tuple[tuple[str, FloatArray], tuple[str, FloatArray]]:
-    scale = unit(cause)[0]
+def residuals(cause: NamedCause) -> tuple[tuple[str, FloatArray], tuple[str, FloatArray]]:
+    scale = residual_unit(cause)[0]
     return (WITHOUT, scale * cause.before_um), (WITH, scale * cause.after_um)
 
 
-def slow(r_nm: FloatArray, width: int) -> FloatArray:
-    """Moving mean over ``width`` samples, the same length, without the ends' bias."""
+def moving_mean(r_nm: FloatArray, width: int) -> FloatArray:
+    """(n,) moving mean over ``width`` samples, shorter at the ends."""
     sums = np.concatenate([[0.0], np.cumsum(r_nm)])
     half = width // 2
     low = np.clip(np.arange(r_nm.size) - half, 0, r_nm.size)
@@ -96,8 +80,8 @@ def slow(r_nm: FloatArray, width: int) -> FloatArray:
     return np.asarray((sums[high] - sums[low]) / (high - low))
 
 
-def period(data: FitData) -> int:
-    """Samples of the drive's slowest strong period: what a mean must span to see only what is slower."""
+def slowest_period(data: FitData) -> int:
+    """Period of the slowest strong component of the drive, in samples."""
     u = data.u_V - data.u_V.mean()
     power = np.abs(np.fft.rfft(u * np.hanning(u.size))) ** 2
     strong = np.flatnonzero(power[3:] > 0.1 * power[3:].max())
@@ -105,55 +89,54 @@ def period(data: FitData) -> int:
     return int(np.clip(u.size // lowest, 10, u.size // 8))
 
 
-# --- Pictures over time: since the record began, since a step, since a reversal, stretch by stretch.
-
-
 def over_time(cause: NamedCause, data: FitData) -> Picture | None:
-    curves = tuple(Curve(role, *envelope(data.t_s, r)) for role, r in both(cause))
-    return Picture("time / s", f"residual / {unit(cause)[1]}", curves)
+    curves = tuple(Curve(role, *envelope(data.t_s, r)) for role, r in residuals(cause))
+    return Picture("time / s", f"residual / {residual_unit(cause)[1]}", curves)
 
 
 def slowly(cause: NamedCause, data: FitData) -> Picture | None:
-    """A drift: the residual's mean over a period of the drive, over time."""
-    width = period(data)
+    """For a drift: the mean residual over a period of the drive, over time."""
+    width = slowest_period(data)
     cut = slice(width // 2, data.n - width // 2)
-    curves = tuple(Curve(role, *envelope(data.t_s[cut], slow(r, width)[cut], 1500)) for role, r in both(cause))
-    return Picture("time / s", f"mean residual over {width * data.dt_s:.3g} s / {unit(cause)[1]}", curves)
+    curves = tuple(
+        Curve(role, *envelope(data.t_s[cut], moving_mean(r, width)[cut], 1500)) for role, r in residuals(cause)
+    )
+    return Picture("time / s", f"mean residual over {width * data.dt_s:.3g} s / {residual_unit(cause)[1]}", curves)
 
 
 def over_log_time(cause: NamedCause, data: FitData) -> Picture | None:
-    """Creep: the residual after each long hold's step over the logarithm of time; without holds, since the start."""
+    """For creep: the residual after a step over the logarithm of time, for each long hold; else since the start."""
     still = np.abs(np.diff(data.u_V, prepend=data.u_V[0])) < 1e-9 * max(data.swing_V, 1e-12)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
-    # A hold after a step shows creep; one that the record begins with shows nothing.
+    # A hold at the beginning of the record follows no step.
     holds = [e for e in edges if e[0] > 0 and (e[1] - e[0]) * data.dt_s > 0.5]
     long = sorted(holds, key=lambda e: e[0] - e[1])[:4]
     curves: list[Curve] = []
     if not long:
-        width = period(data)
+        width = slowest_period(data)
         where = np.unique(np.geomspace(width, data.n - width // 2 - 1, 80).astype(int))
-        for role, r in both(cause):
-            mean = slow(r, width)[where]
+        for role, r in residuals(cause):
+            mean = moving_mean(r, width)[where]
             curves.append(Curve(role, where * data.dt_s, mean - mean[-1]))
-        name = f"mean residual over {width * data.dt_s:.3g} s, less its last / {unit(cause)[1]}"
+        name = f"mean residual over {width * data.dt_s:.3g} s, less its last / {residual_unit(cause)[1]}"
         return Picture("time since the record began / s", name, tuple(curves), log_x=True)
-    for role, r in both(cause):
+    for role, r in residuals(cause):
         for i, (start, stop) in enumerate(long):
             where = np.unique(np.geomspace(max(2, round(0.02 / data.dt_s)), stop - start - 1, 60).astype(int))
             ends = np.minimum(where + np.maximum(1, where // 8), stop - start)
             sums = np.concatenate([[0.0], np.cumsum(r[start:stop])])
             mean = (sums[ends] - sums[where]) / (ends - where)
-            # Up and down alike: creep goes on in the direction of the step.
+            # Creep continues in the direction of the step: make it positive.
             before = max(0, int(start) - 2)
             sign = float(np.sign(data.u_V[start] - data.u_V[before])) or 1.0
             note = f"hold at {data.u_V[start]:.3g} V"
             curves.append(Curve(role, where * data.dt_s, sign * (mean - mean[0]), note, dashed=i > 0))
-    name = f"residual in the step's direction since 20 ms / {unit(cause)[1]}"
+    name = f"residual in the step's direction since 20 ms / {residual_unit(cause)[1]}"
     return Picture("time since the step / s", name, tuple(curves), log_x=True)
 
 
 def _by_stretch(cause: NamedCause, data: FitData, of: FloatArray, least: float, scale: float, name: str) -> Picture:
-    """Slope of the residual over ``of`` in forty stretches of the record."""
+    """Slope of the residual over ``of`` in about forty stretches of the record."""
     stretch = max(50, data.n // 40)
     curves = []
     for role, r in ((WITHOUT, cause.before_um), (WITH, cause.after_um)):
@@ -179,7 +162,7 @@ def lag_over_time(cause: NamedCause, data: FitData) -> Picture | None:
 
 
 def after_steps(cause: NamedCause, data: FitData) -> Picture | None:
-    """The mean residual after the largest steps of the drive; without steps, over the speed: late is a slope."""
+    """For lags: the mean residual after the largest steps of the drive; without steps, over the speed."""
     du = np.diff(data.u_V, prepend=data.u_V[0])
     span = max(8, min(round(0.03 / data.dt_s), data.n // 20))
     order = np.argsort(-np.abs(du))[:20]
@@ -189,12 +172,14 @@ def after_steps(cause: NamedCause, data: FitData) -> Picture | None:
         t = np.asarray((np.arange(span + 2) - 2) * data.dt_s * 1e3, dtype=np.float64)
         curves = tuple(
             Curve(role, t, _mean([r[k - 2 : k + span] * np.sign(du[k]) for k in steps]), points=True)
-            for role, r in both(cause)
+            for role, r in residuals(cause)
         )
-        return Picture("time since the step / ms", f"mean residual in the step's direction / {unit(cause)[1]}", curves)
+        return Picture(
+            "time since the step / ms", f"mean residual in the step's direction / {residual_unit(cause)[1]}", curves
+        )
     speed = np.gradient(data.y_um - cause.after_um, data.dt_s)
-    curves = tuple(Curve(role, *binned(speed, r, 40)) for role, r in both(cause))
-    return Picture("speed / (µm/s)", f"mean residual / {unit(cause)[1]}", curves)
+    curves = tuple(Curve(role, *binned(speed, r, 40)) for role, r in residuals(cause))
+    return Picture("speed / (µm/s)", f"mean residual / {residual_unit(cause)[1]}", curves)
 
 
 def _mean(rows: list[FloatArray]) -> FloatArray:
@@ -202,7 +187,7 @@ def _mean(rows: list[FloatArray]) -> FloatArray:
 
 
 def after_reversals(cause: NamedCause, data: FitData) -> Picture | None:
-    """Friction: the residual against the motion, over the way travelled since the last reversal."""
+    """For friction: the residual in the direction of motion, over the distance since the last reversal."""
     x = data.y_um - cause.after_um
     way = np.sign(np.diff(x, prepend=x[0]))
     turns = np.flatnonzero(way[1:] * way[:-1] < 0) + 1
@@ -215,12 +200,14 @@ def after_reversals(cause: NamedCause, data: FitData) -> Picture | None:
     near = (travelled > 0.0) & (travelled < 0.05 * data.range_um) & (last > 0)
     if near.sum() < 200:
         return None
-    curves = tuple(Curve(role, *binned(travelled[near], (r * way)[near])) for role, r in both(cause))
-    return Picture("way since the reversal / µm", f"residual in the direction of motion / {unit(cause)[1]}", curves)
+    curves = tuple(Curve(role, *binned(travelled[near], (r * way)[near])) for role, r in residuals(cause))
+    return Picture(
+        "way since the reversal / µm", f"residual in the direction of motion / {residual_unit(cause)[1]}", curves
+    )
 
 
 def at_rest(cause: NamedCause, data: FitData) -> Picture | None:
-    """Readings at rest, one by one: the grid they lie on."""
+    """For quantisation: single readings at rest, which show the grid."""
     quiet = np.flatnonzero(standing(data, 0.1))
     start = int(quiet[0]) if quiet.size else 0
     part = slice(start, min(data.n, start + 400))
@@ -233,7 +220,7 @@ def at_rest(cause: NamedCause, data: FitData) -> Picture | None:
 
 
 def picture(cause: NamedCause, data: FitData) -> Picture:
-    """The picture in which this cause shows itself."""
+    """The picture that shows this cause best; the residual over time if that cannot be drawn."""
     for attempt in (_PICTURES.get(cause.name, over_time), over_time):
         made = attempt(cause, data)
         if made is not None:
@@ -241,58 +228,61 @@ def picture(cause: NamedCause, data: FitData) -> Picture:
     raise AssertionError("a residual over time can always be drawn")  # pragma: no cover
 
 
-def _by_way(cause: NamedCause, data: FitData, x: FloatArray, name: str) -> Picture | None:
-    """Mean residual over ``x``, on the way up and on the way down apart."""
+def _over_signal(cause: NamedCause, data: FitData, x: FloatArray, name: str) -> Picture | None:
+    """Mean residual over ``x``, separately for rising and falling voltage."""
     rising = np.gradient(data.u_V)
     eps = 1e-6 * data.swing_V
     curves = []
-    for role, r in both(cause):
+    for role, r in residuals(cause):
         for mask, way, dashed in ((rising > eps, "rising", False), (rising < -eps, "falling", True)):
             if mask.sum() > 100:
                 curves.append(Curve(role, *binned(x[mask], r[mask]), note=way, dashed=dashed))
-    return Picture(name, f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
+    return Picture(name, f"mean residual / {residual_unit(cause)[1]}", tuple(curves)) if curves else None
 
 
 def _over_reading(cause: NamedCause, data: FitData) -> Picture | None:
-    return _by_way(cause, data, data.y_um, "reading / µm")
+    return _over_signal(cause, data, data.y_um, "reading / µm")
 
 
 def _over_motion(cause: NamedCause, data: FitData) -> Picture | None:
-    """The loop that is missing, over the displacement; across a resonance the voltage tells nothing of the way."""
+    """The missing loop over the displacement. Near a resonance the voltage does not give the direction of motion."""
     x = data.y_um - cause.after_um
     speed = np.gradient(x)
     curves = []
-    for role, r in both(cause):
+    for role, r in residuals(cause):
         for mask, way, dashed in ((speed > 0.0, "rising", False), (speed < 0.0, "falling", True)):
             if mask.sum() > 100:
                 curves.append(Curve(role, *binned(x[mask], r[mask], 40), note=way, dashed=dashed))
-    return Picture("displacement / µm", f"mean residual / {unit(cause)[1]}", tuple(curves)) if curves else None
+    return Picture("displacement / µm", f"mean residual / {residual_unit(cause)[1]}", tuple(curves)) if curves else None
 
 
 def _over_voltage(cause: NamedCause, data: FitData) -> Picture | None:
-    return _by_way(cause, data, data.u_V, "voltage / V")
+    return _over_signal(cause, data, data.u_V, "voltage / V")
 
 
 def _over_rate(cause: NamedCause, data: FitData) -> Picture | None:
-    """By how much the loop is wider than the model's, over the rate of the voltage."""
+    """Loop width beyond the model's, over the rate of the voltage."""
     rate, sign = data.rate_V_per_s, np.sign(np.gradient(data.u_V))
     moving: BoolArray = np.asarray(rate > 1e-3 * data.swing_V / data.duration_s)
     if moving.sum() < 200:
         return None
     curves = []
-    for role, r in both(cause):
+    for role, r in residuals(cause):
         x, y = binned(np.log10(rate[moving]), -2.0 * (r * sign)[moving], 25)
         curves.append(Curve(role, 10.0**x, y))
     return Picture(
-        "rate of the voltage / (V/s)", f"loop width beyond the model's / {unit(cause)[1]}", tuple(curves), log_x=True
+        "rate of the voltage / (V/s)",
+        f"loop width beyond the model's / {residual_unit(cause)[1]}",
+        tuple(curves),
+        log_x=True,
     )
 
 
 def _response(cause: NamedCause, data: FitData) -> Picture | None:
-    """Readings over voltage in the frequency domain: measured, and as the model has it without and with the cause."""
+    """Frequency response from voltage to reading: measured, and of the model without and with the cause."""
     from scipy.signal import csd, welch
 
-    # Enough pieces to average over: one alone is all speckle.
+    # Several segments, so that averaging reduces the variance.
     size = max(256, min(data.n // 8, round(2.0 / data.dt_s)))
     u = data.u_V - data.u_V.mean()
     rate = 1.0 / data.dt_s
@@ -307,12 +297,11 @@ def _response(cause: NamedCause, data: FitData) -> Picture | None:
         _, cross = csd(u, y - r, rate, nperseg=size)
         curves.append(Curve(role, f[driven], np.abs(cross[driven]) / power[driven]))
     marks = tuple(v for v in _modes(cause) if f[driven][0] < v < f[driven][-1])
-    # Little is driven far above the drive's own band; there the quotient is noise.
     return Picture("frequency / Hz", "gain / (µm/V)", tuple(curves), log_x=True, log_y=True, marks=marks)
 
 
 def _modes(cause: NamedCause) -> tuple[float, ...]:
-    """Frequencies of its modes, Hz."""
+    """Frequencies (Hz) of the modes of this cause."""
     return tuple(float(v) for name, v in cause.parameters.items() if name.startswith("f0") and name.endswith("_hz"))
 
 
@@ -322,14 +311,14 @@ def _spectrum(cause: NamedCause, data: FitData) -> Picture | None:
     modes = _modes(cause)
     size = max(256, min(data.n // (8 if modes else 1), round(4.0 / data.dt_s)))
     curves = []
-    for role, r in both(cause):
+    for role, r in residuals(cause):
         f, power = welch(r, 1.0 / data.dt_s, nperseg=size)
         curves.append(Curve(role, f[1:], np.sqrt(power[1:])))
     mark = cause.parameters.get("frequency_hz")
     marks = modes or ((float(mark),) if mark else ())
     return Picture(
         "frequency / Hz",
-        f"residual / ({unit(cause)[1]}/√Hz)",
+        f"residual / ({residual_unit(cause)[1]}/√Hz)",
         tuple(curves),
         log_y=True,
         marks=marks,
@@ -341,8 +330,8 @@ def _over_other_axis(cause: NamedCause, data: FitData) -> Picture | None:
         return _spectrum(cause, data)
     if data.other_um is None:
         return None
-    curves = tuple(Curve(role, *binned(data.other_um, r)) for role, r in both(cause))
-    return Picture("displacement of the other axis / µm", f"mean residual / {unit(cause)[1]}", curves)
+    curves = tuple(Curve(role, *binned(data.other_um, r)) for role, r in residuals(cause))
+    return Picture("displacement of the other axis / µm", f"mean residual / {residual_unit(cause)[1]}", curves)
 
 
 _PICTURES: dict[str, Callable[[NamedCause, FitData], Picture | None]] = {

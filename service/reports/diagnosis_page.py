@@ -1,4 +1,4 @@
-"""The page that an engineer reads in two minutes: report.md."""
+"""report.md of a diagnosis: verdict, errors, causes with their numbers, limits, and the next experiment."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from sim.diagnosis.export import ExportedStage
 from sim.diagnosis.result import TEST, Diagnosis, NamedCause
 from sim.effects import EFFECTS
 
-# --- How a diagnosis speaks of numbers.
-
-
-#: Units by the end of a number's name, as written for people.
+#: Units by the suffix of a number's name.
 _UNITS = {
     "_um_per_s": " µm/s", "_um_per_V": " µm/V", "_per_s": " /s", "_V_per_s": " V/s", "_um": " µm", "_hz": " Hz",
     "_Hz": " Hz", "_V": " V", "_s": " s", "_ppm": " ppm", "_per_K": " /K", "_um_per_K": " µm/K",
@@ -20,28 +17,28 @@ _UNITS = {
 
 
 def length(value_um: float) -> str:
-    """A length with the unit that suits it."""
+    """A length in nm or µm."""
     return f"{1e3 * value_um:.3g} nm" if abs(value_um) < 1.0 else f"{value_um:.3g} µm"
 
 
 def with_unit(name: str, value: float) -> str:
-    """A number of a cause with the unit that its name ends in."""
+    """A number of a cause with the unit from its name."""
     for end in sorted(_UNITS, key=len, reverse=True):
         if name.endswith(end):
             return f"{value:.4g}{_UNITS[end]}"
     return f"{value:.4g}"
 
 
-def plain(name: str) -> str:
-    """A cause's name for a sentence."""
+def spaced(name: str) -> str:
+    """A cause's name in a sentence."""
     return name.replace("_", " ")
 
 
-#: Held-out errors within this factor of the noise floor are as good as they get.
+#: A held-out error within this factor of the noise floor counts as being at the floor.
 AT_THE_FLOOR = 1.5
-#: Numbers of one cause on the page; the others stand in report.json.
+#: Most numbers of one cause on the page; report.json has all.
 MOST_NUMBERS = 6
-#: A noise floor that is no more than a bound.
+#: Source of a noise floor that is only an upper bound.
 DIFFERENCES = "differences"
 #: Names of the nominal stages in a sentence.
 _NOMINALS = {"bouc_wen": "the chapter's Bouc-Wen stage", "linear": "a linear stage of one mode"}
@@ -49,7 +46,7 @@ _NOMINALS = {"bouc_wen": "the chapter's Bouc-Wen stage", "linear": "a linear sta
 
 @dataclass(frozen=True)
 class Source:
-    """Where the data came from: names for people. ``test`` is empty where there is no test recording."""
+    """Names of the recordings and of the nominal stage. ``test`` is empty without a test recording."""
 
     data: str
     findings: tuple[str, ...] = ()
@@ -58,12 +55,12 @@ class Source:
 
 
 def picture_name(place: int, cause: NamedCause) -> str:
-    """File of a cause's own picture."""
+    """File name of a cause's picture."""
     return f"{place + 1}-{cause.name}.png"
 
 
 def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewer: bool = True) -> str:
-    """The whole of report.md; ``viewer``: there is a file for the viewer beside it."""
+    """The content of report.md. ``viewer``: diagnosis.rrd is written as well."""
     d = diagnosis
     lines = [f"# {source.data}: what the simulation lacks", "", *_summary(d, source), ""]
     lines += [*_errors(d), ""]
@@ -90,7 +87,7 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
 
 def _file(d: Diagnosis, exported: ExportedStage) -> str:
     missing = (
-        f"the stage library has no equal of {', '.join(plain(n) for n in exported.left_out)} in the form found here."
+        f"the stage library has no equal of {', '.join(spaced(n) for n in exported.left_out)} in the form found here."
     )
     if {c.name for c in d.causes} <= set(exported.left_out) and d.causes:
         return f"`stage.toml` is the calibrated nominal stage only: {missing}"
@@ -121,13 +118,13 @@ def _summary(d: Diagnosis, source: Source) -> list[str]:
 
 
 def _listed(d: Diagnosis) -> str:
-    names = [plain(c.name) + (f" (or {', '.join(plain(a) for a in c.alternatives)})" * bool(c.alternatives))
+    names = [spaced(c.name) + (f" (or {', '.join(spaced(a) for a in c.alternatives)})" * bool(c.alternatives))
              for c in d.causes]  # fmt: skip
     return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)
 
 
 def _gain(d: Diagnosis) -> str:
-    """What the extension is worth, in a sentence; and where it is worth nothing, that."""
+    """How much the causes reduce the held-out error, in one sentence."""
     before, after, floor = d.nominal_heldout_um, d.extended_heldout_um, d.noise_floor_um
     where = "the test recording" if d.heldout_source == TEST else "data that was not used"
     if not d.causes:
@@ -141,11 +138,11 @@ def _gain(d: Diagnosis) -> str:
 
 
 def _beside_floor(error_um: float, d: Diagnosis) -> str:
-    """An error beside the noise floor, in words."""
+    """An error relative to the noise floor, in words."""
     floor = d.noise_floor_um
     near = error_um <= AT_THE_FLOOR * floor
     if near and d.floor_source == DIFFERENCES:
-        # Without rests or periods fast motion counts as noise.
+        # Without rests or periods the estimate contains fast motion.
         return f"below the only bound on the noise that this recording gives ({length(floor)}, from differences)"
     if error_um < 0.5 * floor:
         return f"below its own noise floor ({length(floor)}): the test recording is quieter"
@@ -168,11 +165,11 @@ def _errors(d: Diagnosis) -> list[str]:
 def _causes(d: Diagnosis) -> list[str]:
     lines = ["| cause | or | number | 95 % interval | removes | by chance |", "|---|---|---|---|---|---|"]
     for c in d.causes:
-        first = surest(c)
+        first = best_known_number(c)
         number = f"{first} = {with_unit(first, c.parameters[first])}" if first else ""
         low, high = c.intervals.get(first, (float("nan"), float("nan")))
         lines.append(
-            f"| **{plain(c.name)}** | {', '.join(plain(a) for a in c.alternatives) or '-'} | {number} | {low:.4g} to "
+            f"| **{spaced(c.name)}** | {', '.join(spaced(a) for a in c.alternatives) or '-'} | {number} | {low:.4g} to "
             f"{high:.4g} | {100.0 * c.heldout_gain:.3g} % | {100.0 * c.p_value:.2g} % |"
         )
     lines += ["", "*Removes*: share of the held-out squared error left by those above it. *By chance*: how often noise "
@@ -180,20 +177,20 @@ def _causes(d: Diagnosis) -> list[str]:
     return lines
 
 
-def surest(cause: NamedCause) -> str:
-    """The name of the number that is known best beside its interval: the one to put into a table."""
+def best_known_number(cause: NamedCause) -> str:
+    """The name of the number with the smallest relative interval, for the table."""
 
-    def sureness(name: str) -> float:
+    def certainty(name: str) -> float:
         low, high = cause.intervals[name]
-        # An interval without width is a number at its bound: not known, but stopped.
+        # An interval of width zero is a number at its bound, which is not known at all.
         return abs(cause.parameters[name]) / (high - low) if high > low else 0.0
 
-    return max(cause.parameters, key=sureness, default="")
+    return max(cause.parameters, key=certainty, default="")
 
 
 def _section(place: int, cause: NamedCause) -> list[str]:
     kind = EFFECTS.get(cause.name)
-    lines = [f"## {place + 1}. {plain(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
+    lines = [f"## {place + 1}. {spaced(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
     numbers = []
     for name, value in list(cause.parameters.items())[:MOST_NUMBERS]:
         low, high = cause.intervals[name]
@@ -203,10 +200,10 @@ def _section(place: int, cause: NamedCause) -> list[str]:
     if kind is not None:
         lines.append(f"Its signature: {kind.signature}.")
         if kind.mistaken_for:
-            others = ", ".join(plain(n) for n in kind.mistaken_for)
+            others = ", ".join(spaced(n) for n in kind.mistaken_for)
             lines.append(f"Easily mistaken for {others}; {kind.tells_apart}.")
     if cause.alternatives:
-        lines.append(f"**This recording cannot tell it from {', '.join(plain(a) for a in cause.alternatives)}.**")
+        lines.append(f"**This recording cannot tell it from {', '.join(spaced(a) for a in cause.alternatives)}.**")
     return [*lines, ""]
 
 
@@ -214,7 +211,7 @@ def _left(d: Diagnosis) -> list[str]:
     lines = ["## What is left", "", "The residual above repeats with the drive and is far above the noise."]
     if d.partial:
         lines.append(
-            f"Of the causes tried, {', '.join(plain(n) for n in d.partial)} came closest, but together they leave too "
+            f"Of the causes tried, {', '.join(spaced(n) for n in d.partial)} came closest, but together they leave too "
             "much of what stands above the noise: none of them is named."
         )
     return [*lines, ""]
@@ -223,11 +220,11 @@ def _left(d: Diagnosis) -> list[str]:
 def _limits(d: Diagnosis) -> list[str]:
     lines = ["## What this recording cannot say", ""]
     lines.append(
-        f"Not excited, their usual size would not show here: {', '.join(plain(n) for n in d.not_excited)}."
+        f"Not excited, their usual size would not show here: {', '.join(spaced(n) for n in d.not_excited)}."
         if d.not_excited
         else "Every cause of the catalogue would have shown."
     )
-    sets = [f"{plain(c.name)} and {', '.join(plain(a) for a in c.alternatives)}" for c in d.causes if c.alternatives]
+    sets = [f"{spaced(c.name)} and {', '.join(spaced(a) for a in c.alternatives)}" for c in d.causes if c.alternatives]
     if sets:
         lines.append(f"Inseparable here: {'; '.join(sets)}.")
     if d.verdict == "effects" and d.extended_heldout_um > AT_THE_FLOOR * d.noise_floor_um:

@@ -1,4 +1,4 @@
-"""The same diagnosis for the Rerun viewer: an ``.rrd`` with residuals over time, loops, and each cause's own curves."""
+"""A diagnosis for the Rerun viewer: an ``.rrd`` file with residuals over time, loops, and the curves of each cause."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ import rerun.blueprint as rrb
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, Curve, Picture, envelope, picture
-from service.reports.diagnosis_page import plain
+from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, Curve, Picture, picture
+from service.reports.diagnosis_page import spaced
+from service.reports.plot_style import envelope
+from service.viewer.colours import AFTER, BEFORE, rgb
 from service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
-from service.viewer.style import AMBER, FRAME, LABEL, WHITE, Colour
+from service.viewer.style import FRAME, LABEL, WHITE, Colour
 from sim.diagnosis.result import Diagnosis
 
 APPLICATION, TIMELINE = "dehyst-diagnosis", "t_s"
-BLUE: Colour = (86, 180, 233)
-COLOURS: dict[str, Colour] = {MEASURED: WHITE, WITHOUT: AMBER, WITH: BLUE}
-#: Points of a curve over time; beyond, the extremes of equal stretches.
+COLOURS: dict[str, Colour] = {MEASURED: WHITE, WITHOUT: rgb(BEFORE), WITH: rgb(AFTER)}
+#: Points of a curve over time beyond which it is thinned to the extremes of equal stretches.
 MOST_POINTS = 40_000
-#: Turns of a loop drawn in its plane.
+#: Points of the loop.
 LOOP_POINTS = 6000
 
 
 @dataclass(frozen=True)
 class _Trace:
-    """One curve over time: its place, name, colour, values."""
+    """One curve over time: entity path, name, colour, values (n,)."""
 
     path: str
     name: str
@@ -40,21 +41,21 @@ class _Trace:
 
 
 def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> None:
-    """Write ``path``, overwriting it. ``page`` is the report's text. Raises InputError where it cannot be written."""
+    """Write ``path``; an existing file is replaced. ``page`` is the text of report.md. Raises InputError."""
     d = diagnosis
     data = d.nominal.model.data
     scale, unit = (1e3, "nm") if float(np.quantile(np.abs(d.nominal.residual_um), 0.99)) < 1.0 else (1.0, "µm")
     traces = [
         _Trace("voltage_V", "voltage", WHITE, data.u_V),
         _Trace("reading/measured_um", "measured", WHITE, data.y_um),
-        _Trace("reading/nominal_um", "nominal stage", AMBER, data.y_um - d.nominal.residual_um),
-        _Trace("reading/extended_um", "extended stage", BLUE, data.y_um - d.extended.residual_um),
-        _Trace("residual/nominal", "nominal stage", AMBER, scale * d.nominal.residual_um),
-        _Trace("residual/extended", "extended stage", BLUE, scale * d.extended.residual_um),
+        _Trace("reading/nominal_um", "nominal stage", COLOURS[WITHOUT], data.y_um - d.nominal.residual_um),
+        _Trace("reading/extended_um", "extended stage", COLOURS[WITH], data.y_um - d.extended.residual_um),
+        _Trace("residual/nominal", "nominal stage", COLOURS[WITHOUT], scale * d.nominal.residual_um),
+        _Trace("residual/extended", "extended stage", COLOURS[WITH], scale * d.extended.residual_um),
     ]
     pictures = {f"cause/{i + 1}_{c.name}": picture(c, data) for i, c in enumerate(d.causes)}
     tabs = [
-        _plane_view(f"{i + 1}. {plain(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
+        _plane_view(f"{i + 1}. {spaced(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
     ]
     stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
     path.unlink(missing_ok=True)
@@ -72,7 +73,7 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
         _draw(stream, "loop", _loop(d))
         for where, shown in pictures.items():
             _draw(stream, where, shown)
-        # Pictures stand in files of their own, which the viewer does not look for.
+        # The viewer does not show the pictures: remove their lines.
         text = re.sub(r"!\[.*\]\(.*\)\n", "", page)
         stream.log("report", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     finally:
@@ -81,7 +82,7 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
 
 
 def _loop(d: Diagnosis) -> Picture:
-    """Reading over voltage: measured, and as both stages have it; the largest excursion's stretch of the record."""
+    """Reading over voltage, measured and of both stages, around the largest excursion."""
     data = d.nominal.model.data
     middle = int(np.argmax(np.abs(data.y_um - data.middle_um)))
     start = int(np.clip(middle - LOOP_POINTS // 2, 0, max(0, data.n - LOOP_POINTS)))
@@ -99,7 +100,7 @@ def _loop(d: Diagnosis) -> Picture:
 
 
 def _draw(stream: rr.RecordingStream, origin: str, shown: Picture) -> None:
-    """Curves in a plane with axes, see `service.viewer.layout`; a logarithmic axis is one of log10."""
+    """Draw curves in a plane with axes (`service.viewer.layout`). A logarithmic axis shows log10."""
     x_name = f"log10 of {shown.x_name}" if shown.log_x else shown.x_name
     y_name = f"log10 of {shown.y_name}" if shown.log_y else shown.y_name
     curves = [(c, _scaled(c.x, shown.log_x), _scaled(c.y, shown.log_y)) for c in shown.curves]
@@ -150,7 +151,7 @@ def _plane_view(name: str, origin: str) -> rrb.Spatial2DView:
 
 
 def _desk(causes: list[rrb.Spatial2DView], unit: str) -> rrb.Blueprint:
-    """Over time on the left, the causes and the loop in the middle, the page on the right."""
+    """Layout: curves over time on the left, causes and loop in the middle, the report on the right."""
     whole = rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
 
     def over_time(name: str, *paths: str) -> rrb.TimeSeriesView:

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from service.viewer.colours import MODELS, rgb
 from service.viewer.records import SceneConfig
 
 Colour = tuple[int, int, int]
 
-#: Colour-blind safe on the viewer's dark background; the adaptive model is the brightest.
-COLOURS: dict[str, Colour] = {
-    "linear": (150, 150, 150),
-    "bouc_wen": (204, 121, 167),
-    "mpi": (230, 159, 0),
-    "lssvm_frozen": (86, 180, 233),
-    "lssvm_adaptive": (46, 230, 150),
-}
+#: Colours of the known models, as in every picture.
+COLOURS: dict[str, Colour] = {model: rgb(value) for model, value in MODELS.items()}
 SPARE_COLOURS: tuple[Colour, ...] = ((213, 94, 0), (240, 228, 66), (148, 103, 189), (140, 86, 75), (23, 190, 207))
 WHITE: Colour = (235, 235, 235)
 GREY: Colour = (120, 120, 120)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from lab.cli import main
-from lab.reproduce.markdown import number, table
 from lab.reproduce.measured import data_folder, run_stack
-from lab.reproduce.tables import plain
+from lab.reproduce.report import number, table
+from lab.reproduce.tables import json_form
 
 FIGURES = {"2.2", "2.3", *(f"2.{n}" for n in range(8, 16)), *(f"2.{n}" for n in range(17, 21))}
 
@@ -78,7 +78,7 @@ def test_errors_are_said_and_numbers_are_json(capsys: pytest.CaptureFixture[str]
     assert "--out" in capsys.readouterr().err
     assert main(["reproduce", "--out", str(tmp_path / "a"), "--data", str(tmp_path / "none")]) == 2
     assert "--data" in capsys.readouterr().err
-    assert plain({"a": (np.float64(np.nan), np.int64(3), 1.23456789), "b": np.bool_(True)}) == {
+    assert json_form({"a": (np.float64(np.nan), np.int64(3), 1.23456789), "b": np.bool_(True)}) == {
         "a": [None, 3, 1.234568],
         "b": True,
     }

@@ -18,7 +18,7 @@ from pyarrow import parquet
 from adaptive.types import FloatArray
 from service.reports.diagnosis import write_report
 from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, envelope, picture
-from service.reports.diagnosis_page import Source, length, plain, surest, with_unit
+from service.reports.diagnosis_page import Source, best_known_number, length, spaced, with_unit
 from sim.diagnosis.causes.catalogue import NAMES
 from sim.diagnosis.diagnose import Options, diagnose
 from sim.diagnosis.model.fit_data import FitData
@@ -283,7 +283,7 @@ def test_numbers_are_said_with_their_units() -> None:
     assert with_unit("tau_s", 0.015) == "0.015 s"
     assert with_unit("rate_um_per_s", 2.0) == "2 µm/s"
     assert with_unit("gain_per_decade", 0.01) == "0.01"
-    assert plain("gain_drift") == "gain drift"
+    assert spaced("gain_drift") == "gain drift"
     none = np.zeros(3)
     wide = NamedCause("a", (), {"x": 1.0, "z": 1.0}, {"x": (-9.0, 11.0), "z": (0.9, 1.1)}, 0.1, 0.1, none, none)
-    assert surest(wide) == "z"
+    assert best_known_number(wide) == "z"
