@@ -1,1 +1,11 @@
-"""``dehyst reproduce``: the chapter's tables and figures, drawn and written down beside the chapter's own numbers."""
+"""``dehyst reproduce``: the chapter's tables and figures, computed again and compared with the published numbers.
+
+`study.run_study` computes everything, `tables.tables` turns it into ``tables.json``, and `report.write_study` writes
+the report, the tables and the figures.
+"""
+
+from lab.reproduce.report import write_study
+from lab.reproduce.study import Study, StudyConfig, run_study
+from lab.reproduce.tables import tables
+
+__all__ = ["Study", "StudyConfig", "run_study", "tables", "write_study"]

@@ -69,7 +69,7 @@ def _widths(axis: Any, widths: tuple[Width, ...], at: list[float], title: str) -
 
 
 def record_figure(path: Path, title: str, record: Record) -> Path:
-    """Figs. 2.8 and 2.13: an input and what the stage made of it."""
+    """Figs. 2.8 and 2.13: an input and the response of the stage."""
     drawn, axes = figure(2, 1, (9, 5.5), title, sharex=True)
     line(axes[0, 0], record.t_s, record.u_V, color="black")
     line(axes[1, 0], record.t_s, record.y_um, color="black")
@@ -135,7 +135,7 @@ def figure_2_15(path: Path, name: str, record: Record, runs: list[ForwardRun]) -
 
 
 def third_figure(path: Path, name: str, runs: list[ForwardRun]) -> Path:
-    """The family that the chapter lacks: MAE of every model on every record, logarithmic."""
+    """Records that the chapter does not test: MAE of every model on a logarithmic scale."""
     drawn, axes = figure(1, 1, (10, 4.5), f"What the chapter did not test, on the stage {name!r}")
     axis = axes[0, 0]
     names = list(runs[0].third)
@@ -152,7 +152,7 @@ def third_figure(path: Path, name: str, runs: list[ForwardRun]) -> Path:
 
 
 def draw_models(folder: Path, study: PresetStudy) -> dict[str, Path]:
-    """All of this file's figures for one stage into ``folder``; name of the figure -> file."""
+    """Draw the figures of characterisation and forward models into ``folder``; figure -> file."""
     name, data = study.name, study.data
     keys = {run.key for run in study.forward}
 
@@ -272,7 +272,7 @@ def change_figure(path: Path, name: str, control: Control) -> Path:
 
 
 def draw_control(folder: Path, study: PresetStudy) -> dict[str, Path]:
-    """All of this file's figures for one stage; name of the figure -> file."""
+    """Draw the figures of control into ``folder``; figure -> file."""
     name, control = study.name, study.control
     first = control.loops[0].reference
     names = [LABELS[key] for key in COMPARED]
@@ -292,7 +292,7 @@ def draw_control(folder: Path, study: PresetStudy) -> dict[str, Path]:
 
 
 def stack_figure(path: Path, found: Stack) -> Path:
-    """The test recording, the models' equivalent errors along it, and both published windows."""
+    """The test recording, the equivalent errors of the models, and both published windows."""
     drawn, axes = figure(3, 1, (10, 9), "Measured stack actuator: the ramped sine, on which nothing was identified")
     line(axes[0, 0], found.t_s, found.y_um - np.mean(found.y_um), color="black", label="measured")
     for name, (start, stop, _) in WINDOWS.items():
@@ -324,7 +324,7 @@ def stack_figure(path: Path, found: Stack) -> Path:
 
 
 def benchmark_figure(path: Path, found: Benchmark, rate_Hz: float = 750.0) -> Path:
-    """Prediction of the test multisine, what is left of it, and over which frequencies."""
+    """Prediction of the test multisine, its error, and the spectrum of the error."""
     drawn, axes = figure(3, 1, (10, 8), "Bouc-Wen benchmark: forward prediction of the test multisine")
     n = 750
     t_s = np.arange(n) / rate_Hz

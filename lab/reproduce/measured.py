@@ -1,4 +1,4 @@
-"""The models on data that this project did not simulate: a measured stack actuator, and the field's benchmark.
+"""The models on data from others: a measured stack actuator, and the Bouc-Wen benchmark.
 
 The folder of data is that of the environment variable ``DEHYST_DATA``, by default ``shared/data`` beside the project.
 """
@@ -28,16 +28,16 @@ from sim.recordings import ColumnMap, read, repaired
 Progress = Callable[[str], None]
 
 #: The two windows of the stack's test recording that its authors report on (first row, row after the last), and what
-#: they found there: RMSE between wanted and measured displacement, mean removed, µm.
+#: their result: RMSE between wanted and measured displacement, mean removed, µm.
 WINDOWS = {"linear drive": (5052, 6052, 1.68), "inverse feedforward": (11152, 12152, 0.58)}
 #: Samples of a period of the benchmark's multisines, and their rate, Hz.
 _PERIOD, _RATE_HZ = 8192, 750.0
-#: Best published RMSE on the benchmark's test multisine, m, and by what.
+#: Best published RMSE on the benchmark's test multisine, m, by method.
 BENCHMARK_PUBLISHED = {"PNLSS": 1.87e-5, "dynoNet": 4.52e-5, "NFIR": 1.63e-4}
 
 
 def data_folder() -> Path:
-    """Where measured data are looked for."""
+    """The folder of measured data."""
     here = Path(__file__).resolve().parents[2]
     return Path(os.environ.get("DEHYST_DATA", here.parent / "shared" / "data"))
 
@@ -81,7 +81,7 @@ def _centred_rmse(error: FloatArray) -> float:
 
 
 def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None:
-    """Identify on the 1 Hz recording, test on the ramped sine; None where the files are not there."""
+    """Identify on the 1 Hz recording, test on the ramped sine; None if the files are missing."""
     train_file, test_file = folder / "model_sine_1hz.csv", folder / "test_ramped_sine_ff.csv"
     if not (train_file.is_file() and test_file.is_file()):
         return None
@@ -116,8 +116,8 @@ def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None
     )
 
 
-#: At 5 ms the smoother's prediction of a moving stage is off by more than at 1 ms, where the gate's default belongs;
-#: window and filter learn as often in time as they do there.
+#: The gate's default belongs to 1 ms; at 5 ms the prediction error of the smoother is larger. Window and filter learn
+#: at the same rate in time as at 1 ms.
 _LEARNER = LearnerConfig(learn_every=2, filter_every=1, admission=AdmissionConfig(glitch_share=0.1))
 #: 20 ms a block, and an answer from a snapshot of at least 40 ms before it.
 _BLOCKS = BlockConfig(block=4, delay_blocks=3)
@@ -126,7 +126,7 @@ _BLOCKS = BlockConfig(block=4, delay_blocks=3)
 def _learning(
     result: Identified, test: Stretch, dt_s: float, gain: float, range_um: float, progress: Progress
 ) -> Identified | None:
-    """The same model learning along the test recording; None for those that have no learning form here."""
+    """The same model learning along the test recording; None if it has no learning form here."""
     names = {"bouc_wen": "bouc_wen_online", "mpi": "mpi_online", "lssvm_adaptive": "lssvm_adaptive_online"}
     if result.model is None or result.name not in names:
         return None
@@ -146,7 +146,7 @@ class Benchmark:
     """The Bouc-Wen benchmark: model, its report, and forward prediction of the test multisine, m.
 
     ``rmse_m``, ``max_m`` : of the prediction with 20 steps a sample; ``finer_m`` : RMSE with 40; ``held_m`` : RMSE
-    with the force held between samples, to show what the band-limited input is worth. ``test_rms_m`` : of the test
+    with the force held between samples, which shows the effect of a band-limited input. ``test_rms_m`` : of the test
     itself. ``residual_spectrum`` : frequency Hz and amplitude m of what is left.
     """
 
@@ -173,7 +173,7 @@ def _npz(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def run_benchmark(folder: Path, progress: Progress = lambda _: None) -> Benchmark | None:
-    """Identify on the noisy training periods, predict the noise-free test; None where the files are not there."""
+    """Identify on the noisy training periods, predict the noise-free test; None if the files are missing."""
     files = [folder / f"{name}.npz" for name in ("train_multisine_5periods_noisy", "est_multisine_4periods_noisy")]
     test_file = folder / "test_multisine.npz"
     if not all(file.is_file() for file in (*files, test_file)):
@@ -205,7 +205,7 @@ def run_benchmark(folder: Path, progress: Progress = lambda _: None) -> Benchmar
 
 
 def _held(model: MechanicalBoucWen, u_N: FloatArray, dt_s: float) -> FloatArray:
-    """The model under a force that is held between samples instead of band-limited: what a careless run would give."""
+    """(n,) displacement, m, of the model for a force that is held between samples instead of band-limited."""
     oversample = 20
     held = np.repeat(u_N, oversample)
     return model.steady_state(held, dt_s / oversample, 1)[::oversample]

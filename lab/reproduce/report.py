@@ -24,17 +24,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number with that many decimals, a dash for none."""
+    """A number with ``digits`` decimals; a dash for None."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 
 def short(value: Any) -> str:
-    """Four significant digits, a dash for none."""
+    """A number with four significant digits; a dash for None."""
     return "–" if value is None else f"{value + 0.0:.4g}"
 
 
 def picture(pictures: dict[str, str], key: str, title: str) -> str:
-    """An image line, or nothing where that picture was not drawn."""
+    """An image line, or nothing if that picture was not drawn."""
     return f"![{title}]({pictures[key]})\n" if key in pictures else ""
 
 
@@ -478,36 +478,36 @@ INTRODUCTION = """\
 # The chapter reproduced
 
 Every table and figure of *Feedforward Control Based on Inverse Hysteresis Models*, computed anew by
-`dehyst reproduce`. The chapter's stage is hardware; ours are simulations, so that what can be compared is the shape
-of the result: which model wins, by what factor, and where each one fails. `published` columns are the chapter's own
-numbers. Errors are MAE (2.43) and RMSE (2.44) in percent of the motion range unless said otherwise.
+`dehyst reproduce`. The chapter's stage is hardware; ours are simulations. Only the pattern of the results can be
+compared: which model wins, by what factor, and where each one fails. `published` columns are the chapter's numbers.
+Errors are MAE (2.43) and RMSE (2.44) in percent of the motion range, unless stated otherwise.
 
-Two stages stand in for it. **rich** is of no fitted model's own class: sixty generalised plays with uneven weights and
-rate-dependent thresholds, a smooth part without return points, creep, a mode at 450 Hz, amplifier, sensor lag, 5 nm
-noise, converters of 16 bit. **bouc_wen** is the chapter's identified stage, Table 2.1, and therefore the truth for
-one of the models: there Bouc-Wen has to win, and no conclusion about real stages can be drawn from that it does.
+There are two simulated stages. **rich** is not of the class of any fitted model: sixty generalised plays with uneven
+weights and rate-dependent thresholds, a smooth part without return points, creep, a mode at 450 Hz, amplifier, sensor
+lag, 5 nm noise, 16-bit converters. **bouc_wen** is the chapter's identified stage, Table 2.1. It is exactly one of the
+fitted models, so Bouc-Wen must win there; that says nothing about real stages.
 
-Two things the chapter leaves open are set here and kept for both stages. Its inputs (2.37), (2.45) are printed with an
-amplitude of 5, which peaks at 9.8 V; its tables belong to a peak of 7.85 V, which is an amplitude of 4, and that is
-used. The reference of Fig. 2.17a is only drawn there; ours is the displacement that the stage made under (2.45).
+The chapter leaves two things open. It prints the inputs (2.37), (2.45) with an amplitude of 5, which peaks at 9.8 V,
+but its tables belong to a peak of 7.85 V, an amplitude of 4; 4 is used here. It only draws the reference of Fig.
+2.17a; the reference here is the displacement of the stage under (2.45).
 """
 
 
 CHOSEN = """\
-**What was chosen after looking.** The memory of the forward LSSVM (20 plays, four arc lengths, one kernel width)
-was chosen among a dozen variants by its errors on (2.45) and the third family of the stages of seed 0. The
-feedforward targets are judged on the reference of the shape of (2.45), as in the chapter; the tables of the other
-references are below, and the frozen model does not reach those targets on all of them. In the measured recording,
-the gate, the learning rates and the block of the learning LSSVM were set after seeing that recording.
+**Choices made after seeing results.** The memory of the forward LSSVM (20 plays, four arc lengths, one kernel width)
+was selected from a dozen variants by its errors on (2.45) and on the third family, on the stages of seed 0. The
+feedforward targets apply to the reference of the shape of (2.45), as in the chapter. On the other references (tables
+below) the frozen model does not reach them everywhere. For the measured recording the gate, the learning rates and the
+block length of the learning LSSVM were set after seeing that recording.
 """
 
 
 def targets_section(rows: list[dict[str, Any]]) -> str:
-    """What was to be reached, and what was."""
+    """The targets and whether they are met."""
     lines = [
         [row["what"], f"{row['limit']:g}", f"{row['found']:.3g}", "yes" if row["met"] else "**no**"] for row in rows
     ]
-    return "## What was to hold\n\n" + table(["what", "at most", "found", "holds"], lines) + "\n" + CHOSEN
+    return "## Targets\n\n" + table(["target", "at most", "result", "met"], lines) + "\n" + CHOSEN
 
 
 def report(study: Study, numbers: dict[str, Any], pictures: Pictures) -> str:
@@ -540,7 +540,7 @@ def write_report(path: Path, text: str) -> None:
 
 
 def prepare(out: Path) -> Path:
-    """The folder for the results, made where it is missing. Raises InputError where it cannot be."""
+    """Make the folder for the results. Raises InputError if that fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

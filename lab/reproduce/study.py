@@ -1,4 +1,4 @@
-"""Runs everything that is reported, with progress, and nothing else: no pictures, no files written."""
+"""Compute everything that the report needs, with progress messages. No picture is drawn and no file written."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.chapter.modelling import ForwardRun, identify_forward
 from sim.chapter.replayed import ReplayRun, replay_records
 
 Progress = Callable[[str], None]
-#: Identifications take one core; its time is the same on a busy machine, which the clock's is not.
+#: Identifications run on one core; CPU time does not depend on the load of the machine.
 _CLOCK = time.process_time
 
 
@@ -24,7 +24,7 @@ _CLOCK = time.process_time
 class StudyConfig:
     """presets : names of stages. quick : shorter records and fewer epochs. pso : also the swarms. seed : of the stages.
 
-    data : folder of measured data; None for where they are by default. measured : whether to use them.
+    data : folder of measured data; None for the default folder. measured : whether to use them.
     """
 
     presets: tuple[str, ...] = ("rich", "bouc_wen")
@@ -38,7 +38,7 @@ class StudyConfig:
 
 @dataclass(frozen=True, slots=True)
 class PresetStudy:
-    """All of the chapter on one stage."""
+    """The chapter on one stage."""
 
     name: str
     data: Experiments
@@ -58,7 +58,7 @@ class PresetStudy:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Everything; ``stack`` and ``benchmark`` are None where their data are not there. ``machine`` : for the report."""
+    """The whole study. ``stack`` and ``benchmark`` are None without their data; ``machine`` is text for the report."""
 
     config: StudyConfig
     presets: tuple[PresetStudy, ...]
@@ -69,7 +69,7 @@ class Study:
 
 
 def run_study(config: StudyConfig, progress: Progress = lambda _: None) -> Study:
-    """Run the study. Raises InputError for an unknown preset, MissingTorchError where swarms are asked for without."""
+    """Run the study. Raises InputError for an unknown preset, MissingTorchError for swarms without torch."""
     begin = time.perf_counter()
     studies = []
     for name in config.presets:

@@ -1,4 +1,4 @@
-"""``tables.json``: every number of the report, the chapter's beside ours, and whether the targets are met."""
+"""``tables.json``: every number of the report, published and computed, and whether the targets are met."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCHEMA = 1
 
 
 def json_form(value: Any) -> Any:
-    """JSON form: floats to seven digits, what is not finite to null, arrays and tuples to lists."""
+    """JSON form: floats with seven digits, non-finite numbers as null, arrays and tuples as lists."""
     if isinstance(value, dict):
         return {str(key): json_form(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -122,7 +122,7 @@ def preset_tables(study: PresetStudy) -> dict[str, Any]:
 
 
 def stack_tables(stack: Stack) -> dict[str, Any]:
-    """The measured stack: the authors' figures, anew from the file, and the models' equivalent errors, µm."""
+    """The measured stack: the authors' figures, recomputed from the file, and the models' equivalent errors, µm."""
     return {
         "published_rmse_um": {name: entry[2] for name, entry in WINDOWS.items()},
         "reproduced_rmse_um": stack.reproduced_um,
@@ -165,7 +165,7 @@ def benchmark_tables(found: Benchmark) -> dict[str, Any]:
 
 
 def targets(study: Study) -> list[dict[str, Any]]:
-    """What must hold: name, limit, what was found, and whether it holds."""
+    """The targets: name, limit, result, and whether it is met."""
     found: list[tuple[str, float, float]] = []
     for preset in study.presets:
         limits = (("bouc_wen", 5.0), ("mpi", 2.0), ("lssvm", 2.0), ("bouc_wen_pso", 60.0), ("mpi_pso", 60.0))

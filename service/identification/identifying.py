@@ -1,4 +1,4 @@
-"""From a recording to the models that are served: identify each, and judge it on what it has not seen."""
+"""Identify the served models from a recording, and score each on held-out data."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
 from service.protocol.errors import FieldError
 from sim.recordings import Recording, Repaired
 
-#: Models in the order in which they are identified and shown.
+#: Names of the models, in the order in which they are identified and shown.
 NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
-#: Share of a test recording of its own that only brings the models' memory up to date, and is not scored.
+#: First share of a separate test recording that only settles the models' memory and is not scored.
 SETTLE_SHARE = 0.05
-#: Samples that a part must have to be identified from, and to be judged on.
+#: Least number of samples to identify from, and to score on.
 LEAST_TRAIN, LEAST_TEST = 200, 50
 
 
@@ -29,9 +29,9 @@ LEAST_TRAIN, LEAST_TEST = 200, 50
 class Score:
     """Free-run error of an inverse model on held-out data.
 
-    The model is given the measured motion (smoothed with zero phase) and answers with a voltage; the error is that
-    voltage less the one applied. ``_um`` figures are voltage errors seen as displacement through the mean gain of
-    the training data; ``_pct`` those in percent of the training data's displacement range.
+    The model turns the measured motion (smoothed with zero phase) into a voltage; the error is that voltage less the
+    applied one. ``_um``: the same times the mean gain of the training data. ``_pct``: in percent of the displacement
+    range of the training data.
     """
 
     mae_V: float
@@ -47,9 +47,9 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """One model, how it did on held-out data, and how long identifying took.
+    """One model with its held-out score and the time that its identification took.
 
-    ``error_V`` is (n_test,) V, NaN where a sample is not scored. ``failed`` says why there is no model.
+    ``error_V`` is (n_test,) V, NaN where a sample is not scored. ``failed`` is the reason if there is no model.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Identified:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Measured samples ``dt_s`` apart with their smoothed motion; ``valid`` is False where filled in."""
+    """Measured samples with their smoothed motion (n, 3). ``valid`` (n,) is False where a sample was filled in."""
 
     u_V: FloatArray
     y_um: FloatArray
@@ -92,7 +92,7 @@ def motion_of(recording: Recording) -> FloatArray:
 
 
 def split_at(n: int, holdout: float) -> int:
-    """Index where the held-out last part begins. Raises InputError where either part is too short."""
+    """Index where the held-out last part begins. Raises InputError if either part is too short."""
     if not 0.0 < holdout < 0.9:
         raise FieldError("--holdout", holdout, "a share of the recording above 0 and below 0.9")
     split = round(n * (1.0 - holdout))
@@ -127,8 +127,8 @@ def identify_one(name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: i
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
     """(n_test,) voltages, V, that the model gives for the test's measured motion.
 
-    ``before``, the samples just ahead of the test, only brings the memory up to date; without them the memory is
-    that of a stage at rest where the test begins.
+    ``before`` are the samples just before the test; they only settle the memory. Without them the memory is that of a
+    stage at rest at the first test sample.
     """
     first = before if before is not None and len(before) else test
     memory = model.rest_memory(float(first.motion[0, 0]))
@@ -145,7 +145,7 @@ def _columns(stretch: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Score:
-    """Figures of (n,) voltage errors; NaN entries are left out."""
+    """The score of (n,) voltage errors, without NaN entries."""
     size = np.abs(error_V[np.isfinite(error_V)])
     in_V = (float(np.mean(size)), float(np.sqrt(np.mean(size**2))), float(np.max(size)))
     in_um = tuple(abs(gain_um_per_V) * value for value in in_V)
@@ -163,11 +163,11 @@ def identify_all(
     n: int = 500,
     progress: Callable[[str], None] = lambda _: None,
 ) -> list[Identified]:
-    """Identify every model on ``train``, judge it on ``test``, and where ``whole`` is given identify it anew on that.
+    """Identify every model on ``train`` and score it on ``test``; with ``whole``, identify it again on all data.
 
-    ``follows``: the test continues the training data in time; otherwise it is a recording of its own, whose first
-    ``SETTLE_SHARE`` only settles the memories. The model returned is that of ``whole`` where given. A model that
-    cannot be identified is returned with ``failed``; the others go on.
+    ``follows``: the test continues the training data in time. Otherwise it is a separate recording, whose first
+    ``SETTLE_SHARE`` only settles the memories. With ``whole`` the returned model is identified from it. A model that
+    cannot be identified is returned with ``failed``; the others are not affected.
     """
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     range_um = float(np.ptp(train.motion[:, 0]))

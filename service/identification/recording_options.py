@@ -1,4 +1,4 @@
-"""The options by which a command is told what a foreign recording's columns mean; the same for every command."""
+"""Command-line options that describe the columns of a recording, shared by all commands that read one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
     quantities = ", ".join(QUANTITIES)
     units = "; ".join(f"{quantity}: {' '.join(factors)}" for quantity, (_, factors) in QUANTITIES.items())
     group = parser.add_argument_group("what the file's columns mean", READING)
-    group.add_argument("--map", type=Path, metavar="FILE.toml", help="these options from a file; options go over it")
+    group.add_argument(
+        "--map", type=Path, metavar="FILE.toml", help="read these options from a file; the command line overrides it"
+    )
     group.add_argument(
         "--column", action="append", default=[], metavar="Q=NAME", help=f"column of a quantity ({quantities})"
     )
@@ -35,15 +37,13 @@ def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
         "--index", action="append", default=[], metavar="Q=:,0,2", help="part of an array of several dimensions"
     )
     group.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
-    group.add_argument(
-        "--sensor-late", type=int, metavar="N", help="the sensor's column lies N samples late in the file"
-    )
+    group.add_argument("--sensor-late", type=int, metavar="N", help="the sensor column is N samples late in the file")
     group.add_argument("--delimiter", help="between the columns of a text file (default: as its header line shows)")
     group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default .)")
 
 
 def mapping_from(args: argparse.Namespace) -> ColumnMap:
-    """The mapping that the options (and the file behind ``--map``) describe. Raises InputError."""
+    """The column mapping from the options and the file ``--map``. Raises InputError."""
     base = load_map(args.map) if args.map is not None else ColumnMap()
     scale: dict[str, float] = {}
     for quantity, text in _pairs("--scale", args.scale).items():
@@ -52,7 +52,7 @@ def mapping_from(args: argparse.Namespace) -> ColumnMap:
         except ValueError:
             raise FieldError("--scale", f"{quantity}={text}", "Q=FACTOR with a number") from None
     units = _pairs("--unit", args.unit)
-    # An option goes over the file even where the one gives a unit and the other a scale.
+    # An option overrides the file, also if one gives a unit and the other a scale.
     kept_units = {q: unit for q, unit in base.units.items() if q not in scale}
     kept_scale = {q: factor for q, factor in base.scale.items() if q not in units}
     scalars = {
@@ -81,7 +81,7 @@ def _pairs(option: str, texts: list[str]) -> dict[str, str]:
 
 
 def parse_range(option: str, text: str | None) -> tuple[float | None, float | None]:
-    """``"2:40"`` as (2.0, 40.0) in s; either end may be left out. Raises InputError."""
+    """``"2:40"`` as (2.0, 40.0) s; either end may be empty (None). Raises InputError."""
     if text is None:
         return None, None
     start, colon, stop = text.partition(":")
@@ -106,7 +106,7 @@ def load(path: Path, args: argparse.Namespace, range_option: str | None = None) 
 
 
 def describe(recording: Recording, findings: list[Finding]) -> str:
-    """What was read and what was found, for people."""
+    """A summary of the recording and the findings, as text."""
     extra = [name for name in recording.columns() if name not in ("t_s", "u_V", "y_um")]
     lines = [
         f"{recording.source}: {len(recording)} samples, {recording.duration_s:.4g} s at {1 / recording.dt_s:.6g} Hz"
