@@ -18,7 +18,7 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
 
 
 def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
-    # its input is the converter's held level; downstream effects take its shape from Context.hold_per_s
+    # the input is the held level of the converter; later effects take the output's shape from Context.hold_per_s
     a, _, b = first_order(values["tau_s"], context.dt_s, float("inf"))
     return a, b
 

@@ -1,7 +1,7 @@
-"""Branches that are not point-symmetric: a one-sided dead zone (2.8) on the output of a play (2.4).
+"""Branches without point symmetry: a one-sided dead zone (2.8) on the output of a play (2.4).
 
-Single-valued in the play's output, but not in the voltage: above the dead zone both the slope and the loop of the
-stage change, below it neither.
+It is single-valued in the output of the play, but not in the voltage. Above the dead zone both the slope and the loop
+of the stage change, below it neither.
 """
 
 from __future__ import annotations

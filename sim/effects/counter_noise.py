@@ -1,7 +1,7 @@
-"""Noise by counter: the value of sample k depends on the seed and on k alone.
+"""Counter-based noise: the value of sample k depends on the seed and on k alone.
 
-Stepwise and batch runs, and twins with the same seed, therefore have the same noise to the last bit. The integer
-hash is splitmix64 (Steele, Lea, Flood 2014), the normal deviates follow Box and Muller.
+Stepwise and batch runs, and stages with the same seed, therefore have identical noise. The integer hash is splitmix64
+(Steele, Lea, Flood 2014); normal deviates follow Box and Muller.
 """
 
 from __future__ import annotations

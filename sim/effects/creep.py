@@ -1,8 +1,7 @@
-"""Creep: after a step the displacement goes on growing with the logarithm of time.
+"""Creep: after a step the displacement continues to grow with the logarithm of time.
 
-A sum of first-order lags with time constants spread evenly in log t, two a decade from 0.1 to 1000 s, each of half
-the gain per decade: within the span this is ``y0 (1 + g log10(t/t0))`` with a ripple below 3 % of the creep. Each lag
-is stepped in closed form.
+It is a sum of first-order lags, two per decade from 0.1 to 1000 s, each with half the gain per decade. Within that span
+it equals ``y0 (1 + g log10(t/t0))`` with a ripple below 3 % of the creep. Each lag is stepped in closed form.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from sim.effects.base import Context, Kind, Parameter, Place, block
 from sim.effects.holds import first_order
 
-#: Time constants of the slow parts relative to the shortest: two a decade over four decades.
+#: Time constants relative to the shortest: two per decade over four decades.
 RATIOS = 10.0 ** (np.arange(9) / 2.0)
 POLES = len(RATIOS)
 

@@ -1,4 +1,4 @@
-"""The D/A converter: voltages on a grid, held over the sample."""
+"""D/A converter: voltages on a grid, held over the sample."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
     """p: slots, whole samples, fraction. s: newest slot (-1: not begun), then a ring of past values, µm."""
     slots, whole = int(p[0]), int(p[1])
     for k in range(n):
-        if s[0] < 0.0:  # at rest since long ago
+        if s[0] < 0.0:  # start at rest
             for j in range(slots):
                 s[1 + j] = x[k]
         newest = (int(s[0]) + 1) % slots

@@ -1,7 +1,7 @@
 """A smooth hysteretic part without return-point memory (Coleman and Hodgdon's Duhem model), added to the actuator.
 
 Along a rising voltage ``dh/du = A (f(u) - h) + D``, along a falling one ``dh/du = -A (f(u) - h) + D``, with
-``f(u) = f1 u + f2 u²``: linear in ``h``, hence a closed form over any monotone step.
+``f(u) = f1 u + f2 u²``: linear in ``h``, hence solved in closed form over any monotone step.
 """
 
 from __future__ import annotations

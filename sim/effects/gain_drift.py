@@ -1,4 +1,4 @@
-"""Gain drift: ``y = (1 + g(t)) H[u]``, by ageing, temperature or a change of the amplifier."""
+"""Gain drift ``y = (1 + g(t)) H[u]``, from ageing, temperature or a change in the amplifier."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim.effects.counter_noise import normal
 
 @block
 def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: gain, ramp a sample, amplitude, dt/tau, step of the walk, seed. s: walk."""
+    """p: gain, ramp per sample, amplitude, dt/tau, step of the walk, seed. s: walk."""
     for k in range(n):
         index = k0 + k
         if p[4] > 0.0:

@@ -1,9 +1,9 @@
-"""A hysteretic actuator of many generalised plays, richer than the models that are fitted to it.
+"""A hysteretic actuator of sixty generalised plays, richer than the models that are fitted to it.
 
-Sixty plays with unevenly spaced thresholds and uneven weights; each lies between a lower and an upper envelope of
-different slope, so that loops are asymmetric and change with the level (generalised plays: Preisach's class, beyond
-Prandtl and Ishlinskii's); the thresholds grow with the smoothed rate of the voltage. Memory is nonlocal. At vanishing
-rate it has return-point memory (wiping-out) and congruency, at a finite rate neither.
+Thresholds are unevenly spaced and weights uneven. Each play lies between a lower and an upper envelope of different
+slope, so loops are asymmetric and change with the level: generalised plays are in the Preisach class, beyond the
+Prandtl-Ishlinskii one. The thresholds grow with the smoothed rate of the voltage. The memory is nonlocal. At vanishing
+rate it has the wiping-out and congruency properties, at a finite rate neither.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from sim.effects.base import Context, Kind, Parameter, Place, block
 
 PLAYS = 60
-#: Volts over which envelopes bend: the parameters of asymmetry are per this voltage.
+#: Voltage that the parameters of asymmetry refer to, V.
 BEND_V = 10.0
 
 

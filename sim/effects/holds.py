@@ -1,14 +1,14 @@
-"""Exact one-step coefficients of linear parts, for the way their input goes within a step.
+"""Exact one-step coefficients of first- and second-order systems for a known shape of the input within a step.
 
-Within the step of length ``dt`` the input goes from ``x0`` to ``x1`` as ``A + B exp(-hold t)``:
+Within a step of length ``dt`` the input goes from ``x0`` to ``x1`` as ``A + B exp(-hold t)``:
 
 - ``hold = inf``: it jumps to ``x1`` at the start and stays (a D/A converter with hold),
 - ``hold`` finite: the output of a first-order amplifier of that rate,
 - ``hold = 0``: a straight line.
 
-For each the response of a first- and a second-order system is closed, whatever the length of the step. Converter,
-amplifier, actuator and mechanics together are exact thereby. Creep's slow parts are exact too; that they reach the
-mechanics in the amplifier's shape rather than their own is an error below 1e-4 of the change within a step.
+The response is closed for a step of any length, so converter, amplifier, actuator and mechanics together are exact.
+The slow parts of creep are exact too; that they reach the mechanics in the shape of the amplifier's output instead of
+their own is an error below 1e-4 of the change within a step.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import cmath
 import math
 
-#: Relative distance from a pole below which the input's rate is moved, where the closed form divides by zero.
+#: The input's rate is moved where it is within this relative distance of a pole, where the closed form divides by zero.
 _NEAR = 1e-7
 
 

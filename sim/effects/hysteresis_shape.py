@@ -1,7 +1,7 @@
-"""Hysteresis that the nominal stage lacks: further plays on the voltage, with nonlocal memory.
+"""Additional hysteresis: plays on the voltage, with nonlocal memory.
 
-Ten plays (2.4) with thresholds up to ``largest_V`` and a fading density. Their straight part is taken away, so that
-the effect is the loop alone and a gain is not taken for it.
+Ten plays (2.4) have thresholds up to ``largest_V`` with decreasing density. Their linear part is subtracted, so the
+effect is the loop alone and cannot be confused with a gain.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Mains hum: a line at the mains frequency and its third harmonic, there without any input."""
+"""Mains hum: lines at the mains frequency and its third harmonic, independent of the input."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sim.effects.base import Context, Kind, Parameter, Place, block
 
 @block
 def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: amplitude, of the third harmonic, cycles a sample, phase in cycles."""
+    """p: amplitude, of the third harmonic, cycles per sample, phase in cycles."""
     for k in range(n):
-        # whole cycles are taken off before the sine, so that a run of months keeps its phase
+        # whole cycles are subtracted before the sine, so that a run of months keeps its phase
         cycles = p[2] * (k0 + k)
         angle = 2.0 * math.pi * (cycles - math.floor(cycles) + p[3])
         x[k] += p[0] * math.sin(angle) + p[1] * math.sin(3.0 * angle)

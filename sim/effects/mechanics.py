@@ -1,6 +1,6 @@
 """The chapter's mechanics, the left side of (2.1): mass, damping and stiffness as Table 2.1 gives them.
 
-Stiff and overdamped there (poles at 396 and 3.2e6 rad/s); stepped in closed form, so no step is too long.
+They are stiff and overdamped (poles at 396 and 3.2e6 rad/s) and are stepped in closed form.
 """
 
 from __future__ import annotations

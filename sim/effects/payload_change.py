@@ -1,7 +1,6 @@
 """A payload on the stage: the known mode moves to ``f0 sqrt(m/(m+M))``, the DC gain does not.
 
-It acts through the coefficients of `resonance` or `mechanics` in the same chain, whose mass it multiplies; a chain
-without either is refused.
+It multiplies the mass of `resonance` or `mechanics` in the same chain; a chain without either is refused.
 """
 
 from __future__ import annotations

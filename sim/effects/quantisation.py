@@ -1,4 +1,4 @@
-"""The A/D converter: readings on a grid."""
+"""A/D converter: readings on a grid."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A loop that widens with the rate of the voltage: plays whose thresholds grow with the rate.
 
-What is added is the difference between plays with grown thresholds and the same plays at rest, so that the effect
-vanishes at low rate. ``growth_per_decade`` is relative to the loop ``width_um`` that it acts on.
+The effect adds the difference between plays with grown thresholds and the same plays without growth, so it vanishes at
+low rate. ``growth_per_decade`` is relative to the loop of height ``width_um``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from sim.effects.base import Context, Kind, Parameter, Place, block
 
 PLAYS = 8
-#: Time over which the rate is felt; shorter than any period of interest, so it is not a parameter.
+#: Time constant of the rate, s; shorter than any period of interest, so it is not a parameter.
 RATE_TAU_S = 0.004
 
 

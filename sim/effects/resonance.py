@@ -22,7 +22,7 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
 
 
 def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
-    # the spring and the dashpot stay, the mass grows: the DC gain does not change
+    # a payload adds mass; spring and dashpot, and so the DC gain, stay
     mass = (1.0 + values["payload_ratio"]) * (1.0 + context.payload_ratio)
     omega = 2.0 * math.pi * values["frequency_Hz"] / math.sqrt(mass)
     return second_order(omega, values["damping_ratio"] / math.sqrt(mass), context.dt_s, context.hold_per_s)

@@ -1,4 +1,4 @@
-"""The amplifier's rails: a clamp of the voltage."""
+"""Saturation: the amplifier limits the voltage to its rails."""
 
 from __future__ import annotations
 

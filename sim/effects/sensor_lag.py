@@ -1,4 +1,4 @@
-"""A low-pass in the sensor's electronics, of first order: it takes gain, and the noise too."""
+"""First-order low-pass of the sensor electronics; it attenuates signal and noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
     """p: (a, b0, b1). s: output, input so far, µm; whether it has begun."""
     for k in range(n):
         now = x[k]
-        if s[2] == 0.0:  # it was switched on long ago
+        if s[2] == 0.0:  # start settled
             s[0], s[1], s[2] = now, now, 1.0
         s[0] = p[0] * s[0] + p[1] * s[1] + p[2] * now
         s[1] = now
@@ -22,7 +22,7 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
 
 
 def derive(values: Mapping[str, float], context: Context) -> Sequence[float]:
-    # the displacement goes in straight lines from sample to sample
+    # the displacement is linear between samples
     return first_order(values["tau_s"], context.dt_s, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""White noise of the sensor; the electronics' lag, where there is one, filters it too."""
+"""White noise of the sensor, before the lag of its electronics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor curve: a single-valued polynomial of the displacement, zero at both ends of the range."""
+"""Nonlinearity of the sensor: a single-valued polynomial of the displacement, zero at both ends of the range."""
 
 from __future__ import annotations
 

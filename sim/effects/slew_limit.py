@@ -1,4 +1,4 @@
-"""The amplifier's current limit: the actuator is a capacitor, so the voltage's rate is clamped at I/C."""
+"""Slew limit: the actuator is a capacitor, so the amplifier's current limit I limits the voltage rate to I/C."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sim.effects.base import Context, Kind, Parameter, Place, block
 
 @block
 def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: largest change a sample, V. s: output, V."""
+    """p: largest change per sample, V. s: output, V."""
     for k in range(n):
         s[0] += min(max(x[k] - s[0], -p[0]), p[0])
         x[k] = s[0]

@@ -1,4 +1,4 @@
-"""Friction in the guidance: the displacement follows only after a play (2.4) of its own."""
+"""Stick-slip: friction in the guidance holds the displacement until the pull exceeds it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
     """p: half-width µm, share still stuck. s: where it sticks µm, 1 while slipping."""
     for k in range(n):
         away = x[k] - s[0]
-        # sliding ends where the pull no longer exceeds sliding friction
+        # sliding ends when the pull no longer exceeds sliding friction
         if s[1] * away <= p[0] * p[1]:
             s[1] = 0.0
-        # it holds until the pull exceeds static friction, then jumps the share of the way and slides along
+        # it sticks until the pull exceeds static friction, then jumps and slides
         if s[1] == 0.0 and abs(away) > p[0]:
             s[1] = 1.0 if away > 0.0 else -1.0
         if s[1] != 0.0:

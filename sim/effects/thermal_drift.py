@@ -12,7 +12,7 @@ from sim.effects.counter_noise import normal
 
 @block
 def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: offset, amplitude, dt/tau, ramp a sample, step of the walk, seed. s: walk, µm."""
+    """p: offset, amplitude, dt/tau, ramp per sample, step of the walk, seed. s: walk, µm."""
     for k in range(n):
         index = k0 + k
         if p[4] > 0.0:

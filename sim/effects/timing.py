@@ -9,7 +9,7 @@ from typing import Any
 from sim.effects.base import Context, Kind, Parameter, Place, block
 from sim.effects.counter_noise import uniform
 
-#: Longest lateness that a slow clock can gather, s; beyond it stays there.
+#: Largest lateness of a slow clock, s; it stays there.
 LATEST_S = 0.05
 
 
@@ -19,7 +19,7 @@ def _slots(context: Context) -> int:
 
 @block
 def run(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: probability of a repeat, lateness a sample, slots, seed. s: last reading, slot (-1: not begun), ring."""
+    """p: probability of a repeat, lateness per sample, slots, seed. s: last reading, slot (-1: not begun), ring."""
     slots = int(p[2])
     for k in range(n):
         index = k0 + k

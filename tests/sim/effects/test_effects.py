@@ -254,7 +254,7 @@ def test_chains_travel_between_processes_and_are_hashable() -> None:
 
 
 def test_bouc_wen_stage_agrees_with_the_baseline_model() -> None:
-    """Two derivations of (2.1), (2.2): the library's closed form and the baseline's under the zero-order hold."""
+    """(2.1): the mechanics of the library and the modes of the baseline under the zero-order hold."""
     model = BoucWenParameters(0.2789, 8.9055e5, 3.5244e8, 11.351, 0.4754, 0.8718, 0.9925, hold="zero_order")
     chain = effect("bouc_wen") + effect("mechanics")
     np.testing.assert_allclose(simulate(chain, STAIRS, 1e-3), model.simulate(STAIRS, 1e-3), rtol=0.0, atol=1e-9)

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from adaptive.tuning.evidence import Problem, evaluate, problem
+from adaptive.tuning.evidence import EvidenceSamples, evaluate, evidence_samples
 from baselines.swarm.evidence_search import EvidenceSearch, EvidenceSearchConfig, _Batch
 from baselines.swarm.particle_swarm import MissingTorchError
 
@@ -15,14 +15,14 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 
 
 @pytest.fixture(scope="module")
-def data() -> Problem:
+def data() -> EvidenceSamples:
     rng = np.random.default_rng(3)
     X = rng.uniform(-1.0, 1.0, (70, 2))
     y = np.sin(3.0 * X[:, 0]) + 0.5 * X[:, 1] + 0.02 * rng.normal(size=70)
-    return problem(X, y, rng.uniform(0.5, 2.0, 70))
+    return evidence_samples(X, y, rng.uniform(0.5, 2.0, 70))
 
 
-def test_values_and_gradients_are_those_of_the_evidence(data: Problem) -> None:
+def test_values_and_gradients_are_those_of_the_evidence(data: EvidenceSamples) -> None:
     theta = np.log(np.array([[1e3, 0.3, 0.5], [1e5, 0.2, 2.0], [10.0, 5.0, 0.1]]))
     J2, gradient = _Batch(torch, data, "cpu")(torch.as_tensor(theta))
     for i, point in enumerate(np.exp(theta)):
@@ -31,7 +31,7 @@ def test_values_and_gradients_are_those_of_the_evidence(data: Problem) -> None:
         np.testing.assert_allclose(gradient[i].numpy(), expected.J2_gradient, atol=1e-6)
 
 
-def test_a_matrix_that_cannot_be_factored_spoils_no_other(data: Problem) -> None:
+def test_a_matrix_that_cannot_be_factored_spoils_no_other(data: EvidenceSamples) -> None:
     theta = np.log(np.array([[1e3, 0.3, 0.5], [1e30, 50.0, 50.0]]))
     J2, gradient = _Batch(torch, data, "cpu")(torch.as_tensor(theta))
     assert float(J2[1]) > 1e11
@@ -39,7 +39,7 @@ def test_a_matrix_that_cannot_be_factored_spoils_no_other(data: Problem) -> None
     assert float(J2[0]) == pytest.approx(evaluate(data, 1e3, np.array([0.3, 0.5])).J2, abs=1e-8)
 
 
-def test_it_leaves_a_bad_start_within_the_box(data: Problem) -> None:
+def test_it_leaves_a_bad_start_within_the_box(data: EvidenceSamples) -> None:
     low, high = np.log([1.0, 0.05, 0.05]), np.log([1e6, 20.0, 20.0])
     start = np.log(np.array([1e6, 0.05, 0.05]))
     search = EvidenceSearch(EvidenceSearchConfig(starts=12, steps=25, device="cpu"))
