@@ -1,7 +1,7 @@
-"""Work in a process of its own: started, waited for with a limit, ended with the service.
+"""Background work in a process of its own, with a time limit; it ends with the service.
 
-The process is ``python -m MODULE FOLDER``. It finds ``order.json`` and ``data.npz`` in the folder and leaves
-``result.json`` there; `work` is its side of that.
+The process is ``python -m MODULE FOLDER``. It reads ``order.json`` and ``data.npz`` from the folder and writes
+``result.json`` there. `BackgroundJob` is the side of the service, `run_worker` the side of the process.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from service.background.priority import step_back
 from service.storage.atomic_write import atomic_write
@@ -25,24 +26,24 @@ from service.storage.atomic_write import atomic_write
 _ORDER: Final = "order.json"
 _DATA: Final = "data.npz"
 _RESULT: Final = "result.json"
-#: A process that may not start threads of its own: the cores belong to those who answer.
+#: The process must not start threads of its own: queries need the cores.
 _ENVIRONMENT: Final = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA")
 }  # fmt: skip
 
 
 class BackgroundJob:
-    """One order, in a thread that waits for its process. Never raises.
+    """One order in a process, and the thread that waits for it. Never raises.
 
     Parameters
     ----------
-    module : what runs, and reads the folder. order : for JSON. arrays : by name.
-    timeout_s : longest time; then it is ended.
-    done : is given the result, once, from that thread; not at all after :meth:`cancel`.
+    module : that the process runs. order : JSON object for it. arrays : arrays for it, by name.
+    timeout_s : longest time, s; then the process is killed.
+    done : called once with the result, from the waiting thread; not called after :meth:`cancel`.
 
     Attributes
     ----------
-    result : the process' own, or ``{"error": why}``, or ``{"error": why, "timeout": True}``; None until it is there.
+    result : of the process, or ``{"error": why}``, or ``{"error": why, "timeout": True}``; None while it runs.
     """
 
     def __init__(
@@ -60,20 +61,20 @@ class BackgroundJob:
         self._cancelled = False
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
-        # The process is made in this thread too: a fork takes milliseconds that a learner need not wait.
+        # The thread also starts the process: a fork takes milliseconds, for which the learner must not wait.
         self._thread = threading.Thread(target=self._run, name=module, daemon=True)
 
     def start(self) -> None:
-        """Begin; returns at once."""
+        """Start the thread; returns at once."""
         self._thread.start()
 
     @property
     def running(self) -> bool:
-        """Whether the result is still to come."""
+        """True until there is a result."""
         return self._thread.is_alive()
 
     def cancel(self) -> None:
-        """End the process, drop the result, and wait for the thread."""
+        """Kill the process, drop its result, and wait for the thread."""
         with self._lock:
             self._cancelled = True
             if self._process is not None and self._process.poll() is None:
@@ -86,7 +87,7 @@ class BackgroundJob:
             with tempfile.TemporaryDirectory(prefix="dehyst-") as folder:
                 result = self._work(Path(folder))
         except Exception as error:
-            # A full disk, no processes left: the service goes on, and says why it has no result.
+            # For example a full disk, or no process left: the service continues.
             result = {"error": f"{type(error).__name__}: {error}"}
         self.result = result
         if self._done is not None and not self._cancelled:
@@ -95,7 +96,7 @@ class BackgroundJob:
     def _work(self, folder: Path) -> dict[str, Any]:
         (folder / _ORDER).write_text(json.dumps(self._order), encoding="utf-8")
         np.savez(folder / _DATA, **self._arrays)  # type: ignore[arg-type]
-        # They are in the folder now. Who keeps a job for its result must not keep megabytes of samples with it.
+        # They are in the folder now: a job that is kept for its result must not keep megabytes of samples.
         self._order, self._arrays = {}, {}
         with self._lock:
             if self._cancelled:
@@ -115,20 +116,28 @@ class BackgroundJob:
             process.communicate()
             return {"error": f"took longer than {self._timeout_s:g} s and was ended (timeout_s)", "timeout": True}
         try:
-            told: dict[str, Any] = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
+            result: dict[str, Any] = json.loads((folder / _RESULT).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             last = complaint.decode(errors="replace").strip().splitlines()[-1:] or [f"status {process.returncode}"]
             return {"error": f"the process ended without a result: {last[0][:300]}"}
-        return told
+        return result
 
 
-def work(folder: Path, do: Callable[[dict[str, Any], dict[str, FloatArray]], dict[str, Any]]) -> int:
-    """The process' side: ``do`` gets order and arrays, and its result is written whole or not at all. Returns 0."""
-    # Before the heavy imports: whoever answers queries goes first, always.
+def run_worker(do: Callable[[dict[str, Any], dict[str, FloatArray]], dict[str, Any]]) -> int:
+    """Run one order in this process: call ``do(order, arrays)`` and write its result atomically. Returns 0.
+
+    The folder is the first argument of the process. A DehystError becomes the result ``{"error": message}``.
+    """
+    # Before the heavy imports of ``do``: queries have priority.
     step_back()
+    folder = Path(sys.argv[1])
     order = json.loads((folder / _ORDER).read_text(encoding="utf-8"))
     with np.load(folder / _DATA, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
+    try:
+        result = do(order, arrays)
+    except DehystError as error:
+        result = {"error": str(error)}
     with atomic_write(folder / _RESULT) as file:
-        file.write(json.dumps(do(order, arrays)).encode())
+        file.write(json.dumps(result).encode())
     return 0

@@ -1,4 +1,4 @@
-"""Who goes first on a machine with few cores: work in the background steps back behind whoever answers."""
+"""Priority of processes: background jobs run at low priority, behind the process that answers queries."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: The lowest priority there is.
+#: The lowest priority of Unix (niceness).
 LAST: Final = 19
 _AUTOGROUP: Final = Path("/proc/self/autogroup")
-#: The system takes one such wish in a tenth of a second, from all processes together.
+#: Linux accepts one change of an autogroup in 0.1 s, from all processes together.
 _TRIES, _PAUSE_S = 20, 0.11
 
 
 def step_back(steps: int = LAST) -> None:
-    """Make this process nicer by so many steps, and its session too where it is its own.
+    """Increase the niceness of this process by ``steps``, and that of its session if the process leads it.
 
-    Linux shares a processor between sessions first, with autogroups as most distributions have them, and looks at what
-    is nice within a session only: the lowest priority in a session of its own takes half a core from a service that
-    has another session, and held its answers up for tenths of a second. A session has a niceness of its own for that.
+    With autogroups, which most distributions enable, Linux divides a core between sessions first; niceness counts only
+    within a session. A process of the lowest priority in a session of its own would take half a core from the service
+    and delay answers by tenths of a second. The session therefore gets a niceness too.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.nice(steps)
-        # A session that was somebody else's, such as a shell's, is not this process' to slow down.
+        # Do not slow down a session that another process leads, such as a shell.
         if os.getsid(0) != os.getpid():
             return
         for _ in range(_TRIES):

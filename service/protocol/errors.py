@@ -1,13 +1,13 @@
-"""What the wire and the processes raise, below :class:`adaptive.errors.DehystError`.
+"""Errors of the wire and the processes, below :class:`adaptive.errors.DehystError`.
 
 ::
 
     ServiceError
-    ├── SessionError        a zenoh session could not be opened: port in use, nobody listening, bad endpoint
-    ├── NoReplyError        no service answered: not running, stopped while asked, or access refused
-    ├── ReplyTimeoutError   the service is there but did not answer in time (also the built-in TimeoutError)
-    ├── RefusedError        the service answered with an error of its own; carries field, got and expected
-    └── BehindError         the service has not yet learnt as far as the query asked for with ``as_of``
+    ├── SessionError        a zenoh session cannot be opened: port in use, nobody listens, bad endpoint
+    ├── NoReplyError        no service answered: not running, stopped meanwhile, or access refused
+    ├── ReplyTimeoutError   the service is running but did not answer in time (also the built-in TimeoutError)
+    ├── RefusedError        the service refused the request; has field, got and expected
+    └── BehindError         the service has not yet handled the samples that ``as_of`` covers
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from adaptive.errors import DehystError, InputError
 
 
 class ServiceError(DehystError):
-    """Root of what goes wrong on the wire and in the processes."""
+    """Root of the errors of the wire and the processes."""
 
 
 class SessionError(ServiceError):
-    """A zenoh session could not be opened; the message names the endpoint and what to do."""
+    """A zenoh session cannot be opened; the message names the endpoint and what to do."""
 
 
 class NoReplyError(ServiceError):
-    """A query got no reply at all. The request may be repeated: queries change nothing in the service."""
+    """A query got no reply. It can be repeated: queries change nothing in the service."""
 
 
 class ReplyTimeoutError(ServiceError, TimeoutError):
-    """A query was not answered within its time. The request may be repeated."""
+    """A query was not answered in time. It can be repeated."""
 
 
 class BehindError(ServiceError):
-    """The service had not handled the samples that ``as_of`` needs within the time allowed."""
+    """The service did not handle all samples that ``as_of`` covers within the time allowed."""
 
 
 class RefusedError(ServiceError):
-    """The service refused a request, in its own words.
+    """The service refused a request; the message is that of the service.
 
     Attributes
     ----------
     kind : name of the error class in the service, such as ``InputError``.
-    field, got, expected : what the service said of the offending field; empty where it said nothing.
+    field, got, expected : the refused field, its value and what was expected; empty if the error has none.
     """
 
     def __init__(self, kind: str, message: str, field: str = "", got: str = "", expected: str = "") -> None:
@@ -56,7 +56,7 @@ class RefusedError(ServiceError):
 
 
 class FieldError(InputError):
-    """An :class:`InputError` that also carries its parts, so that they can travel as JSON."""
+    """An :class:`InputError` with its parts as attributes, for the JSON of an error reply."""
 
     def __init__(self, field: str, got: object, expected: str, advice: str = "") -> None:
         self.field = field
@@ -67,28 +67,23 @@ class FieldError(InputError):
 
 def error_to_json(error: BaseException) -> bytes:
     """The payload of an error reply: ``{"error", "message", "field", "got", "expected"}`` as UTF-8 JSON."""
-    # The public name of what a peer gave wrongly is InputError; FieldError is how it carries its parts.
+    # FieldError is not part of the protocol: clients see InputError.
     kind = "InputError" if isinstance(error, InputError) else type(error).__name__
-    return json.dumps(
-        {
-            "error": kind,
-            "message": str(error),
-            "field": getattr(error, "field", ""),
-            "got": getattr(error, "got", ""),
-            "expected": getattr(error, "expected", ""),
-        }
-    ).encode()
+    parts = {"field": "", "got": "", "expected": ""}
+    if isinstance(error, FieldError | RefusedError):
+        parts = {"field": error.field, "got": error.got, "expected": error.expected}
+    return json.dumps({"error": kind, "message": str(error), **parts}).encode()
 
 
 def error_from_json(payload: bytes) -> ServiceError:
-    """The exception for the payload of an error reply, whoever made it; never raises."""
+    """The exception for the payload of an error reply; never raises."""
     try:
         data: Any = json.loads(payload)
     except (ValueError, RecursionError):
         data = None
     if not isinstance(data, dict):
         text = payload.decode(errors="replace")
-        # Zenoh itself answers a query that ran out of time with this word as an error reply.
+        # Zenoh answers a query that timed out with an error reply that contains this word.
         if "timeout" in text.lower():
             return ReplyTimeoutError("the service did not answer in time; ask again or allow more time")
         return RefusedError("unknown", text)

@@ -1,4 +1,4 @@
-"""Key expressions of the wire: ``dehyst/v1/{stage}/{axis}/{what}``. The version chunk changes with the format."""
+"""Zenoh keys: ``dehyst/v1/{stage}/{axis}/{what}``. The version in the key changes with the format."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Final
 from service.protocol.errors import FieldError
 
 ROOT = "dehyst/v1"
-#: One chunk of a key: lower case, digits, underscore and hyphen, beginning with a letter, at most 64 characters.
+#: A name in a key: lower case, digits, underscore and hyphen, beginning with a letter, at most 64 characters.
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}\Z")
-#: The name of the model that is always the best of those that learn.
+#: The model name that stands for the best of the competing models.
 AUTO: Final = "auto"
 
 
 def check_name(field: str, name: object) -> str:
-    """``name`` if it can be one chunk of a key, else InputError naming ``field``."""
+    """``name``. Raises InputError with ``field`` if the name cannot be part of a key."""
     if not isinstance(name, str) or not _NAME.match(name):
         raise FieldError(
             field,
@@ -29,7 +29,7 @@ def check_name(field: str, name: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """The keys of one axis. Raises InputError where a name cannot be part of a key."""
+    """The keys of one axis. Raises InputError if a name cannot be part of a key."""
 
     stage: str
     axis: str
@@ -44,32 +44,32 @@ class Keys:
 
     @property
     def sample(self) -> str:
-        """Published by the stage: what it measured."""
+        """Publication of the stage: its samples."""
         return f"{self.base}/sample"
 
     @property
     def command(self) -> str:
-        """Published by the controller: voltages by sequence number, ahead of time."""
+        """Publication of the controller: voltages by sample number, in advance."""
         return f"{self.base}/command"
 
     @property
     def reference(self) -> str:
-        """Published by the controller: what was wanted, by sequence number; for diagnostics only."""
+        """Publication of the controller: desired motion by sample number, for diagnostics."""
         return f"{self.base}/reference"
 
     @property
     def feedforward(self) -> str:
-        """Query: a desired trajectory in, voltages out."""
+        """Query: desired trajectory -> voltages."""
         return f"{self.base}/feedforward"
 
     @property
     def model(self) -> str:
-        """Query and publication: the learnt model itself."""
+        """Query and publication: the learnt model."""
         return f"{self.base}/model"
 
     @property
     def champion(self) -> str:
-        """Publication: the best of the models that learn, itself."""
+        """Publication: the best of the competing models."""
         return f"{self.base}/champion"
 
     @property
@@ -79,42 +79,42 @@ class Keys:
 
     @property
     def event(self) -> str:
-        """Publication: JSON, one thing that happened."""
+        """Publication: JSON, one event."""
         return f"{self.base}/event"
 
     @property
     def diagnostics(self) -> str:
-        """Publication, 20 Hz while somebody listens: JSON, what the learner sees."""
+        """Publication, 20 Hz while somebody subscribes: JSON, quantities of the learner."""
         return f"{self.base}/diagnostics"
 
     @property
     def operate(self) -> str:
-        """Query: a verb of the operator, JSON in and out."""
+        """Query: a command of the operator, JSON."""
         return f"{self.base}/operate"
 
     @property
     def state(self) -> str:
-        """Query, of services only: a checkpoint of the serving instance as it is, for its standby."""
+        """Query of a standby: a checkpoint of the present state of the serving instance."""
         return f"{self.base}/state"
 
     @property
     def claim_any(self) -> str:
-        """Matches the claims of every instance that serves this axis or wants to."""
+        """Matches the claims of all instances that serve this axis."""
         return f"{self.base}/claim/*/*"
 
     def claim(self, epoch: int, instance: str) -> str:
-        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest one counts."""
+        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence."""
         return f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
 
     def standby(self, instance: str) -> str:
-        """Liveliness, and publication 1 Hz: JSON, the status of an instance that stands by."""
+        """Liveliness, and publication 1 Hz: JSON, the status of a standby."""
         return f"{self.base}/standby/{check_name('instance', instance)}"
 
     @property
     def alive_any(self) -> str:
-        """Matches the liveliness of every instance that serves this axis."""
+        """Matches the liveliness tokens of all instances that serve this axis."""
         return f"{self.base}/alive/*"
 
     def alive(self, instance: str) -> str:
-        """Liveliness of one instance; declared last, so alive means callable."""
+        """Liveliness of one instance; declared last: an alive instance answers queries."""
         return f"{self.base}/alive/{check_name('instance', instance)}"

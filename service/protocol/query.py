@@ -1,4 +1,4 @@
-"""Binary payload of a feedforward query; docs/protocol.md is the page about it."""
+"""Binary payload of a feedforward query (docs/protocol.md)."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from service.protocol.samples import (
     check_finite,
     check_header,
     check_length,
-    check_name,
     check_seq,
     check_sizes,
     column,
+    decode_name,
     doubles,
 )
 
-#: The query carries accelerations (options bit 0), a memory vector (bit 1), or what is under way (bit 2).
+#: Options: the query has accelerations (bit 0), a memory (bit 1), or samples under way (bit 2).
 HAS_ACCELERATION: Final = 1
 HAS_MEMORY: Final = 2
 HAS_PENDING: Final = 4
-#: Samples that may be under way.
+#: Most samples under way in a query.
 MAX_PENDING: Final = 4096
-#: ``as_of`` of a query that takes the newest snapshot.
+#: ``as_of`` of a query to the newest snapshot.
 NEWEST: Final = -1
 
 # version, kind, options, n, as_of, u_before_V, m, bytes of the name
 _QUERY: Final = struct.Struct("<BBHIqdII")
-# first sample and number of those that are under way
+# first sample under way, and their number
 _PENDING: Final = struct.Struct("<qI")
 # y, v, a of a query for one point
 _ONE_POINT: Final = struct.Struct("<3d")
 
 
 class Pending(NamedTuple):
-    """What is under way: commanded, and not yet seen in the samples.
+    """What is under way: commanded, but not yet seen in the samples.
 
     Attributes
     ----------
-    first : the stage's number of the first sample. y_um, u_V : (k,) the motion wanted, µm, and the voltages for it, V.
+    first : number of the first sample. y_um, u_V : (k,) desired displacement, µm, and commanded voltage, V.
     """
 
     first: int
@@ -61,12 +61,12 @@ class FeedforwardQuery(NamedTuple):
 
     Attributes
     ----------
-    y_um, v_um_per_s, a_um_per_s2 : (n,) each, finite; the motion at the instants of the points.
-    memory : (m,) from the reply before, or None: start from what the service tracks from the samples ...
-    pending : ... and from there along this to the first point; None for nothing. Not together with ``memory``.
-    model : name of the model to ask; empty for the service's default.
-    as_of : answer from the newest snapshot that had seen no sample after this number; NEWEST for the newest.
-    u_before_V : voltage just before the first point, V, from where the slew limit counts; NaN where there is none.
+    y_um, v_um_per_s, a_um_per_s2 : (n,) each, finite; displacement, µm, velocity, µm/s, and acceleration, µm/s².
+    memory : (m,) from the previous reply; None: start from the memory that the service tracks from the samples.
+    pending : advance the tracked memory by this up to the first point; None for nothing. Not with ``memory``.
+    model : name of the model to ask; empty for the default of the service.
+    as_of : answer from the newest snapshot that has seen no sample after this number; NEWEST for the newest.
+    u_before_V : voltage before the first point, V, for the slew limit; NaN if there is none.
     """
 
     y_um: FloatArray
@@ -89,7 +89,7 @@ def encode_query(
     u_before_V: float = float("nan"),
     pending: Pending | None = None,
 ) -> bytes:
-    """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError naming what does not fit."""
+    """Payload of a query; shapes as in :class:`FeedforwardQuery`. Raises InputError with the invalid field."""
     options, m, n = 0, 0, 1
     parts = []
     if memory is not None:
@@ -121,12 +121,12 @@ def encode_query(
 
 
 def decode_query(data: bytes) -> FeedforwardQuery:
-    """The query in a payload. Raises InputError where it is malformed, not finite, or out of bounds."""
+    """The query in a payload. Raises InputError if it is malformed, not finite, or out of bounds."""
     options, n = check_header(data, FEEDFORWARD_QUERY, _QUERY.size, HAS_ACCELERATION | HAS_MEMORY | HAS_PENDING)
     *_, as_of, u_before_V, m, name_bytes = _QUERY.unpack_from(data)
     check_sizes(m, name_bytes)
     if m and not options & HAS_MEMORY:
-        raise FieldError("m", m, "0 where the options say that there is no memory")
+        raise FieldError("m", m, "0 without the option for a memory")
     if not NEWEST <= as_of <= MAX_SEQ:
         raise FieldError("as_of", as_of, "a sequence number from 0 to 2**62, or -1 for the newest")
     if u_before_V in (float("inf"), float("-inf")):
@@ -144,14 +144,14 @@ def decode_query(data: bytes) -> FeedforwardQuery:
             check_finite(name, part)
     return FeedforwardQuery(
         y, v, a, memory if options & HAS_MEMORY else None,
-        check_name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
+        decode_name(data[end : end + name_bytes]) if name_bytes else "", as_of, u_before_V, pending,
     )  # fmt: skip
 
 
 def _pending(data: bytes, begin: int, options: int) -> Pending:
-    """What is under way, from ``begin`` to the end of a query. Raises InputError where it is malformed."""
+    """What is under way, from byte ``begin`` to the end of a query. Raises InputError if it is malformed."""
     if options & HAS_MEMORY:
-        raise FieldError("pending", "a memory beside it", "one of the two: a memory is of the instant before y_um[0]")
+        raise FieldError("pending", "a memory too", "one of the two: a memory is of the instant before y_um[0]")
     if len(data) < begin + _PENDING.size:
         raise FieldError("payload", f"{len(data)} bytes", f"at least {begin + _PENDING.size}, for what is under way")
     first, k = _PENDING.unpack_from(data, begin)

@@ -17,8 +17,8 @@ from service.protocol.samples import (
     check_finite,
     check_header,
     check_length,
-    check_name,
     check_sizes,
+    decode_name,
     doubles,
 )
 
@@ -127,7 +127,7 @@ def decode_reply(data: bytes) -> Trajectory:
     check_finite("u_V", u)
     check_finite("memory", memory)
     flags = np.frombuffer(data, dtype=np.uint8, count=n, offset=end)
-    name, stand_in = check_name(data[end + n :]), ""
+    name, stand_in = decode_name(data[end + n :]), ""
     if options & HAS_STAND_IN:
         name, _, stand_in = name.partition("/")
     return Answer(

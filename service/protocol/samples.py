@@ -1,8 +1,8 @@
-"""Binary payloads of the stage and the controller; docs/protocol.md is the page about them.
+"""Binary payloads of the stage and the controller, and the checks that all payloads share (docs/protocol.md).
 
-All numbers are little-endian. Every payload begins with the same eight bytes: version (u8), kind (u8), options (u16),
-count n (u32); columns of n values follow. Decoding is strict: a payload of another length, version or kind is refused
-with an :class:`InputError` that names the field, what was got and what was expected.
+Numbers are little-endian. Every payload begins with the same eight bytes: version (u8), kind (u8), options (u16), count
+n (u32); columns of n values follow. Decoding is strict: a payload of another length, version or kind is refused with an
+:class:`InputError` that has the field, what was got and what was expected.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ KIND_NAMES: Final = {
     MODEL: "model",
 }
 
-#: Longest block that is taken, so that one message cannot ask for all of the memory.
+#: Longest block that is accepted, so that one message cannot use up the memory.
 MAX_COUNT: Final = 65_536
 MAX_SEQ: Final = 2**62
 MAX_MEMORY: Final = 4096
@@ -49,7 +49,7 @@ _BLOCK: Final = struct.Struct("<BBHIq")
 class SampleBatch:
     """n samples of a stage: ``seq`` (n,), ``t_s`` (n,) s, ``u_V`` (n,) V, ``y_um`` (n,) µm.
 
-    The values may be anything, NaN included: what a stage measured is reported as it is, and refused by the gates.
+    Values may be NaN or infinite: a stage reports what it measured, and the gates of the learner refuse it.
     """
 
     seq: NDArray[np.int64]
@@ -67,7 +67,7 @@ class SampleBatch:
 
 
 def joined(batches: Sequence[SampleBatch]) -> SampleBatch:
-    """The samples of several messages, in their order, as those of one."""
+    """The samples of several messages in order."""
     return SampleBatch(
         *(np.concatenate([getattr(batch, name) for batch in batches]) for name in ("seq", "t_s", "u_V", "y_um"))
     )
@@ -85,7 +85,7 @@ class Block:
 
 
 def check_header(data: bytes, kind: int, least_bytes: int, allowed_options: int = 0) -> tuple[int, int]:
-    """(options, n) of a payload that is to be of ``kind`` and at least ``least_bytes`` long."""
+    """(options, n) of a payload. Raises InputError if it is not of ``kind`` or shorter than ``least_bytes``."""
     if len(data) < least_bytes:
         raise FieldError("payload", f"{len(data)} bytes", f"at least {least_bytes} bytes for a {KIND_NAMES[kind]}")
     version, got_kind, options, n = HEADER.unpack_from(data)
@@ -96,40 +96,40 @@ def check_header(data: bytes, kind: int, least_bytes: int, allowed_options: int 
     if options & ~allowed_options:
         raise FieldError("options", f"0x{options:04x}", f"no bit outside 0x{allowed_options:04x}")
     if not 1 <= n <= MAX_COUNT:
-        raise FieldError("n", n, f"1 to {MAX_COUNT}", "split what is longer into several messages")
+        raise FieldError("n", n, f"1 to {MAX_COUNT}", "split a longer block into several messages")
     return options, n
 
 
 def check_length(data: bytes, expected: int) -> None:
-    """InputError unless the payload is exactly as long as its header says."""
+    """Raise InputError if the payload is not exactly as long as its header says."""
     if len(data) != expected:
         raise FieldError("payload", f"{len(data)} bytes", f"exactly {expected} bytes by its own header")
 
 
 def check_finite(field: str, values: FloatArray) -> None:
-    """InputError naming the first element of ``values`` that is not finite."""
+    """Raise InputError with the first element of ``values`` that is not finite."""
     if not all_finite(values):
         bad = int(np.argmin(np.isfinite(values)))
         raise FieldError(f"{field}[{bad}]", float(values[bad]), "a finite number")
 
 
 def check_seq(field: str, seq: int) -> int:
-    """A sequence number that fits the wire, else InputError."""
+    """``seq`` as int. Raises InputError if it is not a sequence number."""
     if not 0 <= seq <= MAX_SEQ:
         raise FieldError(field, seq, "a sequence number from 0 to 2**62")
     return int(seq)
 
 
 def check_sizes(m: int, name_bytes: int) -> None:
-    """InputError where a memory or a name is longer than the wire takes."""
+    """Raise InputError if a memory or a name is too long."""
     if m > MAX_MEMORY:
         raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
     if name_bytes > MAX_NAME_BYTES:
         raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
 
 
-def check_name(raw: bytes) -> str:
-    """A model's name in UTF-8, else InputError."""
+def decode_name(raw: bytes) -> str:
+    """The name of a model. Raises InputError if it is not UTF-8."""
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
@@ -137,12 +137,12 @@ def check_name(raw: bytes) -> str:
 
 
 def doubles(data: bytes, offset: int, count: int) -> FloatArray:
-    """``count`` doubles from ``offset`` on, as an array of its own (aligned and writeable)."""
+    """``count`` doubles from byte ``offset`` on, as a copy."""
     return np.frombuffer(data, dtype="<f8", count=count, offset=offset).astype(np.float64)
 
 
 def column(field: str, values: ArrayLike) -> FloatArray:
-    """``values`` as a contiguous (n,) array of doubles with 1 ≤ n ≤ MAX_COUNT, else InputError."""
+    """``values`` as a contiguous (n,) array of doubles. Raises InputError if it is not, or n is out of range."""
     try:
         array = np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -155,7 +155,7 @@ def column(field: str, values: ArrayLike) -> FloatArray:
 
 
 def encode_samples(seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike) -> bytes:
-    """A message of n samples; all arguments are numbers or (n,). Raises InputError on unequal lengths or bad seq."""
+    """A message of n samples; arguments are numbers or (n,). Raises InputError for unequal lengths or a bad seq."""
     numbers = np.ascontiguousarray(seq, dtype=np.int64).reshape(-1)
     columns = [column("t_s", t_s), column("u_V", u_V), column("y_um", y_um)]
     for name, values in zip(("t_s", "u_V", "y_um"), columns, strict=True):
@@ -167,7 +167,7 @@ def encode_samples(seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLi
 
 
 def decode_samples(data: bytes) -> SampleBatch:
-    """The samples of a message. Raises InputError where it is malformed; values are not judged."""
+    """The samples of a message. Raises InputError if it is malformed; values are not checked."""
     _, n = check_header(data, SAMPLES, HEADER.size)
     check_length(data, HEADER.size + 32 * n)
     seq = np.frombuffer(data, dtype="<i8", count=n, offset=HEADER.size).astype(np.int64)
@@ -183,17 +183,17 @@ def encode_command(seq: int, u_V: ArrayLike) -> bytes:
 
 
 def decode_command(data: bytes) -> Block:
-    """A command block; raises InputError where it is malformed or not finite."""
+    """The block of a command. Raises InputError if it is malformed or not finite."""
     return _decode_block(COMMAND, "u_V", data)
 
 
 def encode_reference(seq: int, y_um: ArrayLike) -> bytes:
-    """Wanted displacements, µm, at samples ``seq``, ``seq + 1``, …; (n,) and finite."""
+    """Desired displacements, µm, at samples ``seq``, ``seq + 1``, …; (n,) and finite."""
     return _encode_block(REFERENCE, "y_um", seq, y_um)
 
 
 def decode_reference(data: bytes) -> Block:
-    """A reference block; raises InputError where it is malformed or not finite."""
+    """The block of a reference. Raises InputError if it is malformed or not finite."""
     return _decode_block(REFERENCE, "y_um", data)
 
 

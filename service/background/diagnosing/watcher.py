@@ -16,8 +16,8 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
 from service.background.diagnosing.alarm import Alarm, Levels
 from service.background.diagnosing.buffer import SampleBuffer
-from service.background.diagnosing.job import Job
 from service.background.diagnosing.settings import WatchConfig
+from service.background.job import BackgroundJob
 from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -29,6 +29,8 @@ _KEPT: Final = 10
 _TOLD: Final = ("job", "seq", "why", "text")
 #: A reference must move through this share of the axis' range.
 _LEAST_MOTION: Final = 0.05
+#: Module of the working process.
+WORKER: Final = "service.background.diagnosing.worker"
 _ARGUMENTS: Final = ("recent_s", "report")
 
 
@@ -56,7 +58,7 @@ class Watcher:
         #: An alarm is looked into once this sample is there.
         self._due_seq = 0
         self._not_before_s = 0.0
-        self._job: Job | None = None
+        self._job: BackgroundJob | None = None
         self._lock = threading.Lock()
         self._counts = {"alarms": 0, "requests": 0, "started": 0, "finished": 0, "failed": 0, "waited": 0, "skipped": 0}
         self._last: dict[str, Any] | None = None
@@ -185,7 +187,8 @@ class Watcher:
             def done(result: dict[str, Any]) -> None:
                 self._finish(about, result, time.monotonic() - now_s)
 
-            self._job = Job(order, reference, recent, self.config.timeout_s, done)
+            arrays = {"reference": reference, "recent": recent}
+            self._job = BackgroundJob(WORKER, order, arrays, self.config.timeout_s, done)
             self._job.start()
         return {"started": True, "job": number}
 

@@ -1,7 +1,4 @@
-"""The process that diagnoses: ``python -m service.background.diagnosing.worker FOLDER``, of the lowest priority.
-
-See ``service.background.job`` for what it finds in the folder and leaves there.
-"""
+"""The process that diagnoses (see `service.background.job`): ``-m service.background.diagnosing.worker FOLDER``."""
 
 from __future__ import annotations
 
@@ -11,14 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.errors import DehystError
 from adaptive.types import BoolArray, FloatArray
-from service.background.job import work
-
-
-def main(arguments: list[str]) -> int:
-    """Diagnose one job. Returns 0; what goes wrong is in the result."""
-    return work(Path(arguments[0]), _diagnosed)
+from service.background.job import run_worker
 
 
 def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
@@ -27,17 +18,15 @@ def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, 
     try:
         return diagnose(job, arrays["reference"], arrays["recent"])
     except TooFewSamples as error:
-        # Of what is recent there will be more; of the reference there will not.
+        # More recent samples will arrive; the reference does not grow.
         return {"error": str(error), "wait": error.stretch == "recent"}
-    except DehystError as error:
-        return {"error": str(error)}
 
 
 def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> dict[str, Any]:
     """The verdict on (4, n) samples ``recent`` (seq, t_s, u_V, y_um) against ``reference``.
 
-    ``job``: ``model`` (bundle file), ``name`` (in it), ``from_seq`` (what is recent of the recent samples), ``report``
-    (folder for the engine's full report, or empty). Raises InputError and ModelFileError.
+    ``job`` holds ``model`` (model file), ``name`` (of the model in it), ``from_seq`` (first recent sample) and
+    ``report`` (folder for a full report, or empty). Raises InputError and ModelFileError.
     """
     from service.storage.model_file import read_bundle
     from sim.changes.compare import compare
@@ -53,9 +42,9 @@ def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> 
 
 
 def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
-    """Samples (4, n) as a stretch for the comparison; what is before ``from_seq`` only settles the memory.
+    """Samples (4, n) as a stretch for the comparison; those before ``from_seq`` only settle the hysteresis memory.
 
-    A stage that said nothing for long cuts them: then the part with most of what is from ``from_seq`` on.
+    A long gap splits the samples: then the part with most samples from ``from_seq`` on is taken.
     """
     from adaptive.smoothing import SmootherConfig, smooth_recording
     from sim.changes.signatures import Stretch
@@ -65,7 +54,7 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
     numbers = np.rint(whole.t_s / dt_s) + samples[0, 0]
     scored = valid & (numbers >= from_seq)
     config = SmootherConfig.for_rate(dt_s)
-    # Past its ends the smoother makes up what it has not seen.
+    # At its ends the smoother extrapolates.
     scored[: config.lag] = scored[-config.lag :] = False
     motion = smooth_recording(whole.y_um, config)
     return Stretch(dt_s, whole.t_s, np.ascontiguousarray(whole.u_V), motion, scored)
@@ -74,7 +63,7 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
 def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, BoolArray]:
     from sim.recordings import Recording, repaired
 
-    # As for what learns, the numbers say how much time has passed: the stage's clock may have been set meanwhile.
+    # Sample numbers give the time, as in the learner: the clock of the stage may have been set.
     recording = Recording(
         t_s=dt_s * (samples[0] - samples[0, :1]), u_V=samples[2], y_um=samples[3], dt_s=dt_s, source="recent samples",
         seq=samples[0].astype(np.int64),
@@ -84,7 +73,7 @@ def _repaired(samples: FloatArray, dt_s: float, since: int = 0) -> tuple[Any, Bo
 
 
 def full_report(out: Path, samples: FloatArray, dt_s: float) -> dict[str, Any]:
-    """What the diagnosis of measured data finds in the recent samples, against the chapter's stage; with its report."""
+    """The diagnosis of the recent samples as measured data, with its report in the folder ``out``."""
     from service.reports.diagnosis import Source, write_report
     from sim.diagnosis.diagnose import diagnose_prepared
     from sim.diagnosis.prepare import prepare
@@ -96,4 +85,4 @@ def full_report(out: Path, samples: FloatArray, dt_s: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_worker(_diagnosed))

@@ -1,28 +1,21 @@
-"""The process that tunes: ``python -m service.background.retuning.worker FOLDER``, of the lowest priority.
-
-See ``service.background.job`` for what it finds in the folder and leaves there.
-"""
+"""The process that tunes (see `service.background.job`): ``-m service.background.retuning.worker FOLDER``."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from adaptive.types import FloatArray
-from service.background.job import work
-
-
-def main(arguments: list[str]) -> int:
-    """Do one order. Returns 0; what goes wrong is in the result."""
-    return work(Path(arguments[0]), tuned)
+from service.background.job import run_worker
 
 
 def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
-    """``order``: ``{"kind": "propose", "search": {...}, "torch": bool}`` on the window ``before`` of the arrays, or
-    ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` on ``before`` and ``after``."""
-    from adaptive.errors import DehystError
+    """The result of one order.
+
+    ``order`` is ``{"kind": "propose", "search": {...}, "torch": bool}`` for the window ``before`` in the arrays, or
+    ``{"kind": "compare", "search": {...}, "gamma", "widths"}`` for ``before`` and ``after``. Raises DehystError.
+    """
     from adaptive.tuning.config import RetuneConfig
     from adaptive.tuning.retuning import compare, propose
     from adaptive.types import Hyperparameters
@@ -31,15 +24,12 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}
     ranges = {name: tuple(order["search"][name]) for name in ("gamma_range", "width_range")}
     config = RetuneConfig(**{**order["search"], **ranges})
-    try:
-        if order["kind"] == "compare":
-            hyper = Hyperparameters(float(order["gamma"]), tuple(float(width) for width in order["widths"]))
-            trial = compare(data["before"], data["after"], hyper, config)
-            return asdict(trial)
-        search, by = _search(bool(order["torch"]))
-        found = propose(data["before"], config, search)
-    except DehystError as error:
-        return {"error": str(error)}
+    if order["kind"] == "compare":
+        hyper = Hyperparameters(float(order["gamma"]), tuple(float(width) for width in order["widths"]))
+        trial = compare(data["before"], data["after"], hyper, config)
+        return asdict(trial)
+    search, by = _search(bool(order["torch"]))
+    found = propose(data["before"], config, search)
     return {
         "gamma": found.hyper.gamma,
         "widths": list(found.hyper.widths),
@@ -52,7 +42,7 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
 
 
 def _search(wanted: bool) -> tuple[Any, str]:
-    """(what finds starts, its name): torch's batch where it is wanted and installed."""
+    """(search for starting points, its name): the batch search with torch if it is wanted and installed."""
     if wanted:
         from baselines.swarm.evidence_search import EvidenceSearch
         from baselines.swarm.particle_swarm import MissingTorchError, torch_module
@@ -67,4 +57,4 @@ def _search(wanted: bool) -> tuple[Any, str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_worker(tuned))

@@ -18,10 +18,10 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.types import InverseModel
 from service.answers.guard import Limits
-from service.background.diagnosing.job import Job
 from service.background.diagnosing.settings import WatchConfig
-from service.background.diagnosing.watcher import Watcher
+from service.background.diagnosing.watcher import WORKER, Watcher
 from service.background.diagnosing.worker import diagnose
+from service.background.job import BackgroundJob
 from service.client.client import Client
 from service.config.config import AxisConfig
 from service.identification.identifying import identify_one
@@ -84,6 +84,12 @@ def recorded(model_file: Path, seconds: float, change_s: float, **change: float)
     return np.stack([seq, seq * DT_S, u_V, y_um])
 
 
+def diagnosis_job(
+    order: dict[str, Any], reference: Any, recent: Any, timeout_s: float, done: Callable[[dict[str, Any]], None]
+) -> BackgroundJob:
+    return BackgroundJob(WORKER, order, {"reference": reference, "recent": recent}, timeout_s, done)
+
+
 def order(model_file: Path, from_seq: int) -> dict[str, Any]:
     return {"model": str(model_file), "name": "lssvm_adaptive", "from_seq": from_seq, "report": ""}
 
@@ -91,7 +97,7 @@ def order(model_file: Path, from_seq: int) -> dict[str, Any]:
 def test_a_job_names_the_change_in_a_process_of_its_own(model_file: Path) -> None:
     samples = recorded(model_file, 14.0, 7.0, gain_drift__gain=-0.019)
     told: list[dict[str, Any]] = []
-    job = Job(order(model_file, 7000), samples[:, :6500], samples[:, 2000:], 60.0, told.append)
+    job = diagnosis_job(order(model_file, 7000), samples[:, :6500], samples[:, 2000:], 60.0, told.append)
     job.start()
     eventually(lambda: not job.running, 60.0)
     assert told[0]["verdict"] == "changed"
@@ -116,7 +122,7 @@ def test_a_job_does_not_keep_what_it_was_given(model_file: Path) -> None:
     samples = [recorded(model_file, 3.0, 0.0) for _ in range(2)]
     known = [weakref.ref(each) for each in samples]
     told: list[dict[str, Any]] = []
-    job = Job(order(model_file, 0), *samples, 60.0, told.append)
+    job = diagnosis_job(order(model_file, 0), *samples, 60.0, told.append)
     samples.clear()
     job.start()
     eventually(lambda: not job.running, 60.0)
@@ -128,9 +134,9 @@ def test_a_job_that_cannot_be_done_says_why(model_file: Path, tmp_path: Path) ->
     samples = recorded(model_file, 3.0, 0.0)
     told: list[dict[str, Any]] = []
     jobs = (
-        Job(order(tmp_path / "none.npz", 0), samples, samples, 60.0, told.append),
-        Job(order(model_file, 2900), samples, samples, 60.0, told.append),
-        Job(order(model_file, 0), samples, samples, 0.05, told.append),
+        diagnosis_job(order(tmp_path / "none.npz", 0), samples, samples, 60.0, told.append),
+        diagnosis_job(order(model_file, 2900), samples, samples, 60.0, told.append),
+        diagnosis_job(order(model_file, 0), samples, samples, 0.05, told.append),
     )
     for job in jobs:
         job.start()
@@ -141,7 +147,7 @@ def test_a_job_that_cannot_be_done_says_why(model_file: Path, tmp_path: Path) ->
 def test_a_cancelled_job_tells_nothing_and_leaves_no_process(model_file: Path) -> None:
     samples = recorded(model_file, 3.0, 0.0)
     told: list[dict[str, Any]] = []
-    job = Job(order(model_file, 0), samples, samples, 60.0, told.append)
+    job = diagnosis_job(order(model_file, 0), samples, samples, 60.0, told.append)
     job.start()
     eventually(lambda: job._process is not None, 10.0)
     job.cancel()
