@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from adaptive.identification import IdentifyConfig, identify_lssvm
-from adaptive.tuning import proposal as retune
+from adaptive.tuning import retuning as retune
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, WindowData
 from service.answers.guard import Limits
