@@ -1,1 +1,42 @@
-"""config."""
+"""Configuration of the service: schema, example, reference page, and the learner's settings from a file.
+
+`read_config` reads a file of ``dehyst serve`` into a `ServeConfig`. Names are imported on first use, because the
+configuration imports zenoh and its parser (`service.config.schema`) does not.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from service.config.config import AxisConfig, ServeConfig, parse_config, read_config
+    from service.config.learner import LearnerSettings, read_learner_settings
+    from service.config.schema import Setting, build_settings
+
+_MODULES = {
+    "AxisConfig": "config",
+    "LearnerSettings": "learner",
+    "ServeConfig": "config",
+    "Setting": "schema",
+    "build_settings": "schema",
+    "parse_config": "config",
+    "read_config": "config",
+    "read_learner_settings": "learner",
+}
+__all__ = [
+    "AxisConfig",
+    "LearnerSettings",
+    "ServeConfig",
+    "Setting",
+    "build_settings",
+    "parse_config",
+    "read_config",
+    "read_learner_settings",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,1 +1,1 @@
-"""One module a command."""
+"""The commands of the service. Each module has ``add_arguments(parser)`` and ``run(args) -> int``, the exit status."""
