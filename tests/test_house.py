@@ -20,7 +20,7 @@ TRACKED = [
 
 
 #: Abilities that are still found by name. A library's object or any exception may lack the attribute; nothing of ours.
-ATTRIBUTES_BY_NAME_AT_MOST = 7
+ATTRIBUTES_BY_NAME_AT_MOST = 5
 
 
 @pytest.fixture(scope="module")
