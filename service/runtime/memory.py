@@ -1,4 +1,4 @@
-"""Memory of a process that runs for months: what is freed goes back to the system, and does not add up in pieces."""
+"""Memory of a process that runs for months: freed memory returns to the system instead of fragmenting the heaps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TRIM_THRESHOLD: Final = -1
 _MMAP_THRESHOLD: Final = -3
 _ARENA_MAX: Final = -8
 
-#: How often what is free inside the heaps is given back, s: it takes milliseconds, in which who asks for some waits.
+#: Interval at which free memory of the heaps is returned, s; it takes milliseconds, in which allocations wait.
 TRIM_S: Final = 60.0
 
 #: By default glibc has eight heaps a core, of which each keeps what its threads have ever needed at once, and puts even
@@ -26,7 +26,7 @@ _OPTIONS: Final = {_ARENA_MAX: 2, _MMAP_THRESHOLD: 256 * 1024, _TRIM_THRESHOLD: 
 
 
 def keep_little() -> bool:
-    """Few heaps, and large blocks apart from them. False where the C library is another one, which is left as it is."""
+    """Use few heaps, and keep large blocks out of them. False, without effect, if the C library is not glibc."""
     if not sys.platform.startswith("linux"):
         return False
     with contextlib.suppress(OSError, AttributeError):
@@ -35,7 +35,7 @@ def keep_little() -> bool:
 
 
 def give_back() -> bool:
-    """Give what is free inside the heaps back to the system. False where the C library is another one."""
+    """Return free memory of the heaps to the system. False if the C library is not glibc."""
     if not sys.platform.startswith("linux"):
         return False
     with contextlib.suppress(OSError, AttributeError):
@@ -45,11 +45,10 @@ def give_back() -> bool:
 
 @contextlib.contextmanager
 def starting() -> Iterator[Callable[[], None]]:
-    """While a process starts there is much to look through for garbage, and none to find. Call what is yielded once it
-    has started: what is there by then stays, and is never looked through again.
+    """Switch the garbage collector off while a process starts. Call the yielded function once it has started.
 
-    A collection of all of a serving process holds everybody up for 0.1 to 0.3 s; one of what it made since, for
-    milliseconds.
+    Objects that exist by then are excluded from later collections. A full collection of a serving process stops all
+    threads for 0.1 to 0.3 s; one of the objects made since takes milliseconds.
     """
     gc.disable()
 
@@ -98,7 +97,7 @@ def _malloc_bytes() -> int | None:
 
 @cache
 def _library() -> ctypes.CDLL:
-    """The C library, opened once: each time anew leaves classes behind, in circles that are found late."""
+    """The C library, opened once: each opening leaves classes in reference cycles behind."""
     library = ctypes.CDLL(None)
     with contextlib.suppress(AttributeError):  # the C library is older than this function, or another one
         library.mallinfo2.restype = _Mallinfo2

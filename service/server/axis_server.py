@@ -9,7 +9,6 @@ from typing import Any, Final
 import zenoh
 
 from service.answers.answering import trust_by_age
-from service.answers.latency import LatencyMeter
 from service.background.retuning.retuner import Retuner
 from service.intake.sample_queue import SampleQueue
 from service.operating.journal import Journal
@@ -19,6 +18,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from service.server.latency import LatencyMeter
 from service.server.publications import Publications
 from service.server.query_answers import QueryAnswers
 from service.server.status import axis_status

@@ -28,8 +28,8 @@ from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.models import LearnerFactory, load_axis, make_learner
 from service.storage.checkpoint_keeper import learn_again, restore_newest
 
-#: How long a Python thread may keep the interpreter's lock from another that waits for it, s. The default of 5 ms
-#: would be the latency of a query that meets the learner.
+#: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
+#: 5 ms a query that meets the learner would wait for that long.
 _SWITCH_S: Final = 1e-4
 #: How long an instance looks for another that serves before it serves itself, s: one that is to stand by, one that a
 #: standby may be about to connect to, which it tries five times a second, and any other that is connected to something;
@@ -40,12 +40,12 @@ PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
-#: The publishing thread looks at least this often, s.
+#: Longest pause of the publishing thread, s.
 _TICK_S: Final = 0.02
 
 
 def make_recorder(config: AxisConfig) -> SampleSink | None:
-    """The recorder of an axis, or None where the configuration names no folder."""
+    """The recorder of an axis, or None if the configuration names no folder."""
     if config.recorder is None:
         return None
     from service.storage.recorder import Recorder, RecorderConfig
@@ -54,7 +54,7 @@ def make_recorder(config: AxisConfig) -> SampleSink | None:
 
 
 def make_watcher(axis: Axis) -> SampleWatcher | None:
-    """What finds out in the background what has changed, or None where the configuration switches it off."""
+    """The background diagnosis of an axis, or None if the configuration switches it off."""
     if not axis.config.diagnosis.enabled:
         return None
     from service.background.diagnosing.watcher import Watcher
@@ -79,7 +79,7 @@ def as_standby(config: ServeConfig) -> ServeConfig:
 
 
 def _restore(server: AxisServer) -> None:
-    """Go on from the newest checkpoint, and learn again what the journal holds behind it."""
+    """Restore the newest checkpoint, then learn the samples after it from the recording."""
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
     if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
         learn_again(axis, axis.config.recorder)
@@ -140,7 +140,7 @@ class Service:
         Raises ModelFileError, InputError, SessionError.
         """
         config = self.config
-        # Everything that can be refused is looked at before anything can be seen on the wire.
+        # Everything that can be refused is read before anything appears on the wire.
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
@@ -197,7 +197,7 @@ class Service:
             self._session = None
 
     def ready(self) -> dict[str, Any]:
-        """What a caller needs to know to reach this service."""
+        """Fields of the line that `dehyst serve` prints when it is ready: role, endpoints, axes and their models."""
         return {
             "ready": True,
             "instance": self.instance,
@@ -223,13 +223,13 @@ class Service:
                 try:
                     axis.tick(time.monotonic())
                 except Exception as error:
-                    # Publishing informs; it must not end because one message could not be made.
+                    # One message that cannot be made must not end publishing.
                     axis.axis.note("internal_error", f"publishing: {type(error).__name__}: {error}")
                     self._stopping.wait(_TICK_S)
 
 
 def tune_process() -> None:
-    """One BLAS thread (two stall for tens of ms now and then), quick changes between Python's threads, few heaps."""
+    """One BLAS thread (two stall for tens of ms now and then), fast switches between Python's threads, few heaps."""
     keep_little()
     threadpool_limits(1)
     sys.setswitchinterval(_SWITCH_S)

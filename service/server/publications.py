@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import zenoh
 
-from service.answers.latency import LatencyMeter
 from service.protocol.json_message import JSON, to_json
 from service.protocol.keys import AUTO, Keys
 from service.runtime.delivery import SURELY, is_followed
 from service.server.axis_loop import AxisLoop
+from service.server.latency import LatencyMeter
 from service.server.query_answers import QueryAnswers
 
 STATUS_PERIOD_S: Final = 1.0

@@ -10,7 +10,6 @@ from typing import Any, Final
 import zenoh
 
 from adaptive.errors import DehystError
-from service.answers.latency import LatencyMeter
 from service.failover.state_transfer import send_state
 from service.protocol.errors import FieldError, error_to_json
 from service.protocol.json_message import JSON, to_json
@@ -19,6 +18,7 @@ from service.protocol.model import encode_model
 from service.protocol.query import decode_query
 from service.protocol.reply import encode_reply
 from service.server.axis import Axis
+from service.server.latency import LatencyMeter
 from service.storage.checkpoint import encode_checkpoint
 from service.storage.checkpoint_keeper import CheckpointKeeper
 

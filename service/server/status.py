@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
-from service.answers.latency import LatencyMeter
 from service.protocol.keys import Keys
 from service.protocol.model_classes import stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.security.refusals import refusal_counters
 from service.server.axis_loop import AxisLoop
+from service.server.latency import LatencyMeter
 from service.server.learner_state import fingerprint
 
 SCHEMA: Final = 1
