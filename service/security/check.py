@@ -1,4 +1,4 @@
-"""Whether what listens or connects beyond the machine is closed to strangers; if not, it is refused."""
+"""Refuses endpoints beyond this machine that are not protected by TLS, passwords and access control."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def check_reach(
     """Refuse endpoints beyond this machine without mutual TLS, passwords and, to listen, access control.
 
     Raises InputError naming ``where``, the endpoint and what is missing; SessionError where the file is not zenoh's.
-    ``insecure`` is the explicit word that lets everything pass.
+    ``insecure`` : True allows every endpoint.
     """
     if insecure:
         return
@@ -50,7 +50,7 @@ def check_reach(
 
 
 def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
-    """What a zenoh configuration lacks to be closed to strangers; empty where nothing. Raises SessionError."""
+    """The protections that a zenoh configuration lacks; empty if it has all. Raises SessionError."""
     if zenoh_config is None:
         return ["no zenoh_config"]
     config = read_zenoh_config(zenoh_config)
@@ -74,7 +74,7 @@ def missing_protection(zenoh_config: Path | None, listens: bool) -> list[str]:
 
 
 def has_access_control(zenoh_config: Path | None) -> bool:
-    """Whether a configuration has zenoh's access control on, and denies what it does not name."""
+    """Whether a configuration enables the access control of zenoh and denies by default."""
     if zenoh_config is None:
         return False
     control = _section(read_zenoh_config(zenoh_config), "access_control")

@@ -1,9 +1,9 @@
-"""Counts what zenoh refuses: its log is the only place where a refusal shows.
+"""Counts connections and messages that zenoh refuses, from its log.
 
-Access control drops a message without a word to either end. The log line of each drop, of each wrong password and of
-each wrong certificate is all there is, and zenoh writes its log to the standard output. So the standard output is
-turned into a pipe that a thread reads and counts; what is not counted goes on to the standard error, and Python's own
-prints to where the standard output was before.
+Access control drops a message without notice to either end. Each drop, wrong password and wrong certificate shows only
+as a line of zenoh's log, which goes to the standard output. A pipe therefore replaces the standard output of the
+process; a thread reads it, counts refusals and passes other lines to the standard error. Python's own prints go to the
+original standard output.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LOG: Final = ",".join(
 )
 _PIPE_BYTES: Final = 1 << 20
 _COLOUR: Final = re.compile(rb"\x1b\[[0-9;]*m")
-#: What a line must hold -> the counter it adds to. In this order: the first that fits takes it.
+#: Pattern of a log line -> its counter. The first matching pattern counts.
 _PATTERNS: Final = (
     (re.compile(rb"interceptor: +Msg intercepted"), "messages"),
     (re.compile(rb"did not match any configured ACL subject"), "identities"),

@@ -1,8 +1,8 @@
 """Zenoh's access control for this project: what each role may send to a service or a router (docs/access.md).
 
-Everything is denied that is not allowed here. A rule looks at what comes in (``ingress``: what the other end sends)
-and at what goes out to it (``egress``). Replies and publications may go out to every role that is known; the
-difference between roles is in what they may send.
+Everything that is not allowed here is denied. A rule applies to incoming messages (``ingress``: sent by the other end)
+or to outgoing ones (``egress``). Replies and publications may go out to every known role; roles differ in what they may
+send.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from service.protocol.keys import ROOT
 
-#: What a role may do; the first five are programs and people, the last two the machinery between them.
+#: Permissions of each role. The first four are programs and people; services and routers connect them.
 CLIENT: Final = "client"
 CONTROLLER: Final = "controller"
 STAGE: Final = "stage"
@@ -55,7 +55,7 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
         _rule("operate", ("query",), _keys((_OPERATE,))),
         _rule("serve", (*_SERVE, "query", "put"), [_ALL]),
         _rule("ask", ("query", *_LISTEN), [_ALL], "egress"),
-        # A denial goes over whatever allows.
+        # Deny rules override allow rules.
         _rule("not_of_service", ("put",), _keys((*_OF_STAGE, *_OF_CONTROLLER)), permission="deny"),
         _rule("not_commanding", ("query",), _keys((_OPERATE,)), permission="deny"),
         _rule("pass_on", ("put", "query", *_SERVE), [_ALL]),
