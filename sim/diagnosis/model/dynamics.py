@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-from sim.diagnosis.model.hysteresis_loops import rising_step
+from baselines.bouc_wen.step import hysteresis_step
 
 
 @compiled
@@ -193,6 +193,7 @@ def modes_with_loop(
     m = poles_re.shape[0]
     out = np.zeros(steps // every + 1)
     xr, xi = np.zeros(m), np.zeros(m)
+    beta, gamma = 0.5 * (rise + fall), 0.5 * (rise - fall)
     end = 0.0
     for j in range(m):
         end += ends_re[j]
@@ -210,7 +211,7 @@ def modes_with_loop(
             xr[j] = nr
             there += nr
         way = there - y
-        after = rising_step(z, way, 1.0, rise, fall) if way >= 0.0 else -rising_step(-z, -way, 1.0, rise, fall)
+        after = hysteresis_step(z, way, 1.0, beta, gamma)
         late = share * (guess - after)
         for j in range(m):
             xr[j] += ends_re[j] * late
@@ -218,7 +219,7 @@ def modes_with_loop(
         there += end * late
         way = there - y
         before = z
-        z = rising_step(z, way, 1.0, rise, fall) if way >= 0.0 else -rising_step(-z, -way, 1.0, rise, fall)
+        z = hysteresis_step(z, way, 1.0, beta, gamma)
         y = there
         if not abs(y) < 1e12:
             break

@@ -2,49 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.types import FloatArray
-
-
-@compiled
-def rising_step(g: float, length: float, push: float, rate_up: float, rate_down: float) -> float:
-    """h of (2.2) with n = 1 after a rise of the voltage by ``length``, from h = ``g``; exact.
-
-    ``push`` = alpha d in µm/V; the rates are beta + gamma where h > 0 and beta - gamma where h < 0. On either side of
-    zero the equation is linear in u, so the solution is one exponential; a sign change splits the step once.
-    """
-    if g < 0.0:
-        # Length of u after which g crosses zero: g = s/r + (g0 - s/r) exp(-r length).
-        if abs(rate_down) * length < 1e-9:
-            to_zero = -g / push if push > 0.0 else length + 1.0
-        else:
-            ratio = 1.0 - rate_down * g / push if push > 0.0 else 0.0
-            to_zero = math.log(ratio) / rate_down if ratio > 0.0 else length + 1.0
-        first = min(length, to_zero)
-        x = rate_down * first
-        step = -math.expm1(-x) / rate_down if abs(x) > 1e-9 else first
-        g = g * math.exp(-x) + push * step
-        length -= first
-        if length <= 0.0:
-            return g
-        g = 0.0
-    x = rate_up * length
-    step = -math.expm1(-x) / rate_up if abs(x) > 1e-9 else length
-    return g * math.exp(-x) + push * step
-
-
-@compiled
-def exact_step(h: float, du: float, push: float, beta: float, gamma: float) -> float:
-    """h after a step ``du`` (V) of the voltage. By the symmetry of (2.2) a falling step of h is a rising one of -h."""
-    if du > 0.0:
-        return rising_step(h, du, push, beta + gamma, beta - gamma)
-    if du < 0.0:
-        return -rising_step(-h, -du, push, beta + gamma, beta - gamma)
-    return h
+from baselines.bouc_wen.step import hysteresis_step
 
 
 @compiled
@@ -59,7 +21,7 @@ def bouc_wen_loop(u_V: FloatArray, slope: float, beta: float, gamma: float, h0: 
     out[0] = h
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
-        h = exact_step(h, du, slope, beta, gamma)
+        h = hysteresis_step(h, du, slope, beta, gamma)
         out[k] = h
     return out
 
@@ -76,7 +38,7 @@ def bouc_wen_paced(
     for k in range(1, n):
         du = u_V[k] - u_V[k - 1]
         push = max(slope * (1.0 + gain * pace[k]), 1e-12)
-        h = exact_step(h, du, push, beta, gamma)
+        h = hysteresis_step(h, du, push, beta, gamma)
         out[k] = h
     return out
 
