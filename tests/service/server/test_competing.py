@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from adaptive.tuning.proposal import RetuneConfig
 
 from adaptive.errors import InputError
+from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, InverseModel
 from baselines.fit import fit_linear, fit_mpi
 from service.answers.guard import Limits
