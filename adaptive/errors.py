@@ -1,14 +1,14 @@
-"""What dehyst raises. One tree, so that a caller can catch as much or as little as it wants.
+"""The exceptions of dehyst: one tree, so that a caller can catch a single kind or all of them.
 
 ::
 
     DehystError
-    ├── InputError        (also ValueError)  a field's value is not what it must be
-    ├── ModelFileError                       a file of ours is damaged, foreign or of another version
-    ├── NumericsError                        a computation left the finite or its tolerance
+    ├── InputError        (also ValueError)  the value of a field is not acceptable
+    ├── ModelFileError                       a file is damaged, foreign or of another version
+    ├── NumericsError                        a computation left the finite numbers or its tolerance
     └── ServiceError                         defined in service.protocol.errors: the wire and the processes
 
-Every message names the field, what was got, what was expected and what to do.
+Every message names the field, the value, what was expected and what to do.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class DehystError(Exception):
 
 
 class InputError(DehystError, ValueError):
-    """A value that a user or a peer gave is not acceptable; the message says how to mend it."""
+    """A value from a user or a peer is not acceptable; the message says how to correct it."""
 
 
 class ModelFileError(DehystError):

@@ -1,6 +1,6 @@
 """From motion to the inputs of a model: normalised motion, play operators, arc and slow states.
 
-Displacement and velocity do not determine the voltage: hysteresis has memory. Three kinds of operators carry it.
+Displacement and velocity do not determine the voltage: hysteresis has memory. Three kinds of operators hold it.
 Play operators on the displacement (the inverse of a Prandtl-Ishlinskii model is a Prandtl-Ishlinskii model of the
 displacement); *arc states*, which relax towards y over the path travelled and not over time (the Duhem model's way:
 smooth loops without return points); and *slow states*, leaky integrals with log-spaced time constants, for creep.
@@ -15,8 +15,7 @@ Two vectors come out of a point:
 - ``kernel`` (d,): inputs of its kernel part, ``[y, v, (y - play_r)/r for the chosen r]``.
 
 All operators and inputs see the displacement in the *frame* of the identified stage, (y - offset)/gain: a stage
-whose gain has dropped goes through the same states at other readings, and its memory must not take the drop for a
-motion.
+whose gain has dropped goes through the same states at other readings, and the drop is no motion for its memory.
 
 The chapter's two-input model is the special case without memory: basis ``[1]``, kernel ``[y, v]``.
 """
@@ -32,9 +31,7 @@ from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, StateDict
 
-# --- The compiled loops of a feature map: the memory after a point, and the inputs of a model at that point.
-#
-# What the operators and the two vectors are is said in ``adaptive.features``, whose map these loops take as arrays.
+# --- The compiled loops: the memory after a point, and the inputs of a model at that point.
 
 
 #: basis columns ahead of the plays when the linear part is on: 1, y, v, a, y², y³
@@ -43,7 +40,7 @@ VELOCITY, ACCELERATION = 2, 3
 
 
 class FeatureArrays(NamedTuple):
-    """A feature map as the compiled loops take it; not to be changed.
+    """A feature map as arrays for the compiled loops; read only.
 
     thresholds (K,), arc lengths (A,), both µm; retain (M,) = exp(-dt/tau) of the slow states; scale
     [y0, 1/y, 1/v, 1/a]; kernel_plays (d - 2,) indices; flags [linear, asymmetric];
@@ -64,8 +61,8 @@ def advance(y_um: float, memory: FloatArray, m: FeatureArrays) -> None:  # pragm
     """Memory after one point at ``y_um``, in place.
 
     A play follows y at the distance of its threshold; an arc state relaxes towards y, by exp(-path/rho); a slow
-    state by exp(-dt/tau). The path is counted behind a dead band: the noise of a stage at rest is no path, and would
-    relax the arcs within seconds, where those of the noise-free reference stay.
+    state by exp(-dt/tau). The path is counted behind a dead band: the noise of a stage at rest would otherwise relax
+    the arcs within seconds.
     """
     y = (y_um - m.frame[0]) * m.frame[1]
     n = m.thresholds.shape[0]
@@ -239,7 +236,7 @@ class FeatureMap:
 
     @property
     def arrays(self) -> FeatureArrays:
-        """The map as the compiled loops take it; not to be changed."""
+        """The map as arrays for the compiled loops; read only."""
         return self._arrays
 
     def rest_memory(self, y_um: float) -> FloatArray:
@@ -252,7 +249,7 @@ class FeatureMap:
         return np.concatenate([plays, arcs, slow, np.full(1 if rho.size else 0, y)])
 
     def memory_in(self, other: FeatureMap, memory: FloatArray) -> FloatArray:
-        """(m,) memory as a map in another frame has it, of the same readings: every entry is a displacement."""
+        """(m,) memory converted to the frame of another map for the same readings; every entry is a displacement."""
         if other == self:
             return memory.copy()
         carried: FloatArray = (self.offset_um + self.gain * memory - other.offset_um) / other.gain
@@ -275,7 +272,7 @@ class FeatureMap:
         fill(y_um, v_um_per_s, a_um_per_s2, memory, self._arrays, basis, kernel)
 
     def motion_of(self, kernel: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement µm and velocity µm/s, (n,) each, of kernel inputs (n, d): what a person can look at."""
+        """Displacement µm and velocity µm/s, (n,) each, of kernel inputs (n, d), for display."""
         m = self._arrays
         y_um = (kernel[:, 0] / m.scale[1] + m.scale[0]) / m.frame[1] + m.frame[0]
         return y_um, kernel[:, 1] / (m.scale[2] * m.frame[1])

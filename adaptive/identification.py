@@ -1,9 +1,9 @@
-"""Identification: a recording in, an inverse LSSVM and what is to be said of it out.
+"""Identification: from a recording to an inverse LSSVM and a report of its errors.
 
 ``inputs="two"`` is the chapter: displacement and its backward difference after a zero-phase 50 Hz low-pass, a bias,
 a radial kernel. ``inputs="memory"`` is what is served by default: a linear part over motion, play operators and slow
-states with a Gaussian prior (so that a short recording can't drive twenty coefficients wild), and a kernel for what
-is left of it.
+states with a Gaussian prior, so that a short recording determines some twenty coefficients safely, and a kernel for the
+residual.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from adaptive.tuning import evidence
 from adaptive.tuning.search import InferenceConfig, infer
 from adaptive.types import FloatArray
 
-# --- What an identification is asked for.
+# --- Settings.
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,22 +56,20 @@ class IdentifyConfig:
             raise InputError(f"kernel_plays: got {self.kernel_plays}, expected 0 to {self.plays}")
 
 
-# --- An inverse LSSVM fitted to the inputs of a recording: linear part, support vectors, hyper-parameters.
-#
-# The linear part has a Gaussian prior, so that a short recording can't drive its coefficients wild; the kernel learns
-# what is left of it, on spread-out rows, with regularisation and widths of the best evidence.
+# --- Fit: the linear part with its Gaussian prior, then the kernel on the residual at spread-out rows, with the
+# regularisation and widths of the best evidence.
 
 
 #: Prior standard deviations of the linear part as shares of the voltage range.
 PRIOR_FREE, PRIOR_MOTION, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRIOR_SLOW = (
     10.0, 0.3, 0.1, 0.05, 0.01, 0.03, 0.03,
 )  # fmt: skip
-#: A model's error lasts about this long, s: so many samples of a recording count as one.
+#: Correlation time of a model's error, s: the samples within it count as one.
 CORRELATION_S = 0.02
-#: Smallest model error that the prior of the linear part reckons with, as a share of the voltage range.
+#: Smallest model error assumed for the linear part, as a share of the voltage range.
 ERROR_FLOOR = 5e-4
-#: Rows that hyper-parameters are inferred from, and where they are searched: above a gamma of 1e5 only digits are
-#: lost, below a width of 0.3 the kernel knows nothing between its samples.
+#: Rows for the evidence, and the range of the search: above a gamma of 1e5 only digits are lost, below a width of 0.3
+#: the kernel does not interpolate between its samples.
 EVIDENCE_ROWS = 240
 SEARCH = InferenceConfig(
     starts=((100.0, 1.0), (100.0, 4.0)), gamma_range=(1.0, 1e5), width_range=(0.3, 12.0), iterations=20
@@ -89,7 +87,7 @@ def prior_deviations(features: FeatureMap, u_range_V: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """What a fit found: linear part with its covariance, support vectors with their weights, variances in V²."""
+    """Result of a fit: linear part with its covariance, support vectors with their weights, variances in V²."""
 
     beta: FloatArray
     covariance: FloatArray
@@ -124,7 +122,7 @@ def select(kernel: FloatArray, widths: FloatArray, n: int) -> NDArray[np.int64]:
         return np.arange(m)
     scaled = kernel / widths
     chosen = np.empty(n, dtype=np.int64)
-    # Half evenly in time, so that density follows the recording; the rest where the space is still empty.
+    # Half evenly in time, so that their density follows the recording; the others by largest distance.
     chosen[: n // 2] = np.linspace(0, m - 1, n // 2).astype(np.int64)
     distance = np.full(m, np.inf)
     for k in range(n):
@@ -143,7 +141,7 @@ def tune(
     dt_s: float,
     config: IdentifyConfig,
 ) -> tuple[float, FloatArray]:
-    """(gamma, widths (d,)) by the evidence on what the kernel has to learn."""
+    """(gamma, widths (d,)) by the evidence on the targets of the kernel."""
     target = u_V
     if features.linear:
         beta, _ = _linear(features, basis, u_V, float(np.ptp(u_V)), dt_s)
@@ -196,15 +194,15 @@ def evidence_search(kernel: FloatArray, target: FloatArray) -> tuple[float, Floa
     return float(best.gamma), np.array(best.widths, dtype=np.float64)
 
 
-# --- What is to be said of an identified model.
+# --- Report and result.
 
 
 @dataclass(frozen=True, slots=True)
 class IdentificationReport:
-    """What was found. Errors are of the inverse model, voltages in V, percent of the voltage range.
+    """Result of an identification. Errors are those of the inverse model: voltages in V, percent of the voltage range.
 
-    train : on the recording's first part. heldout : free run over its last part, from which nothing was learnt;
-    ``heldout_um`` is that voltage error seen as displacement through the mean gain.
+    train : on the first part of the recording. heldout : free run over its last part, which was not learnt;
+    ``heldout_rmse_um`` is that voltage error as a displacement, by the mean gain.
     """
 
     samples: int
@@ -313,7 +311,7 @@ def design_features(motion: FloatArray, dt_s: float, config: IdentifyConfig, mem
         y_min_um=float(y.min()),
         y_max_um=float(y.max()),
         v_scale_um_per_s=max(float(np.abs(motion[:, 1]).max()), 1e-9 * span),
-        # A share of the recording's peak would follow its noise; 10 Hz over the whole range is a scale, no limit.
+        # Not a share of the peak, which follows the noise. 10 Hz over the whole range is a scale, not a limit.
         a_scale_um_per_s2=0.5 * span * (2.0 * np.pi * min(10.0, 0.05 / dt_s)) ** 2,
         linear=False,
         y_rest_um=float(y[0]),

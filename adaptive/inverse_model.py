@@ -3,9 +3,9 @@
     u = beta' basis(x) + sum_i alpha_i K(x, x_i)
 
 with basis and kernel inputs from a ``FeatureMap``. The linear part carries the model on where the kernel has no
-samples. One standard deviation comes from the nearest sample alone: with one sample of covariance k to the point, a
-Gaussian process of unit variance has 1 - k²/(1 + 1/gamma) left, an upper bound of what all samples leave, and it
-costs nothing on top of the mean. The learner calibrates its scale on its own prediction errors.
+samples. The standard deviation comes from the nearest sample alone: given one sample of covariance k to the point, a
+Gaussian process of unit variance has the variance 1 - k²/(1 + 1/gamma), an upper bound of that given all samples, at no
+cost beyond the mean. The learner calibrates its scale on its own prediction errors.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from adaptive.kernels import rbf_column, weigh
 from adaptive.state_codec import prefixed, under
 from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 
-# --- The compiled loops of a served inverse LSSVM: voltages and deviations of a trajectory, and its memory carried on.
+# --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
 
 
 @compiled_reassociating
 def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
     """basis' covariance basis, V², (p, p) and (p,); 0 for a covariance of no size. Half of a point's time, in order."""
     p, total, j = covariance.shape[0], 0.0, 0
-    # Four rows at a time: each sum that ends costs as much as the row.
+    # Four rows at a time: the end of each sum costs as much as a row.
     while j + 3 < p:
         r0, r1, r2, r3 = covariance[j], covariance[j + 1], covariance[j + 2], covariance[j + 3]
         b0, b1, b2, b3 = basis[j], basis[j + 1], basis[j + 2], basis[j + 3]
@@ -68,7 +68,7 @@ def evaluate(
 ) -> None:  # pragma: no cover - compiled
     """Voltages, deviations and domain flags of n points; ``memory`` advances in place.
 
-    ``anchor`` (p,) or (0,): linear part that the voltage leaves by ``allowed``, V, at most.
+    ``anchor`` (p,) or (0,): linear part from which the voltage may differ by at most ``allowed``, V.
     """
     n = y.shape[0]
     d, count = scaled.shape
@@ -134,9 +134,9 @@ def evaluate_packed(
     std: FloatArray,
     inside: BoolArray,
 ) -> None:  # pragma: no cover - compiled
-    """`evaluate` with all that a model is made of in two arrays, as `LssvmInverse` packs it.
+    """`evaluate` with the whole model in two arrays, as `LssvmInverse` packs it.
 
-    Twenty arrays cost more to hand over than one point costs to work out, and are twenty places in memory to fetch.
+    To hand over twenty arrays costs more than to evaluate one point.
     """
     m, beta, inverse_widths, alpha, scaled, at = unpacked(constants, counts)
     c, p = counts[6], beta.shape[0]
@@ -175,7 +175,7 @@ def voltage_of(
 def evaluate_point(
     y: float, v: float, a: float, memory: FloatArray, constants: FloatArray, counts: IntArray
 ) -> tuple[float, float, bool]:  # pragma: no cover - compiled
-    """`evaluate_packed` of one point, numbers to numbers: to hand over an array costs as much as five of them."""
+    """`evaluate_packed` of one point with plain numbers: an array costs as much to hand over as five of them."""
     five, inside = np.empty(5), np.empty(1, dtype=np.bool_)
     five[0], five[1], five[2] = y, v, a
     evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
@@ -229,9 +229,9 @@ class LssvmInverse:
     beta_covariance : (p, p) of the linear part, V², or (0, 0) where unknown.
     span_V : voltage range of the recording it was identified from, V.
     seq : sequence number of the last sample that it has seen, -1 for none.
-    valid : whether the learner vouches for it.
-    anchor, allowed_V : (p,) linear part of the identified model, or (0,), and by how much the voltage may leave what it
-    asks for, V: whatever was learnt, no answer is further from what was identified.
+    valid : whether the learner declares it valid.
+    anchor, allowed_V : (p,) linear part of the identified model, or (0,), and the largest difference of the voltage
+    from it, V: whatever was learnt, no answer is further from the identified model.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """The radial kernel with one width per feature, (2.31): for one pair, a column and a Gram matrix.
 
 K(x, x') = exp(-sum_j (x_j - x'_j)² / sigma_j²). Features are dimensionless (normalised), so are the widths.
-The compiled column works on *scaled* features x_j / sigma_j, stored (d, N) so that its loops run over
-contiguous samples, and on its own exponential, which vectorises where a call into the C library does not.
+The compiled column takes *scaled* features x_j / sigma_j, stored as (d, N) so that its loops run over contiguous
+samples, and has its own exponential, which vectorises where a call into the C library does not.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LN2_LOW = 1.90821492927058770002e-10
 _ROUND = 6755399441055744.0
 #: Below this the result is set to zero: exp(-708) is 3e-308, the smallest normal double is near.
 _UNDERFLOW = -708.0
-#: Elements of a Gram matrix that are worked out at a time: 256 KiB, and as much scratch.
+#: Elements of a Gram matrix per block: 256 KiB, and as much scratch.
 _GRAM_BLOCK = 32768
 
 
@@ -56,7 +56,7 @@ def gram(X: FloatArray, other: FloatArray | None, widths: FloatArray) -> FloatAr
     right = X if other is None else other
     count, columns = right.shape[0], np.ascontiguousarray(right.T)
     K = np.empty((X.shape[0], count))
-    # Some rows at a time, with one scratch for all: they stay in the cache, and no large piece of memory is asked for.
+    # In blocks of rows with one scratch: they stay in the cache.
     block = max(1, _GRAM_BLOCK // max(count, 1))
     scratch = np.empty((min(block, X.shape[0]), count))
     for start in range(0, X.shape[0], block):
@@ -124,7 +124,7 @@ def rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatA
     else:
         for j in range(count):
             target[j] = 0.0
-    # Two features at a time: to go through the samples once more costs as much as what is worked out.
+    # Two features at a time: one more pass over the samples costs as much as the arithmetic.
     while i < scaled.shape[0]:
         row, other, xi, yi = scaled[i], scaled[i + 1], x_scaled[i], x_scaled[i + 1]
         for j in range(count):
@@ -141,7 +141,7 @@ def weigh(k: FloatArray, alpha: FloatArray) -> tuple[float, float]:
     total = 0.0
     for j in range(n):
         total += alpha[j] * k[j]
-    # Four maxima side by side: one would wait for itself at every step.
+    # Four maxima side by side: a single one would be a chain of dependent operations.
     m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
     for j in range(n // 4):
         m0 = max(m0, k[4 * j])

@@ -1,6 +1,6 @@
 """Factorisations that release the interpreter's lock while they run.
 
-``scipy.linalg.lapack`` holds it for the whole call, which would stall queries for milliseconds. The same
+``scipy.linalg.lapack`` holds it for the whole call, which would block queries for milliseconds. The same
 routines, taken from scipy's C interface and called through ctypes, do not. Matrices are C-ordered and
 symmetric; only one triangle is read and written, which Fortran sees as the other one.
 """

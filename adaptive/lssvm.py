@@ -1,4 +1,4 @@
-"""The least-squares support vector machine and its direct solver: the oracle of everything recursive.
+"""The least-squares support vector machine and its direct solver, the oracle for the recursive window.
 
 The dual system (2.27), generalised to a **partially linear** form and to per-sample noise weights w_i:
 
@@ -6,7 +6,7 @@ The dual system (2.27), generalised to a **partially linear** form and to per-sa
                                [ H   Omega + diag(1/(gamma w_i)) ] [alpha] = [y]
 
 H = [1] is the chapter (p = 1, beta = b). H = [1, some features] adds an unpenalised linear part beside the
-kernel, so that the model goes on along a straight line where the kernel has no samples. With R the lower
+kernel, so that the model continues along a straight line where the kernel has no samples. With R the lower
 right block and P = R^-1: S = P H, Sy = P y, beta = (H'S)^-1 H'Sy (2.29), alpha = Sy - S beta.
 """
 
@@ -104,7 +104,7 @@ class LssvmModel:
 
 @dataclass(frozen=True, slots=True)
 class LssvmFit:
-    """A model with the factor it was solved from, for what the mean alone can't answer.
+    """A model with the factor that it was solved from, for variance and leave-one-out.
 
     Attributes
     ----------

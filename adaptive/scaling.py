@@ -30,7 +30,7 @@ class MinMaxScaling:
         if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(high > low)):
             raise InputError(
                 f"scaling: got low {low.tolist()}, high {high.tolist()}, expected finite low < high in every column; "
-                "a constant feature carries nothing, leave it out"
+                "a constant feature carries no information, leave it out"
             )
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)

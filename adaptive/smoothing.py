@@ -1,7 +1,7 @@
 """Displacement, velocity and acceleration from noisy samples: fixed-lag online, zero-phase offline.
 
-The chapter smooths with a zero-phase 50 Hz low-pass, which needs the future. Online, a Kalman filter of a chain of
-``order`` integrators driven by white noise, read ``lag`` samples late, does its work. With process noise
+The chapter smooths with a zero-phase 50 Hz low-pass, which needs future samples. Online, a Kalman filter of a chain of
+``order`` integrators driven by white noise, read ``lag`` samples late, replaces it. With process noise
 q = r dt w_c^(2 order) the two-sided smoother of that model is 1 / (1 + (w / w_c)^(2 order)): the squared
 Butterworth response that ``filtfilt`` has, so the cut-off frequency is its only tuning.
 
@@ -50,7 +50,7 @@ class SmootherConfig:
 
     @classmethod
     def for_rate(cls, dt_s: float, cutoff_hz: float = 80.0) -> SmootherConfig:
-        """A cut-off that the sample rate can carry, and the lag (1.3 periods of it) after which nothing is gained."""
+        """A cut-off that suits the sample rate, and a lag of 1.3 periods of it; a longer lag gains nothing."""
         cutoff = min(cutoff_hz, 0.2 / dt_s)
         return cls(dt_s=dt_s, cutoff_hz=cutoff, lag=max(4, round(1.3 / (cutoff * dt_s))))
 
@@ -64,7 +64,7 @@ class SmootherState:
     count: int = 0
 
     def copy(self) -> SmootherState:
-        """A state that goes its own way from here."""
+        """An independent copy."""
         return SmootherState(self.x.copy(), self.ring.copy(), self.count)
 
 
@@ -165,7 +165,7 @@ class FixedLagSmoother:
         return out.item(0), out.item(1) * self.scale.item(1), out.item(2) * self.scale.item(2)
 
     def skip(self, state: SmootherState) -> tuple[float, float, float] | None:
-        """A sample that never came: the filter runs on, on its own prediction."""
+        """A missing sample: the filter continues with its own prediction."""
         return self.step(state, float(state.x[0]))
 
     def run(self, y_um: FloatArray) -> FloatArray:
@@ -198,7 +198,7 @@ def _checked(y_um: FloatArray) -> FloatArray:
 def smooth_recording(y_um: FloatArray, config: SmootherConfig) -> FloatArray:
     """(n,) samples to (n, 3) of y, v, a at every sample, past the ends by odd reflection.
 
-    The same response as the online smoother, so a model identified from it meets no surprise online.
+    The response is that of the online smoother, so that a model identified from it fits online samples.
     """
     y = _checked(y_um)
     pad = min(4 * (config.lag + 1), y.size - 1)
@@ -216,7 +216,7 @@ def zero_phase_lowpass(y_um: FloatArray, dt_s: float, cutoff_hz: float = 50.0, o
     y = _checked(y_um)
     if cutoff_hz >= 0.45 / dt_s:
         return y.copy()
-    # Here and not above: the serving process has no use for it, and it is slow to import.
+    # Imported here: it is slow to import, and the serving process does not need it.
     from scipy.signal import butter, sosfiltfilt
 
     sos = butter(order, cutoff_hz, fs=1.0 / dt_s, output="sos")

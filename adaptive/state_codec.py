@@ -1,4 +1,4 @@
-"""States inside states: flat entries, whose names tell by a prefix whose they are."""
+"""Nested states as flat entries, whose names have the prefix of their part."""
 
 from __future__ import annotations
 

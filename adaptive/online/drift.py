@@ -1,9 +1,9 @@
-"""What is fast and global: a Kalman filter on the model's linear part, and the detection of sudden changes.
+"""Drift of the stage: a Kalman filter on the model's linear part, detection of sudden changes, and creep at rest.
 
-The linear part ``beta`` walks at random. How it may walk is what makes it fast without forgetting: mostly along
-itself, which is a change of the stage's gain; in the constant, an offset; in velocity and acceleration, where a lag
-and a payload show; and a little in every other coefficient. A gain drop of 6 % is one direction to find, not twenty,
-so it is found within tens of milliseconds, while what the plays know of the loop's shape stays.
+The linear part ``beta`` is a random walk. Its process noise makes it fast without forgetting: large along beta itself
+(a change of the gain), in the constant (an offset), and in velocity and acceleration (a lag, a payload); small in every
+other coefficient. A gain drop of 6 % is one direction to find instead of twenty, so it is found within tens of
+milliseconds, and the play coefficients keep the shape of the loop.
 
 The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form). ``algebra="filterpy"`` has the library do it;
 ``"compiled"``, the default, is the same by ``adaptive.online.drift``, held to the library by tests. The library's calls
@@ -16,12 +16,13 @@ the other.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isnan, nan
 from typing import Any, Literal
 
 import numpy as np
 
 from adaptive.compiled import compiled
-from adaptive.errors import InputError
+from adaptive.errors import InputError, ModelFileError
 from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
 from adaptive.types import FloatArray, StateDict
 
@@ -363,3 +364,72 @@ class DriftFilter:
             updates=int(values["updates"]),
         )
         return made
+
+
+# --- Creep at rest.
+
+#: Steps of the filter between two moves of the frame: a new feature map costs as much as a step.
+_FRAME_EVERY = 10
+#: Largest move of the frame, as a share of the range a second: creep is slow.
+_FASTEST_PER_S = 0.02
+#: Largest move of a voltage that holds a stage in place, as a share of the span a second. A stuck sensor shows a stage
+#: at rest too, but with a voltage that moves on.
+_STILL_PER_S = 0.1
+
+
+@dataclass(slots=True)
+class RestCreep:
+    """Creep of a stage at rest, and the move of the frame that follows from it.
+
+    To hold a creeping stage in place the voltage must creep back, and this small reversal enters the stage's
+    hysteresis. If the constant of the linear part took up the difference, the hysteresis of the model would stay as it
+    was, which shows as soon as the stage moves. Creep is a displacement without a voltage. As an offset of the feature
+    map's frame (``adaptive.features``) it lets the modelled hysteresis reverse as the voltage does.
+
+    constant_V : constant of the linear part when the rest began, NaN while the stage moves. steps : of the filter
+    since.
+    u_V : voltage at the last step that could move the frame.
+    """
+
+    constant_V: float = nan
+    steps: int = 0
+    u_V: float = nan
+
+    def leave(self) -> None:
+        """The stage moves: the constant keeps its value."""
+        self.constant_V, self.steps, self.u_V = nan, 0, nan
+
+    def shift_um(
+        self, constant_V: float, u_V: float, span_V: float, range_um: float, step_s: float, creep_s: float
+    ) -> float:
+        """Move of the frame's offset, µm, after one more step of the filter at rest; mostly 0.
+
+        ``constant_V`` is that of the linear part now, ``u_V`` the voltage; ``span_V`` and ``range_um`` those of the
+        model. The gain of the constant since the rest began moves to the frame with the time constant ``creep_s``
+        (0: never).
+        """
+        if isnan(self.constant_V):
+            self.constant_V, self.u_V = constant_V, u_V
+        self.steps += 1
+        if creep_s <= 0.0 or self.steps % _FRAME_EVERY:
+            return 0.0
+        went_V, self.u_V = abs(u_V - self.u_V), u_V
+        if went_V > _STILL_PER_S * span_V * _FRAME_EVERY * step_s:
+            self.leave()
+            return 0.0
+        gained_um = (constant_V - self.constant_V) * range_um / span_V
+        most_um = _FASTEST_PER_S * range_um * _FRAME_EVERY * step_s
+        return -min(max(gained_um * min(1.0, _FRAME_EVERY * step_s / creep_s), -most_um), most_um)
+
+    def state_dict(self) -> StateDict:
+        return {"constant_V": self.constant_V, "steps": self.steps, "u_V": self.u_V}
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> RestCreep:
+        """Inverse of ``state_dict``; older states have no entries: the stage moves."""
+        if not values:
+            return cls()
+        try:
+            return cls(float(values["constant_V"]), int(values["steps"]), float(values["u_V"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(f"rest: entry missing or damaged: {error}") from error

@@ -1,7 +1,6 @@
-"""What a stage can become: the bounds on all that is believed of it, from the physics of piezo stages.
+"""The envelope: bounds on the learnt model around the identified one, from the physics of piezo stages.
 
-The identified model is never forgotten. What is learnt may leave it by so much and no more, and by no more than the
-readings themselves show. A belief outside is not taken: the last good model, or the identified one, stays in service.
+A model outside the envelope is not served: the last good model or the identified one stays in service.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from adaptive.features import FeatureMap
 class EnvelopeConfig:
     """Bounds about the identified model.
 
-    gain : the largest factor by which the stage's gain, or the sensor's, may become more or less. The gain of a piezo
-    stage changes by a few percent with temperature and age, by 20 to 30 % with amplitude and load.
+    gain : largest factor of change of the stage's or the sensor's gain, up or down. The gain of a piezo stage changes
+    by a few percent with temperature and age, by 20 to 30 % with amplitude and load.
     offset : share of the range by which the zero may move.
     shape : share of the voltage span by which the linear part and the kernel together may leave the identified linear
     part, at every point.
-    jump : largest share of the range that is believed at once, from some readings at one level. A larger change is
-    believed only after motion has shown it.
+    jump : largest jump, as a share of the range, that is accepted from some readings at one level. A larger change is
+    accepted only after motion has confirmed it.
     drift_per_s : largest share of the range, a second, by which readings may drift away from the voltage.
     follow_s : time of motion over which readings must follow the drive before they are trusted again, s.
     """
@@ -56,10 +55,10 @@ class EnvelopeConfig:
         return ""
 
     def gain_allows(self, gain: float) -> bool:
-        """Whether readings that go ``gain`` times as far as the stage must have gone can be the stage's."""
+        """Whether readings that move ``gain`` times as far as the reckoned stage can come from a sound sensor."""
         return bool(1.0 / self.gain <= gain <= self.gain)
 
 
 def _at_rest(frame: FeatureMap) -> float:
-    """What a reading shows, µm, where the identified stage rests without voltage."""
+    """Reading, µm, where the identified stage rests without voltage."""
     return frame.offset_um + frame.gain * frame.y_rest_um

@@ -1,8 +1,8 @@
-"""Which samples may teach: gates in the order of the data's way, each with a name under which it is counted.
+"""Gates: which samples may be learnt. Each gate has a name under which its samples are counted.
 
-The first gates look at the raw sample (finite, in sequence, sane time step, not a glitch of the sensor); what passes
-them advances the smoother. The later gates look at the pair of smoothed motion and voltage that comes out of it
-(settled, not saturated, in range, moving). Refused samples change no model.
+The first gates check the raw sample: finite, in sequence, plausible time step, not a glitch of the sensor. A sample
+that passes them advances the smoother. The later gates check the resulting pair of smoothed motion and voltage:
+settled, not saturated, in range, moving. Refused samples change no model.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from math import isfinite
 from adaptive.errors import InputError
 from adaptive.types import Sample, StateDict
 
-#: µm or V that no reading has.
+#: Limit of plausible readings and voltages, µm or V.
 ABSURD = 1e9
-#: How a kink of the voltage fades, a sample, and by how many times what it moves the stage by predictions may be off.
+#: Decay of a kink of the voltage per sample, and allowed prediction error as a multiple of the motion it causes.
 KINK_DECAY, KINK_SHARE = 0.9, 2.0
-#: Samples over which the smoother's prediction errors are averaged; one counts as this many rms at most.
+#: Samples over which the smoother's prediction errors are averaged; each counts at most this many times the rms.
 INNOVATION_SAMPLES, FAR_RMS = 500, 2.0
-#: Readings that stay equal while the voltage moves by this share of its span, and by this many times the usual error of
-#: the smoother's predictions, are those of a sensor that is stuck, or at its end; so many of them at least.
+#: The sensor is stuck or at its end where so many readings are equal while the voltage moves by this share of its span
+#: and by this many times the usual prediction error of the smoother: share, multiple, number of readings.
 STUCK_SHARE, STUCK_SIGMA, REPEATED = 0.002, 8.0, 4
-#: Sample time up to which ``glitch_share`` holds as it is, s.
+#: Sample time up to which ``glitch_share`` is not scaled, s.
 GLITCH_DT_S = 1e-3
 
 LEARNT = "learnt"
-#: Passed all gates, but neither filter nor window was due: the rates of both are configured.
+#: Passed all gates, but neither filter nor window was due (``filter_every``, ``learn_every``).
 PASSED = "passed"
 NOT_FINITE = "not_finite"
 DUPLICATE = "duplicate"
@@ -34,9 +34,9 @@ OUT_OF_ORDER = "out_of_order"
 TIMING = "timing"
 GAP = "gap"
 GLITCH = "glitch"
-#: Held back: the stage rings, after a knock or a jump.
+#: Held back: the stage rings after a shock or a jump.
 RINGING = "ringing"
-#: The sensor has lost its trust, and has to follow the drive again first.
+#: The sensor is on trial: it must follow the drive again first.
 UNTRUSTED = "untrusted"
 SETTLING = "settling"
 SATURATED = "saturated"
@@ -56,8 +56,8 @@ REASONS = (
 class AdmissionConfig:
     """Limits of the gates.
 
-    u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one does not teach.
-    y_min_um, y_max_um : what the sensor can show; beyond it a reading is out of range.
+    u_min_V, u_max_V : the amplifier's rails; a voltage within ``rail_margin_V`` of one is not learnt.
+    y_min_um, y_max_um : range of the sensor; a reading outside is out of range.
     surprise_share, surprise_sigma : a reading this far from the smoother's prediction, as a share of the model's range
     at sample times of up to 1 ms (``at``), and this many times the usual error of the prediction, is held back until
     others tell what it is. glitch_share : a reading this far off is, however wrong the predictions usually are.
@@ -65,8 +65,8 @@ class AdmissionConfig:
     doubt_persistence : ... or than that where the sensor was wrong within ``doubt_s``, and for jumps outside
     ``glitch_share`` to ``jump_share`` of the range.
     undo_s : a jump back within this time undoes a jump.
-    max_gap : missing samples that are bridged; beyond it, the smoother starts again.
-    settle : samples after a (re)start that do not teach.
+    max_gap : most missing samples that are bridged; after more, the smoother restarts.
+    settle : samples after a (re)start that are not learnt.
     timing_tolerance : relative error of the time step between two samples.
     rest_share, rest_s : a stage that has not left a place by this share of the range for this long, s, is at rest.
     """
@@ -105,7 +105,7 @@ class AdmissionConfig:
                 raise InputError(f"admission.{name}: got {getattr(self, name)}, expected a number, not negative")
 
     def at(self, dt_s: float) -> AdmissionConfig:
-        """The limits at a sample time, s: predictions over a longer step are worse, and with them what is a glitch."""
+        """The limits for a sample time, s: predictions over a longer step are worse, so the limits widen."""
         wider = max(1.0, dt_s / GLITCH_DT_S)
         return replace(self, glitch_share=self.glitch_share * wider, surprise_share=self.surprise_share * wider)
 
@@ -150,7 +150,7 @@ class AdmissionState:
 
 def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample, dt_s: float) -> str:
     """Gate of the raw sample: "" where it may go on. Does not change the state. Never raises on data."""
-    # No instrument reads beyond these, and the square of what it reads must be finite too.
+    # The square of a reading must be finite too.
     if not (isfinite(sample.t_s) and abs(sample.u_V) < ABSURD and abs(sample.y_um) < ABSURD):
         return NOT_FINITE
     if state.seq < 0:
@@ -166,7 +166,7 @@ def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample,
 
 
 def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: float) -> str:
-    """Gate of a smoothed pair: "" where it may teach. The voltage before it counts too: lags carry it over."""
+    """Gate of a smoothed pair: "" where it may be learnt. The voltage before it counts too, because of lags."""
     low, high = config.u_min_V + config.rail_margin_V, config.u_max_V - config.rail_margin_V
     if not (low < u_V < high and low < u_before_V < high):
         return SATURATED
@@ -176,14 +176,14 @@ def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: flo
 
 
 def new_counters() -> dict[str, int]:
-    """All reasons at zero, so that a reader sees every gate there is."""
+    """All outcomes at zero, so that a report lists every gate."""
     return dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
 
 
 def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, span_V: float) -> None:
-    """Notice a commanded step: a kink of the voltage that would move the stage by more than a glitch's share.
+    """Detect a commanded step: a kink of the voltage that moves the stage by more than the share of a glitch.
 
-    For ``settle`` samples after it, readings that surprise the smoother are the stage's own answer, and no glitch.
+    For ``settle`` samples after it, readings far from the prediction are the stage's response, not a glitch.
     """
     kink = abs(u_V - 2.0 * state.u_V + state.u_before_V)
     state.since_step = 0 if kink > 0.25 * config.glitch_share * span_V else state.since_step + 1
@@ -194,26 +194,26 @@ def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, sp
 def surprise(config: AdmissionConfig, state: AdmissionState, span_V: float) -> float:
     """Distance from the smoother's prediction beyond which a reading is held back, in ranges.
 
-    What is usual is no surprise, nor is what a kink of the voltage, as a share of its span, makes of the motion.
+    A multiple of the usual prediction error, plus the motion that a recent kink of the voltage can cause.
     """
     usual = min(max(config.surprise_share, config.surprise_sigma * state.innovation2**0.5), config.glitch_share)
     return float(usual + KINK_SHARE * state.kink_V / span_V)
 
 
 def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation: float) -> None:
-    """Keep account of the smoother's prediction errors, in ranges; those far from usual count as a little more."""
+    """Update the mean square prediction error of the smoother, in ranges²; outliers are limited to ``FAR_RMS``."""
     most = max(FAR_RMS * state.innovation2**0.5, config.surprise_share / config.surprise_sigma)
     error = min(abs(innovation), most)
     state.innovation2 += (error * error - state.innovation2) / INNOVATION_SAMPLES
 
 
 def stuck_share(state: AdmissionState) -> float:
-    """How far the stage must have gone, in ranges, before readings that stay equal are no chance of the sensor's."""
+    """Motion of the stage, in ranges, after which equal readings show a stuck sensor."""
     return max(STUCK_SHARE, STUCK_SIGMA * float(state.innovation2**0.5))
 
 
 def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float) -> bool:
-    """Whether the sensor repeats itself while the voltage moves on; to be told every reading with its voltage."""
+    """Whether the sensor repeats its reading while the voltage moves. Call it with every reading and its voltage."""
     if y_um != state.y_um:
         state.y_um, state.same, state.low_V, state.high_V = y_um, 1, u_V, u_V
         return False
@@ -223,16 +223,16 @@ def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float)
 
 
 def settling(config: AdmissionConfig, state: AdmissionState) -> bool:
-    """Whether the smoother has just started or the voltage stepped: readings that surprise are the stage's own."""
+    """Whether the smoother has just started or the voltage stepped: large prediction errors are then expected."""
     return min(state.since_start, state.since_step) <= config.settle
 
 
 def at_rest(
     config: AdmissionConfig, state: AdmissionState, y_um: float, count: int, range_um: float, dt_s: float
 ) -> bool:
-    """Whether the stage, now at ``y_um``, has not left its place for a while; ``count`` is of the smoother's steps.
+    """Whether the stage, now at ``y_um``, has stayed in place for ``rest_s``; ``count`` of the smoother's steps.
 
-    By place and not by speed: speed is noisy, and a slow scan is no rest, nor is a turning point.
+    Judged by position, not by speed: speed is noisy, and neither a slow scan nor a turning point is a rest.
     """
     if abs(y_um - state.anchor_um) > config.rest_share * range_um:
         state.anchor_um, state.moved = y_um, count

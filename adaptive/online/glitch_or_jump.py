@@ -8,7 +8,7 @@ goes on from before it; each reading's distance from that place is judged:
 - ringing about the old level (``adaptive.online.glitch_or_jump``): motion of the stage, waited for as long as it lasts;
 - a settled new level, by distance or by ratio, within what a jump may be: a jump, if it claims no more than the
   readings have moved, and the readings go on following the stage;
-- anything else after ``undecided_s``: the readings have lost their trust (``adaptive.online.sensor_trial``).
+- anything else after ``undecided_s``: the readings have lost their trust (``adaptive.online.sensor_trust``).
 """
 
 from __future__ import annotations

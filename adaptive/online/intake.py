@@ -7,7 +7,7 @@ A reading is in one of three hands. Trusted, it goes to the smoother. One that s
 follow (``adaptive.online.glitch_or_jump``) until they turn out to be a glitch, ringing, or a jump; a jump of the
 reading that no
 voltage made moves the frame of the features, and with it everything that was learnt. Readings that stay undecided, or
-that do not follow the drive, are on trial (``adaptive.online.sensor_trial``). While readings are held or on trial
+that do not follow the drive, are on trial (``adaptive.online.sensor_trust``). While readings are held or on trial
 nothing is taught,
 and dead reckoning carries the hysteresis memory on.
 """
@@ -29,14 +29,13 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
-from adaptive.online.sensor_check import CONFIRMED, Following
-from adaptive.online.sensor_trial import Outcome, Trial
+from adaptive.online.sensor_trust import CONFIRMED, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother
 from adaptive.state_codec import joined, prefixed, under
 from adaptive.types import FloatArray, Sample, StateDict
 
-# --- What a front holds beside its numbers, as flat entries and back.
+# --- What a intake holds beside its numbers, as flat entries and back.
 
 
 def parts_to_state(
@@ -78,14 +77,14 @@ def parts_of(
 
 
 #: Samples without a reading whose voltages are kept.
-MOST_HEARD = MOST_BRIDGED
+MOST_LOGGED = MOST_BRIDGED
 
 
-class Heard:
+class VoltageLog:
     """Pairs (seq, voltage in V) of samples whose readings were none, since the last one taken."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[int, float]] = deque(maxlen=MOST_HEARD)
+        self._kept: deque[tuple[int, float]] = deque(maxlen=MOST_LOGGED)
 
     def put(self, sample: Sample) -> None:
         """Keep the voltage of a sample: no reading, but the stage goes on."""
@@ -101,8 +100,8 @@ class Heard:
         heard = {seq: u for seq, u in self._kept if seq < sample.seq}
         # Nobody knows the voltages of samples that never came; a straight line between is the best guess.
         slope_V = (sample.u_V - gates.u_V) / (missing + 1)
-        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_HEARD))]
-        return between, missing > MOST_HEARD or missing - len(heard) > max_gap
+        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_LOGGED))]
+        return between, missing > MOST_LOGGED or missing - len(heard) > max_gap
 
     def array(self) -> FloatArray:
         """(n, 2) pairs, for a file."""
@@ -136,8 +135,8 @@ CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 2, 5.0, 0
 Model = Callable[[], LssvmInverse]
 
 
-class Front:
-    """The front end of a learner; ``base`` is the model that it starts from.
+class Intake:
+    """The intake end of a learner; ``base`` is the model that it starts from.
 
     Attributes
     ----------
@@ -165,7 +164,7 @@ class Front:
         self._hold: Hold | None = None
         self._trial: Trial | None = None
         self._lost = True  # The smoother has to start again.
-        self._heard = Heard()
+        self._voltages = VoltageLog()
         self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
@@ -203,7 +202,7 @@ class Front:
         self.gates = admission.AdmissionState()
         self._hold, self._trial, self._lost = None, None, True
         self._proven = self._proven_past = None
-        self._heard.clear()
+        self._voltages.clear()
         self._forget()
 
     def _forget(self) -> None:
@@ -240,11 +239,11 @@ class Front:
             refused = admission.OUT_OF_RANGE
         if refused:
             if gates.seq >= 0 and not admission.check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
-                self._heard.put(sample)
+                self._voltages.put(sample)
             return Taken(refused)
         missing = sample.seq - gates.seq - 1 if gates.seq >= 0 else 0
-        between, gone = self._heard.missed(gates, sample, c.max_gap) if missing else ([], False)
-        self._heard.clear()
+        between, gone = self._voltages.missed(gates, sample, c.max_gap) if missing else ([], False)
+        self._voltages.clear()
         for u in (*between, sample.u_V):
             admission.watch_voltage(c, gates, u, self.base.span_V)
         gates.seq, gates.t_s = sample.seq, sample.t_s
@@ -649,7 +648,7 @@ class Front:
         if self._proven_past is not None:
             state |= prefixed("proven_past.", self._proven_past.state_dict())
         state |= {
-            "heard": self._heard.array(),
+            "heard": self._voltages.array(),
             "lost": self._lost,
             "jump_um": self._jump_um,
             "calm": self._calm,
@@ -677,7 +676,7 @@ class Front:
         self._proven = FeatureMap.from_state(proven) if proven else None
         past = under("proven_past.", state)
         self._proven_past = Past.from_state(past) if past else None
-        self._heard.restore(state["heard"])
+        self._voltages.restore(state["heard"])
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
         self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))

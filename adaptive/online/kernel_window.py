@@ -1,4 +1,4 @@
-"""The learner's window: a sliding LSSVM on what the linear part leaves, and whose slot a new sample takes."""
+"""The learner's window: a sliding LSSVM on the residual of the linear part, its eviction rule and sample weights."""
 
 from __future__ import annotations
 
@@ -19,21 +19,19 @@ from adaptive.window.config import SolverConfig, WindowConfig
 from adaptive.window.healing import Healing
 from adaptive.window.window import Window
 
-# --- How much a sample counts: doubtful and old ones less, by their noise weight (weighted LSSVM).
-#
-# A weight w stands for 1/w times the noise variance, in the window and in the filter alike; 1 is an ordinary sample.
+# --- Sample weights: a weight w means 1/w times the noise variance, in window and filter. An ordinary sample has 1.
 
 
 @dataclass(frozen=True, slots=True)
 class WeightConfig:
-    """All weights 1, but for samples from before a change.
+    """Weights of doubtful and old samples. By default only samples from before a change count less.
 
-    near_bad : weight of a pair whose smoothing has looked at a reading that was refused.
-    on_probation : weight for as long as a jump may still be undone.
-    acceleration : noise that acceleration adds, as a share of the ordinary, at full scale of the feature map: the
-    weight is 1/(1 + (acceleration a/scale)²). What the smoother leaves is worst where the motion turns fast.
+    near_bad : weight of a pair where the smoother has used a refused reading.
+    on_probation : weight while a jump may still be undone.
+    acceleration : noise that acceleration adds at full scale of the feature map, as a share of the ordinary noise: the
+    weight is 1/(1 + (acceleration a/scale)²). The smoother's error is largest where the motion turns fast.
     half_life_s : time after which a sample of the window counts half, s; 0 for never.
-    before_change : most that a sample counts from before a change of the stage that was found; 1 to keep them all.
+    before_change : largest weight of samples from before a detected change of the stage; 1 keeps them all.
     """
 
     near_bad: float = 1.0
@@ -52,19 +50,19 @@ class WeightConfig:
                 raise InputError(f"weights.{name}: got {value}, expected a finite number, not negative")
 
     def of(self, near_bad: bool, on_probation: bool, a_share: float) -> float:
-        """Weight of a pair that may teach; ``a_share`` is its acceleration, full scale being 1."""
+        """Weight of a pair; ``a_share`` is its acceleration as a share of full scale."""
         weight = (self.near_bad if near_bad else 1.0) * (self.on_probation if on_probation else 1.0)
         if self.acceleration > 0.0:
             weight /= 1.0 + (self.acceleration * a_share) ** 2
         return weight
 
     def faded(self, weight: float, age_s: float) -> float:
-        """Weight of a sample that has been in the window for so long; never below a thousandth of its own."""
+        """Weight of a sample after ``age_s`` in the window, s; at least a thousandth of its own."""
         return weight * max(float(0.5 ** (age_s / self.half_life_s)), 1e-3) if self.half_life_s > 0.0 else weight
 
 
 Eviction = Literal["nearest", "fifo"]
-#: A sample this close (kernel value) to one that the window holds takes its slot even where there is room.
+#: A sample with a kernel value above this to a held one takes its slot even where there are free slots.
 SAME = 0.98
 #: No slot.
 NOWHERE = -1
@@ -73,8 +71,8 @@ NOWHERE = -1
 class ResidualWindow:
     """A window LSSVM over kernel inputs (d,), targets in V.
 
-    With ``eviction="nearest"`` a new sample takes the slot of its nearest neighbour: what the window knows of the
-    rest of the range stays, however long the stage dwells in one place. ``"fifo"`` drops the oldest.
+    With ``eviction="nearest"`` a new sample takes the slot of its nearest neighbour, so that a rest in one place does
+    not remove the samples of the other places. ``"fifo"`` drops the oldest sample.
     """
 
     def __init__(
@@ -103,7 +101,7 @@ class ResidualWindow:
         made = cls(capacity, model, eviction, solver)
         n = model.support.shape[0]
         if n:
-            # A solution knows its targets: y = K alpha + alpha / gamma; its bias is in the linear part already.
+            # The targets follow from the solution: y = K alpha + alpha / gamma. Its bias is in the linear part.
             targets = kernels.gram(model.support, None, model.widths) @ model.alpha + model.alpha / model.gamma
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
@@ -126,7 +124,7 @@ class ResidualWindow:
 
     @property
     def form(self) -> str:
-        """``inverse`` or ``cholesky``, whichever is at work."""
+        """The form in use, ``inverse`` or ``cholesky``."""
         return self._window.form
 
     def mean(self, kernel: FloatArray) -> float:
@@ -134,27 +132,24 @@ class ResidualWindow:
         return self._window.predict(kernel)
 
     def learn(self, kernel: FloatArray, target_V: float, weight: float = 1.0) -> str:
-        """Take one sample, of a noise weight. Returns "learnt", or "numerics" where the step was refused, undone.
+        """Learn one sample with a noise weight. Returns "learnt", or "numerics" where the step was refused and undone.
 
-        A refusal of the window's numerics starts its healing: the same solution is served, and steps that it can't take
-        are refused, until a new factorisation is swapped in, `window_healing.STEPS` samples later.
+        A numerical refusal starts the healing of the window. The same solution is served, and steps that fail are
+        refused, until a new factorisation is swapped in `adaptive.window.healing.STEPS` samples later.
         """
         self._healing.step()
         window, n = self._window, len(self._window)
-        slot, value = -1, 0.0
-        if n:
-            # ``kernels.column`` of inputs that are divided by the widths already.
-            away = window.arrays.scaled[:, :n].T - kernel * window.arrays.inverse_widths
-            column = np.exp(-np.sum(away**2, axis=1))
-            slot = int(np.argmax(column))
-            value = float(column[slot])
+        slot, value = window.nearest(kernel)
         self._clock += 1
         room = n < self._config.capacity and value < SAME
         if room:
             slot = n
         elif self.eviction == "fifo":
             slot = int(np.argmin(self._born[:n]))
-        status = self._step(slot, room, kernel, target_V, weight)
+        if room:
+            status = window.append(kernel, target_V, weight)
+        else:
+            status = window.replace(slot, kernel, target_V, weight)
         if status == Status.ILL_CONDITIONED and n:
             self._healing.begin()
         if status != Status.ACCEPTED:
@@ -164,7 +159,7 @@ class ResidualWindow:
         return admission.LEARNT
 
     def fade(self, weights: WeightConfig, step_s: float) -> None:
-        """Let one sample count by its age, another at each call; ``step_s`` is the time between two steps, s."""
+        """Reweight one sample by its age, the next one at each call; ``step_s``: time between two steps, s."""
         n = len(self._window)
         if weights.half_life_s <= 0.0 or n == 0:
             return
@@ -173,18 +168,18 @@ class ResidualWindow:
         self._window.reweight(slot, weights.faded(float(self._own[slot]), age_s))
 
     def expect_change(self) -> None:
-        """The stage has changed: what is in the window is from before. See `let_go`."""
+        """The stage has changed: mark all samples as from before the change. See `let_go`."""
         self._changed, self._next = self._clock, 0
 
     def keep(self) -> None:
-        """There was no change: what has not been let go stays as it is."""
+        """There was no change: leave the remaining samples as they are."""
         self._next = NOWHERE
 
     def let_go(self, most: float) -> None:
-        """Let one sample from before the last change count ``most`` at most, another at each call.
+        """Limit the weight of one sample from before the last change to ``most``, the next one at each call.
 
-        It is not taken out: where nothing newer has come it is still the best there is, but who is nearer or newer now
-        outvotes it. One a call, so that no sample has to wait for five hundred steps of the window.
+        Old samples are down-weighted, not removed: where nothing newer has come they are the best there are. One per
+        call, because 500 steps of the window at once would delay a sample.
         """
         n = len(self._window)
         while 0 <= self._next < n:
@@ -196,26 +191,19 @@ class ResidualWindow:
                 return
         self._next = NOWHERE
 
-    def _step(self, slot: int, room: bool, kernel: FloatArray, target_V: float, weight: float) -> Status:
-        return (
-            self._window.append(kernel, target_V, weight)
-            if room
-            else self._window.replace(slot, kernel, target_V, weight)
-        )
-
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""
         return self._window.X, self._window.alpha, self._window.bias
 
     def counters(self) -> dict[str, int]:
-        """Of the window's numerics."""
+        """Events of the window's numerics; see `Window.counters`."""
         return self._window.counters()
 
     # ---- hyper-parameters
 
     @property
     def hyper(self) -> Hyperparameters:
-        """Regularisation and kernel widths at work."""
+        """Regularisation and kernel widths in use."""
         return Hyperparameters(self._config.gamma, self._config.widths)
 
     def data(self) -> WindowData:
@@ -229,14 +217,14 @@ class ResidualWindow:
         return np.ascontiguousarray(self._window.X[self._newest(count)])
 
     def newest_error_V(self, count: int) -> float:
-        """rms, V, of what all others foretell for each of the newest samples: exact leave-one-out; 0 without any."""
+        """rms leave-one-out error of the newest samples, V; exact; 0 without any."""
         errors = self._window.leave_one_out()[self._newest(count)]
         return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
 
     def with_hyperparameters(self, hyper: Hyperparameters) -> ResidualWindow:
-        """A window of the same samples, order of age and counts that works with others.
+        """A window with the same samples, ages and counters, and other hyper-parameters.
 
-        Raises InputError on values that are not positive, NumericsError where the kernel matrix can't be factored.
+        Raises InputError on values that are not positive, NumericsError where the kernel matrix cannot be factored.
         """
         made = object.__new__(ResidualWindow)
         c = self._config
@@ -262,7 +250,7 @@ class ResidualWindow:
     # ---- keeping
 
     def state_dict(self) -> StateDict:
-        """All arrays under flat names, and the hyper-parameters that they are of."""
+        """All arrays under flat names, and their hyper-parameters."""
         own = {
             "born": self._born.copy(),
             "own_weights": self._own.copy(),
@@ -276,7 +264,7 @@ class ResidualWindow:
         return {**self._window.state_dict(), **own, **hyper, **healing}
 
     def restore(self, values: StateDict) -> None:
-        """Go on from a ``state_dict``. Raises InputError where it is of another capacity or number of inputs."""
+        """Continue from a ``state_dict``. Raises InputError where its capacity or number of inputs differs."""
         c = self._config
         widths = tuple(float(w) for w in values["widths"])
         self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.form, c.accuracy)

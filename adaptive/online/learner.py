@@ -1,89 +1,353 @@
 """The learner: samples in, snapshots out. Deterministic, bounded in time and memory, never raises on data.
 
-One sample's way: gates of ``admission``, fixed-lag smoother, hysteresis memory and features at that past instant
-(``front``), then two learners of one model. The Kalman filter of ``drift`` follows the linear part; the sliding-window
-LSSVM of ``residual`` learns what is left, each new sample in the slot of its nearest neighbour. Each takes the voltage
-minus the other's part as its target, so a change is taken up once, and the window's old samples stay true.
+A sample passes the intake (``adaptive.online.intake``): gates, fixed-lag smoother, and hysteresis memory and features
+at the smoothed instant. Then two learners share one model. The Kalman filter (``drift``) follows the linear part, the
+sliding-window LSSVM (``kernel_window``) learns the rest. Each takes the voltage minus the other's part as its target,
+so that a change is learnt once and the old samples of the window stay valid.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite, sqrt
 from typing import Any
 
 import numpy as np
 
+from adaptive.errors import DehystError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.online.config import LearnerConfig
-from adaptive.online.gates import check_pair
-from adaptive.online.learner_parts import RAIL_S, RAIL_SHARE, Parts, model_of, restored, state_of, warm
+from adaptive.online.dead_reckoning import Reckoning, drive_V
+from adaptive.online.drift import DriftFilter, RestCreep
+from adaptive.online.gates import check_pair, new_counters
+from adaptive.online.glitch_or_jump import level_of
+from adaptive.online.intake import Intake
+from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.track import Pair
-from adaptive.state_codec import prefixed
-from adaptive.tuning.adoption import adopt
+from adaptive.online.validity import Delay, Judgement
+from adaptive.state_codec import joined, prefixed, under
 from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
 
-# --- What a learner tells of itself: counters, and what a viewer draws.
+Mark = tuple[FloatArray, FloatArray]
 
+#: Names of what is counted beside the samples.
+EVENTS = ("fallbacks", "rollbacks", "distrusts", "begun_again", "adoptions", "adoptions_refused")
 
-def counters(learner: Learner) -> dict[str, int]:
-    """Samples by outcome, and events. A copy."""
-    parts = learner.parts
-    drift = parts.filter.state
-    events = {
-        "restarts": parts.front.restarts,
-        "jumps": parts.front.jumps,
-        "jumps_undone": parts.front.undone,
-        "trials": parts.front.trials,
-        **parts.events,
-    }
-    return {
-        **parts.counters,
-        **events,
-        "filter_updates": drift.updates,
-        "bursts": drift.bursts,
-        **prefixed("window_", parts.window.counters()),
-    }
+#: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
+#: well, its estimate is marked this often, s.
+ROLLBACK_S, MARK_S = 0.5, 1.0
 
+#: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
+JUMP_DOUBT = 0.3
+#: Time between two looks at the envelope, the rails and the sensor, s; a step of the filter at least.
+CHECK_S = 0.004
+#: A voltage at a limit for this long, s, where the model is wrong by this share of the span, is the model's doing.
+RAIL_S, RAIL_SHARE = 0.1, 0.05
+#: Time inside the envelope after which a model that had left it is no trouble any more, s.
+LEFT_S = 1.0
+#: Time on trial from which on the identified model may be served, s, and how large its own recent error may be for
+#: that, rms, as a share of the span for each second on trial, and at most. The last estimate is exact where the stage
+#: was when readings were last believed; the longer that is ago, the less it is worth.
+ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.05
 
-def diagnostics(learner: Learner) -> dict[str, Any]:
-    """Errors in V and in percent of the voltage span, gain and offset, the window's samples.
-
-    ``gain`` is the stage's, relative to the identified model: that of the frame and of the linear part together.
-    """
-    parts, base = learner.parts, learner.base
-    j, front, percent = parts.judgement, parts.front, 100.0 / base.span_V
-    estimate = parts.filter.beta
-    now, before = estimate[1:], base.beta[1:]
-    along = float(now @ before)
-    window_y_um, window_v_um_per_s = front.served.motion_of(parts.window.arrays()[0])
-    return {
-        "error_V": j.error_V,
-        "rms_error_pct": float(np.sqrt(j.long_V2)) * percent,
-        "recent_rms_error_pct": float(np.sqrt(j.short_V2)) * percent,
-        "frozen_rms_error_pct": float(np.sqrt(j.frozen_V2)) * percent,
-        "share_within_std": j.inside / max(1, j.judged),
-        "gain": front.served.gain * (float(before @ before) / along if along > 0.0 else 1.0),
-        "frame_gain": front.served.gain,
-        "frame_offset_um": front.served.offset_um,
-        "offset_V": float(estimate[0] - base.beta[0]),
-        "u_V": front.gates.u_V,
-        "std_V": float(np.sqrt(j.variance_V2)),
-        "window_samples": float(len(parts.window)),
-        "window_residual_V": parts.window.residual_V,
-        "window_cholesky": float(parts.window.form == "cholesky"),
-        "valid": float(j.valid),
-        "fallback": float(j.fallback),
-        "frozen": float(learner.frozen),
-        "lag_s": front.smoother.config.lag * base.dt_s,
-        "window_y_um": window_y_um.tolist(),
-        "window_v_um_per_s": window_v_um_per_s.tolist(),
-    }
-
-
+#: Number of newest samples on which old and new hyper-parameters are compared.
+NEWEST = 100
+#: Largest move of the output at an adoption, in its stated standard deviations (rms over the newest samples).
+MOST_MOVED = 2.0
 #: Troubles of the model, after which the identified one is served.
 RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
+
+
+class Parts:
+    """Everything of a learner that changes.
+
+    Attributes
+    ----------
+    intake : gates, smoother, frame and hysteresis memory. filter : of the linear part. window : the kernel part.
+    rest : what a rest has taught. judgement, delay : errors at the age of serving.
+    domain : (6,) learnt range, as of the snapshot.
+    point : (d,) kernel inputs of the last instant that was due to teach, NaN before any.
+    first : the filter's estimate of the identified model.
+    check_every, check_s : samples between two looks at envelope, rails and sensor, and the time between them, s.
+    allowed_V : by how much the model may leave the identified linear part, V; 0 for no bound.
+    left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
+    alone : whether readings have been on trial for so long that the identified model, if it is good, is the better.
+    rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
+    confirmed : estimates from before readings that certainly followed the drive, the older one first. mark_ages,
+    confirmed_ages : at which judgement the marks were made.
+    mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
+    some of what went wrong. jump_mark, proven_mark : those before the last jump, and before the first that is open.
+    counters : samples by outcome. events : by name.
+    """
+
+    def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
+        self.config = config
+        self.intake = Intake(base, config)
+        p = base.features.basis_size
+        covariance = base.beta_covariance if base.beta_covariance.size else (0.01 * base.span_V) ** 2 * np.eye(p)
+        step_s = config.filter_every * base.dt_s
+        self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
+        self.first = self.filter.mark()
+        self.window = ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
+        self.mark: Mark = self.filter.mark()
+        self.next_mark: Mark = self.mark
+        self.jump_mark: Mark = self.mark
+        self.proven_mark: Mark = self.mark
+        self.confirmed: tuple[Mark, Mark] = (self.mark, self.mark)
+        self.mark_ages = self.confirmed_ages = (0, 0)
+        self.domain = base.domain.copy()
+        self.point = np.full(base.features.kernel_size, np.nan)
+        start_V2 = max(base.noise_variance, (1e-4 * base.span_V) ** 2)
+        self.judgement = Judgement(start_V2, start_V2, start_V2, start_V2)
+        self.rest = RestCreep()
+        self.delay = Delay(round(config.serving_age_s / step_s))
+        steps = max(1, round(CHECK_S / self.filter.step_s))
+        self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
+        # A model without a linear part has nothing that the kernel could be held to; what the kernel of the identified
+        # one adds to its linear part is allowed beside the bound.
+        self.allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
+        self.rail_s = 0.0
+        self.railed = False
+        self.left_s = 0.0
+        self.left = False
+        self.alone = False
+        self.counters = new_counters()
+        self.events = dict.fromkeys(EVENTS, 0)
+
+    def expect_change(self) -> None:
+        """The stage has changed: the filter follows faster, and what the window has from before will count less."""
+        self.filter.expect_change()
+        self.window.expect_change()
+
+    def follow(self, basis: FloatArray, target_V: float, u_V: float, weight: float, rest: bool) -> bool:
+        """A step of the filter towards ``target_V`` at basis (p,); False for an outlier, which teaches nothing.
+
+        ``u_V`` : the voltage there. ``rest`` : whether the stage is at rest.
+        """
+        said = self.filter.update(basis, target_V, not rest, weight)
+        if said == "outlier":
+            return False
+        if said == "burst":
+            self.window.expect_change()
+        if self.judgement.valid and not self.intake.on_probation:
+            self.window.let_go(self.config.weights.before_change)
+        self.take_rest(u_V, moving=not rest)
+        return True
+
+    def take_rest(self, u_V: float, moving: bool) -> None:
+        """After a step of the filter: at rest, let what the constant has gained go over to the frame."""
+        intake, f = self.intake, self.filter
+        if moving:
+            self.rest.leave()
+            return
+        constant_V, creep_s = float(f.beta[0]), self.config.creep_s
+        shift_um = self.rest.shift_um(constant_V, u_V, f.span_V, intake.range_um, f.step_s, creep_s)
+        if shift_um:
+            intake.creep(shift_um)
+
+    def judge(self, error_V: float, frozen_error_V: float) -> None:
+        """Take the errors at one instant: of the linear part as it was served for it, and of the frozen model."""
+        c, j, step_s = self.config, self.judgement, self.filter.step_s
+        span_V = self.filter.span_V
+        j.take(error_V, frozen_error_V, step_s)
+        j.decide(c.valid_enter * span_V, c.valid_leave * span_V)
+        before = j.fallback
+        self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
+        if j.fallen_s > ROLLBACK_S:
+            # Half a second of losing to the frozen model: what was learnt since all was well is wrong, and so is a
+            # jump that the frozen model knows nothing of.
+            j.fallen_s = 0.0
+            self.intake.to_base_frame()
+            self.filter.go_back(self.mark)
+            self.events["rollbacks"] += 1
+        elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
+            self.mark, self.next_mark = self.next_mark, self.filter.mark()
+            self.mark_ages = (self.mark_ages[1], j.judged)
+            if self.confirmed_ages[0] < self.mark_ages[0]:
+                # Where the stage moves little, nothing is confirmed for long: what was good for a second is as good.
+                self.confirmed = (self.mark, self.confirmed[1])
+                self.confirmed_ages = (self.mark_ages[0], self.confirmed_ages[1])
+
+    def watch_rail(self, saturated: bool) -> None:
+        """After ``judge``: a voltage that stays at a limit by the model's fault ends in the identified model.
+
+        ``railed`` is True from then until the voltage has been off the limits for as long.
+        """
+        limit_V = RAIL_SHARE * self.filter.span_V
+        step_s = self.check_s
+        if saturated:
+            self.rail_s = min(max(self.rail_s, 0.0) + step_s, RAIL_S)
+            if self.rail_s >= RAIL_S and self.judgement.short_V2 > limit_V * limit_V and not self.railed:
+                self.railed = True
+                self.begin_again()
+        else:
+            self.rail_s = max(min(self.rail_s, 0.0) - step_s, -RAIL_S)
+            self.railed = self.railed and self.rail_s > -RAIL_S
+
+    def watch_shape(self, away_V: float) -> None:
+        """How far the model is from the identified linear part, V. One that stays outside ends in the identified one.
+
+        ``left`` is True from then until it has been inside for a second.
+        """
+        step_s = self.check_s
+        if self.allowed_V and abs(away_V) > self.allowed_V:
+            self.left_s = max(self.left_s, 0.0) + step_s
+            if self.left_s >= RAIL_S:
+                self.left, self.left_s = True, 0.0
+                self.begin_again()
+        else:
+            self.left_s = max(min(self.left_s, 0.0) - step_s, -LEFT_S)
+            self.left = self.left and self.left_s > -LEFT_S
+
+    def watch_trial(self) -> bool:
+        """At each sample: returns whether ``alone`` has changed."""
+        on_trial_s, before = self.intake.distrusted_s, self.alone
+        if on_trial_s or before:
+            limit_V = min(ALONE_SHARE_PER_S * on_trial_s, ALONE_SHARE) * self.filter.span_V
+            self.alone = on_trial_s >= ALONE_S and self.judgement.frozen_V2 <= limit_V * limit_V
+        if self.alone and not before:
+            self.intake.reckon_by(self.intake.base)
+        return self.alone != before
+
+    def confirm(self) -> None:
+        """The readings follow the drive: what was learnt from those before them is right."""
+        newer = int(self.confirmed_ages[1] >= self.confirmed_ages[0])
+        self.confirmed = (self.confirmed[newer], self.filter.mark())
+        self.confirmed_ages = (self.confirmed_ages[newer], self.judgement.judged)
+
+    def go_back(self, undone: bool) -> None:
+        """The readings do not follow the drive: forget what was learnt since they certainly did.
+
+        ``undone``: jumps are taken back with them; all since the first of them is forgotten.
+        """
+        self.filter.restore(self.proven_mark if undone else self.confirmed[0])
+        self.window.keep()
+        self.events["distrusts"] += 1
+
+    def begin_again(self) -> None:
+        """Forget all that was learnt: the identified model is the one that is known to be right."""
+        base, c = self.intake.base, self.config
+        self.intake.to_base_frame()
+        self.filter.go_back(self.first)
+        self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
+        self.mark = self.next_mark = self.jump_mark = self.proven_mark = self.filter.mark()
+        self.confirmed = (self.mark, self.mark)
+        self.mark_ages = self.confirmed_ages = (self.judgement.judged,) * 2
+        self.domain = base.domain.copy()
+        self.events["begun_again"] += 1
+
+    def take_jump(self, jump_um: float, fresh: bool, first: bool) -> None:
+        """The reading has jumped by so much, µm; ``fresh``: and did not only undo a jump; ``first``: see ``Taken``."""
+        intake = self.intake
+        self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2
+        if fresh:
+            self.jump_mark = self.filter.mark()
+        if first:
+            self.proven_mark = self.jump_mark
+        self.confirmed, self.confirmed_ages = (self.filter.mark(),) * 2, (self.judgement.judged,) * 2
+
+    def undo_jump(self) -> None:
+        """Forget what was learnt since the last jump: it was learnt of a stage that never was."""
+        self.filter.restore(self.jump_mark)
+        self.window.keep()
+
+    def widen_domain(self, motion: tuple[float, float, float]) -> None:
+        """Take a learnt instant (µm, µm/s, µm/s²) into the domain."""
+        ends = self.domain.tolist()
+        for i, x in enumerate(motion):
+            if x < ends[2 * i]:
+                self.domain[2 * i] = x
+            if x > ends[2 * i + 1]:
+                self.domain[2 * i + 1] = x
+
+    def shift_constant(self, by_V: float) -> None:
+        """Add to the constant of the linear part, now, in its marks, and as it was served."""
+        self.filter.shift_constant(by_V)
+        marks = (self.mark, self.next_mark, self.jump_mark, self.proven_mark, *self.confirmed)
+        for beta, _ in {id(m): m for m in marks}.values():
+            beta[0] += by_V
+        self.delay.shift(by_V)
+
+
+def _model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
+    """What is learnt, as an immutable model; the identified one while learning is worse than it."""
+    j, window, seq = parts.judgement, parts.window, parts.intake.gates.seq
+    valid = j.valid and not parts.intake.fault
+    if j.fallback or parts.alone:
+        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
+    support, alpha, bias = window.arrays()
+    beta = parts.filter.beta
+    beta[0] += bias
+    return replace(
+        base,
+        features=parts.intake.served,
+        beta=beta,
+        support=support,
+        alpha=alpha,
+        widths=np.array(window.hyper.widths),
+        gamma=window.hyper.gamma,
+        domain=parts.domain,
+        noise_variance=j.variance_V2,
+        kernel_variance=window.kernel_variance,
+        beta_covariance=np.empty((0, 0)),
+        seq=seq,
+        valid=valid,
+        anchor=base.beta if parts.allowed_V else np.empty(0),
+        allowed_V=parts.allowed_V,
+    )
+
+
+def _adopt(parts: Parts, hyper: Hyperparameters) -> str:
+    """Let the window of ``parts`` continue with other hyper-parameters. Returns "", or why they are refused.
+
+    The window is factored anew over its own samples: O(N³), once. The constant of the linear part takes up the
+    difference at the last point that was learnt, so that the output there does not jump. Refused without a change where
+    the kernel matrix cannot be factored, where the leave-one-out errors of the newest samples (rms) are not smaller, or
+    where the output would move too far.
+    """
+    window = parts.window
+    try:
+        challenger = window.with_hyperparameters(hyper)
+        now_V, then_V = challenger.newest_error_V(NEWEST), window.newest_error_V(NEWEST)
+    except DehystError as error:
+        return f"numerics: {error}"
+    if not now_V <= then_V:
+        return f"worse: {now_V:.3g} V rms on the newest samples, {then_V:.3g} V as it is"
+    point = parts.point
+    shift_V = window.mean(point) - challenger.mean(point) if np.all(np.isfinite(point)) else 0.0
+    moves_V = np.array([challenger.mean(x) + shift_V - window.mean(x) for x in window.newest(NEWEST)])
+    moved_V = max(abs(shift_V), sqrt(float(np.mean(moves_V**2))) if moves_V.size else 0.0)
+    limit_V = MOST_MOVED * sqrt(parts.judgement.variance_V2)
+    if not moved_V <= limit_V:
+        return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
+    parts.window = challenger
+    parts.shift_constant(shift_V)
+    return ""
+
+
+def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
+    """Load, or compile, every step of a learner, on parts that nobody keeps."""
+    parts = Parts(base, config)
+    basis, kernel = np.empty(base.features.basis_size), np.empty(base.features.kernel_size)
+    base.features.fill(0.0, 0.0, 0.0, base.rest_memory(0.0), basis, kernel)
+    base.mean(basis, kernel)
+    window = parts.window
+    if len(window) < config.window:
+        window.learn(10.0 + np.zeros_like(kernel), 0.0)
+    window.learn(window.arrays()[0][0], 0.0)
+    y = base.features.y_rest_um
+    readings = np.array([y, y])
+    reckoning = Reckoning.begin(base, (y, 0.0, 0.0), 0.0, np.zeros(2), readings, base.rest_memory(y))
+    reckoning.advance(0.0)
+    for drifts in (False, True):
+        level_of(np.arange(8.0) % 3.0, 1.0, drifts)
+    window.with_hyperparameters(window.hyper).newest_error_V(1)
+    for moving in (True, False):
+        parts.filter.update(basis, 0.0, moving)
+    parts.expect_change()
+    window.let_go(0.5)
 
 
 class Learner:
@@ -115,7 +379,7 @@ class Learner:
     @property
     def seq(self) -> int:
         """Sequence number of the last sample taken, -1 before any."""
-        return self.parts.front.gates.seq
+        return self.parts.intake.gates.seq
 
     def handle(self, sample: Sample) -> str:
         """Take one sample. Returns "learnt", "passed" (no step was due), or the name of the gate that refused it."""
@@ -125,7 +389,7 @@ class Learner:
 
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number, after the stage itself began anew."""
-        self.parts.front.resync()
+        self.parts.intake.resync()
 
     def take_place_of(self, other: OnlineModel) -> None:
         """Go on where ``other`` is, with what this one knows: after samples that ``other`` should not have believed.
@@ -135,16 +399,16 @@ class Learner:
         if not isinstance(other, Learner):
             self.resync()
             return
-        mine, its = self.parts.front, other.parts.front
+        mine, its = self.parts.intake, other.parts.intake
         if its.track is None:
             self.resync()
             return
         mine.restore(its.state_dict())
 
     def _handle(self, sample: Sample) -> str:
-        parts, front = self.parts, self.parts.front
-        front.doubt_V = sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2))
-        taken = front.take(sample, self.snapshot)
+        parts, intake = self.parts, self.parts.intake
+        intake.doubt_V = sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2))
+        taken = intake.take(sample, self.snapshot)
         if taken.distrusted:
             self._go_on_without_readings(taken.undone)
         elif taken.undone:
@@ -157,7 +421,7 @@ class Learner:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
-            pair, switched = front.advance(step)
+            pair, switched = intake.advance(step)
             if switched:
                 parts.expect_change()
             if not taken.refused:
@@ -166,8 +430,8 @@ class Learner:
 
     def _teach(self, pair: Pair) -> str:
         """Let the pair at the smoother's instant teach filter and window, where it may."""
-        c, parts, front = self.config, self.parts, self.parts.front
-        gates, track = front.gates, front.track
+        c, parts, intake = self.config, self.parts, self.parts.intake
+        gates, track = intake.gates, intake.track
         assert track is not None
         if min(gates.since_start, gates.since_step) <= c.admission.settle:
             return admission.SETTLING
@@ -182,9 +446,9 @@ class Learner:
             return refused or admission.PASSED
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
         track.features.fill(*motion, track.memory, self._basis, parts.point)
-        rest = front.rests(pair.y_um)
+        rest = intake.rests(pair.y_um)
         a_share = pair.a_um_per_s2 / self.base.features.a_scale_um_per_s2
-        weight = c.weights.of(pair.near_bad, front.on_probation, a_share)
+        weight = c.weights.of(pair.near_bad, intake.on_probation, a_share)
         outcome = refused or admission.PASSED
         if filter_due:
             target = pair.u_V - parts.window.mean(parts.point)
@@ -209,7 +473,7 @@ class Learner:
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:
             return refused
-        if window_due and not rest and not self._frozen and parts.judgement.valid and not front.on_probation:
+        if window_due and not rest and not self._frozen and parts.judgement.valid and not intake.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
             parts.widen_domain(motion)
@@ -218,14 +482,14 @@ class Learner:
 
     def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
         """Now and then: is the model inside its envelope, does the sensor follow? Returns why nothing may be taught."""
-        parts, front = self.parts, self.parts.front
+        parts, intake = self.parts, self.parts.intake
         parts.watch_shape(pair.u_V - target_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
         parts.watch_rail(saturated)
-        if saturated or not front.follow(pair, frozen_V, parts.check_s):
-            if front.confirmed:
+        if saturated or not intake.follow(pair, frozen_V, parts.check_s):
+            if intake.confirmed:
                 parts.confirm()
             return ""
-        taken = front.distrust(self.snapshot)
+        taken = intake.distrust(self.snapshot)
         if taken is None:
             return ""
         self._go_on_without_readings(taken.undone)
@@ -235,7 +499,7 @@ class Learner:
         """The readings are on trial. ``undone``: and jumps were taken back with them."""
         self.parts.go_back(undone)
         self._cache = None
-        self.parts.front.reckon_by(self.snapshot())
+        self.parts.intake.reckon_by(self.snapshot())
 
     @property
     def trouble(self) -> str:
@@ -246,19 +510,19 @@ class Learner:
         learnt was further from the identified model than a stage can be. In both the identified model is served.
         """
         parts = self.parts
-        return parts.front.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
+        return parts.intake.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
 
     @property
     def distrusts(self) -> bool:
         """Whether the readings are on trial: what is served is from before them."""
-        return self.parts.front.distrusted_s > 0.0
+        return self.parts.intake.distrusted_s > 0.0
 
     @property
     def why(self) -> str:
         """The reason for ``trouble`` in words, with numbers."""
         parts = self.parts
-        if parts.front.fault:
-            return parts.front.why
+        if parts.intake.fault:
+            return parts.intake.why
         if parts.railed:
             return f"the voltage was at a limit for {RAIL_S} s with the model off by more than {100 * RAIL_SHARE:.0f} %"
         return f"more than {parts.allowed_V:.3g} V from the identified model for {RAIL_S} s" if parts.left else ""
@@ -268,7 +532,7 @@ class Learner:
     def snapshot(self) -> LssvmInverse:
         """The model as it stands, immutable. The same object while nothing new was learnt."""
         if self._cache is None:
-            self._cache = model_of(self.base, self.parts)
+            self._cache = _model_of(self.base, self.parts)
         return self._cache
 
     def memory(self) -> FloatArray:
@@ -276,7 +540,7 @@ class Learner:
 
         It is of the smoother's instant, ``lag`` samples before ``seq``.
         """
-        track = self.parts.front.track
+        track = self.parts.intake.track
         return self.base.rest_memory(self.base.features.y_rest_um) if track is None else track.memory.copy()
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
@@ -286,24 +550,24 @@ class Learner:
         make the model wrong until the stage has wiped the difference out. None before the first sample.
         ``smoothed`` : from the smoother's instant, ``lag`` samples ago; None while readings are held back.
         """
-        front = self.parts.front
+        intake = self.parts.intake
         # Of two memories in one frame, that of the learner has seen no reading that was not believed.
-        if front.track is None or (smoothed and front.holds) or not isinstance(model, LssvmInverse):
+        if intake.track is None or (smoothed and intake.holds) or not isinstance(model, LssvmInverse):
             return None
-        frozen = model.features != front.served and model.features == self.base.features
+        frozen = model.features != intake.served and model.features == self.base.features
         if smoothed:
-            return (front.track.frozen_memory if frozen else front.track.memory).copy()
-        return front.memory_now(frozen)
+            return (intake.track.frozen_memory if frozen else intake.track.memory).copy()
+        return intake.memory_now(frozen)
 
     @property
     def features(self) -> FeatureMap:
         """The feature map that is served."""
-        return self.parts.front.served
+        return self.parts.intake.served
 
     def warm(self) -> None:
         """Load (or compile) every step on a copy: no sample that teaches, no change of the stage and no other
         hyper-parameters must wait for one, which takes seconds where it was never compiled before."""
-        warm(self.base, self.config)
+        _warm(self.base, self.config)
 
     def freeze(self) -> None:
         """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""
@@ -328,10 +592,9 @@ class Learner:
     def adopt(self, hyper: Hyperparameters) -> str:
         """Go on with other hyper-parameters, from the present sample on. Returns "", or why they were refused.
 
-        Atomic, and without a jump of what is served; refused unless it foretells better. See
-        ``adaptive.tuning.adoption``.
+        Atomic, and without a jump of what is served; refused unless it predicts the newest samples better.
         """
-        reason = adopt(self.parts, hyper)
+        reason = _adopt(self.parts, hyper)
         self.parts.events["adoptions_refused" if reason else "adoptions"] += 1
         if not reason:
             self._cache = None
@@ -350,11 +613,56 @@ class Learner:
 
     def counters(self) -> dict[str, int]:
         """Samples by outcome, and events. A copy."""
-        return counters(self)
+        parts = self.parts
+        drift = parts.filter.state
+        events = {
+            "restarts": parts.intake.restarts,
+            "jumps": parts.intake.jumps,
+            "jumps_undone": parts.intake.undone,
+            "trials": parts.intake.trials,
+            **parts.events,
+        }
+        return {
+            **parts.counters,
+            **events,
+            "filter_updates": drift.updates,
+            "bursts": drift.bursts,
+            **prefixed("window_", parts.window.counters()),
+        }
 
     def diagnostics(self) -> dict[str, Any]:
-        """For a viewer; see ``adaptive.online.learner``."""
-        return diagnostics(self)
+        """Errors in V and in percent of the voltage span, gain and offset, the window's samples.
+
+        ``gain`` is the stage's, relative to the identified model: that of the frame and of the linear part together.
+        """
+        parts, base = self.parts, self.base
+        j, intake, percent = parts.judgement, parts.intake, 100.0 / base.span_V
+        estimate = parts.filter.beta
+        now, before = estimate[1:], base.beta[1:]
+        along = float(now @ before)
+        window_y_um, window_v_um_per_s = intake.served.motion_of(parts.window.arrays()[0])
+        return {
+            "error_V": j.error_V,
+            "rms_error_pct": float(np.sqrt(j.long_V2)) * percent,
+            "recent_rms_error_pct": float(np.sqrt(j.short_V2)) * percent,
+            "frozen_rms_error_pct": float(np.sqrt(j.frozen_V2)) * percent,
+            "share_within_std": j.inside / max(1, j.judged),
+            "gain": intake.served.gain * (float(before @ before) / along if along > 0.0 else 1.0),
+            "frame_gain": intake.served.gain,
+            "frame_offset_um": intake.served.offset_um,
+            "offset_V": float(estimate[0] - base.beta[0]),
+            "u_V": intake.gates.u_V,
+            "std_V": float(np.sqrt(j.variance_V2)),
+            "window_samples": float(len(parts.window)),
+            "window_residual_V": parts.window.residual_V,
+            "window_cholesky": float(parts.window.form == "cholesky"),
+            "valid": float(j.valid),
+            "fallback": float(j.fallback),
+            "frozen": float(self._frozen),
+            "lag_s": intake.smoother.config.lag * base.dt_s,
+            "window_y_um": window_y_um.tolist(),
+            "window_v_um_per_s": window_v_um_per_s.tolist(),
+        }
 
     def take_events(self) -> list[tuple[str, str]]:
         """None: what happens to a learner shows in ``counters`` and ``trouble``."""
@@ -362,7 +670,7 @@ class Learner:
 
     def state_dict(self) -> StateDict:
         """All of the state; ``from_state`` goes on from it with the same result to the last bit."""
-        return state_of(self.base, self.config, self.parts, self._frozen)
+        return _state_of(self.base, self.config, self.parts, self._frozen)
 
     def restored(self, state: StateDict) -> Learner:
         """A learner with ``state``. Raises ModelFileError where entries are missing or do not fit together."""
@@ -372,7 +680,89 @@ class Learner:
     def from_state(cls, state: StateDict) -> Learner:
         """Inverse of ``state_dict``. Raises ModelFileError where entries are missing or do not fit together."""
         made = cls.__new__(cls)
-        base, config, parts, frozen = restored(state)
+        base, config, parts, frozen = _restored(state)
         made._begin(base, config, parts)
         made._frozen = frozen
         return made
+
+
+# --- The state of a learner.
+
+
+def _state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:
+    """All of a learner's state; ``restored`` goes on from it with the same result to the last bit."""
+    groups = {
+        "base": base.state_dict(),
+        "config": config.state_dict(),
+        "front": parts.intake.state_dict(),
+        "filter": parts.filter.state_dict(),
+        "window": parts.window.state_dict(),
+        "rest": parts.rest.state_dict(),
+        "judgement": parts.judgement.state_dict(),
+        "counters": dict(parts.counters),
+        "events": dict(parts.events),
+        "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
+        "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
+        "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
+        "proven_mark": {"beta": parts.proven_mark[0].copy(), "covariance": parts.proven_mark[1].copy()},
+        "confirmed0": {"beta": parts.confirmed[0][0].copy(), "covariance": parts.confirmed[0][1].copy()},
+        "confirmed1": {"beta": parts.confirmed[1][0].copy(), "covariance": parts.confirmed[1][1].copy()},
+    }
+    state = joined(groups)
+    return state | {
+        "domain": parts.domain.copy(),
+        "point": parts.point.copy(),
+        "delay": parts.delay.array(),
+        "frozen": frozen,
+        "rail_s": parts.rail_s,
+        "railed": parts.railed,
+        "left_s": parts.left_s,
+        "left": parts.left,
+        "alone": parts.alone,
+        "mark_ages": np.array(parts.mark_ages),
+        "confirmed_ages": np.array(parts.confirmed_ages),
+    }
+
+
+def _restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool]:
+    """Inverse of ``state_of``. Raises ModelFileError where entries are missing or do not fit together."""
+    try:
+        base = LssvmInverse.from_state(under("base.", state))
+        config = LearnerConfig.from_state(under("config.", state))
+        parts = Parts(base, config)
+        parts.intake.restore(under("front.", state))
+        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, under("filter.", state))
+        parts.window.restore(under("window.", state))
+        parts.rest = RestCreep.from_state(under("rest.", state))
+        parts.judgement = Judgement.from_state(under("judgement.", state))
+        parts.counters |= {key: int(value) for key, value in under("counters.", state).items()}
+        parts.events |= {key: int(value) for key, value in under("events.", state).items()}
+        parts.domain = np.array(state["domain"], dtype=np.float64)
+        parts.point = np.array(state["point"], dtype=np.float64)
+        parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
+        parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
+        parts.alone = bool(state.get("alone", False))
+        parts.mark_ages, parts.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
+        parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
+        names = ("mark", "next_mark", "jump_mark")
+        parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
+        proven = under("proven_mark.", state)
+        parts.proven_mark = _mark(proven) if proven else parts.jump_mark
+        kept = [under(f"confirmed{i}.", state) for i in range(2)]
+        parts.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (parts.mark, parts.next_mark)
+        return base, config, parts, bool(state["frozen"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(
+            f"learner state: entry missing or damaged: {error}; start from the model instead"
+        ) from error
+
+
+def _ages(values: object) -> tuple[int, int]:
+    """Two counts; a state from before there were any knows none."""
+    first, second = (0, 0) if values is None else np.asarray(values).tolist()
+    return int(first), int(second)
+
+
+def _mark(values: StateDict) -> Mark:
+    """A mark of the drift filter from its entries."""
+    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)

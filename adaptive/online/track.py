@@ -1,4 +1,4 @@
-"""Where the stage is and has been: fixed-lag smoother, the last voltages and readings, frame and hysteresis memory."""
+"""Track of the stage: fixed-lag smoother, the last voltages and readings, frame and hysteresis memory."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Motion = tuple[float, float, float]
 
 
 class Step(NamedTuple):
-    """One step of the smoother: reading, µm, voltage applied from then on, V, and whether it is a good reading.
+    """One step of the smoother: reading, µm, voltage applied from then on, V, and whether the reading is good.
 
-    Where it is none, ``y_um`` is where the stage must have been.
+    Where it is not, ``y_um`` is the reckoned place.
     """
 
     y_um: float
@@ -29,10 +29,10 @@ class Step(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """What one instant can teach: its number, smoothed motion (µm, µm/s, µm/s²), its voltage and the one before, V.
+    """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), its voltage and the one before, V.
 
-    good : whether the readings at that instant and before it were. near_bad : whether one that the smoother has looked
-    at for it was not.
+    good : whether the readings at that instant and before it are good. near_bad : whether the smoother has used a bad
+    reading for it.
     """
 
     now: int
@@ -46,11 +46,11 @@ class Pair(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What a sample came to: the gate that refused it or "", and the steps to make.
+    """Result of the intake of a sample: the gate that refused it or "", and the steps to make.
 
-    jump_um : by how much the frame has moved, µm. first : whether no other jump is open before this one. undone :
-    whether it has gone back to where it was, and what was learnt since is to be forgotten. distrusted : whether the
-    readings are on trial from now on; renamed : whether what is wrong with them has got another name, or none.
+    jump_um : move of the frame, µm. first : whether no other unconfirmed jump is open. undone : whether a jump was
+    taken back, so that everything learnt since is to be forgotten. distrusted : whether the readings are on trial from
+    now on; renamed : whether the name of the sensor fault has changed.
     """
 
     refused: str
@@ -64,7 +64,7 @@ class Taken(NamedTuple):
 
 @dataclass(slots=True)
 class Past:
-    """A place that the stage is known to have been at, and the voltages since: reckoning can begin from there.
+    """A known place of the stage, and the voltages since: dead reckoning can start from it.
 
     motion, u_before_V, lag_V, lag_um : as ``Track.since_motion`` gives them. memory : (m,) of that instant.
     u_V : voltages since.

@@ -1,8 +1,7 @@
-"""How good the served model is: prediction errors at the age at which it is served, and what follows from them.
+"""Validity of the served model, from its prediction errors.
 
-A model is judged by the voltage that it would have given for the motion that was measured, before that sample
-taught it anything, and as old as an answer is when it takes effect. The frozen model that it started from is judged
-beside it.
+The error is the measured voltage minus the voltage that the model gives for the measured motion, before the sample is
+learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ import numpy as np
 
 from adaptive.types import FloatArray, StateDict
 
-#: Time constants of the mean square errors, s: one to report and state uncertainty by, one to notice trouble by.
+#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
 LONG_S, SHORT_S = 2.0, 0.1
 
-#: The frozen model is served where the learner's short-term error is this many times its own, and a floor more.
+#: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
 FALLBACK_RATIO = 1.3
 
 
@@ -26,10 +25,10 @@ FALLBACK_RATIO = 1.3
 class Judgement:
     """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model.
 
-    error_V : the last of the learner. judged : how many. valid : whether the learner vouches for its model.
-    inside : how many errors lay within one stated standard deviation.
-    fallback : whether the frozen model is served, because it predicts better; fallen_s : for how long, s.
-    doubt_V2 : variance that no error has shown yet, after a jump whose cause is open; fades as errors are seen.
+    error_V : the learner's last error. judged : number of errors. valid : whether the learnt model is valid.
+    inside : number of errors within one stated standard deviation.
+    fallback : whether the frozen model is served because it predicts better; fallen_s : for how long, s.
+    doubt_V2 : extra variance after a jump whose cause is open; it decays as errors are seen.
     """
 
     long_V2: float
@@ -45,7 +44,7 @@ class Judgement:
     doubt_V2: float = 0.0
 
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
-        """One error of each."""
+        """Take one error of the learnt and of the frozen model, V."""
         squared = error_V * error_V
         slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
         if self.judged > 0 and squared <= self.variance_V2:
@@ -60,7 +59,7 @@ class Judgement:
         self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
 
     def decide(self, enter_V: float, leave_V: float) -> bool:
-        """Validity with hysteresis: left when the short-term rms exceeds ``leave_V``, entered below ``enter_V``."""
+        """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
         rms = sqrt(self.short_V2)
         if self.valid and rms > leave_V:
             self.valid = False
@@ -69,7 +68,7 @@ class Judgement:
         return self.valid
 
     def choose(self, floor_V: float, step_s: float) -> bool:
-        """Whether to serve the frozen model: it must win clearly to be taken, and lose to be left."""
+        """Whether to serve the frozen model: taken when clearly better, left when worse."""
         learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
         if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
             self.fallback = True
@@ -80,7 +79,7 @@ class Judgement:
 
     @property
     def variance_V2(self) -> float:
-        """What an answer's uncertainty is stated from: the worse of long and short term, and doubt."""
+        """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
         return max(self.long_V2, self.short_V2) + self.doubt_V2
 
     def state_dict(self) -> StateDict:
@@ -104,7 +103,7 @@ class Judgement:
 
 
 class Delay:
-    """The last ``steps`` + 1 vectors of a model, so that errors are of the model as it was ``steps`` ago."""
+    """The last ``steps`` + 1 coefficient vectors: errors are those of the model as it was ``steps`` ago."""
 
     def __init__(self, steps: int) -> None:
         self._past: deque[FloatArray] = deque(maxlen=steps + 1)
@@ -120,7 +119,7 @@ class Delay:
             vector[0] += by
 
     def array(self) -> FloatArray:
-        """All kept, oldest first, for a state file."""
+        """All vectors, oldest first, for a state file."""
         return np.array(self._past, dtype=np.float64)
 
     def restore(self, vectors: FloatArray) -> None:

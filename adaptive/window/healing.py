@@ -1,7 +1,7 @@
-"""Healing a window at work: its factor is made anew in a thread, and swapped in a fixed number of steps later.
+"""Healing a window at work: a thread makes a new factorisation, which is swapped in a fixed number of steps later.
 
-What was refused, and how often, does not depend on how fast the thread was: where it is not ready by then it is waited
-for. So a replay, a copy and a window restored from its state all go on with the same numbers to the last bit.
+The result does not depend on the speed of the thread: where it is not ready in time, the stepping thread waits for it.
+A replay, a copy and a window restored from its state continue with the same numbers to the last bit.
 """
 
 from __future__ import annotations
@@ -17,20 +17,17 @@ from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.window import Window
 
-# --- Refreshing a window's factorisation beside its work: begin, factor elsewhere, catch up, swap.
-#
-# A refresh costs O(N³), some hundred steps' worth. It is split in three: `begin` copies the state (on the
-# stepping thread, O(N²)), `Refresh.factor` does the work on any thread without the interpreter's lock, `finish`
-# (again on the stepping thread) carries over what was learnt meanwhile, one ordinary step a changed slot, and
-# swaps the arrays in. What comes of it depends on when it was begun and finished, not on when the factor was ready.
+# --- A refresh costs O(N³), as much as some hundred steps. It has three parts: `begin` copies the state (stepping
+# thread, O(N²)), `Refresh.factor` factors the copy (any thread, without the interpreter's lock), `Refresh.finish`
+# applies the steps made meanwhile, one for each changed slot, and swaps the arrays in (stepping thread).
 
 
-#: What a factorisation is made from; factoring does not write to these.
+#: Arrays that a factorisation reads and does not write.
 _FIELDS = ("R", "X", "scaled")
 
 
 class Refresh:
-    """One refresh under way. ``form`` : of the new factorisation, that of the window unless given."""
+    """A refresh in progress. ``form`` : of the new factorisation; that of the window unless given."""
 
     def __init__(self, window: Window, form: int | None = None) -> None:
         self._source = window
@@ -47,7 +44,7 @@ class Refresh:
 
     @property
     def factored(self) -> bool:
-        """Whether `factor` has done its work."""
+        """Whether `factor` has succeeded."""
         return self._factored
 
     def changed_slots(self) -> IntArray:
@@ -61,8 +58,7 @@ class Refresh:
 
         Returns
         -------
-        False where nothing was swapped: not factored yet, slots removed or the form changed since, or a step of the
-        catch-up refused.
+        False where nothing was swapped: not factored yet, the form changed since, or a step of the catch-up refused.
         """
         n, source, copy = len(self._source), self._source.arrays, self._copy
         if not self._factored or source.C[ws.FORM] != self._form:
@@ -85,7 +81,7 @@ class Refresh:
         return True
 
     def state_dict(self) -> StateDict:
-        """What the factorisation is made from, as it was at the beginning; while `factor` runs, too."""
+        """The input of the factorisation, as it was at the beginning. May be called while `factor` runs."""
         A = self._copy.arrays
         fields = {name: getattr(A, name).copy() for name in _FIELDS}
         samples = {"y": A.V[ws.Y].copy(), "w": A.V[ws.W].copy()}
@@ -93,7 +89,7 @@ class Refresh:
 
     @classmethod
     def from_state(cls, window: Window, state: StateDict) -> Refresh:
-        """The refresh of ``window`` that a ``state_dict`` is of; its factor, made again, comes out the same."""
+        """Inverse of ``state_dict``, for ``window``. The factor has to be made again; it comes out the same."""
         made = cls(window, int(state["new_form"]))
         A = made._copy.arrays
         for name in _FIELDS:
@@ -105,19 +101,19 @@ class Refresh:
 
 
 def begin(window: Window, form: int | None = None) -> Refresh:
-    """Start refreshing ``window``, which may go on stepping. Raises NumericsError while it is empty."""
+    """Start refreshing ``window``, which may continue to step. Raises NumericsError while it is empty."""
     if len(window) == 0:
         raise NumericsError("refresh: the window is empty, there is nothing to factor; wait for samples")
     return Refresh(window, form)
 
 
-#: Steps from the refusal that shows a window worn out to the swap. At 100 a second a third of a second: ten times what
-#: factoring 500 samples takes, and catching up with as many steps costs no more than a fifth of that.
+#: Steps from the refusal that begins a refresh to the swap. At 100 steps a second this is a third of a second, ten
+#: times the time to factor 500 samples; to catch up costs at most a fifth of a factorisation.
 STEPS = 32
 
 
 class Healing:
-    """At most one refresh of one window; see the module. Not for two threads at a time."""
+    """At most one refresh of one window. Owns the thread ``window-healing``. Not for two threads at a time."""
 
     def __init__(self, window: Window) -> None:
         self._window = window
@@ -127,17 +123,17 @@ class Healing:
 
     @property
     def open(self) -> bool:
-        """Whether a refresh is under way."""
+        """Whether a refresh is in progress."""
         return self._refresh is not None
 
     def begin(self) -> None:
-        """Start one, unless one is under way; of a window that holds samples."""
+        """Start a refresh unless one is in progress. The window must hold samples."""
         if self._refresh is None:
             self._refresh, self._left = begin(self._window, self._window.form_called_for()), STEPS
             self._start()
 
     def step(self) -> None:
-        """Before each step of the window: swap in what is due. Where that does not fit, heal in line."""
+        """Call before each step of the window: swap in the refresh that is due. Where that fails, heal in line."""
         if self._refresh is None:
             return
         self._left -= 1
@@ -161,17 +157,17 @@ class Healing:
         self._thread = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # A thread is of one process: a copy has the factor itself.
+        # Threads are not copied: wait, so that the copy has the factor.
         self._wait()
         return self.__dict__.copy()
 
     def state_dict(self) -> StateDict:
-        """Flat; empty where nothing is under way. The thread is not waited for."""
+        """Flat; empty where no refresh is in progress. Does not wait for the thread."""
         return {} if self._refresh is None else {"left": self._left, **self._refresh.state_dict()}
 
     @classmethod
     def from_state(cls, window: Window, state: StateDict) -> Healing:
-        """Goes on where ``state_dict`` was taken, with the same result to the last bit."""
+        """Inverse of ``state_dict``: continues with the same result to the last bit."""
         made = cls(window)
         if state:
             made._left, made._refresh = int(state["left"]), Refresh.from_state(window, state)
@@ -183,4 +179,4 @@ def _factor(refresh: Refresh) -> None:
     try:
         refresh.factor()
     except NumericsError:
-        return  # it stays unfactored, and `finish` says so
+        return  # `Refresh.finish` returns False then.

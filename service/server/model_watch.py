@@ -28,7 +28,7 @@ import numpy as np
 
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
-from adaptive.online.sensor_trial import SENSOR_FAULTS
+from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray, InverseModel
 from service.answers.guard import Limits
 

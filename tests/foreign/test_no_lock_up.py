@@ -31,7 +31,7 @@ from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from adaptive.online.sensor_trial import SENSOR_FAULTS
+from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray
 from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
 from lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, MessageLine

@@ -26,7 +26,7 @@ def voltage(seconds: float) -> FloatArray:
 
 
 def begun(learner: Learner) -> Reckoning:
-    track = learner.parts.front.track
+    track = learner.parts.intake.track
     assert track is not None
     motion, u_before_V, u_V, y_um = track.since_motion()
     return Reckoning.begin(learner.snapshot(), motion, u_before_V, u_V, y_um, track.memory)

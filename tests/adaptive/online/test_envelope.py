@@ -16,7 +16,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.envelope import EnvelopeConfig
 from adaptive.online.gates import AdmissionConfig
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL, Learner
-from adaptive.online.sensor_trial import OUT_OF_ENVELOPE, SENSOR_GAIN
+from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
 from adaptive.types import FloatArray, Sample, StateDict
 from sim.stage.presets import preset
 from sim.stage.stage import Stage

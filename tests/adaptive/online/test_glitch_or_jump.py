@@ -269,7 +269,7 @@ def test_a_knock_is_waited_for_and_teaches_nothing(
     for k in range(at, at + 900):
         updates = learner.parts.filter.state.updates
         said += feed(learner, knocked, k, k + 1)
-        if learner.parts.front.holds:
+        if learner.parts.intake.holds:
             assert learner.parts.filter.state.updates == updates
             assert said[-1] in HELD
         assert learner.trouble == ""
@@ -436,7 +436,7 @@ def test_state_goes_on_to_the_last_bit_while_it_rings(
     one = Learner.from_state(slow_states[at])
     said = feed(one, knocked, at, at + at_ms)
     assert said[-1] in HELD
-    assert one.parts.front.holds
+    assert one.parts.intake.holds
     assert_goes_on(one, knocked, at + at_ms, at + 700)
 
 
@@ -449,7 +449,7 @@ def test_state_goes_on_to_the_last_bit_while_it_rings_about_a_new_level(
     one = Learner.from_state(slow_states[at])
     feed(one, (u, y), at, at + 30)
     assert events(one, slow_states[at])["jumps"] == 1
-    assert one.parts.front.holds
+    assert one.parts.intake.holds
     assert_goes_on(one, (u, y), at + 30, at + 700)
 
 
@@ -465,7 +465,7 @@ def test_state_goes_on_to_the_last_bit_while_readings_are_on_trial(
     feed(one, (u, y), at, at + 400)
     assert events(one, fast_states[at])["trials"] >= 1
     assert one.trouble
-    assert one.parts.front.holds
+    assert one.parts.intake.holds
     assert_goes_on(one, (u, y), at + 400, at + 1500)
 
 

@@ -246,7 +246,7 @@ def test_a_rollback_takes_the_estimate_back_and_not_the_place(
     assert not np.array_equal(after, model.beta)
     assert np.abs(before - after).max() > 1e-4 * model.span_V
     # The place is that of one that learns nothing, but for what their models reckon differently.
-    mine, its = learner.parts.front.track, bystander.parts.front.track
+    mine, its = learner.parts.intake.track, bystander.parts.intake.track
     assert mine is not None
     assert its is not None
     assert learner.seq == bystander.seq == k

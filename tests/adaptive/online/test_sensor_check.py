@@ -8,7 +8,15 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from adaptive.online.sensor_check import CREEP_PER_S, OF_VOLTAGE, SLOPES, STEP_S, STEP_SIGMA, STILL_STEPS, Following
+from adaptive.online.sensor_trust import (
+    CREEP_PER_S,
+    FOLLOWING_SLOPES,
+    OF_VOLTAGE,
+    STEP_S,
+    STEP_SIGMA,
+    STILL_STEPS,
+    Following,
+)
 from adaptive.types import FloatArray
 
 SPAN_V = 10.0
@@ -33,7 +41,7 @@ def first(said: list[bool]) -> int:
     return said.index(True) if True in said else -1
 
 
-@pytest.mark.parametrize("slope", [1.05 * SLOPES[0], 0.9, 1.0, 1.35, 0.95 * SLOPES[1]])
+@pytest.mark.parametrize("slope", [1.05 * FOLLOWING_SLOPES[0], 0.9, 1.0, 1.35, 0.95 * FOLLOWING_SLOPES[1]])
 @pytest.mark.parametrize("offset_V", [0.0, -6.0])
 def test_a_sensor_that_follows_is_no_fault(slope: float, offset_V: float) -> None:
     """Whatever its offset, and with a gain that a stage and a model of another amplitude may have."""
@@ -51,10 +59,10 @@ def test_hysteresis_and_turning_points_are_no_fault() -> None:
     assert not any(asked(Following(), u, p))
 
 
-@pytest.mark.parametrize("slope", [-1.0, -0.3, 0.02, 0.3, 0.8 * SLOPES[0], 1.3 * SLOPES[1], 5.0])
+@pytest.mark.parametrize("slope", [-1.0, -0.3, 0.02, 0.3, 0.8 * FOLLOWING_SLOPES[0], 1.3 * FOLLOWING_SLOPES[1], 5.0])
 def test_another_slope_or_sign_is_a_fault_within_a_tenth_of_the_span(slope: float) -> None:
     u = np.linspace(2.0, 8.0, 600)
-    assert not SLOPES[0] <= slope <= SLOPES[1]
+    assert not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
     following = Following()
     said = asked(following, u, slope * u)
     assert first(said) > 0
@@ -98,7 +106,7 @@ def test_readings_that_go_too_far_and_not_at_all_in_turns_are_a_fault() -> None:
     straight = []
     for a, b in zip(u, p, strict=True):
         fault = following.take(float(a), float(b), SPAN_V, STEP_S)
-        if following.uu > 0.0 and SLOPES[0] < following.up / following.uu < SLOPES[1]:
+        if following.uu > 0.0 and FOLLOWING_SLOPES[0] < following.up / following.uu < FOLLOWING_SLOPES[1]:
             straight.append(fault)
     assert any(straight)
 

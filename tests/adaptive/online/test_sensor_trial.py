@@ -18,7 +18,7 @@ from adaptive.online.envelope import EnvelopeConfig
 from adaptive.online.gates import AdmissionConfig
 from adaptive.online.glitch_or_jump import Circumstances
 from adaptive.online.learner import Learner
-from adaptive.online.sensor_trial import (
+from adaptive.online.sensor_trust import (
     LOOKS,
     SENSOR_FAULTS,
     SENSOR_FOREIGN,
@@ -150,7 +150,7 @@ def test_a_fault_has_its_name_teaches_nothing_and_good_readings_lead_back(
                 named = k - at if named < 0 else named
                 assert learner.trouble in FAULTS[fault]
             # From the moment on at which the readings are distrusted; that is looked at now and then.
-            if learner.parts.front.trials > before["trials"] and (not kept or k % EVERY == 0):
+            if learner.parts.intake.trials > before["trials"] and (not kept or k % EVERY == 0):
                 kept = kept or learnt(learner)
                 assert learnt(learner) == kept
         assert learnt(learner) == kept
@@ -341,7 +341,7 @@ def begun(model: LssvmInverse, recording: Recording, at: int, off_um: float = 0.
     """A trial that begins at ``at``, from where the stage then is, or with a place that is off by so much."""
     learner = Learner.from_model(model)
     feed(learner, recording, 0, at)
-    track = learner.parts.front.track
+    track = learner.parts.intake.track
     assert track is not None
     (y, v, a), u_before_V, u_V, y_um = track.since_motion()
     reckoning = Reckoning.begin(model, (y + off_um, v, a), u_before_V, u_V, y_um + off_um, track.memory)

@@ -152,7 +152,7 @@ def test_the_memory_to_serve_with_is_the_one_that_was_learnt_with(
         # The smallest play is at most its threshold away from where the stage is in the frame that is served.
         frame = served.features
         place = (y[stop - 1] - frame.offset_um) / frame.gain
-        if not learner.parts.front.holds:
+        if not learner.parts.intake.holds:
             assert abs(own[0] - place) <= frame.thresholds_um[0] + 1e-9
         np.testing.assert_allclose(own[5:20], learner.memory()[5:20], atol=3.0)
     # The frozen model, which fallback serves, knows of no jump.

@@ -342,7 +342,7 @@ def test_one_that_knows_its_own_memory_is_judged_by_it() -> None:
     compared = 0
     for k in range(3000):
         model.handle(Sample(k, k * DT, float(u[k]), float(y[k])))
-        if k % model.config.block == 0 and k > 2000 and not learner.parts.front.holds:
+        if k % model.config.block == 0 and k > 2000 and not learner.parts.intake.holds:
             compared += 1
             np.testing.assert_array_equal(model.judge.scores[0].memory, learner.memory())
     assert compared > 20

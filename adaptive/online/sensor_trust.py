@@ -1,24 +1,30 @@
-"""A sensor that has lost its trust, and how it earns it back: its readings must follow the drive.
+"""Trust in the sensor: does it follow the drive, and what is wrong with it where it does not?
 
-While readings are on trial they teach nothing and move no frame. Dead reckoning carries the hysteresis memory on, and
-the readings y are compared with the places x that it gives, over a window of ``envelope.follow_s`` of motion:
+**All the time** `Following` compares readings with the drive. A sensor that sticks with some noise, or whose gain
+creeps away, does not surprise the smoother. So the identified model gives the voltage p for the motion that was read,
+and the steps of p are compared with the steps of the applied voltage u. A step ends when one of the two has moved far
+enough, beyond the noise that readings cause in p. All steps count alike, whatever their size. A fault shows as readings
+that stand still in several steps in a row, as a slope p/u that no stage has, or as steps that do not lie on a line.
 
-    y = slope x + constant, share = what of the variance of y this explains
+**On trial** (`Trial`) readings teach nothing and move no frame. Dead reckoning carries the hysteresis memory on. The
+readings y are compared with the reckoned places x over a window of ``envelope.follow_s`` of motion:
 
-- share near 1 and a slope that a stage can have: the sensor follows. Slope and constant say how the frame has changed.
+    y = slope x + constant, share = share of the variance of y that this explains
+
+- share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
 - readings that hardly vary: ``sensor_stuck``; a negative slope: ``sensor_sign``; another slope: ``sensor_gain``; no
-  straight line at all: ``sensor_foreign``. The name is told once it was found in ``NAMED`` looks in a row.
-- a stage at rest shows nothing, except that a reading is where it was before.
+  straight line: ``sensor_foreign``. The fault is named when ``NAMED`` looks in a row have found it.
+- a stage at rest shows only whether a reading is where it was before.
 
-A reckoning that is wrong must not shut out a good sensor. So the identified model is asked for the voltage p of the
-readings too: where p follows the applied voltage u, no fault is named, and after ``OBEYED`` windows the readings are
-trusted whatever the reckoning says.
+A wrong reckoning must not shut out a good sensor. The identified model is therefore asked for the voltage p of the
+readings here too: where p follows the applied voltage u, no fault is named, and after ``OBEYED`` windows the readings
+are trusted whatever the reckoning says.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -29,6 +35,115 @@ from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, slope_of, tolerance_um
 from adaptive.state_codec import prefixed, under
 from adaptive.types import FloatArray, StateDict
+
+# --- All the time.
+
+#: Size of a step: this share of the voltage span, and this many times the noise of p.
+STEP_SHARE, STEP_SIGMA = 0.004, 8.0
+#: Pairs over which that noise is averaged.
+NOISE_PAIRS = 250
+#: Shortest time of a step, s: over it, ringing of the stage is small compared with the motion.
+STEP_S = 0.01
+#: Forgetting factor of a step; fewest steps for a decision; share of the steps in which the voltage must have moved.
+FORGET, ENOUGH, OF_VOLTAGE = 0.9, 3.4, 0.7
+#: A voltage slower than this share of the span a second may only hold a creeping stage in place.
+CREEP_PER_S = 0.05
+#: Fewest steps for a decision by the slope.
+ENOUGH_SLOPE = 6.0
+#: Slopes that a stage can have, hysteresis and a wrong model included, and the smallest squared correlation.
+FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
+#: A reading that moves by less than this share of the voltage's step stands still; number of such steps for a fault.
+STEP_STILL, STILL_STEPS = 0.2, 4
+#: Good steps after which the readings so far are confirmed to have followed.
+CONFIRMED = 10
+
+
+@dataclass(slots=True)
+class Following:
+    """Check of readings that raise no surprise: sums over the last steps, each a vector (u, p) whose larger part is 1.
+
+    u_V, p_V, steps : voltage and answer of the model at the end of the last step, and number of pairs since.
+    count, driven : number of steps, and of those in which the voltage moved, with forgetting as in the sums uu, pp, up.
+    good, still : steps in a row in which the readings followed, and stood still.
+    last_V, noise2 : last p - u, V, and mean square change of it from one pair to the next, V².
+    """
+
+    u_V: float = math.nan
+    p_V: float = math.nan
+    steps: int = 0
+    count: float = 0.0
+    driven: float = 0.0
+    uu: float = 0.0
+    pp: float = 0.0
+    up: float = 0.0
+    good: int = 0
+    still: int = 0
+    last_V: float = math.nan
+    noise2: float = 0.0
+
+    def forget(self) -> None:
+        """Start again without history."""
+        self.u_V = self.p_V = math.nan
+        self.last_V = math.nan
+        self.steps = self.good = self.still = 0
+        self.count = self.driven = self.uu = self.pp = self.up = 0.0
+
+    def take(self, u_V: float, p_V: float, span_V: float, dt_s: float) -> bool:
+        """Take one pair: the voltage, and the model's voltage for the reading. Returns whether a fault shows.
+
+        ``span_V`` : range of the drive, V. ``dt_s`` : time between two pairs, s.
+        """
+        self.steps += 1
+        change_V, self.last_V = p_V - u_V - self.last_V, p_V - u_V
+        if not math.isnan(change_V):
+            self.noise2 += (min(change_V * change_V, 16.0 * self.noise2 + (STEP_SHARE * span_V) ** 2) - self.noise2) / (
+                NOISE_PAIRS
+            )
+        step_V = max(STEP_SHARE * span_V, STEP_SIGMA * math.sqrt(self.noise2))
+        du, dp = u_V - self.u_V, p_V - self.p_V
+        if math.isnan(du) or math.isnan(dp):
+            self.u_V, self.p_V, self.steps = u_V, p_V, 0
+            return False
+        size = max(abs(du), abs(dp))
+        if size < step_V or self.steps * dt_s < STEP_S:
+            return False
+        slow = size < CREEP_PER_S * span_V * self.steps * dt_s
+        self.u_V, self.p_V, self.steps = u_V, p_V, 0
+        if slow:
+            return False
+        u, p = du / size, dp / size
+        self.still = self.still + 1 if abs(p) <= STEP_STILL * abs(u) else 0
+        self.count = FORGET * self.count + 1.0
+        self.uu = FORGET * self.uu + u * u
+        self.pp = FORGET * self.pp + p * p
+        self.up = FORGET * self.up + u * p
+        # Readings that move without the voltage are handled as glitch or jump.
+        self.driven = FORGET * self.driven + (abs(u) >= STEP_STILL)
+        if self.count < ENOUGH or self.driven < OF_VOLTAGE * self.count:
+            return False
+        fault = self._fault()
+        self.good = 0 if fault else self.good + 1
+        return fault or self.still >= STILL_STEPS
+
+    def _fault(self) -> bool:
+        slope, straight = self.up / self.uu, self.up * self.up / (self.uu * self.pp) if self.pp > 0.0 else 0.0
+        if straight < FOLLOWING_STRAIGHT:
+            # More motion than the drive explains: something else moves the stage, the sensor is not at fault.
+            return self.pp <= FOLLOWING_SLOPES[1] ** 2 * self.uu
+        return self.count >= ENOUGH_SLOPE and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
+
+    def state_dict(self) -> StateDict:
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Following:
+        """Inverse of ``state_dict``; older states have no entries: start without history."""
+        if not values:
+            return cls()
+        return cls(**{name: type(value)(values[name]) for name, value in asdict(cls()).items()})
+
+
+# --- On trial.
 
 SENSOR_STUCK = "sensor_stuck"
 SENSOR_SIGN = "sensor_sign"

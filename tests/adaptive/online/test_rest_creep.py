@@ -11,7 +11,7 @@ import pytest
 from adaptive.errors import ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
-from adaptive.online.creep import Rest
+from adaptive.online.drift import RestCreep
 from adaptive.online.learner import Learner
 from adaptive.types import Sample
 from sim.stage.presets import preset
@@ -21,7 +21,7 @@ DT = 1e-3
 STEP_S = 2e-3
 
 
-def after(rest: Rest, steps: int, gained_V: float, creep_s: float = 0.1) -> float:
+def after(rest: RestCreep, steps: int, gained_V: float, creep_s: float = 0.1) -> float:
     """By how much the frame has moved, µm, after so many steps with a constant that has gained so much."""
     rest.shift_um(1.0, 5.0, 8.0, 80.0, STEP_S, creep_s)
     return sum(rest.shift_um(1.0 + gained_V, 5.0, 8.0, 80.0, STEP_S, creep_s) for _ in range(steps))
@@ -29,22 +29,22 @@ def after(rest: Rest, steps: int, gained_V: float, creep_s: float = 0.1) -> floa
 
 def test_a_stage_that_needs_more_voltage_has_crept_back() -> None:
     # 1 mV more at 10 µm/V are 10 nm; every tenth step takes a fifth of what is left to the frame.
-    assert after(Rest(), 9, 1e-3) == pytest.approx(-0.2 * 0.01)
-    assert after(Rest(), 19, 1e-3) == pytest.approx(-0.4 * 0.01)
+    assert after(RestCreep(), 9, 1e-3) == pytest.approx(-0.2 * 0.01)
+    assert after(RestCreep(), 19, 1e-3) == pytest.approx(-0.4 * 0.01)
 
 
 def test_it_moves_no_faster_than_a_stage_creeps() -> None:
-    moved_um = after(Rest(), 499, 5.0)
+    moved_um = after(RestCreep(), 499, 5.0)
     assert moved_um == pytest.approx(-0.02 * 80.0, rel=1e-9), "one second at 2 % of the range"
 
 
 def test_nothing_moves_where_it_is_switched_off_or_before_anything_was_gained() -> None:
-    assert after(Rest(), 100, 1e-3, creep_s=0.0) == 0.0
-    assert after(Rest(), 100, 0.0) == 0.0
+    assert after(RestCreep(), 100, 1e-3, creep_s=0.0) == 0.0
+    assert after(RestCreep(), 100, 0.0) == 0.0
 
 
 def test_a_voltage_that_goes_on_holds_no_stage_in_place() -> None:
-    stuck, still = Rest(), Rest()
+    stuck, still = RestCreep(), RestCreep()
     # 8 V in 4 s under a reading that does not change, and a hundredth of that.
     moved = [sum(r.shift_um(1.0 + 0.01 * k, 2.0 + v * k, 8.0, 80.0, STEP_S, 0.1) for k in range(400))
              for r, v in ((stuck, 4e-3), (still, 4e-5))]  # fmt: skip
@@ -53,7 +53,7 @@ def test_a_voltage_that_goes_on_holds_no_stage_in_place() -> None:
 
 
 def test_a_new_rest_begins_from_the_constant_that_it_finds() -> None:
-    rest = Rest()
+    rest = RestCreep()
     after(rest, 50, 1e-3)
     rest.leave()
     assert isnan(rest.constant_V)
@@ -61,15 +61,15 @@ def test_a_new_rest_begins_from_the_constant_that_it_finds() -> None:
 
 
 def test_its_state_goes_on_and_damage_is_named() -> None:
-    rest = Rest()
+    rest = RestCreep()
     after(rest, 13, 1e-3)
-    again = Rest.from_state(rest.state_dict())
+    again = RestCreep.from_state(rest.state_dict())
     one, other = ([r.shift_um(1.002, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(20)] for r in (rest, again))
     assert one == other
     assert sum(one) < 0.0
-    assert isnan(Rest.from_state({}).constant_V), "a state from before there was any"
+    assert isnan(RestCreep.from_state({}).constant_V), "a state from before there was any"
     with pytest.raises(ModelFileError, match="rest"):
-        Rest.from_state({"constant_V": 1.0, "steps": 3})
+        RestCreep.from_state({"constant_V": 1.0, "steps": 3})
 
 
 def rested(model: LssvmInverse, config: LearnerConfig, hold_s: float) -> tuple[float, Learner]:
