@@ -1,20 +1,20 @@
-"""Dead reckoning: where the stage must be, from the voltage alone. The inverse model is solved for the displacement.
+"""Dead reckoning: the place of the stage from the voltage alone, by solving the inverse model for the displacement.
 
-While readings are in doubt, the smoother's extrapolation is off by micrometres within ten samples. The inverse model is
-not: at each sample the displacement is sought at which it asks for the applied voltage; the hysteresis memory goes
-along. The model's own error is taken away where the reckoning begins, so only its change from then on counts.
+While readings are not trusted, extrapolation by the smoother is wrong by micrometres within ten samples. Dead reckoning
+instead solves, at each sample, for the displacement at which the inverse model gives the applied voltage, and advances
+the hysteresis memory. The model's error at the start is subtracted, so that only its change from then on counts.
 
-Why it cannot run off, for any model:
+Why the place cannot diverge, for any model:
 
-- The velocity that the model sees is no free unknown. Where voltage rises with velocity (a lag), it is the backward
+- The velocity is not a free unknown. Where voltage rises with velocity (a lag), it is the backward
   difference of the displacement: an implicit Euler step, which is stable. Where voltage falls with velocity, that
   recursion would be unstable; there the velocity follows from the change of the voltage itself, which is no recursion.
-- A step of the displacement answers a change of the voltage by a slope within ``SLOPES`` times the mean one. Summed
-  from the start this gives a band, and the place is held to it.
+- A change of the voltage moves the stage by a slope within ``SLOPES`` times the mean one. Summed from the start this
+  gives a band that limits the place.
 - The place stays within ``OFF_LINE`` ranges of a straight line through the start, of the model's mean slope.
 
-What the band and the line cut off is counted as uncertainty, and with it the way gone. Beyond ``LOST_SHARE`` of the
-range the reckoning is lost and says so; who asks then holds frame and last velocity, and begins anew at a reading.
+The uncertainty grows with the way gone and with what the band and the line cut off. Beyond ``LOST_SHARE`` of the range
+the reckoning is `lost`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _Y, _V, _A, _U, _LOW, _HIGH, _WAY, _CUT, _OFF, _SLOPE, _LINE = range(11)
 
 @dataclass(slots=True)
 class Reckoning:
-    """A place carried on by a model that stays as it was at the start.
+    """A reckoned place, and the fixed model that reckons it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Reckoning:
         return made
 
     def begin_way(self) -> None:
-        """The doubt begins here: readings up to here, or the model over the voltages up to here, are believed."""
+        """Set the way gone to zero: everything up to here is trusted."""
         self.numbers[[_WAY, _CUT]] = 0.0
 
     @property
@@ -106,7 +106,7 @@ class Reckoning:
 
     @property
     def y_um(self) -> float:
-        """Where a reading must be at the last sample, µm."""
+        """Expected reading at the last sample, µm."""
         return float(self.numbers[_Y] + self.numbers[_OFF])
 
     @property
@@ -118,7 +118,7 @@ class Reckoning:
     def std_um(self) -> float:
         """One standard deviation of the place, µm: it grows with the way gone, and by what the band cut off.
 
-        The way makes it no larger than a share of the range: the voltage alone tells the place but for hysteresis.
+        The part of the way is limited to a share of the range: but for hysteresis the voltage determines the place.
         """
         most = WAY_MOST * self.range_um
         return most * (1.0 - math.exp(-WAY_SHARE * self.way_um / most)) + float(self.numbers[_CUT])
@@ -150,13 +150,13 @@ class Reckoning:
         return Reckoning(replace(self.model, features=frame), self.memory.copy(), n)
 
     def by_model(self, model: LssvmInverse) -> Reckoning:
-        """Go on by another model of the same frame. A reading must be where it had to be before the change."""
+        """Continue with another model of the same frame; the expected reading stays the same."""
         made = Reckoning(model, self.memory.copy(), self.numbers.copy())
         made.numbers[_OFF] += self.y_um - made.advance(float(self.numbers[_U]))
         return made
 
     def advance(self, u_V: float) -> float:
-        """One sample on, under the voltage ``u_V``; returns where its reading must be, µm."""
+        """Advance by one sample with the voltage ``u_V``; returns the expected reading, µm."""
         f = self.model.features
         constants, counts = self.model.packed
         _step(u_V, f.dt_s, self.range_um, self.memory, self.numbers, constants, counts)
@@ -178,7 +178,7 @@ class Reckoning:
 
 
 def drive_V(model: LssvmInverse) -> float:
-    """Voltage, V, over which a model drives its range: that of its recording, or more where it asks for more."""
+    """Voltage span of a model over its range, V; at least that of its recording."""
     low_V, high_V, _ = _ends(model)
     return max(model.span_V, abs(high_V - low_V))
 
@@ -187,12 +187,12 @@ def mean_slope(model: LssvmInverse) -> float:
     """Slope, V/µm, of the straight line through the ends of a model's range, of a size that a stage can have."""
     low_V, high_V, range_um = _ends(model)
     usual, slope = model.span_V / range_um, (high_V - low_V) / range_um
-    # A model that asks for the same voltage everywhere has at least a sign.
+    # A model with the same voltage everywhere still has a sign.
     return math.copysign(max(abs(slope), 0.5 * usual), slope)
 
 
 def answers(model: LssvmInverse) -> bool:
-    """Whether a model asks for other voltages at the two ends of its range, as a stage's inverse does."""
+    """Whether the voltages of a model at the two ends of its range differ, as those of a stage's inverse do."""
     low_V, high_V, _ = _ends(model)
     return bool(abs(high_V - low_V) > 0.3 * model.span_V)
 
@@ -242,7 +242,7 @@ def _step(
             v = du / (slope * dt)
             there = voltage_of(y, v, n[_A], memory, scratch, m, beta, scaled, alpha, inverse_widths)
         y -= (there - u) / slope
-    # The band: what this change of the voltage can have made of the place, at the least and at the most.
+    # The band: the least and the largest motion that this change of the voltage can cause.
     rises, falls = max(sign * du, 0.0), min(sign * du, 0.0)
     n[_LOW] += rises / most + falls / least
     n[_HIGH] += rises / least + falls / most

@@ -1,14 +1,13 @@
-"""Readings that surprise: a glitch, ringing after a knock, a jump for good, or nothing that a stage does?
+"""Readings far from the prediction: a glitch, ringing after a shock, a lasting jump, or a fault of the sensor?
 
-From the first surprising reading on, samples are held back and teach nothing. Dead reckoning
-(``adaptive.online.dead_reckoning``)
-goes on from before it; each reading's distance from that place is judged:
+From the first such reading on, samples are held back and not learnt. Dead reckoning continues from before it
+(``adaptive.online.dead_reckoning``). `judge` decides by the distances of the readings from the reckoned place:
 
-- back at the old level for ``CALM_S``: a glitch or a knock that is over;
-- ringing about the old level (``adaptive.online.glitch_or_jump``): motion of the stage, waited for as long as it lasts;
-- a settled new level, by distance or by ratio, within what a jump may be: a jump, if it claims no more than the
-  readings have moved, and the readings go on following the stage;
-- anything else after ``undecided_s``: the readings have lost their trust (``adaptive.online.sensor_trust``).
+- back at the old level for ``CALM_S``: a glitch or a shock that is over;
+- ringing about the old level: motion of the stage; wait until it ends;
+- settled at a new level, by a distance or by a ratio that a jump may have: a jump, if the readings have moved that far
+  and still follow the stage;
+- anything else after ``UNDECIDED_S``: the sensor goes on trial (``adaptive.online.sensor_trust``).
 """
 
 from __future__ import annotations
@@ -30,27 +29,22 @@ from adaptive.online.track import Step
 from adaptive.state_codec import prefixed, under
 from adaptive.types import BoolArray, FloatArray, StateDict
 
-# --- What a run of surprising readings is: ringing, a new level, a drift, or a sensor that does not follow the stage.
-#
-# The distances r(k) of the readings from where the stage must be (``adaptive.online.dead_reckoning``) are explained
-# in turn:
+# --- The level of a run of readings. The distances r(k) of the readings from the reckoned place are fitted by:
 #
 # - a level with ringing on it: r(k) = sum a_i r(k-i) + c + noise. A mode of the stage obeys this exactly with two
 #   coefficients, with a lag or a second mode three and four; without any it is a plain level. The level is
-#   c/(1 - sum a_i), its deviation follows from the fit's covariance. So ringing, at whatever frequency, is motion and
-#   no
-#   level: after a knock the level is zero, however large the swing.
+#   c/(1 - sum a_i), its deviation follows from the covariance of the fit. Ringing of any frequency therefore is no
+#   level: after a shock the level is zero, however large the swing.
 # - the same of the shares r(k)/place(k): a change of the gain.
 # - a straight line: a drift under way.
 #
-# The one that tells most per coefficient is taken (Bayesian information criterion). Nothing is decided from it unless
-# the
-# level is ``SIGMA`` deviations beyond what is usual, or as many within it. Measured error rates: docs/learner.md.
+# The fit with the best Bayesian information criterion is taken. It decides only where the level is ``SIGMA`` deviations
+# outside the usual distance, or as many inside. Measured error rates: docs/learner.md.
 
 
-#: Coefficients of ringing that are tried, at most.
+#: Most coefficients of ringing.
 ORDERS = 4
-#: Deviations between a level and what it is decided not to be.
+#: Deviations between a level and a limit for a decision.
 SIGMA = 5.0
 #: A recursion whose sum of coefficients is nearer to 1 than this has no level.
 NO_LEVEL = 0.05
@@ -59,7 +53,7 @@ SPARE = 4
 
 
 class Level(NamedTuple):
-    """Where readings settle.
+    """The level at which readings settle.
 
     Attributes
     ----------
@@ -155,7 +149,7 @@ class Slope(NamedTuple):
 
 
 def slope_of(x: FloatArray, y: FloatArray) -> Slope:
-    """How (n,) values ``y`` follow (n,) values ``x``; n at least 3."""
+    """Straight line of (n,) values ``y`` over (n,) values ``x``; n at least 3."""
     n = x.size
     dx, dy = x - x.mean(), y - y.mean()
     xx, xy, yy = float(dx @ dx), float(dx @ dy), float(dy @ dy)
@@ -200,7 +194,7 @@ FOLLOWING, MOTION_SHARE, SHOWN_SHARE = (0.6, 1.7), 0.004, 0.015
 
 
 class Verdict(Enum):
-    """What a held reading decides."""
+    """Decision after a held reading."""
 
     WAIT = 0
     BACK = 1
@@ -210,7 +204,7 @@ class Verdict(Enum):
 
 
 class Circumstances(NamedTuple):
-    """What the readings of a hold are judged by.
+    """Limits and units by which the readings of a hold are judged.
 
     Attributes
     ----------
@@ -236,9 +230,9 @@ class Circumstances(NamedTuple):
 
 @dataclass(slots=True)
 class Hold:
-    """Samples held back, and what is needed to judge them.
+    """Samples held back, and the quantities that judge them.
 
-    reckoning : where the stage is meanwhile. last_um : the last reading that was believed.
+    reckoning : of the place meanwhile. last_um : the last trusted reading.
     u_V, y_um, old_um : by sample: voltage, reading (NaN for none), and where it must be without any change.
     slope, shift_um : after the jumps taken so far a reading must be at slope old + shift.
     jumped : number of samples at the last of them, 0 for none. silent : number of samples at the last one without a
@@ -270,7 +264,7 @@ class Hold:
     high_um: float = 0.0
 
     def put(self, u_V: float, y_um: float) -> None:
-        """Keep one sample, and carry the place on."""
+        """Keep one sample, and advance the reckoned place."""
         old_um = self.reckoning.advance(u_V)
         if y_um == self.same_um:
             self.same += 1
@@ -290,7 +284,7 @@ class Hold:
 
     @property
     def expected_um(self) -> float:
-        """Where the last reading must be."""
+        """Expected value of the last reading, µm."""
         return self.slope * self.old_um[-1] + self.shift_um
 
     def take(self, slope: float, shift_um: float) -> None:
@@ -320,12 +314,12 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
 
 
 def is_stuck(hold: Hold, stuck_um: float) -> bool:
-    """Whether the last readings are equal although the stage has moved: no sensor that works shows that."""
+    """Whether the last readings are equal although the stage has moved: the sensor is stuck."""
     return hold.same >= REPEATED and hold.high_um - hold.low_um > SLOPES[0] * stuck_um
 
 
 def tolerance_um(now: Circumstances, reckoning: Reckoning) -> float:
-    """Distance from where it must be up to which a reading is there, µm, after the way gone since the doubt began."""
+    """Largest distance of a good reading from the reckoned place, µm; it grows with the way gone."""
     way_um = min(WAY_SHARE * reckoning.way_um, WAY_MOST * now.range_um)
     return now.usual_um + way_um + reckoning.std_um
 
@@ -337,7 +331,7 @@ def needed(config: AdmissionConfig, away_um: float, range_um: float, trusted: bo
 
 
 def judge(hold: Hold, now: Circumstances) -> Verdict:
-    """What the last sample of a hold decides. Changes what the hold has seen; for JUMP, ``level`` and ``away_um``."""
+    """Decide by the last sample of a hold. Updates the hold; for JUMP also its ``level`` and ``away_um``."""
     n = len(hold.y_um)
     away_um = hold.y_um[-1] - hold.expected_um
     if math.isnan(away_um):
@@ -357,7 +351,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         return Verdict.LOST if shown or n >= MOST_BRIDGED else Verdict.WAIT
     if hold.reckoning.lost:
         return Verdict.LOST
-    # A stage that goes where its readings do not has a sensor that is wrong: no need to wait.
+    # Readings that clearly do not follow the stage: the sensor is wrong, no need to wait.
     if n * now.dt_s >= SPAN_S and n >= 10 and not _follow(hold, min(n, round(2 * SPAN_S / now.dt_s)), now, SHOWN_SHARE):
         return Verdict.LOST
     stride = max(1, round(SPACING_S / now.dt_s))
@@ -470,8 +464,8 @@ def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SH
 def jump_after(frame: FeatureMap, at_um: float, away_um: float) -> tuple[float, float]:
     """(slope, shift in µm) of a jump by ``away_um`` at ``at_um``: a reading goes to slope y + shift.
 
-    One jump can't tell a gain from an offset; a gain about the place of rest is the likelier where there is
-    displacement to scale. What is wrong about it the filter finds as the stage moves.
+    One jump cannot tell a gain from an offset. A gain about the rest position is assumed where there is displacement to
+    scale; the filter corrects it as the stage moves.
     """
     rest_um = frame.offset_um + frame.gain * frame.y_rest_um
     place = at_um - rest_um

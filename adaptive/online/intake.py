@@ -1,15 +1,14 @@
-"""From readings to motion: what each sample is, and which steps of the track (``adaptive.online.track``) it leads to.
+"""Intake of samples: judges each reading, and turns good ones into smoothed motion.
 
-Samples go in by ``take``, which says what each is and which steps are to be made for it; ``advance`` makes them and
-returns the pair of smoothed motion and voltage, ``lag`` samples old, that may teach.
+`Intake.take` judges a sample and returns the steps of the track (``adaptive.online.track``) to make for it.
+`Intake.advance` makes a step and returns the pair of smoothed motion and voltage, ``lag`` samples old, to learn.
 
-A reading is in one of three hands. Trusted, it goes to the smoother. One that surprises is held back with those that
-follow (``adaptive.online.glitch_or_jump``) until they turn out to be a glitch, ringing, or a jump; a jump of the
-reading that no
-voltage made moves the frame of the features, and with it everything that was learnt. Readings that stay undecided, or
-that do not follow the drive, are on trial (``adaptive.online.sensor_trust``). While readings are held or on trial
-nothing is taught,
-and dead reckoning carries the hysteresis memory on.
+A reading is in one of three states. *Trusted*: it goes to the smoother. *Held*: a reading far from the prediction is
+held back with those that follow (``adaptive.online.glitch_or_jump``) until they are known to be a glitch, ringing or a
+jump. A jump that no voltage caused moves the frame of the features, so that everything learnt stays valid. *On trial*:
+readings that stay undecided, or that do not follow the drive, must first prove that they do
+(``adaptive.online.sensor_trust``). While readings are held or on trial nothing is learnt, and dead reckoning advances
+the hysteresis memory.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def parts_to_state(
     before: FeatureMap | None,
     following: Following,
 ) -> StateDict:
-    """All of the parts that are there; copies."""
+    """All parts that exist; copies."""
     parts = {"gates": gates.state_dict(), "following": following.state_dict()}
     for name, part in (("track", track), ("hold", hold), ("trial", trial), ("before", before)):
         if part is not None:
@@ -73,21 +72,21 @@ def parts_of(
     )
 
 
-# --- The voltages of samples without a reading, and a guess at those of samples that never came.
+# --- Voltages of samples without a good reading, and an estimate for missing samples.
 
 
-#: Samples without a reading whose voltages are kept.
+#: Most samples without a good reading whose voltages are kept.
 MOST_LOGGED = MOST_BRIDGED
 
 
 class VoltageLog:
-    """Pairs (seq, voltage in V) of samples whose readings were none, since the last one taken."""
+    """Pairs (seq, voltage in V) of the samples without a good reading since the last one taken."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[int, float]] = deque(maxlen=MOST_LOGGED)
 
     def put(self, sample: Sample) -> None:
-        """Keep the voltage of a sample: no reading, but the stage goes on."""
+        """Keep the voltage of a sample whose reading is not used: the stage moves all the same."""
         self._kept.append((sample.seq, sample.u_V))
 
     def clear(self) -> None:
@@ -95,10 +94,10 @@ class VoltageLog:
         self._kept.clear()
 
     def missed(self, gates: AdmissionState, sample: Sample, max_gap: int) -> tuple[list[float], bool]:
-        """Voltages, V, of the samples without a reading before ``sample``, and whether too many never came."""
+        """Voltages, V, of the samples without a reading before ``sample``, and whether too many are missing."""
         first, missing = gates.seq + 1, sample.seq - gates.seq - 1
         heard = {seq: u for seq, u in self._kept if seq < sample.seq}
-        # Nobody knows the voltages of samples that never came; a straight line between is the best guess.
+        # The voltages of missing samples are unknown: interpolate.
         slope_V = (sample.u_V - gates.u_V) / (missing + 1)
         between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_LOGGED))]
         return between, missing > MOST_LOGGED or missing - len(heard) > max_gap
@@ -115,18 +114,18 @@ class VoltageLog:
 
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
-#: A place further from the middle of the range than this many ranges is none, and a reading no reading.
+#: A reading further from the middle of the range than this many ranges is out of range.
 FAR_OUT = 1.5
-#: Over the smoother's lag, between what shares of what the mean slope makes of the voltage a reading moves, where that
-#: is more than this share of the range and so many deviations. Turning points, lag and hysteresis included.
+#: Limits of the motion over the smoother's lag, as shares of the motion that the voltage causes by the mean slope;
+#: checked where that is more than this share of the range and this many deviations. Hysteresis is included.
 LAGS, LAGS_SHARE, LAGS_SIGMA = (0.3, 3.0), 0.008, 10.0
-#: Time between two looks at that, s.
+#: Time between two such checks, s.
 LOOK_S = 0.002
-#: Share of the identified range beyond its ends up to which the model is known.
+#: Share of the identified range beyond its ends up to which the model is valid.
 KNOWN = 0.05
-#: Deviation of a reckoned place, as a share of the range, up to which a hold begins from a past one.
+#: Largest deviation of a reckoned place, as a share of the range, for a hold to begin from a past place.
 PAST_SHARE = 0.02
-#: Age at which a place is from before anything that is noticed now, s.
+#: Age of a place that is certainly from before a fault that is detected now, s.
 CLEAN_S = 0.06
 #: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with;
 #: time from one to the next while it has full credit, and while not, s; windows after which one has shown nothing.
@@ -136,13 +135,13 @@ Model = Callable[[], LssvmInverse]
 
 
 class Intake:
-    """The intake end of a learner; ``base`` is the model that it starts from.
+    """The intake of a learner; ``base`` is the identified model.
 
     Attributes
     ----------
-    track : where the stage is and has been, None before the first reading. gates : of the admission.
-    doubt_V : deviation of the model's predictions, V, as far as it is known; the learner tells.
-    following : whether the readings follow the drive; confirmed : whether they were found to just now.
+    track : of the stage, None before the first reading. gates : state of the gates.
+    doubt_V : standard deviation of the model's predictions, V; set by the learner.
+    following : check that the readings follow the drive; confirmed : whether it has just confirmed that they do.
     """
 
     def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
@@ -171,11 +170,11 @@ class Intake:
         self._proven: FeatureMap | None = None
         self._proven_past: Past | None = None
         self._calm = 1_000_000  # Samples since readings were last held back.
-        # A model that does not answer to the displacement cannot tell whether a sensor does.
+        # A model that does not depend on the displacement cannot check a sensor.
         self._tells = answers(base)
         self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
-        # A trial of readings that nobody doubts, the credit that such trials have left the model, and the samples until
-        # the next. A fault that it finds is the model's: a model that finds faults in a sound sensor is no judge.
+        # A control trial judges readings that are trusted. A fault that it finds is the model's, and costs the model
+        # credit: without credit the model may not judge the sensor. Samples until the next control trial.
         self._control: Trial | None = None
         self._credit, self._until_control = FIRST_CREDIT, 0
         self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
@@ -189,7 +188,7 @@ class Intake:
 
     @property
     def _judges(self) -> bool:
-        """Whether the model is good enough to tell by it that a sensor is wrong."""
+        """Whether the model is good enough to judge the sensor."""
         return self._tells and self._credit > 0
 
     @property
@@ -206,7 +205,7 @@ class Intake:
         self._forget()
 
     def _forget(self) -> None:
-        """What the readings did so far says nothing about what comes."""
+        """Forget how the readings followed so far."""
         self.following.forget()
         self._pasts.clear()
         self._control = None
@@ -229,7 +228,7 @@ class Intake:
     # ---- what a sample is
 
     def take(self, sample: Sample, model: Model) -> Taken:
-        """Judge one sample; ``model`` gives what is served, should the place have to be reckoned by it.
+        """Judge one sample; ``model`` returns the served model, for dead reckoning if needed.
 
         Never raises on data.
         """
@@ -249,7 +248,7 @@ class Intake:
         gates.seq, gates.t_s = sample.seq, sample.t_s
         gates.since_glitch += 1 + missing
         if self._trial is not None:
-            # What never came is taken for no motion: the reckoning is off by it, and the readings will say so.
+            # Missing samples count as no motion; the readings correct the reckoning later.
             for u in between:
                 self._trial.put(u, nan, self._circumstances(0.0))
             return self._try(self._trial, sample)
@@ -270,7 +269,7 @@ class Intake:
             if known and (self._control is not None or self._until_control <= 0):
                 self._check_model(track, sample, model)
             return Taken("", (Step(sample.y_um, sample.u_V),))
-        # What a kink of the voltage makes of the motion is reckoned; it was a surprise to the smoother alone.
+        # Dead reckoning knows the motion that a kink of the voltage causes; only the smoother does not.
         limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
         return self._decide(sample, track, self._keep(track, model, sample.u_V, sample.y_um), limit)
 
@@ -294,13 +293,13 @@ class Intake:
         """Hold a sample back; begins a hold where there is none."""
         self._control = None
         if self._hold is None:
-            # Soon after another one its readings are no anchor: some of them may have rung.
+            # Soon after another hold the readings are no anchor: some of them may have rung.
             self._hold = self._begin_hold(track, model(), past=self._calm <= 2 * self.smoother.config.lag)
         self._hold.put(u_V, y_um)
         return self._hold
 
     def _check_model(self, track: Track, sample: Sample, model: Model) -> None:
-        """Now and then, of a sample that is believed: would a trial of such readings find a fault?"""
+        """Control trial: would a trial of trusted readings find a fault?"""
         if self._control is None:
             if not self._tells:
                 return
@@ -401,7 +400,7 @@ class Intake:
         )
 
     def _decide(self, sample: Sample, track: Track, hold: Hold, limit: float) -> Taken:
-        """What the last sample held back decides."""
+        """The decision after the last sample held back."""
         now = self._circumstances(limit)
         verdict = hypotheses.judge(hold, now)
         if verdict is Verdict.JUMP:
@@ -409,7 +408,7 @@ class Intake:
         if verdict is Verdict.WAIT:
             if hold.rang or hold.taken:
                 return Taken(admission.RINGING)
-            # What waits for readings that never came is no wrong reading.
+            # A hold that waits for missing readings has seen no wrong one.
             return Taken(admission.GAP if hold.silent and hold.seen_um <= now.usual_um else admission.GLITCH)
         if verdict is Verdict.LOST:
             return self._give_up(sample, hold)
@@ -422,13 +421,13 @@ class Intake:
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
 
     def _give_up(self, sample: Sample, hold: Hold) -> Taken:
-        """A hold that stays unexplained: a trial, or a new start where the model may not judge the sensor."""
+        """An unexplained hold: begin a trial, or restart where the model may not judge the sensor."""
         return self._begin_trial(hold.reckoning) if self._judges else self._restart(sample, admission.SETTLING)
 
     def _take_jump(self, sample: Sample, track: Track, hold: Hold, now: Circumstances) -> Taken:
-        """The readings have settled elsewhere: frame and place move.
+        """The readings have settled at another level: move frame and place.
 
-        No voltage made this jump, so it is none of the hysteresis'. A jump back soon after another one undoes it.
+        No voltage caused this jump, so the hysteresis memory stays. A jump back soon after another one undoes it.
         """
         before, f, away_um = self._before, track.served, hold.away_um
         undone = False
@@ -462,10 +461,10 @@ class Intake:
         hold.take(slope, shift_um)
         self._forget()
         if undone:
-            # What was reckoned since then was reckoned in a frame that never was.
+            # The reckoning since then used the wrong frame.
             hold.shift_um += level_um - hold.expected_um
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
-            # It rings about the new level: the frame is right already, the readings are awaited.
+            # It rings about the new level: the frame is right, wait for settled readings.
             return Taken(admission.RINGING, (), away_um, undone, first=first)
         self._hold = None
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um), away_um, undone, first=first)
@@ -473,9 +472,9 @@ class Intake:
     # ---- readings on trial
 
     def distrust(self, model: Model) -> Taken | None:
-        """The readings do not follow the drive: from the next sample on they are on trial, if they are not already.
+        """The readings do not follow the drive: begin a trial with the next sample, unless one is open.
 
-        Where the stage is follows from a place at which they still did, and the voltages since.
+        The place is reckoned from one at which they still followed, over the voltages since.
         """
         track = self.track
         if track is None or track.motion is None or self._trial is not None or not self._judges:
@@ -491,8 +490,8 @@ class Intake:
         assert track is not None
         undone, jump = proven is not None, (0.0, 0.0)
         if proven is not None:
-            # Jumps that no motion has borne out are in doubt with the readings that they were taken from.
-            # What they had made of a reading in the frame from before: y -> slope y + shift.
+            # Unconfirmed jumps are taken back with the readings that they were taken from. Their effect on a reading in
+            # the frame before: y -> slope y + shift.
             slope = track.served.gain / proven.gain
             jump = slope, track.served.offset_um - slope * proven.offset_um
             reckoning = reckoning.in_frame(proven)
@@ -507,7 +506,7 @@ class Intake:
         return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
 
     def _try(self, trial: Trial, sample: Sample) -> Taken:
-        """One sample of a sensor that has to earn its trust."""
+        """One sample of a sensor on trial."""
         fault = trial.fault
         decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
         if decision.outcome is Outcome.OPEN:
@@ -531,9 +530,9 @@ class Intake:
         return taken._replace(jump_um=away_um, renamed=True)
 
     def reckon_by(self, model: LssvmInverse) -> None:
-        """From now on ``model`` is served while readings are on trial: the place is reckoned by the same.
+        """``model`` is served while readings are on trial: reckon the place with the same model.
 
-        After jumps that were taken back it is reckoned again, from before the first of them.
+        After jumps that were taken back the place is reckoned again from before the first of them.
         """
         past, self._proven_past = self._proven_past, None
         if self._trial is None or self.track is None:
@@ -550,14 +549,13 @@ class Intake:
         return self._hold is not None or self._trial is not None
 
     def memory_now(self, frozen: bool = False) -> FloatArray:
-        """(m,) hysteresis memory of a stage that is where the last sample saw it, or must be by its voltage.
+        """(m,) hysteresis memory at the place of the last sample, measured or reckoned.
 
         ``frozen`` : for a model in the frame that learning began with.
         """
         assert self.track is not None
         reckoned = self._hold or self._trial
-        # The model of the beginning, in a frame of its own, has a memory of its own; while readings are in doubt the
-        # reckoned one is the better.
+        # The identified model has its own memory in its own frame. On trial, the reckoned one is better.
         if reckoned is not None and (not frozen or self._trial is not None):
             memory = reckoned.reckoning.memory
             return self.served.memory_in(self.base.features, memory) if frozen else memory.copy()
@@ -576,14 +574,14 @@ class Intake:
         if self._trial is not None or self._proven_past is not None:
             self._note_voltage(step.u_V)
         if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
-            # A stage at rest shows nothing: the place is as good as it was.
+            # At rest nothing is checked, and the present place is as good as the past one.
             self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
         return self.track.advance(step)
 
     def _note_voltage(self, u_V: float) -> None:
-        """For a trial, and for the place from before the jumps that are open."""
+        """Note a voltage for the trial and for the place from before unconfirmed jumps."""
         if self._trial is not None:
-            # Distrusted amid the samples of a hold: the rest of them are no readings, but the stage has moved on.
+            # The trial began within the samples of a hold: their readings are not used, their voltages are.
             self._trial.reckoning.advance(u_V)
         if self._proven_past is not None and not any(self._proven_past is past for past in self._pasts):
             self._proven_past.u_V.append(u_V)
@@ -591,9 +589,9 @@ class Intake:
                 self._proven_past = None
 
     def to_base_frame(self) -> None:
-        """Go back to the frame that learning began with, and the memory tracked in it; nothing without a jump.
+        """Return to the identified frame and the memory tracked in it; nothing without a jump.
 
-        For when the model of the beginning is right again: then no jump has moved the sensor for good.
+        For when the identified model predicts well: then no jump was a lasting one.
         """
         track = self.track
         if track is None or self.jumps == self.undone or track.served == self.base.features:
@@ -604,22 +602,21 @@ class Intake:
         self.undone += 1
 
     def creep(self, by_um: float) -> None:
-        """The stage has crept by so much, µm, that no voltage made. Not while a jump of the frame is under way."""
+        """The stage has crept by ``by_um``, µm, without a voltage: move the frame unless a jump is still open."""
         if self.track is not None and not self.on_probation:
             self.track.creep(by_um)
 
     def follow(self, pair: Pair, p_V: float, since_s: float) -> bool:
-        """Ask of one pair whether the readings follow the drive.
+        """Check with one pair whether the readings follow the drive; True where they do not and a trial is due.
 
-        ``p_V`` : what the identified model asks for there. ``since_s`` : time since the last that was asked, s.
-        Returns whether they do not; they are to be distrusted then.
+        ``p_V`` : voltage of the identified model for the pair's motion. ``since_s`` : time since the last check, s.
         """
         track, self.confirmed = self.track, False
         assert track is not None
         if not self._judges:
             return False
         if track.features is not track.served:
-            # Motion from before a jump, and from after it: together they follow nothing.
+            # Motion from before and after a jump cannot be compared.
             self._forget()
             return False
         fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
@@ -639,7 +636,7 @@ class Intake:
     # ---- keeping
 
     def state_dict(self) -> StateDict:
-        """All of the state under flat names."""
+        """The whole state under flat names."""
         state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
         for i, past in enumerate(self._pasts):
             state |= prefixed(f"past{i}.", past.state_dict())
@@ -662,7 +659,7 @@ class Intake:
         return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
 
     def restore(self, state: StateDict) -> None:
-        """Go on from a ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
+        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
         parts = parts_of(self.smoother, self.base, state)
         self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
         pasts = (under(f"past{i}.", state) for i in range(2))

@@ -32,53 +32,53 @@ from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineMode
 
 Mark = tuple[FloatArray, FloatArray]
 
-#: Names of what is counted beside the samples.
+#: Names of the events that are counted beside the samples.
 EVENTS = ("fallbacks", "rollbacks", "distrusts", "begun_again", "adoptions", "adoptions_refused")
 
-#: The filter goes back to its last good estimate after losing to the frozen model for this long, s; while all is
-#: well, its estimate is marked this often, s.
+#: The filter returns to its last good estimate after the frozen model was better for this long, s; a good estimate is
+#: marked this often, s.
 ROLLBACK_S, MARK_S = 0.5, 1.0
 
-#: Share of a jump by which it may be wrong to take it for a gain and not an offset, or the other way round.
+#: Error, as a share of a jump, where a gain is taken for an offset or the other way round.
 JUMP_DOUBT = 0.3
-#: Time between two looks at the envelope, the rails and the sensor, s; a step of the filter at least.
+#: Time between two checks of envelope, rails and sensor, s; at least a step of the filter.
 CHECK_S = 0.004
-#: A voltage at a limit for this long, s, where the model is wrong by this share of the span, is the model's doing.
+#: A voltage at a limit for this long, s, with a model error above this share of the span, is caused by the model.
 RAIL_S, RAIL_SHARE = 0.1, 0.05
-#: Time inside the envelope after which a model that had left it is no trouble any more, s.
+#: Time inside the envelope after which ``model_left_envelope`` ends, s.
 LEFT_S = 1.0
-#: Time on trial from which on the identified model may be served, s, and how large its own recent error may be for
-#: that, rms, as a share of the span for each second on trial, and at most. The last estimate is exact where the stage
-#: was when readings were last believed; the longer that is ago, the less it is worth.
+#: The identified model may be served after this time on trial, s, if its own recent rms error is below this share of
+#: the span for each second on trial, and below this share in all. The last estimate was exact when readings were last
+#: trusted; it loses value with time.
 ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.05
 
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
 #: Largest move of the output at an adoption, in its stated standard deviations (rms over the newest samples).
 MOST_MOVED = 2.0
-#: Troubles of the model, after which the identified one is served.
+#: Troubles of the model. The identified one is served then.
 RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
 
 
 class Parts:
-    """Everything of a learner that changes.
+    """The changing state of a learner, and the operations on several of its parts.
 
     Attributes
     ----------
     intake : gates, smoother, frame and hysteresis memory. filter : of the linear part. window : the kernel part.
-    rest : what a rest has taught. judgement, delay : errors at the age of serving.
+    rest : creep at rest. judgement, delay : errors at the age of serving.
     domain : (6,) learnt range, as of the snapshot.
-    point : (d,) kernel inputs of the last instant that was due to teach, NaN before any.
+    point : (d,) kernel inputs of the last instant that was due for learning, NaN before any.
     first : the filter's estimate of the identified model.
-    check_every, check_s : samples between two looks at envelope, rails and sensor, and the time between them, s.
-    allowed_V : by how much the model may leave the identified linear part, V; 0 for no bound.
+    check_every, check_s : samples between two checks of envelope, rails and sensor, and the time between them, s.
+    allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
-    alone : whether readings have been on trial for so long that the identified model, if it is good, is the better.
+    alone : whether readings have been on trial for so long that a good identified model is served.
     rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
-    confirmed : estimates from before readings that certainly followed the drive, the older one first. mark_ages,
-    confirmed_ages : at which judgement the marks were made.
-    mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, as the last may already hold
-    some of what went wrong. jump_mark, proven_mark : those before the last jump, and before the first that is open.
+    confirmed : the filter's estimates from before readings that followed the drive, the older one first. mark_ages,
+    confirmed_ages : number of errors judged when the marks were made.
+    mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, because the last may already
+    contain a beginning fault. jump_mark, proven_mark : those before the last, and before the first open jump.
     counters : samples by outcome. events : by name.
     """
 
@@ -105,8 +105,7 @@ class Parts:
         self.delay = Delay(round(config.serving_age_s / step_s))
         steps = max(1, round(CHECK_S / self.filter.step_s))
         self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
-        # A model without a linear part has nothing that the kernel could be held to; what the kernel of the identified
-        # one adds to its linear part is allowed beside the bound.
+        # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
         self.allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.rail_s = 0.0
         self.railed = False
@@ -117,12 +116,12 @@ class Parts:
         self.events = dict.fromkeys(EVENTS, 0)
 
     def expect_change(self) -> None:
-        """The stage has changed: the filter follows faster, and what the window has from before will count less."""
+        """The stage has changed: the filter follows faster, and older samples of the window will count less."""
         self.filter.expect_change()
         self.window.expect_change()
 
     def follow(self, basis: FloatArray, target_V: float, u_V: float, weight: float, rest: bool) -> bool:
-        """A step of the filter towards ``target_V`` at basis (p,); False for an outlier, which teaches nothing.
+        """One step of the filter with ``target_V`` at basis (p,); False for an outlier, which is not learnt.
 
         ``u_V`` : the voltage there. ``rest`` : whether the stage is at rest.
         """
@@ -137,7 +136,7 @@ class Parts:
         return True
 
     def take_rest(self, u_V: float, moving: bool) -> None:
-        """After a step of the filter: at rest, let what the constant has gained go over to the frame."""
+        """After a step of the filter at rest: move the gain of the constant to the frame."""
         intake, f = self.intake, self.filter
         if moving:
             self.rest.leave()
@@ -148,7 +147,7 @@ class Parts:
             intake.creep(shift_um)
 
     def judge(self, error_V: float, frozen_error_V: float) -> None:
-        """Take the errors at one instant: of the linear part as it was served for it, and of the frozen model."""
+        """Take the errors of the model as it was served at this instant, and of the frozen model, V."""
         c, j, step_s = self.config, self.judgement, self.filter.step_s
         span_V = self.filter.span_V
         j.take(error_V, frozen_error_V, step_s)
@@ -156,8 +155,8 @@ class Parts:
         before = j.fallback
         self.events["fallbacks"] += j.choose(c.fallback_floor * span_V, step_s) and not before
         if j.fallen_s > ROLLBACK_S:
-            # Half a second of losing to the frozen model: what was learnt since all was well is wrong, and so is a
-            # jump that the frozen model knows nothing of.
+            # The frozen model was better for half a second: take back what was learnt since the last good estimate,
+            # and jumps that the frozen model does not have.
             j.fallen_s = 0.0
             self.intake.to_base_frame()
             self.filter.go_back(self.mark)
@@ -166,12 +165,12 @@ class Parts:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
             self.mark_ages = (self.mark_ages[1], j.judged)
             if self.confirmed_ages[0] < self.mark_ages[0]:
-                # Where the stage moves little, nothing is confirmed for long: what was good for a second is as good.
+                # Where the stage moves little, nothing is confirmed for long; a good second counts as much.
                 self.confirmed = (self.mark, self.confirmed[1])
                 self.confirmed_ages = (self.mark_ages[0], self.confirmed_ages[1])
 
     def watch_rail(self, saturated: bool) -> None:
-        """After ``judge``: a voltage that stays at a limit by the model's fault ends in the identified model.
+        """After ``judge``: return to the identified model where the voltage stays at a limit because of the model.
 
         ``railed`` is True from then until the voltage has been off the limits for as long.
         """
@@ -187,7 +186,7 @@ class Parts:
             self.railed = self.railed and self.rail_s > -RAIL_S
 
     def watch_shape(self, away_V: float) -> None:
-        """How far the model is from the identified linear part, V. One that stays outside ends in the identified one.
+        """Take the distance from the identified linear part, V; return to the identified model where it stays large.
 
         ``left`` is True from then until it has been inside for a second.
         """
@@ -202,7 +201,7 @@ class Parts:
             self.left = self.left and self.left_s > -LEFT_S
 
     def watch_trial(self) -> bool:
-        """At each sample: returns whether ``alone`` has changed."""
+        """Update ``alone`` after a sample; returns whether it has changed."""
         on_trial_s, before = self.intake.distrusted_s, self.alone
         if on_trial_s or before:
             limit_V = min(ALONE_SHARE_PER_S * on_trial_s, ALONE_SHARE) * self.filter.span_V
@@ -212,22 +211,22 @@ class Parts:
         return self.alone != before
 
     def confirm(self) -> None:
-        """The readings follow the drive: what was learnt from those before them is right."""
+        """The readings follow the drive: the estimate from before them is confirmed."""
         newer = int(self.confirmed_ages[1] >= self.confirmed_ages[0])
         self.confirmed = (self.confirmed[newer], self.filter.mark())
         self.confirmed_ages = (self.confirmed_ages[newer], self.judgement.judged)
 
     def go_back(self, undone: bool) -> None:
-        """The readings do not follow the drive: forget what was learnt since they certainly did.
+        """The readings do not follow the drive: return to the last confirmed estimate.
 
-        ``undone``: jumps are taken back with them; all since the first of them is forgotten.
+        ``undone``: unconfirmed jumps are taken back too; return to the estimate before the first of them.
         """
         self.filter.restore(self.proven_mark if undone else self.confirmed[0])
         self.window.keep()
         self.events["distrusts"] += 1
 
     def begin_again(self) -> None:
-        """Forget all that was learnt: the identified model is the one that is known to be right."""
+        """Forget everything learnt and start again from the identified model."""
         base, c = self.intake.base, self.config
         self.intake.to_base_frame()
         self.filter.go_back(self.first)
@@ -239,7 +238,7 @@ class Parts:
         self.events["begun_again"] += 1
 
     def take_jump(self, jump_um: float, fresh: bool, first: bool) -> None:
-        """The reading has jumped by so much, µm; ``fresh``: and did not only undo a jump; ``first``: see ``Taken``."""
+        """The frame has moved by ``jump_um``, µm. ``fresh``: not by undoing a jump; ``first``: see ``Taken``."""
         intake = self.intake
         self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2
         if fresh:
@@ -249,12 +248,12 @@ class Parts:
         self.confirmed, self.confirmed_ages = (self.filter.mark(),) * 2, (self.judgement.judged,) * 2
 
     def undo_jump(self) -> None:
-        """Forget what was learnt since the last jump: it was learnt of a stage that never was."""
+        """The last jump was none: return to the estimate from before it."""
         self.filter.restore(self.jump_mark)
         self.window.keep()
 
     def widen_domain(self, motion: tuple[float, float, float]) -> None:
-        """Take a learnt instant (µm, µm/s, µm/s²) into the domain."""
+        """Extend the domain to a learnt instant (µm, µm/s, µm/s²)."""
         ends = self.domain.tolist()
         for i, x in enumerate(motion):
             if x < ends[2 * i]:
@@ -263,7 +262,7 @@ class Parts:
                 self.domain[2 * i + 1] = x
 
     def shift_constant(self, by_V: float) -> None:
-        """Add to the constant of the linear part, now, in its marks, and as it was served."""
+        """Add to the constant of the linear part: now, in all marks, and in the delayed estimates."""
         self.filter.shift_constant(by_V)
         marks = (self.mark, self.next_mark, self.jump_mark, self.proven_mark, *self.confirmed)
         for beta, _ in {id(m): m for m in marks}.values():
@@ -272,7 +271,7 @@ class Parts:
 
 
 def _model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
-    """What is learnt, as an immutable model; the identified one while learning is worse than it."""
+    """The learnt model, immutable; the identified one while that predicts better."""
     j, window, seq = parts.judgement, parts.window, parts.intake.gates.seq
     valid = j.valid and not parts.intake.fault
     if j.fallback or parts.alone:
@@ -328,7 +327,7 @@ def _adopt(parts: Parts, hyper: Hyperparameters) -> str:
 
 
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
-    """Load, or compile, every step of a learner, on parts that nobody keeps."""
+    """Load or compile every step of a learner, on parts that are thrown away."""
     parts = Parts(base, config)
     basis, kernel = np.empty(base.features.basis_size), np.empty(base.features.kernel_size)
     base.features.fill(0.0, 0.0, 0.0, base.rest_memory(0.0), basis, kernel)
@@ -351,9 +350,9 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
 
 
 class Learner:
-    """Learns one axis online, from an identified model on. Implements ``adaptive.types.OnlineModel``.
+    """Learns one axis online, starting from an identified model. Implements ``adaptive.types.OnlineModel``.
 
-    Not for several threads at once: one writer calls ``handle`` and ``snapshot``; snapshots may go anywhere.
+    Not for several threads at once: one thread calls ``handle`` and ``snapshot``; snapshots may be used anywhere.
     """
 
     def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None) -> None:
@@ -392,9 +391,9 @@ class Learner:
         self.parts.intake.resync()
 
     def take_place_of(self, other: OnlineModel) -> None:
-        """Go on where ``other`` is, with what this one knows: after samples that ``other`` should not have believed.
+        """Continue at the position of ``other`` with the parameters of this learner.
 
-        Where the stage is and has been ``other`` knows still, and in what frame its readings are.
+        For when ``other`` has learnt from bad samples: its track and frame of the stage are still right.
         """
         if not isinstance(other, Learner):
             self.resync()
@@ -416,7 +415,7 @@ class Learner:
         if taken.jump_um:
             parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
         moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
-        # An ordinary sample neither begins nor ends a trial.
+        # An ordinary sample neither begins nor ends a trial of the sensor.
         if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
             self._cache = None
         outcome = taken.refused
@@ -429,7 +428,7 @@ class Learner:
         return outcome
 
     def _teach(self, pair: Pair) -> str:
-        """Let the pair at the smoother's instant teach filter and window, where it may."""
+        """Learn the pair at the smoothed instant, in filter and window, if the gates allow it."""
         c, parts, intake = self.config, self.parts, self.parts.intake
         gates, track = intake.gates, intake.track
         assert track is not None
@@ -438,7 +437,7 @@ class Learner:
         if not pair.good:
             return admission.GLITCH
         refused = check_pair(c.admission, pair.u_V, pair.u_before_V, pair.y_um)
-        # A saturated sample teaches nothing, but it tells where the stage is, and so whether the model is right.
+        # A saturated sample is not learnt, but it shows where the stage is, and so the error of the model.
         if refused and refused != admission.SATURATED:
             return refused
         filter_due, window_due = pair.now % c.filter_every == 0, pair.now % c.learn_every == 0
@@ -481,7 +480,7 @@ class Learner:
         return outcome
 
     def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
-        """Now and then: is the model inside its envelope, does the sensor follow? Returns why nothing may be taught."""
+        """Check envelope, rails and sensor. Returns the gate that forbids learning, or ""."""
         parts, intake = self.parts, self.parts.intake
         parts.watch_shape(pair.u_V - target_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
         parts.watch_rail(saturated)
@@ -496,18 +495,18 @@ class Learner:
         return admission.UNTRUSTED
 
     def _go_on_without_readings(self, undone: bool) -> None:
-        """The readings are on trial. ``undone``: and jumps were taken back with them."""
+        """The readings are on trial from now on. ``undone``: unconfirmed jumps were taken back."""
         self.parts.go_back(undone)
         self._cache = None
         self.parts.intake.reckon_by(self.snapshot())
 
     @property
     def trouble(self) -> str:
-        """Name of what keeps the learner from learning, "" while nothing does.
+        """Name of what prevents learning, "" while nothing does.
 
         Of the sensor: ``sensor_stuck``, ``sensor_gain``, ``sensor_sign``, ``sensor_foreign``, ``out_of_envelope``.
-        ``rail`` : the voltage was at a limit although the model was wrong there. ``model_left_envelope`` : what was
-        learnt was further from the identified model than a stage can be. In both the identified model is served.
+        ``rail`` : the voltage was at a limit because the model was wrong. ``model_left_envelope`` : the learnt model
+        was further from the identified one than a stage can be. The identified model is served then.
         """
         parts = self.parts
         return parts.intake.fault or (RAIL if parts.railed else MODEL_LEFT_ENVELOPE if parts.left else "")
@@ -546,12 +545,12 @@ class Learner:
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """(m,) hysteresis memory with which ``model``, a snapshot of this learner, goes on from the last sample.
 
-        What was learnt was learnt with it: one that is tracked otherwise, over readings that were not believed, would
-        make the model wrong until the stage has wiped the difference out. None before the first sample.
+        The model was learnt with this memory. One that is tracked over readings that were not trusted would make its
+        answers wrong until the motion has wiped out the difference. None before the first sample.
         ``smoothed`` : from the smoother's instant, ``lag`` samples ago; None while readings are held back.
         """
         intake = self.parts.intake
-        # Of two memories in one frame, that of the learner has seen no reading that was not believed.
+        # Of two memories in one frame, the learner's has not followed untrusted readings.
         if intake.track is None or (smoothed and intake.holds) or not isinstance(model, LssvmInverse):
             return None
         frozen = model.features != intake.served and model.features == self.base.features
@@ -565,12 +564,11 @@ class Learner:
         return self.parts.intake.served
 
     def warm(self) -> None:
-        """Load (or compile) every step on a copy: no sample that teaches, no change of the stage and no other
-        hyper-parameters must wait for one, which takes seconds where it was never compiled before."""
+        """Load or compile every step on a copy, so that no sample waits seconds for the compiler."""
         _warm(self.base, self.config)
 
     def freeze(self) -> None:
-        """Stop learning: samples go on moving smoother and memory, and are judged, but teach nothing."""
+        """Stop learning. Samples still advance smoother, memory and error statistics."""
         self._frozen = True
 
     def thaw(self) -> None:
@@ -590,9 +588,9 @@ class Learner:
         return self.parts.window.hyper
 
     def adopt(self, hyper: Hyperparameters) -> str:
-        """Go on with other hyper-parameters, from the present sample on. Returns "", or why they were refused.
+        """Continue with other hyper-parameters from the present sample on. Returns "", or why they were refused.
 
-        Atomic, and without a jump of what is served; refused unless it predicts the newest samples better.
+        Atomic, and without a jump of the output; refused unless it predicts the newest samples better.
         """
         reason = _adopt(self.parts, hyper)
         self.parts.events["adoptions_refused" if reason else "adoptions"] += 1
@@ -601,7 +599,7 @@ class Learner:
         return reason
 
     def window_data(self) -> WindowData:
-        """A copy of the window's samples and hyper-parameters, to tune on elsewhere; see ``adopt``."""
+        """A copy of the window's samples and hyper-parameters, to tune them elsewhere; see ``adopt``."""
         return self.parts.window.data()
 
     def window_samples(self) -> tuple[FloatArray, FloatArray]:
@@ -665,11 +663,11 @@ class Learner:
         }
 
     def take_events(self) -> list[tuple[str, str]]:
-        """None: what happens to a learner shows in ``counters`` and ``trouble``."""
+        """Always empty: the events of a learner are in ``counters`` and ``trouble``."""
         return []
 
     def state_dict(self) -> StateDict:
-        """All of the state; ``from_state`` goes on from it with the same result to the last bit."""
+        """The whole state; ``from_state`` continues from it with the same result to the last bit."""
         return _state_of(self.base, self.config, self.parts, self._frozen)
 
     def restored(self, state: StateDict) -> Learner:
@@ -690,7 +688,7 @@ class Learner:
 
 
 def _state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:
-    """All of a learner's state; ``restored`` goes on from it with the same result to the last bit."""
+    """The whole state; `_restored` continues from it with the same result to the last bit."""
     groups = {
         "base": base.state_dict(),
         "config": config.state_dict(),
@@ -758,7 +756,7 @@ def _restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, boo
 
 
 def _ages(values: object) -> tuple[int, int]:
-    """Two counts; a state from before there were any knows none."""
+    """Two counts; older states have none."""
     first, second = (0, 0) if values is None else np.asarray(values).tolist()
     return int(first), int(second)
 

@@ -150,7 +150,7 @@ SENSOR_SIGN = "sensor_sign"
 SENSOR_GAIN = "sensor_gain"
 SENSOR_FOREIGN = "sensor_foreign"
 OUT_OF_ENVELOPE = "out_of_envelope"
-#: Names of what can be wrong with a sensor.
+#: Names of sensor faults.
 SENSOR_FAULTS = frozenset({SENSOR_STUCK, SENSOR_SIGN, SENSOR_GAIN, SENSOR_FOREIGN, OUT_OF_ENVELOPE})
 
 #: Values in the window at most; looks a window.
@@ -184,7 +184,7 @@ OBEYED, OBEYS, OBEYS_SLOPE, OBEYS_SURE, SAME_SHARE = 2, 0.8, 1.4, 1.2, 0.03
 
 
 class Outcome(Enum):
-    """What a trial has come to."""
+    """Result of a trial."""
 
     OPEN = 0
     #: The readings are where they were, but for what the reckoning may be off.
@@ -194,7 +194,7 @@ class Outcome(Enum):
 
 
 class Decision(NamedTuple):
-    """credit : 1 where the reckoning was right all the time, -1 where it was not and the readings were, else 0."""
+    """credit : 1 where reckoning and readings agreed, -1 where only the readings were right, else 0."""
 
     outcome: Outcome
     slope: float = 1.0
@@ -331,7 +331,7 @@ class Trial:
         if near and there:
             return Decision(Outcome.SAME, credit=1)
         slope, shift_um = (1.0, off_um) if near else (s.slope, s.constant)
-        # A change of the stage is the same in the next window; an error of the model is another one elsewhere.
+        # A change of the stage is the same in the next window; an error of the model differs from place to place.
         self.followed += 1
         moved_um = (self.slope - slope) * at_um + self.shift_um - shift_um
         agrees = abs(self.slope - slope) <= AGREE and abs(moved_um) <= max(AGREE * now.range_um, 2.0 * now.usual_um)
@@ -354,7 +354,7 @@ class Trial:
         return OPEN
 
     def refuse(self, why: str) -> None:
-        """What the readings say is refused by the envelope."""
+        """The envelope refuses the change that the readings show."""
         # Straight lines outside tell more than the identified model's answer.
         self.obeyed = -OBEYED * LOOKS
         self._suspect(OUT_OF_ENVELOPE, why)
@@ -387,7 +387,7 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # A state from before there were any knows of no jumps that were taken back.
+        # Older states have no jumps that were taken back.
         values = {"open_slope": 0.0, "open_shift_um": 0.0} | values
         numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)

@@ -148,7 +148,7 @@ class Track:
         return self.state.x.item(0)
 
     def copy(self) -> Track:
-        """A track that goes its own way from here."""
+        """An independent copy."""
         return Track(
             self.smoother, self.base, self.state.copy(), self.u_V.copy(), self.y_um.copy(), self.good.copy(),
             self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion, self.switch,
