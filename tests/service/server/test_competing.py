@@ -249,7 +249,7 @@ def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_sam
     while not adoption.read(tmp_path) and time.monotonic() < until:
         time.sleep(0.01)
     again, without = tunable(bundle), tunable(bundle)
-    again.adoptions.add(*adoption.read(tmp_path))
+    again.adopt_at(*adoption.read(tmp_path))
     for other in (again, without):
         give(other, rippled, 6000, 12500, size=37)
     untuned_mV = prequential_mV(without, rippled, 12500, 14000)
