@@ -71,11 +71,16 @@ def axis_of(bundle: Bundle, **more: Any) -> Axis:
 
 
 def give(
-    axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: int, stop: int, retuner: Retuner | None = None
+    axis: Axis,
+    recorded: tuple[np.ndarray, np.ndarray],
+    start: int,
+    stop: int,
+    retuner: Retuner | None = None,
+    size: int = 20,
 ) -> None:
     u_V, y_um = recorded
-    for k in range(start, stop, 20):
-        seq = np.arange(k, min(stop, k + 20))
+    for k in range(start, stop, size):
+        seq = np.arange(k, min(stop, k + size))
         t_s: FloatArray = (seq * DT_S).astype(np.float64)
         axis.handle(SampleBatch(seq, t_s, u_V[seq], y_um[seq]))
         if retuner is not None:
