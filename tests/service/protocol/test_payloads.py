@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -194,3 +196,17 @@ HONEST = [
     encode_query([1.0], [0.0], model="mpi", pending=wire_query.Pending(3, np.ones(2), np.ones(2))),
     encode_reply(Answer(np.ones(2), np.ones(2), np.zeros(2, np.uint8), np.ones(1), 5, "mpi")),
 ]
+
+
+def test_the_bytes_printed_on_the_page_are_what_it_says() -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"(?:^    (?:[0-9a-f]{2} ){8}.*\n)+", page, re.M)
+    sample, query = (
+        bytes.fromhex("".join(line.strip()[:23] for line in block.strip().splitlines())) for block in blocks
+    )
+    batch = wire.decode_samples(sample)
+    assert (batch.seq[0], batch.t_s[0], batch.u_V[0], batch.y_um[0]) == (1000, 1.0, 5.0, 40.25)
+    assert sample == wire.encode_samples(batch.seq, batch.t_s, batch.u_V, batch.y_um)
+    asked = decode_query(query)
+    assert (asked.y_um[0], asked.v_um_per_s[0], asked.as_of, asked.model) == (40.0, 0.0, -1, "")
+    assert math.isnan(asked.u_before_V)
