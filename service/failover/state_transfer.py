@@ -44,7 +44,7 @@ def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
 
 
 def fetch_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
-    """The bytes that `send_state` answers with; None if nobody answers or a part is lost."""
+    """The bytes that `send_state` answers with; None if there is no reply or a part is lost."""
     # Replies inherit priority and congestion control from their query.
     replies = session.get(
         f"{key}?pause_s={pause_s:g}",

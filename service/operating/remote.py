@@ -30,7 +30,7 @@ def operate(
     arguments: Mapping[str, Any] | None = None,
     timeout_s: float = 5.0,
 ) -> dict[str, Any]:
-    """Command the axis and return the service's answer (docs/operating.md), ``seq`` and ``result`` among it.
+    """Command the axis; returns the reply of the service, with ``seq`` and ``result`` (docs/operating.md).
 
     Raises RefusedError with the service's message, NoReplyError if there is no reply (a refusal by access control
     gives none either), ReplyTimeoutError after ``timeout_s``. A command without a reply may have been applied: read
@@ -52,13 +52,14 @@ def operate(
             raise _with_advice(error_from_json(error), keys, timeout_s)
         if time.monotonic() >= until:
             raise NoReplyError(
-                f"{keys.operate}: nobody answers; does a service with this stage and axis run, and may you command it?"
+                f"{keys.operate}: no reply within {_SETTLE_S:g} s. Check that a service for stage {keys.stage!r}, axis "
+                f"{keys.axis!r} is running and that your role may command it."
             )
         time.sleep(_PAUSE_S)
 
 
 def statuses(session: zenoh.Session, stage: str = "*", axis: str = "*", timeout_s: float = 1.0) -> list[dict[str, Any]]:
-    """The status of every instance of every axis that answers, ordered by stage, axis and role; may be empty."""
+    """The status of every instance of every axis that replies, ordered by stage, axis and role; may be empty."""
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     # Two instances reply on one key; consolidation would drop one of them.
     for reply in session.get(
@@ -105,6 +106,6 @@ class Standbys:
 def _with_advice(failure: ServiceError, keys: Keys, timeout_s: float) -> ServiceError:
     if isinstance(failure, ReplyTimeoutError):
         return ReplyTimeoutError(
-            f"{keys.operate}: no answer within {timeout_s:g} s; see the status before you repeat it"
+            f"{keys.operate}: no reply within {timeout_s:g} s; read the status before you repeat the command"
         )
     return failure

@@ -97,7 +97,7 @@ def table(statuses: Sequence[dict[str, Any]], width: int = 0, colour: bool = Fal
             for i, (line, fine) in enumerate(zip(lines, healthy, strict=True))
         ]
     if not statuses:
-        lines.append("no instance answers")
+        lines.append("no instance replies")
     return "\n".join(lines)
 
 

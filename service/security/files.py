@@ -1,14 +1,14 @@
-"""Makes what an installation on several hosts needs: a small certificate authority, passwords, zenoh configurations.
+"""Creates the access files of an installation on several hosts: certificates, passwords, zenoh configurations.
 
 ::
 
-    DIR/access.json        who there is: name -> role; what the other files are made from
-    DIR/ca/                key and certificate of the authority; the key signs, and stays off the other machines
-    DIR/users.txt          name:password a line, for services and routers
-    DIR/NAME.json5         zenoh's configuration of NAME, certificate and key within; for NAME's machine alone
+    DIR/access.json        users and their roles; the other files are made from it
+    DIR/ca/                key and certificate of the certificate authority; never copy the key to another machine
+    DIR/users.txt          one line name:password per user, for services and routers
+    DIR/NAME.json5         zenoh's configuration of NAME with its certificate and key; for the machine of NAME only
 
-A service or router needs ``users.txt`` beside its configuration. Everything is readable by its owner only. The
-certificates are made by the ``openssl`` command.
+A service or router needs ``users.txt`` beside its configuration. Only the owner can read the files. The ``openssl``
+command makes the certificates.
 """
 
 from __future__ import annotations
@@ -40,8 +40,13 @@ _NEW_KEY: Final = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Who takes part: ``users`` name -> role; ``stages`` of a stage's user the one stage it may publish for;
-    ``hosts`` the names and addresses under which services and routers are reached."""
+    """The users of an installation.
+
+    Attributes
+    ----------
+    users : role by user name. hosts : names and addresses of services and routers.
+    stages : by name of a user with the role stage, the only stage that it may publish for; ``*`` for all.
+    """
 
     users: Mapping[str, str]
     hosts: tuple[str, ...] = DEFAULT_HOSTS
@@ -62,12 +67,13 @@ class Plan:
 
 
 def create(folder: Path, plan: Plan, days: int = 825) -> list[Path]:
-    """Make everything in ``folder``, which may not hold an earlier one; returns the files for the machines.
+    """Create all access files in ``folder``; returns the files for the machines.
 
-    Raises InputError where something is there already, ServiceError where openssl is missing or fails.
+    ``days`` is the validity of the certificates. Raises InputError if ``folder`` already holds access files,
+    ServiceError if openssl is missing or fails.
     """
     if (folder / MANIFEST).exists():
-        raise FieldError(str(folder), "an access folder", "a new one", "use 'dehyst access add' to let more in")
+        raise FieldError(str(folder), "an access folder", "a new one", "use 'dehyst access add' to add users")
     ca = folder / "ca"
     ca.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder.chmod(0o700)
@@ -82,7 +88,7 @@ def create(folder: Path, plan: Plan, days: int = 825) -> list[Path]:
 
 
 def add(folder: Path, users: Mapping[str, str], stages: Mapping[str, str], days: int = 825) -> list[Path]:
-    """Let ``users`` (name -> role) in as well; returns the files that are new or changed. Raises InputError."""
+    """Add ``users`` (name -> role); returns the new and changed files. Raises InputError if a name is taken."""
     plan = read_plan(folder)
     known = [name for name in users if name in plan.users]
     if known:
@@ -92,9 +98,9 @@ def add(folder: Path, users: Mapping[str, str], stages: Mapping[str, str], days:
 
 
 def remove(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Shut ``names`` out: gone from passwords and access control; returns the files that changed. Raises InputError.
+    """Remove ``names`` from passwords and access control; returns the changed files. Raises InputError.
 
-    Services and routers read their files at their start: they shut out when started again with the new ones.
+    Services and routers read their files at the start: restart them with the new files to exclude the users.
     """
     plan = read_plan(folder)
     for name in names:
@@ -111,7 +117,7 @@ def remove(folder: Path, names: Sequence[str]) -> list[Path]:
 
 
 def read_plan(folder: Path) -> Plan:
-    """The plan of an access folder. Raises InputError where it is none."""
+    """The plan of an access folder. Raises InputError if ``folder`` is not one."""
     try:
         data = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if data["schema"] != _SCHEMA:
@@ -122,7 +128,7 @@ def read_plan(folder: Path) -> Plan:
 
 
 def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[Path]:
-    """Certificates for ``new``, and every file that depends on who there is."""
+    """Write certificates for the users ``new``, and every file that depends on the list of users."""
     passwords = dict(
         line.split(":", 1) for line in (folder / USERS).read_text(encoding="utf-8").splitlines() if ":" in line
     )
@@ -156,7 +162,7 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
 
 
 def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str, Any]:
-    """Zenoh's settings of one user; keys and certificates within, so that one file is all a machine needs."""
+    """Zenoh's settings of one user, with keys and certificates in the same file."""
     texts = {key: base64.b64encode(pem).decode() for key, pem in pems.items()}
     tls: dict[str, Any] = {
         "root_ca_certificate_base64": texts["ca"],
@@ -172,7 +178,7 @@ def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str
 
 
 def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int) -> dict[str, bytes]:
-    """A new key and a certificate with ``name`` as its common name, good for both ends of a connection."""
+    """A new key and certificate with the common name ``name``, valid for both ends of a connection."""
     named = ",".join(f"{'IP' if _is_address(host) else 'DNS'}:{host}" for host in hosts)
     with tempfile.TemporaryDirectory() as scratch:
         at = Path(scratch)
@@ -218,6 +224,6 @@ def _json(data: Any) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write atomically; only the owner can read the file, from the first byte on."""
+    """Write atomically; only the owner can read the file at any time."""
     with atomic_write(path, mode=0o600) as file:
         file.write(text.encode())

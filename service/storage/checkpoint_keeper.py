@@ -1,4 +1,7 @@
-"""Keeps checkpoints of an axis: a copy of its state in the thread that handles samples, the rest in one of its own."""
+"""Writes the checkpoints of an axis, and restores an axis from a checkpoint and the journal behind it.
+
+The thread that handles samples only copies the state; a thread of its own encodes and writes it.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from service.server.axis import Axis
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
 from service.storage.segments import rows_behind
 
-#: Samples that a restart learns again at most, and in what portions: those of a minute at 1 kHz, which takes 3 s.
+#: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
 _PORTION = 100
 
 
 class CheckpointKeeper:
-    """Writes the checkpoints of one axis. A disk that fails costs checkpoints, which are counted, and nothing else."""
+    """Writes the checkpoints of one axis. A failing disk costs checkpoints only; they are counted."""
 
     def __init__(
         self,
@@ -50,35 +53,35 @@ class CheckpointKeeper:
             self._thread.start()
 
     def on_snapshot(self) -> None:
-        """Copy the state if a checkpoint is due; from the thread of the axis, right after a snapshot."""
+        """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
         now_s = self._clock()
         if self.folder is not None and now_s >= self._due_at_s:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
             self._copy()
 
     def write_now(self, timeout_s: float = 2.0) -> None:
-        """Have a checkpoint written of the state as it is. Raises ServiceError where the learner is too far behind."""
+        """Write a checkpoint of the present state. Raises ServiceError if the learner does not respond in time."""
         if self.folder is not None:
             self._queue.call(self._copy, timeout_s)
 
     def copy_now(self) -> None:
-        """The same, from the thread that handles samples."""
+        """As `write_now`, in the thread that handles samples."""
         if self.folder is not None:
             self._copy()
 
     def state(self, timeout_s: float = 2.0) -> tuple[CheckpointMeta, StateDict]:
-        """(meta, copy of the state), for a standby. Raises ServiceError where the learner is too far behind."""
+        """(meta, copy of the state), for a standby. Raises ServiceError if the learner does not respond in time."""
         return self._queue.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
 
     def counters(self) -> dict[str, Any] | None:
-        """Checkpoints written, age of the newest, and failures of the disk; None where none are kept."""
+        """Checkpoints written, age of the newest in s, failures of the disk; None if no checkpoints are written."""
         if self.folder is None:
             return None
         at = self._written_at_s
         return {**self._counts, "age_s": None if at is None else time.monotonic() - at}
 
     def close(self) -> None:
-        """Write the last state and end; after the thread that handles samples has ended."""
+        """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
         if self.folder is None:
             return
         self._copy()
@@ -97,7 +100,7 @@ class CheckpointKeeper:
         meta = self._meta()
         copied = (meta, self._axis.state_dict())
         with self._ready:
-            # One that was not yet written is out of date.
+            # Replaces a copy that has not been written yet.
             self._copied = copied
             self._ready.notify()
 
@@ -122,9 +125,9 @@ class CheckpointKeeper:
 
 
 def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
-    """Let ``axis`` go on from the newest checkpoint that is whole and matches; its number, None where there is none.
+    """Restore ``axis`` from the newest checkpoint that is complete and matches; returns its number, None for none.
 
-    Those that are refused become events with the reason, and the one before is tried.
+    A refused checkpoint is noted as an event with the reason, and the previous one is tried.
     """
     for number in folder.numbers():
         try:
@@ -139,9 +142,9 @@ def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
 
 
 def learn_again(axis: Axis, recordings: Path) -> int:
-    """Learn again, from the journals in the folder ``recordings``, what came after the state that was restored.
+    """Learn the samples after the restored state again, from the journals in the folder ``recordings``.
 
-    Returns the number of samples; nothing of it is recorded a second time.
+    Returns the number of samples. They are not recorded a second time.
     """
     rows = rows_behind(recordings, axis.sequence.received)
     if rows is None:

@@ -1,9 +1,9 @@
-"""The journal: samples appended as rows of fixed size, whole up to the last row whatever kills the process.
+"""The journal of a recording: samples appended as rows of fixed size, readable up to the last row after any crash.
 
-A file is 16 bytes of header, then records of 40 bytes: seq (i64), t_s, u_V, y_um (f64), index (u32), reason (u16)
-and a mark (u16) by which a torn or empty row is told. ``index`` counts the samples of the axis in the order in which
-they were handled, modulo 2^32: a restart goes on behind a checkpoint by it. A record of reason 65535 defines a word:
-its number stands in ``seq``, its UTF-8 text in the 24 bytes after. All little-endian.
+A file has a header of 16 bytes, then records of 40 bytes: seq (i64), t_s, u_V, y_um (f64), index (u32), reason (u16)
+and a mark (u16) that shows whether the record is complete. ``index`` counts the samples of the axis in the order in
+which they were handled, modulo 2^32; a restart uses it to find the samples after a checkpoint. A record with reason
+65535 defines a word: ``seq`` holds its number, the next 24 bytes its UTF-8 text. All values are little-endian.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ INDEX_MODULUS: Final = 2**32
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """n samples as they are recorded; ``reason`` is what the learner did with each (``learnt``, or the gate)."""
+    """n samples as recorded; ``reason`` of each is ``learnt``, or the gate that refused it."""
 
     seq: NDArray[np.int64]
     t_s: FloatArray
@@ -57,15 +57,15 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Sequence[Rows]) -> Rows:
-        """All rows of some, one behind the other; at least one part."""
-        if len(parts) == 1:  # nearly always
+        """The rows of all ``parts``, in order; ``parts`` must not be empty."""
+        if len(parts) == 1:  # the usual case
             return parts[0]
         seq = np.concatenate([part.seq for part in parts])
         t_s, u_V, y_um = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t_s", "u_V", "y_um"))
         return cls(seq, t_s, u_V, y_um, [word for part in parts for word in part.reason])
 
     def part(self, start: int, stop: int) -> Rows:
-        """Rows ``start`` up to ``stop``."""
+        """Rows ``start`` to ``stop`` - 1."""
         if start == 0 and stop == len(self):
             return self
         cut = slice(start, stop)
@@ -73,7 +73,7 @@ class Rows:
 
 
 class Journal:
-    """A journal being written. Every method raises OSError as the disk does."""
+    """A journal being written. Methods raise OSError if the disk fails, except `close`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -90,9 +90,9 @@ class Journal:
             raise
 
     def write(self, rows: Rows, index: NDArray[np.int64]) -> None:
-        """Append rows with the (n,) ``index`` of each, all or none, and hand them over to the operating system.
+        """Append ``rows`` with the (n,) ``index`` of each: all of them or none.
 
-        A killed process loses nothing of what was handed over.
+        The operating system has the rows when this returns, so a killed process does not lose them.
         """
         words = dict(self._words)
         new = [word for word in dict.fromkeys(rows.reason) if word not in words]
@@ -112,11 +112,11 @@ class Journal:
         self.rows += len(rows)
 
     def handle(self) -> int:
-        """Another descriptor of the file, which whoever asks for it closes."""
+        """A duplicate descriptor of the file; the caller closes it."""
         return os.dup(self._fd)
 
     def close(self) -> None:
-        """Let go of the file; never raises."""
+        """Close the file; never raises."""
         with contextlib.suppress(OSError):
             os.close(self._fd)
 
@@ -126,15 +126,16 @@ class Journal:
             while view:
                 view = view[os.write(self._fd, view) :]
         except OSError:
-            # A disk that filled up in the middle has taken a part: rows after it would not be found.
+            # A full disk may have stored a part of a row; rows after an incomplete one could not be read.
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._size)
             raise
 
 
 class Syncer:
-    """Has a journal on the disk itself every so often, beside the thread that writes: a disk may take its time, and
-    what waits for it in memory would be lost with the process.
+    """Syncs a journal to the disk at intervals, in a thread of its own.
+
+    A sync may take long. In the thread that writes, it would leave samples in memory, where a crash loses them.
     """
 
     def __init__(self, every_s: float) -> None:
@@ -144,7 +145,7 @@ class Syncer:
         self._error: OSError | None = None
 
     def look(self, journal: Journal) -> None:
-        """Begin where it is due. Raises OSError where the last time failed."""
+        """Start a sync if one is due. Raises OSError if the previous one failed."""
         error, self._error = self._error, None
         if error is not None:
             raise error
@@ -171,7 +172,7 @@ def _definition(number: int, word: str) -> Any:
 
 
 def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
-    """(rows, (n,) index of each), up to the first record that is not whole. Raises OSError as the disk does."""
+    """(rows, (n,) index of each), up to the first incomplete record. Raises OSError if the disk fails."""
     data = path.read_bytes()
     if data[: len(HEADER)] != HEADER:
         data = HEADER

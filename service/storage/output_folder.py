@@ -1,4 +1,4 @@
-"""The folder that a command writes into: there, writable, and without what an earlier run left."""
+"""Prepares the output folder of a command: it exists, is writable, and holds no results of an earlier run."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from adaptive.errors import InputError
 
 
 def clear_output(out: Path, names: Iterable[str]) -> None:
-    """Make ``out`` and remove what stands there under ``names``, files or folders; the rest stays.
+    """Create ``out`` if missing, and remove the files and folders called ``names`` in it; others stay.
 
-    Raises InputError where the folder cannot be written to.
+    Raises InputError if the folder cannot be written to.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,10 @@
-"""Every sample onto disk, in a thread of its own, without ever holding up who hands it over.
+"""Records every sample to disk in a thread of its own, without delaying the caller.
 
-``put`` only appends to a bounded queue and wakes the thread; where the queue is full the samples are dropped and
-counted. Within about a millisecond the thread appends them to a journal, which outlives this process. It has a segment
-of bounded length made of each journal, and removes the oldest when all of them outgrow their share of the disk. A disk
-that fails (full, read-only, gone) degrades the recording and nothing else: samples are counted as lost, and a new
-segment is tried again after a while.
+``put`` only appends to a bounded queue and wakes the thread; if the queue is full, the samples are dropped and counted.
+Within about a millisecond the thread appends them to a journal, which survives a crash of this process. Full journals
+are converted to segments of bounded length, and the oldest segments are removed when all of them exceed their share of
+the disk. A failing disk (full, read-only, gone) affects the recording only: samples are counted as lost, and after a
+pause a new segment is started.
 """
 
 from __future__ import annotations
@@ -23,27 +23,24 @@ from service.protocol.errors import FieldError
 from service.storage.journal import Journal, Rows, Syncer
 from service.storage.segments import Closer, claim, journal_of, left_open, make_room, next_number
 
-# --- How a recorder writes.
-
-
-#: Folder, in that of a recorder, for samples that were never handled; what reads a folder passes over such names.
+#: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderConfig:
-    """How a recorder writes.
+    """Settings of a recorder.
 
     Attributes
     ----------
-    directory : where the segments go; made if missing. One axis has one directory.
-    segment_rows : samples a segment holds before it is closed (600,000 are ten minutes at 1 kHz, some 15 MB).
-    max_bytes : all closed segments together, bytes; the oldest are removed beyond that. The journals of the newest two
-    segments, 40 bytes a sample, come on top.
-    queue_samples : samples that may wait for the disk.
-    flush_s : longest time that a sample waits in memory, s. It is about a millisecond where the disk keeps up: handing
-    samples over wakes who writes them. And how often it is looked whether a segment is closed.
-    sync_s : longest time that a sample waits for the disk itself, s: what a cut of the power loses.
+    directory : folder of the segments; created if missing. Each axis needs its own.
+    segment_rows : samples per segment (600,000 are ten minutes at 1 kHz, about 15 MB).
+    max_bytes : size of all closed segments together; beyond it the oldest are removed. The journals of the newest two
+        segments, 40 bytes per sample, come on top.
+    queue_samples : most samples that wait for the disk.
+    flush_s : longest time that a sample waits in memory, s; about a millisecond if the disk keeps up, because `put`
+        wakes the thread. Also the interval at which the recorder checks whether a segment has been closed.
+    sync_s : longest time until a sample is synced to the disk, s; a power failure loses later samples.
     retry_s : pause after a failure of the disk, s.
     """
 
@@ -65,15 +62,14 @@ class RecorderConfig:
                 raise FieldError(name, getattr(self, name), "a positive time in s")
 
     def aside(self) -> RecorderConfig:
-        """For samples that nobody handles: beside the others, with a tenth of their share of the disk on top of it."""
+        """Settings for samples that the axis does not handle: a folder inside this one, a tenth of its disk space."""
         return replace(self, directory=self.directory / ASIDE, max_bytes=max(1, self.max_bytes // 10))
 
 
 class Recorder:
-    """Writes the samples of one axis. Thread-safe; use as a context manager, or call :meth:`close`.
+    """Records the samples of one axis. Thread-safe; use it as a context manager, or call `close`.
 
-    Never raises after construction; the constructor raises InputError on a bad configuration only. A directory
-    that cannot be made or written to shows in :meth:`counters` and is tried again.
+    A failing disk never raises: a directory that cannot be created or written shows in `counters` and is tried again.
     """
 
     def __init__(self, config: RecorderConfig, index: int = 0) -> None:
@@ -90,10 +86,10 @@ class Recorder:
         self._error = ""
         self._segment: Journal | None = None
         self._claim: IO[bytes] | None = None
-        # Whether journals may lie there that are to be closed; whether one of them is this recorder's own.
+        # Whether there may be journals to close, and whether one of them is from this recorder.
         self._left_open, self._own = True, False
         self._closer: Closer | None = None
-        # Writes what nobody handles into a folder of its own, from the first such sample on.
+        # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
         self._not_before = 0.0
         self._syncer = Syncer(config.sync_s)
@@ -107,10 +103,10 @@ class Recorder:
         self.close()
 
     def put(self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]) -> bool:
-        """Hand over n samples (numbers or (n,)); ``reason`` is one word for all or one for each.
+        """Queue n samples (numbers or (n,) arrays, copied); ``reason`` is one word for all or one for each.
 
-        Returns False where they were dropped because the queue is full or the recorder is closed. Raises InputError
-        on unequal lengths. The arrays are copied.
+        Returns False if they were dropped, because the queue is full or the recorder is closed. Raises InputError on
+        unequal lengths.
         """
         numbers = np.array(seq, dtype=np.int64).reshape(-1)
         t, u, y = (np.array(c, dtype=np.float64).reshape(-1) for c in (t_s, u_V, y_um))
@@ -123,15 +119,16 @@ class Recorder:
                 return False
             self._queue.append((first, rows))
             self._waiting += len(rows)
-        # What a killed process has only in memory is lost: the thread takes it now and not when its pause is over.
+        # Wake the thread before its pause is over: a crash loses samples that are only in memory.
         self._wake.set()
         return True
 
     def put_aside(
         self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike, reason: str | list[str]
     ) -> bool:
-        """As :meth:`put`, for samples that nobody handles: into a folder of their own, since they have no place in the
-        order in which a restart and a replay go through the others.
+        """As `put`, for samples that the axis does not handle.
+
+        They go into a folder of their own: a restart or a replay must not learn them.
         """
         with self._lock:
             if self._aside is None and not self._stop:
@@ -140,8 +137,10 @@ class Recorder:
         return aside is not None and aside.put(seq, t_s, u_V, y_um, reason)
 
     def counters(self) -> dict[str, Any]:
-        """Samples offered, written, dropped (queue full) and lost (disk); segments closed and removed; the last error;
-        samples written ``aside``. ``degraded`` is True from a failure of the disk until the next batch is written.
+        """Counts for the status.
+
+        Samples offered, written, dropped (queue full), lost (disk) and written ``aside``; segments closed and removed;
+        the last error. ``degraded`` is True from a failure of the disk until the next batch is written.
         """
         with self._lock:
             return {
@@ -154,7 +153,7 @@ class Recorder:
             }
 
     def close(self, timeout_s: float = 10.0) -> bool:
-        """Write what waits, close the segment, end the thread. False where that did not end within the time."""
+        """Write the queue, close the segment, end the thread. Returns False if that takes longer than ``timeout_s``."""
         with self._lock:
             self._stop = True
         self._wake.set()
@@ -164,13 +163,13 @@ class Recorder:
         return not self._thread.is_alive()
 
     def rebase(self, index: int) -> None:
-        """The next sample handed over is the ``index``-th that its axis handles: it has gone on from another state."""
+        """Set the index of the next sample, after the axis has continued from another state."""
         with self._lock:
             self.index = index
 
     def _run(self) -> None:
         while True:
-            # In this order: what is handed over meanwhile wakes it once more, and what came before the stop is written.
+            # In this order: samples queued meanwhile wake the thread again; those queued before the stop are written.
             self._wake.clear()
             stop = self._stop
             taken = self._take()
@@ -217,7 +216,7 @@ class Recorder:
         return Journal(journal_of(directory, next_number(directory)))
 
     def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
-        # After a failure nothing is tried for a while, except at the end: a last chance costs nobody anything.
+        # After a failure: pause, except at the end, where one more attempt costs nothing.
         if time.monotonic() < self._not_before and not self._stop:
             self._count(lost=len(rows))
             return
@@ -242,12 +241,12 @@ class Recorder:
             self._failed(error)
             self._count(lost=len(rows) - done)
             if self._segment is not None:
-                # What this journal already holds is made into Parquet later.
+                # The rows in this journal are converted to Parquet later.
                 self._segment.close()
                 self._segment, self._left_open = None, True
 
     def _look_after_closing(self) -> None:
-        """Have segments made of the journals that are full, or that a crash or a failing disk left behind."""
+        """Convert the journals that are full, or that a crash or a failing disk left."""
         closer = self._closer
         if closer is None and self._left_open and self._segment is not None and time.monotonic() >= self._not_before:
             self._left_open = False
@@ -273,10 +272,10 @@ class Recorder:
             self._failed(error)
 
     def _close_all(self) -> None:
-        """At the end: wait for what is being closed, then close the rest."""
+        """Wait for the segments that are being closed, then close the rest."""
         if self._closer is not None:
             self._take_result(self._closer)
-        if self._claim is None and not self._claimed_what_a_crash_left():
+        if self._claim is None and not self._claim_leftovers():
             return
         self._own = self._own or self._segment is not None
         try:
@@ -284,12 +283,12 @@ class Recorder:
         except OSError as error:
             self._failed(error)
 
-    def _claimed_what_a_crash_left(self) -> bool:
-        """Whether journals lie there, though no sample came by which the folder would have become this recorder's."""
+    def _claim_leftovers(self) -> bool:
+        """Whether an earlier recorder left journals and this one, which has recorded nothing, could lock the folder."""
         if not left_open(self.config.directory):
             return False
         try:
             self._claim = claim(self.config.directory)
         except OSError:
-            return False  # another's, or of a disk that nothing can be written to
+            return False  # another process holds it, or the disk cannot be written
         return True

@@ -1,10 +1,12 @@
 """Segments of a recording on disk: open ones as journals that survive a crash, closed ones as Parquet.
 
-A Parquet file is worthless until its end is written; a journal is whole up to its last row. So the open segment is a
-journal, and closing it writes the Parquet file beside it under another name, syncs it and renames it. The journal of
-the segment closed last stays until the next is closed: a restart goes on from it behind its checkpoint.
-``python -m service.storage.segments DIRECTORY`` closes what lies open there; the recorder has that done by a process of
-its own, because it takes memory and the interpreter's lock that the service needs for better things.
+A Parquet file cannot be read until its end is written; a journal can be read up to its last row. The open segment is
+therefore a journal. Closing it writes a Parquet file under a temporary name, syncs it and renames it. The journal of
+the newest closed segment stays until the next segment is closed: a restart learns the samples after its checkpoint from
+it.
+
+``python -m service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it as a
+process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service.
 """
 
 from __future__ import annotations
@@ -24,18 +26,18 @@ from service.storage.atomic_write import PART, atomic_write
 from service.storage.journal import INDEX_MODULUS, Rows, read_journal
 
 OPEN, CLOSED = ".journal", ".parquet"
-#: The name of the journal of a segment that is Parquet already.
+#: Suffix of the journal of a closed segment.
 DONE: Final = ".done"
-#: Journals' names begin so: what reads the folder as one data set, as pyarrow does, passes over such files.
+#: Prefix of the names of journals: readers that take the folder as one data set, such as pyarrow, skip such files.
 HIDDEN: Final = "_"
-#: In place of the journal that is being written, where none is.
+#: Command-line argument for "no journal is being written".
 _NONE: Final = "-"
-#: Longest time that the closing of a segment may take, s.
+#: Longest time for closing segments, s.
 _CONVERT_S: Final = 120.0
 
 
 def schema() -> Any:
-    """Columns of a segment: the canonical ones, ``seq``, and ``reason`` as a dictionary of words."""
+    """Columns of a segment: ``seq``, ``t_s``, ``u_V``, ``y_um``, and ``reason`` as text."""
     import pyarrow as pa
 
     numbers = [("t_s", pa.float64()), ("u_V", pa.float64()), ("y_um", pa.float64())]
@@ -43,9 +45,9 @@ def schema() -> Any:
 
 
 def convert(journal: Path) -> Path | None:
-    """Turn a journal, cut off or whole, into Parquet. Returns its path, None where it held no rows.
+    """Convert a journal, complete or cut off, to Parquet. Returns the path of the segment; None if it has no rows.
 
-    The journal stays, as ``.done``; one that held nothing goes.
+    The journal is kept with the suffix ``.done``; a journal without rows is removed.
     """
     rows, _ = read_journal(journal)
     if not len(rows):
@@ -64,23 +66,23 @@ def convert(journal: Path) -> Path | None:
 
 
 def close_left_open(directory: Path, but: Path | None = None) -> list[Path]:
-    """Close the journals there, remove half-written files and journals no longer needed.
+    """Close the open segments in ``directory``; remove incomplete files and journals that are no longer needed.
 
-    ``but``: the journal that is being written; it and those after it are left alone. Returns the segments made.
-    Raises OSError as the disk does.
+    ``but`` is the journal that is being written; it and later ones stay open. Returns the new segments. Raises OSError
+    if the disk fails.
     """
     for part in directory.glob(f"*segment-*{PART}"):
         part.unlink(missing_ok=True)
     left = [path for path in left_open(directory) if but is None or number_of(path) < number_of(but)]
     made = [path for path in map(convert, left) if path is not None]
-    # The newest one that is done is what a restart may need.
+    # A restart may need the newest one.
     for done in _sorted(directory, DONE)[:-1]:
         done.unlink(missing_ok=True)
     return made
 
 
 class Closer:
-    """:func:`close_left_open` in a process of its own. Raises OSError where it cannot be started."""
+    """`close_left_open` in a process of its own. Raises OSError if the process cannot be started."""
 
     def __init__(self, directory: Path, but: Path | None) -> None:
         root = Path(__file__).resolve().parents[2]
@@ -92,17 +94,17 @@ class Closer:
             stderr=subprocess.PIPE,
             text=True,
             env=environment,
-            # Ctrl-C is for the service, which then waits for this one.
+            # Ctrl-C must end the service only, which then waits for this process.
             start_new_session=True,
         )
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process still runs."""
         return self._process.poll() is None
 
     def result(self, timeout_s: float = _CONVERT_S) -> int:
-        """Wait for it; the number of segments made. Raises OSError with its words where it failed."""
+        """Wait for the process; returns the number of new segments. Raises OSError with its message if it failed."""
         try:
             out, err = self._process.communicate(timeout=timeout_s)
         except subprocess.TimeoutExpired:
@@ -116,9 +118,9 @@ class Closer:
 
 
 def rows_behind(directory: Path, index: int) -> Rows | None:
-    """The rows that were handled from the ``index``-th sample on, in that order, as far as none is missing.
+    """The rows from the ``index``-th handled sample on, in the order of handling, up to the first missing one.
 
-    None where the journals do not reach back that far, or hold nothing newer.
+    Returns None if the journals do not reach back to that sample, or hold no later one.
     """
     columns: list[list[Any]] = [[] for _ in range(5)]
     for path in [*_sorted(directory, DONE), *_sorted(directory, OPEN)]:
@@ -126,7 +128,7 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
             rows, numbers = read_journal(path)
         except OSError:
             continue
-        # How far behind the checkpoint, in a count that wraps around.
+        # Position relative to ``index``; the stored count wraps around.
         place = (numbers - index + INDEX_MODULUS // 2) % INDEX_MODULUS - INDEX_MODULUS // 2
         starts = [0, *(np.nonzero(np.diff(place) != 1)[0] + 1).tolist()] if len(rows) else []
         for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
@@ -134,7 +136,7 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
             skip = max(0, -at)
             if at > have or skip >= stop - start:
                 continue
-            # Samples that were handled again, by an instance that took an older state over, replace what was before.
+            # An instance that continued from an older state handles samples again: later rows replace earlier ones.
             run = rows.part(start + skip, stop)
             parts: tuple[Any, ...] = (run.seq, run.t_s, run.u_V, run.y_um, run.reason)
             for column, more in zip(columns, parts, strict=True):
@@ -146,11 +148,12 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
 
 
 def claim(directory: Path) -> IO[bytes]:
-    """Hold the directory for one process, until the file is closed. Raises BlockingIOError where another has it.
+    """Lock the directory for this process until the returned file is closed.
 
-    Two recorders in one directory would take each other's open segment for the remains of a crash.
+    Two recorders in one directory would each treat the open segment of the other as left by a crash. Raises
+    BlockingIOError if another process holds the lock.
     """
-    lock = open(directory / ".lock", "wb")  # noqa: SIM115 - held as long as the recorder lives
+    lock = open(directory / ".lock", "wb")  # noqa: SIM115 - stays open as long as the recorder
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -160,7 +163,7 @@ def claim(directory: Path) -> IO[bytes]:
 
 
 def number_of(path: Path) -> int:
-    """The running number in a segment's name, -1 where it is no segment of ours."""
+    """The number in the name of a segment; -1 if the name is not that of a segment."""
     stem = path.stem.removeprefix(HIDDEN)
     return int(stem.removeprefix("segment-")) if stem.startswith("segment-") and stem[8:].isdigit() else -1
 
@@ -171,23 +174,23 @@ def segments(directory: Path) -> list[Path]:
 
 
 def left_open(directory: Path) -> list[Path]:
-    """Journals there, oldest first: of who records into it now, or of who was killed."""
+    """Journals of open segments, oldest first: of the present recorder, or of one that was killed."""
     return _sorted(directory, OPEN)
 
 
 def journal_of(directory: Path, number: int) -> Path:
-    """Where the open segment of that number is written."""
+    """The path of the journal of the open segment ``number``."""
     return directory / f"{HIDDEN}segment-{number:06d}{OPEN}"
 
 
 def next_number(directory: Path) -> int:
-    """One more than any segment there has, open or closed: names are never used twice."""
+    """One more than the number of any segment, open or closed, so that no name is used twice."""
     taken = [number_of(p) for p in directory.glob("*segment-*")]
     return max([0, *taken]) + 1
 
 
 def make_room(directory: Path, max_bytes: int) -> int:
-    """Remove the oldest closed segments until all of them fit into ``max_bytes``. Returns how many went."""
+    """Remove the oldest closed segments until the rest fit into ``max_bytes``. Returns the number removed."""
     sizes: list[tuple[Path, int]] = []
     for path in segments(directory):
         with contextlib.suppress(FileNotFoundError):
@@ -207,17 +210,18 @@ def _sorted(directory: Path, suffix: str) -> list[Path]:
 
 
 def main() -> int:
-    """Close what lies open in the directory named first; prints how many.
+    """Close the open segments in the directory given as first argument, and print their number.
 
-    A recorder, which holds the directory, names second the journal that it writes; without it nobody may hold it.
+    A recorder, which holds the lock, passes the journal that it writes as second argument, or ``-``. Without a second
+    argument this process takes the lock itself.
     """
     directory, but = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     if but not in (None, _NONE):
-        # Samples go on coming; nobody waits for this.
+        # The recorder is still running and does not wait for the result.
         step_back()
     try:
         if but is None:
-            held = claim(directory)  # noqa: F841 - until the process ends
+            held = claim(directory)  # noqa: F841 - held until the process ends
         print(len(close_left_open(directory, None if but in (None, _NONE) else Path(but))))
     except OSError as error:
         print(f"{error.strerror or error}", file=sys.stderr)

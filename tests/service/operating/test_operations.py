@@ -273,7 +273,7 @@ def test_the_table_shows_every_instance_in_a_line_and_survives_what_is_missing()
         assert word in lines[1]
     assert "frozen" in lines[2]
     assert "standby" in lines[2]
-    assert table([]).splitlines()[-1] == "no instance answers"
+    assert table([]).splitlines()[-1] == "no instance replies"
 
 
 def test_what_others_say_moves_no_cursor() -> None:

@@ -204,7 +204,7 @@ def test_each_may_do_its_own_and_nothing_else(closed: ServeProcess, folder: Path
     for name in ("plot", "loop", "afm", "service"):
         with (
             open_client(closed.endpoint, zenoh_config=folder / f"{name}.json5") as session,
-            pytest.raises(NoReplyError, match="may you command"),
+            pytest.raises(NoReplyError, match="your role may command"),
         ):
             operate(session, KEYS, "freeze", name, timeout_s=2.0)
     for name in ("plot", "loop", "alice"):
