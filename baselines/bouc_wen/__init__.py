@@ -1,4 +1,36 @@
-"""The Bouc-Wen stage (2.1)-(2.3): ``model``, exact ``step``, ``inverse``, ``identify`` and ``online`` form.
+"""The Bouc-Wen stage, equations (2.1)-(2.3).
 
-``mechanical`` is the related oscillator whose hysteresis acts in the restoring force.
+`BoucWenParameters` is the model, `step.hysteresis_step` its exact step, `identify_bouc_wen` identifies it,
+`BoucWenInverse` inverts it and `BoucWenOnline` adapts it. ``mechanical`` is the related oscillator whose hysteresis
+acts in the restoring force. The names are loaded on first use.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from baselines.bouc_wen.identify import identify_bouc_wen
+    from baselines.bouc_wen.inverse import BoucWenInverse
+    from baselines.bouc_wen.model import BoucWenParameters
+    from baselines.bouc_wen.online import BoucWenOnline
+
+_MODULES = {
+    "BoucWenInverse": "inverse",
+    "BoucWenOnline": "online",
+    "BoucWenParameters": "model",
+    "identify_bouc_wen": "identify",
+}
+__all__ = [
+    "BoucWenInverse",
+    "BoucWenOnline",
+    "BoucWenParameters",
+    "identify_bouc_wen",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,5 +1,33 @@
 """Several online models on the same samples; the best is served.
 
-``competition`` runs them, ``scoring`` measures their errors, ``champion_choice`` decides, ``champion`` is the inverse
-model that is served, and ``contestants`` lists what can compete. ``config`` imports no numerics.
+`Competition` runs them, ``scoring`` measures their errors, ``champion_choice`` decides, `ChampionInverse` is the
+inverse model that is served, and ``contestants`` lists what can compete. The names are loaded on first use, because
+`CompetitionConfig` needs no numerics.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from baselines.competition.champion import ChampionInverse
+    from baselines.competition.competition import Competition
+    from baselines.competition.config import CompetitionConfig
+
+_MODULES = {
+    "ChampionInverse": "champion",
+    "Competition": "competition",
+    "CompetitionConfig": "config",
+}
+__all__ = [
+    "ChampionInverse",
+    "Competition",
+    "CompetitionConfig",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

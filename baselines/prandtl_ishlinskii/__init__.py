@@ -1,1 +1,37 @@
-"""The modified Prandtl-Ishlinskii model (2.4)-(2.18): operators, model, inverse, identification, online form."""
+"""The modified Prandtl-Ishlinskii model (MPI), equations (2.4)-(2.18).
+
+`MpiParameters` is the model, `identify_mpi` identifies it over an `MpiGrid`, `MpiInverse` is its exact inverse and
+`MpiOnline` adapts it; `operators` has the play and dead-zone operators. The names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
+    from baselines.prandtl_ishlinskii.inverse import MpiInverse
+    from baselines.prandtl_ishlinskii.model import MpiParameters
+    from baselines.prandtl_ishlinskii.online import MpiOnline
+
+_MODULES = {
+    "MpiGrid": "identify",
+    "MpiInverse": "inverse",
+    "MpiOnline": "online",
+    "MpiParameters": "model",
+    "identify_mpi": "identify",
+}
+__all__ = [
+    "MpiGrid",
+    "MpiInverse",
+    "MpiOnline",
+    "MpiParameters",
+    "identify_mpi",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

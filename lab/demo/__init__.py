@@ -1,4 +1,30 @@
 """The demonstration: one reference, five models on twin stages, a change half way, and a table at the end.
 
-`lab.demo.session.run` runs it; `lab.demo.plan.Plan` says what it does and when.
+`run` runs it as the `Plan` says and returns a `DemoRun`; `table` shows the result. The names are loaded on first use.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from lab.demo.plan import Plan
+    from lab.demo.result import DemoRun, table
+    from lab.demo.session import run
+
+_MODULES = {
+    "DemoRun": "result",
+    "Plan": "plan",
+    "run": "session",
+    "table": "result",
+}
+__all__ = [
+    "DemoRun",
+    "Plan",
+    "run",
+    "table",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

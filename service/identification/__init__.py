@@ -1,7 +1,32 @@
 """Identification of the served models from a recording, with held-out scores and a picture.
 
-`identifying` identifies and scores; `pictures` draws; `recording_options` are the command-line options for recordings.
-Import from these modules: the package itself loads nothing, because the options are needed without the models.
+`identify_all` identifies and scores; `draw_identification` draws; `recording_options` has the command-line options for
+recordings. The names are loaded on first use, because the options are needed without the models.
 """
 
-__all__: list[str] = []
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.identification.identifying import Identified, Stretch, identify_all, identify_one
+    from service.identification.pictures import draw_identification
+
+_MODULES = {
+    "Identified": "identifying",
+    "Stretch": "identifying",
+    "draw_identification": "pictures",
+    "identify_all": "identifying",
+    "identify_one": "identifying",
+}
+__all__ = [
+    "Identified",
+    "Stretch",
+    "draw_identification",
+    "identify_all",
+    "identify_one",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -1,1 +1,29 @@
-"""Samples on their way into an axis: the queue, the numbers of the samples, and their times."""
+"""Samples on their way to an axis.
+
+`SampleQueue` holds samples and calls between zenoh's threads and that of the axis, `SequenceTracker` checks sample
+numbers, and `SampleClock` gives continuous sample times. The names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.intake.clock import SampleClock
+    from service.intake.sample_queue import SampleQueue
+    from service.intake.sequence import SequenceTracker
+
+_MODULES = {
+    "SampleClock": "clock",
+    "SampleQueue": "sample_queue",
+    "SequenceTracker": "sequence",
+}
+__all__ = [
+    "SampleClock",
+    "SampleQueue",
+    "SequenceTracker",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -1,1 +1,42 @@
-"""Operator's commands: requests over zenoh, their journal, and the table of statuses (docs/operating.md)."""
+"""Operator's commands: requests over zenoh, their journal, and the table of statuses (docs/operating.md).
+
+`operate` sends a command and `statuses` collects the statuses of all instances; `screen` shows them. `OperationsServer`
+takes the commands of one axis, runs its `Verbs` and writes them to a `Journal`. The names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.operating.journal import Journal
+    from service.operating.remote import Standbys, operate, statuses
+    from service.operating.request import Request
+    from service.operating.server import OperationsServer
+    from service.operating.table import screen
+    from service.operating.verbs import Verbs
+
+_MODULES = {
+    "Journal": "journal",
+    "OperationsServer": "server",
+    "Request": "request",
+    "Standbys": "remote",
+    "Verbs": "verbs",
+    "operate": "remote",
+    "screen": "table",
+    "statuses": "remote",
+}
+__all__ = [
+    "Journal",
+    "OperationsServer",
+    "Request",
+    "Standbys",
+    "Verbs",
+    "operate",
+    "screen",
+    "statuses",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

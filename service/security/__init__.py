@@ -1,1 +1,47 @@
-"""Who may reach a service, and for what: zenoh's TLS, passwords and access control, written, checked and counted."""
+"""Access to a service: zenoh's TLS, passwords and access control.
+
+`create`, `add` and `remove` make the access files of a `Plan`, `access_control` the rules of the `ROLES`. `check_reach`
+refuses to start a service that others could reach without protection. `count_refusals` counts what zenoh refuses. The
+names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.security.check import check_reach, has_access_control
+    from service.security.files import Plan, add, create, read_plan, remove
+    from service.security.refusals import Refusals, count_refusals
+    from service.security.rules import ROLES, access_control
+
+_MODULES = {
+    "ROLES": "rules",
+    "Plan": "files",
+    "Refusals": "refusals",
+    "access_control": "rules",
+    "add": "files",
+    "check_reach": "check",
+    "count_refusals": "refusals",
+    "create": "files",
+    "has_access_control": "check",
+    "read_plan": "files",
+    "remove": "files",
+}
+__all__ = [
+    "ROLES",
+    "Plan",
+    "Refusals",
+    "access_control",
+    "add",
+    "check_reach",
+    "count_refusals",
+    "create",
+    "has_access_control",
+    "read_plan",
+    "remove",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

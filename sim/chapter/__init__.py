@@ -1,1 +1,42 @@
-"""The chapter's experiments on a simulated stage: its tables and the data of its figures, as arrays. No plots here."""
+"""The chapter's experiments on a simulated stage: its tables and the data of its figures, as arrays without plots.
+
+`experiments.experiments` records the `Experiments`; `characterise`, `identify_forward`, `run_control` and
+`track_learning` repeat the studies on them. The names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim.chapter.adaptive_loop import track_learning
+    from sim.chapter.characterisation import characterise
+    from sim.chapter.control import run_control
+    from sim.chapter.experiments import Experiments, Record, Score
+    from sim.chapter.modelling import identify_forward
+
+_MODULES = {
+    "Experiments": "experiments",
+    "Record": "experiments",
+    "Score": "experiments",
+    "characterise": "characterisation",
+    "identify_forward": "modelling",
+    "run_control": "control",
+    "track_learning": "adaptive_loop",
+}
+__all__ = [
+    "Experiments",
+    "Record",
+    "Score",
+    "characterise",
+    "identify_forward",
+    "run_control",
+    "track_learning",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

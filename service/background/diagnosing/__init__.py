@@ -1,1 +1,32 @@
-"""The service's own diagnosis: when its model's error grows, what has changed is found out beside it, not in it."""
+"""Diagnosis in the background: when the error of a model grows, a process finds out what changed in the stage.
+
+`Watcher` keeps the recent samples of an axis, raises an alarm and starts the process, as `WatchConfig` says. The names
+are loaded on first use: the configuration needs `WatchConfig` only.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.background.diagnosing.alarm import Alarm
+    from service.background.diagnosing.buffer import SampleBuffer
+    from service.background.diagnosing.settings import WatchConfig
+    from service.background.diagnosing.watcher import Watcher
+
+_MODULES = {
+    "Alarm": "alarm",
+    "SampleBuffer": "buffer",
+    "WatchConfig": "settings",
+    "Watcher": "watcher",
+}
+__all__ = [
+    "Alarm",
+    "SampleBuffer",
+    "WatchConfig",
+    "Watcher",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

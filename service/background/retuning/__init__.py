@@ -1,1 +1,32 @@
-"""Re-tuning of the learner's hyper-parameters in the background, by a process that cannot hold anybody up."""
+"""Re-tuning in the background: a process proposes hyper-parameters and tries them on fresh samples.
+
+`Retuner` controls it for an axis, as `RetuningConfig` says. A `Retuned` is an adoption at a definite sample;
+`Adoptions` holds those that an axis has yet to make. The names are loaded on first use: the configuration needs
+`RetuningConfig` only.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from service.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.background.retuning.adoption import Adoptions, Retuned
+    from service.background.retuning.retuner import Retuner
+    from service.background.retuning.settings import RetuningConfig
+
+_MODULES = {
+    "Adoptions": "adoption",
+    "Retuned": "adoption",
+    "Retuner": "retuner",
+    "RetuningConfig": "settings",
+}
+__all__ = [
+    "Adoptions",
+    "Retuned",
+    "Retuner",
+    "RetuningConfig",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)
