@@ -39,8 +39,7 @@ def warm() -> None:
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
     all_finite(still)
-    # The compiled algebra is warm already; the library's is an option.
-    drift = DriftFilter(DriftConfig(algebra="filterpy"), np.zeros(p), np.eye(p), 1e-3, 1.0)
+    drift = DriftFilter(DriftConfig(), np.zeros(p), np.eye(p), 1e-3, 1.0)
     for moving in (True, False):
         drift.update(np.ones(p), 0.0, moving)
     drift.expect_change()

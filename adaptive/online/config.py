@@ -72,8 +72,8 @@ class LearnerConfig:
         parts = {name: asdict(getattr(self, name)) for name in names}
         flat = joined(parts)
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
-        # The file format has an entry for a choice that there no longer is; older versions read it.
-        return {**own, **flat, "solver.backend": "compiled"}
+        # The file format has entries for two settings that no longer exist; older versions read them.
+        return {**own, **flat, "solver.backend": "compiled", "drift.algebra": "compiled"}
 
     @classmethod
     def from_state(cls, values: StateDict) -> LearnerConfig:
@@ -82,7 +82,7 @@ class LearnerConfig:
         return cls(
             **own,
             admission=AdmissionConfig(**under("admission.", values)),
-            drift=DriftConfig(**under("drift.", values)),
+            drift=DriftConfig(**{n: v for n, v in under("drift.", values).items() if n != "algebra"}),
             weights=WeightConfig(**under("weights.", values)),
             solver=SolverConfig(values["solver.form"], values["solver.accuracy"]),
             envelope=EnvelopeConfig(**under("envelope.", values)),

@@ -5,19 +5,15 @@ The linear part ``beta`` is a random walk. Its process noise makes it fast witho
 other coefficient. A gain drop of 6 % is one direction to find instead of twenty, so it is found within tens of
 milliseconds, and the play coefficients keep the shape of the loop.
 
-The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form). ``algebra="filterpy"`` has the library do it;
-``"compiled"``, the default, is the same by ``adaptive.online.drift``, held to the library by tests. The library's calls
-and copies cost 70 µs an update of 63 coefficients, as much as all the rest of the learner, and a query that meets them
-waits: the promise of the service's latency cannot be kept with them (docs/measurements/latency.md). The measurement is
-the voltage minus the kernel part of the model, so that filter and window learn one model together and neither undoes
-the other.
+The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form), compiled: the library's calls and copies cost
+70 µs an update of 63 coefficients, as much as the rest of the learner. Tests and ``dehyst bench`` compare the two. The
+measurement is the voltage minus the kernel part of the model, so that filter and window learn one model together.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan, nan
-from typing import Any, Literal
 
 import numpy as np
 
@@ -157,7 +153,6 @@ class DriftConfig:
     burst_floor : rms innovations below this are never a change.
     gate_sigma : innovations beyond this many standard deviations are refused ...
     gate_persistence : ... unless this many in a row are.
-    algebra : ``filterpy``, or ``compiled``, the same to rounding at a twentieth of the time.
     """
 
     gain_walk: float = 0.005
@@ -172,14 +167,9 @@ class DriftConfig:
     burst_floor: float = 0.0025
     gate_sigma: float = 8.0
     gate_persistence: int = 6
-    algebra: Literal["filterpy", "compiled"] = "compiled"
 
     def __post_init__(self) -> None:
-        if self.algebra not in ("filterpy", "compiled"):
-            raise InputError(f"drift.algebra: got {self.algebra!r}, expected 'filterpy' or 'compiled'")
         for name in self.__dataclass_fields__:
-            if name == "algebra":
-                continue
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"drift.{name}: got {value}, expected a finite number, not negative")
@@ -204,13 +194,6 @@ FAST_S = 0.008
 SLOW_S = 2.0
 #: No second burst within this time, s: the first one needs it to be used up.
 DEAD_S = 0.25
-
-
-def _library_filter(p: int) -> Any:
-    # Here and not above: who has chosen the compiled algebra is spared the import.
-    from filterpy.kalman import KalmanFilter
-
-    return KalmanFilter(dim_x=p, dim_z=1)
 
 
 class DriftFilter:
@@ -238,7 +221,6 @@ class DriftFilter:
         self._x = np.array(beta, dtype=np.float64)
         self._P = np.array(covariance, dtype=np.float64, order="C")
         self._k, self._row = np.empty(p), np.empty(p)
-        self._library = _library_filter(p) if config.algebra == "filterpy" else None
         walk, burst = np.full(p, config.shape_walk), np.zeros(p)
         walk[0], burst[0] = config.offset_walk, config.burst_offset
         if p >= MOTION_COLUMNS:
@@ -287,9 +269,7 @@ class DriftFilter:
             outcome = "burst"
         # The long-term level must not learn the change itself, or a second change would hide behind the first.
         s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
-        if moving and self._library is not None:
-            self._take_in(self._library, basis, target_V, noise_V2)
-        elif moving and outcome == "updated":
+        if moving and outcome == "updated":
             take_in(x, P, basis, innovation, variance, noise_V2, self._k, self._row)
         elif moving:
             # The burst has opened the covariance since.
@@ -298,16 +278,6 @@ class DriftFilter:
             update_constant(x, P, basis, target_V, noise_V2, self._row)
         s.updates += 1
         return outcome
-
-    def _take_in(self, kf: Any, basis: FloatArray, target_V: float, noise_V2: float) -> None:
-        x, P = self._x, self._P
-        # The library's estimate is set and read each time: at rest and in a burst what it stands for changes here.
-        kf.x, kf.P = x[:, None], P
-        kf.update(np.array([[target_V]]), R=noise_V2, H=basis[None, :])
-        x[:] = kf.x[:, 0]
-        # Rounding leaves a little asymmetry, which the recursion would keep.
-        np.add(kf.P, kf.P.T, out=P)
-        P *= 0.5
 
     def expect_change(self) -> None:
         """Open the directions in which a sudden change of the stage shows: gain, offset, velocity, acceleration."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 
 from adaptive.errors import InputError
+from adaptive.online import drift
+from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftConfig, DriftFilter
 
 P, STEP = 10, 2e-3
@@ -104,34 +107,39 @@ def test_bad_configuration_is_named() -> None:
         DriftFilter(DriftConfig(), TRUE, np.eye(3), STEP, 8.0)
 
 
-def test_the_librarys_algebra_and_the_compiled_one_agree_through_changes_and_rests() -> None:
-    library, compiled = made(DriftConfig(algebra="filterpy")), made(DriftConfig(algebra="compiled"))
-    basis = rows(900)
+def by_filterpy(
+    x: np.ndarray, P: np.ndarray, h: np.ndarray, z: float, noise: float, k: np.ndarray, row: np.ndarray
+) -> None:
+    """`joseph` by filterpy."""
+    reference = KalmanFilter(dim_x=x.size, dim_z=1)
+    reference.x, reference.P = x[:, None].copy(), P.copy()
+    reference.update(np.array([[z]]), R=noise, H=h[None, :])
+    x[:] = reference.x[:, 0]
+    P[:] = 0.5 * (reference.P + reference.P.T)
+
+
+def test_the_compiled_filter_agrees_with_filterpy_through_changes_and_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, compiled = made(), made()
     outcomes = set()
-    for k, row in enumerate(basis):
+    for k, row in enumerate(rows(900)):
         truth = TRUE * (0.94 if k > 300 else 1.0)
         target = float(row @ truth) + 1e-4 * np.sin(37.0 * k)
-        moving = not 600 <= k < 700
-        said = library.update(row, target, moving, 1.0 if k % 5 else 0.3)
-        assert compiled.update(row, target, moving, 1.0 if k % 5 else 0.3) == said
-        outcomes.add(said)
-    assert "burst" in outcomes
-    np.testing.assert_allclose(library.beta, compiled.beta, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(library.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
+        moving, weight = not 600 <= k < 700, 1.0 if k % 5 else 0.3
+        with monkeypatch.context() as patched:
+            patched.setattr(drift, "joseph", by_filterpy)
+            patched.setattr(
+                drift, "take_in", lambda x, P, h, e, v, noise, k, row, z=target: by_filterpy(x, P, h, z, noise, k, row)
+            )
+            outcome = reference.update(row, target, moving, weight)
+        assert compiled.update(row, target, moving, weight) == outcome
+        outcomes.add(outcome)
+    assert {"burst", "updated"} <= outcomes
+    np.testing.assert_allclose(reference.beta, compiled.beta, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(reference.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
 
 
-def test_the_library_is_called_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    from filterpy.kalman import KalmanFilter
-
-    calls = []
-    update = KalmanFilter.update
-    monkeypatch.setattr(KalmanFilter, "update", lambda self, z, **more: (calls.append(1), update(self, z, **more)))
-    feed(made(DriftConfig(algebra="filterpy")), rows(5), TRUE)
-    assert len(calls) == 5
-    feed(made(), rows(5), TRUE)
-    assert len(calls) == 5
-
-
-def test_an_unknown_algebra_is_refused() -> None:
-    with pytest.raises(InputError, match="algebra"):
-        DriftConfig(algebra="magic")  # type: ignore[arg-type]
+@pytest.mark.parametrize(("table", "key"), [("solver", "backend"), ("drift", "algebra")])
+def test_a_state_from_before_a_setting_was_removed_is_read(table: str, key: str) -> None:
+    state = LearnerConfig().state_dict()
+    assert state[f"{table}.{key}"] == "compiled"
+    assert LearnerConfig.from_state(state) == LearnerConfig()

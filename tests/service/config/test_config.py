@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 
 from adaptive.errors import InputError
+from adaptive.online.config import LearnerConfig
 from service.config.config import parse_config, read_config
 from service.config.reference import example, page
+from service.config.schema import build_settings
+from service.protocol.errors import FieldError
 from service.runtime.session import check_endpoint, is_loopback
 
 GOOD = """
@@ -124,3 +127,11 @@ def test_loopback_is_told_from_the_rest(endpoint: str, local: bool) -> None:
 def test_bad_endpoints_are_refused(endpoint: object) -> None:
     with pytest.raises(InputError, match="listen"):
         check_endpoint("listen", endpoint)
+
+
+@pytest.mark.parametrize(("table", "key", "known"), [("solver", "backend", "accuracy"), ("drift", "algebra", "noise")])
+def test_a_setting_that_no_longer_exists_is_refused_by_name(table: str, key: str, known: str) -> None:
+    with pytest.raises(FieldError) as refused:
+        build_settings(LearnerConfig, {table: {key: "compiled"}}, "axis[0].learner")
+    assert f"axis[0].learner.{table}.{key}" in str(refused.value)
+    assert known in str(refused.value)
