@@ -87,7 +87,9 @@ class Block:
 def check_header(data: bytes, kind: int, least_bytes: int, allowed_options: int = 0) -> tuple[int, int]:
     """(options, n) of a payload. Raises InputError if it is not of ``kind`` or shorter than ``least_bytes``."""
     if len(data) < least_bytes:
-        raise FieldError("payload", f"{len(data)} bytes", f"at least {least_bytes} bytes for a {KIND_NAMES[kind]}")
+        raise FieldError(
+            "payload", f"{len(data)} bytes", f"at least {least_bytes} bytes for the kind '{KIND_NAMES[kind]}'"
+        )
     version, got_kind, options, n = HEADER.unpack_from(data)
     if version != VERSION:
         raise FieldError("version", version, f"{VERSION}", "use a client of the same wire version as the service")

@@ -166,4 +166,6 @@ def test_a_live_service_answers_every_bad_query_with_an_error_and_holds_its_memo
         assert client.status()["samples"]["malformed"] > 10
         assert client.point(40.0, model="linear").u_V == honest_u_V
     code, _, err = process.stop()
-    assert (code, err) == (0, "")
+    assert code == 0
+    # Events are logged; nothing else, such as a traceback, may be there.
+    assert all("dehyst.axis." in line for line in err.splitlines()), err
