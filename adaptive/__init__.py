@@ -29,8 +29,9 @@ Names are imported on first use: numba and scipy take seconds, which a process t
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from adaptive.errors import DehystError, InputError, ModelFileError, NumericsError
@@ -77,8 +78,4 @@ __all__ = [
     "identify_lssvm",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)

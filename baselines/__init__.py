@@ -15,8 +15,9 @@ Names are imported when they are first used, because some of them load compiled 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from baselines.bouc_wen.inverse import BoucWenInverse as BoucWenInverse
@@ -65,8 +66,4 @@ __all__ = [
     "fit_mpi",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -7,8 +7,9 @@ acts in the restoring force. The names are loaded on first use.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from baselines.bouc_wen.identify import identify_bouc_wen
@@ -29,8 +30,4 @@ __all__ = [
     "identify_bouc_wen",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)

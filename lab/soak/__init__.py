@@ -6,8 +6,9 @@ processes of a soak import this package and must start fast.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from lab.soak.fault_plan import FAULT_KINDS, SoakPlan, make_plan, select_kinds
@@ -16,15 +17,11 @@ if TYPE_CHECKING:
 __all__ = ["FAULT_KINDS", "SoakPlan", "make_plan", "run", "select_kinds"]
 
 _MODULES: Final = {
-    "FAULT_KINDS": "lab.soak.fault_plan",
-    "SoakPlan": "lab.soak.fault_plan",
-    "make_plan": "lab.soak.fault_plan",
-    "select_kinds": "lab.soak.fault_plan",
-    "run": "lab.soak.session",
+    "FAULT_KINDS": "fault_plan",
+    "SoakPlan": "fault_plan",
+    "make_plan": "fault_plan",
+    "select_kinds": "fault_plan",
+    "run": "session",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -10,6 +10,8 @@ The names are loaded on first use: `import service.client` alone loads neither z
 
 from __future__ import annotations
 
+from adaptive.lazy_names import lazy_names
+
 # Not from typing: that would double the import time of this package. mypy knows the name.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -20,16 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["Client", "Follower", "Point", "Trajectory"]
 
 _MODULES = {
-    "Client": "service.client.client",
-    "Follower": "service.client.follower",
-    "Point": "service.protocol.reply",
-    "Trajectory": "service.protocol.reply",
+    "Client": "client",
+    "Follower": "follower",
+    "Point": ".protocol.reply",
+    "Trajectory": ".protocol.reply",
 }
 
-
-def __getattr__(name: str) -> object:
-    import importlib
-
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -8,8 +8,9 @@ some of these modules, and `role_control` needs the server.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.failover.peer_files import PeerFiles, standby_folder
@@ -19,14 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["PeerFiles", "Reachability", "RoleControl", "standby_folder"]
 
 _MODULES: Final = {
-    "PeerFiles": "service.failover.peer_files",
-    "Reachability": "service.failover.reachability",
-    "RoleControl": "service.failover.role_control",
-    "standby_folder": "service.failover.peer_files",
+    "PeerFiles": "peer_files",
+    "Reachability": "reachability",
+    "RoleControl": "role_control",
+    "standby_folder": "peer_files",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_names(__name__, _MODULES)

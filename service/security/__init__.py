@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from service.lazy_names import lazy_names
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.security.check import check_reach, has_access_control

@@ -6,8 +6,9 @@ The names are loaded on first use: the keys and faults alone do not load the sim
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.stage_node.faults import Fault, Injector, fault_key
@@ -16,16 +17,12 @@ if TYPE_CHECKING:
 __all__ = ["Fault", "Injector", "NodeConfig", "StageNode", "fault_key", "status_key"]
 
 _MODULES: Final = {
-    "NodeConfig": "service.stage_node.node",
-    "StageNode": "service.stage_node.node",
-    "status_key": "service.stage_node.node",
-    "Fault": "service.stage_node.faults",
-    "Injector": "service.stage_node.faults",
-    "fault_key": "service.stage_node.faults",
+    "NodeConfig": "node",
+    "StageNode": "node",
+    "status_key": "node",
+    "Fault": "faults",
+    "Injector": "faults",
+    "fault_key": "faults",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_names(__name__, _MODULES)

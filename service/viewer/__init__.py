@@ -8,8 +8,9 @@ use: the records alone load neither zenoh nor Rerun.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.viewer.consumer import Consumer, ConsumerConfig
@@ -33,22 +34,18 @@ __all__ = [
 ]
 
 _MODULES: Final = {
-    "Diagnostics": "service.viewer.records",
-    "Event": "service.viewer.records",
-    "Health": "service.viewer.records",
-    "Record": "service.viewer.records",
-    "SceneConfig": "service.viewer.records",
-    "Status": "service.viewer.records",
-    "Tracking": "service.viewer.records",
-    "Consumer": "service.viewer.consumer",
-    "ConsumerConfig": "service.viewer.consumer",
-    "Output": "service.viewer.output",
-    "OutputConfig": "service.viewer.output",
-    "write_recording": "service.viewer.offline",
+    "Diagnostics": "records",
+    "Event": "records",
+    "Health": "records",
+    "Record": "records",
+    "SceneConfig": "records",
+    "Status": "records",
+    "Tracking": "records",
+    "Consumer": "consumer",
+    "ConsumerConfig": "consumer",
+    "Output": "output",
+    "OutputConfig": "output",
+    "write_recording": "offline",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from service.lazy_names import lazy_names
+from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.background.diagnosing.alarm import Alarm

@@ -7,15 +7,16 @@ from importlib import import_module
 
 
 def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
-    """The ``__getattr__`` of ``package``: ``modules`` gives the module, within the package, that defines each name.
+    """The ``__getattr__`` of ``package``: ``modules`` gives the module that defines each name.
 
-    The returned function raises AttributeError on other names.
+    A module is relative to the package; ``.other.module`` is beside it. The returned function raises AttributeError
+    on other names.
     """
 
     def load(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value: object = getattr(import_module(f"{package}.{modules[name]}"), name)
+        value: object = getattr(import_module(f".{modules[name]}", package), name)
         return value
 
     return load
