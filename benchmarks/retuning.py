@@ -23,8 +23,9 @@ from benchmarks.latency_setup import LatencySetup, running_setup
 from benchmarks.measuring import DIMENSION, stream
 from benchmarks.sample_feed import AXIS, STAGE
 from lab.testbed.identified_stage import WINDOW
-from service.background.retuning.job import Job, pack
+from service.background.job import BackgroundJob
 from service.background.retuning.settings import RetuningConfig
+from service.background.retuning.worker import pack, start_job
 from service.client.client import Client
 
 QUANTILES = {"p50": 50.0, "p99": 99.0}
@@ -42,7 +43,7 @@ class Tuning:
         hyper = Hyperparameters(100.0, (1.0,) * DIMENSION)
         data = WindowData(X, y, np.ones(WINDOW), np.arange(WINDOW, 0, -1.0) - 1.0, hyper)
         self._arrays = pack("before", data)
-        self._job: Job | None = None
+        self._job: BackgroundJob | None = None
         self.done = 0
 
     def step(self) -> None:
@@ -53,7 +54,7 @@ class Tuning:
             self._job, self.done = None, self.done + 1
         if self._job is None:
             order = {"kind": "propose", "search": asdict(RetuneConfig()), "torch": RetuningConfig().torch}
-            self._job = Job(order, self._arrays, 60.0)
+            self._job = start_job(order, self._arrays, 60.0)
 
     def stop(self) -> None:
         """Cancel the running proposal."""

@@ -1,4 +1,4 @@
-"""When to look: the learner's own figures against those of the time when all was well."""
+"""The alarm of the diagnosis: compares the figures of the learner with those of a reference period."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.background.diagnosing.settings import WatchConfig
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """What the learner says of itself: the stage's gain, offset in V, rms error in % of the span, validity."""
+    """Figures of a learner: gain of the stage, offset in V, recent rms error in % of the voltage span, validity."""
 
     gain: float
     offset_V: float
@@ -20,14 +20,14 @@ class Levels:
     valid: bool
 
     @staticmethod
-    def of(told: Mapping[str, Any]) -> Levels | None:
-        """From a learner's diagnostics; None where it does not tell."""
+    def of(diagnostics: Mapping[str, Any]) -> Levels | None:
+        """From the diagnostics of a learner; None if they lack a figure or one is not finite."""
         try:
             levels = Levels(
-                float(told["gain"]),
-                float(told["offset_V"]),
-                float(told["recent_rms_error_pct"]),
-                bool(told.get("valid", 1.0)),
+                float(diagnostics["gain"]),
+                float(diagnostics["offset_V"]),
+                float(diagnostics["recent_rms_error_pct"]),
+                bool(diagnostics.get("valid", 1.0)),
             )
         except (KeyError, TypeError, ValueError):
             return None
@@ -35,7 +35,7 @@ class Levels:
 
 
 class Alarm:
-    """Raised once something has been out of its bounds for ``hold_s``. Explicit state, no clock: time is handed in."""
+    """Raises an alarm when a figure has been out of bounds for ``hold_s``. The caller passes the time."""
 
     def __init__(self, config: WatchConfig, span_V: float) -> None:
         self._config = config
@@ -45,15 +45,15 @@ class Alarm:
 
     @property
     def armed(self) -> bool:
-        """Whether it knows what is normal."""
+        """Whether it has reference levels."""
         return self._normal is not None
 
     def arm(self, levels: Levels | None) -> None:
-        """Take ``levels`` for normal; None disarms."""
+        """Take ``levels`` as the reference; None disarms."""
         self._normal, self._since_s = levels, None
 
     def check(self, t_s: float, now: Levels) -> str:
-        """Why there is an alarm at ``t_s``, or an empty text."""
+        """The reason for an alarm at ``t_s``; "" for no alarm."""
         if self._normal is None:
             return ""
         why = self._out_of_bounds(now, self._normal)

@@ -1,4 +1,4 @@
-"""The last samples of one axis in a ring of fixed size; one thread writes, any thread copies."""
+"""The newest samples of one axis in a ring buffer of fixed size. One thread writes; any thread may copy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from adaptive.types import FloatArray
 from service.protocol.samples import SampleBatch
 
-#: Samples are kept up to this many, whatever the sample rate.
+#: Most samples that are kept, at any sample rate.
 MOST_SAMPLES: Final = 200_000
-#: That many old samples in a row are not late: the stage counts anew, and what was kept belongs to another time.
+#: Old samples in a row that mean a restarted count of the stage rather than late samples.
 _RESTART_AFTER: Final = 200
 
 
 class SampleBuffer:
-    """The newest samples as columns (seq, t_s, u_V, y_um), oldest overwritten."""
+    """The newest samples as rows (seq, t_s, u_V, y_um) of a (4, n) array; new samples overwrite the oldest."""
 
     def __init__(self, samples: int) -> None:
         self._rows = np.full((4, max(1, min(samples, MOST_SAMPLES))), np.nan)
@@ -29,20 +29,20 @@ class SampleBuffer:
 
     @property
     def last_seq(self) -> int:
-        """Newest number, -1 before any."""
+        """Number of the newest sample; -1 for none."""
         return self._last
 
     @property
     def size(self) -> int:
-        """Samples kept."""
+        """Number of samples kept."""
         return self._kept
 
     def add(self, batch: SampleBatch) -> bool:
-        """Append what is newer than all before. Returns False where the stage began to count anew."""
+        """Append the samples newer than all earlier ones. Returns False if the stage has restarted its count."""
         new = batch.seq > self._last
         going_on = True
         if not new.all():
-            # Doubles and stragglers teach nothing; a long run of them is a restarted stage.
+            # Skip duplicates and late samples; a long run of them means a restarted stage.
             self._old = self._old + int(batch.seq.size - new.sum()) if not new.any() else 0
             if self._old >= _RESTART_AFTER:
                 self.clear()
@@ -64,7 +64,7 @@ class SampleBuffer:
         return going_on
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all samples."""
         with self._lock:
             self._end = self._kept = self._old = 0
             self._last = -1

@@ -9,20 +9,21 @@ from adaptive.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
-    """When to diagnose, on what, and for how long.
+    """When to diagnose, which samples, and for how long.
 
     Attributes
     ----------
-    enabled : False switches it off: no samples are kept, no process is started.
-    history_s : how far back samples are kept, s; what lies before the recent ones settles the loop's memory.
-    reference_s : length of the stretch in which all was well, taken after the start and after each verdict, s.
-    recent_s : what a request looks at, s. collect_s : what is waited for after an alarm, and looked at, s.
+    enabled : False switches the diagnosis off: no samples are kept, no process is started.
+    history_s : length of the samples kept, s; those before the recent ones settle the hysteresis memory.
+    reference_s : length of the reference, s; it is taken after the start and after each verdict.
+    recent_s : length of the samples diagnosed on request, s.
+    collect_s : length of the samples collected after an alarm and then diagnosed, s.
     gain_alarm : relative change of the stage's gain since the reference that raises an alarm.
-    offset_alarm : change of its offset, share of the model's voltage span.
-    error_factor, error_floor_pct : the learner's recent rms error against that of the reference, and in percent of
-        the voltage span, beyond both of which it raises an alarm.
-    hold_s : how long it must last, s. cooldown_s : least time between two alarms, s.
-    timeout_s : longest time that a diagnosis may take before it is ended, s.
+    offset_alarm : change of the stage's offset since the reference that raises an alarm, share of the voltage span.
+    error_factor, error_floor_pct : an alarm is raised when the recent rms error of the learner exceeds this multiple of
+        that in the reference, and this percentage of the voltage span.
+    hold_s : time for which a condition must last to raise an alarm, s. cooldown_s : least time between two alarms, s.
+    timeout_s : longest time of a diagnosis, s; then its process is killed.
     reports : folder for full reports on request (``"report": true``); empty for none.
     """
 
@@ -60,5 +61,6 @@ class WatchConfig:
         longest = max(self.reference_s, self.recent_s, self.collect_s)
         if self.history_s < longest:
             raise InputError(
-                f"history_s: got {self.history_s:g} s, expected at least {longest:g} s, the longest stretch looked at"
+                f"history_s: got {self.history_s:g} s, expected at least {longest:g} s, "
+                "the longest of reference_s, recent_s and collect_s"
             )

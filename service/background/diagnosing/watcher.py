@@ -1,7 +1,7 @@
-"""Watches one axis: keeps its last samples, notices when the model's error grows, and has a process say why.
+"""Watches one axis: keeps its recent samples, detects a growing error of the model, and starts a process to explain it.
 
-The samples come from the thread that learns, which is never made to wait: a copy into a ring, and four times a
-second a look at the learner's own figures. Everything else is done by a process of the lowest priority, one at a time.
+The thread that learns passes the samples and never waits: it copies them into a ring buffer, and reads the figures of
+the learner four times per second. A process of the lowest priority does the rest, one diagnosis at a time.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 
-#: How often the learner is asked for its figures, s of samples.
+#: Interval at which the figures of the learner are read, s of samples.
 _LOOK_S: Final = 0.25
-#: Verdicts told in the status, of which only the last one whole.
+#: Verdicts in the status, and the fields of all but the newest, which is complete.
 _KEPT: Final = 10
 _TOLD: Final = ("job", "seq", "why", "text")
-#: A reference must move through this share of the axis' range.
+#: Least motion in a reference, as a share of the range of the axis.
 _LEAST_MOTION: Final = 0.05
-#: Module of the working process.
+#: Module of the process.
 WORKER: Final = "service.background.diagnosing.worker"
 _ARGUMENTS: Final = ("recent_s", "report")
 
 
 class Watcher:
-    """The diagnosis in the background of one axis.
+    """The background diagnosis of one axis.
 
     ``take`` is called from the thread that learns, ``tick`` from the one that publishes, ``request`` and ``status``
     from any. Close it before the interpreter ends.
@@ -49,13 +49,13 @@ class Watcher:
         self._buffer = SampleBuffer(self._samples(config.history_s))
         self._alarm = Alarm(config, _span_V(axis))
         self._reference: FloatArray | None = None
-        #: A new reference is due once enough has been seen since the last verdict.
+        #: Whether a new reference is due, as soon as there are enough samples after the last verdict.
         self._renew = True
         self._since_reference = 0
         self._next_look_s = 0.0
         self._alarm_seq: int | None = None
         self._alarm_why = ""
-        #: An alarm is looked into once this sample is there.
+        #: The diagnosis of an alarm starts when this sample has arrived.
         self._due_seq = 0
         self._not_before_s = 0.0
         self._job: BackgroundJob | None = None
@@ -66,7 +66,7 @@ class Watcher:
         self._closed = False
 
     def take(self, batch: SampleBatch) -> None:
-        """Keep the samples of a message and look for a reason to diagnose. Never blocks; call from one thread."""
+        """Keep the samples of a message and check for an alarm. Never blocks; call it from one thread."""
         if not len(batch):
             return
         if not self._buffer.add(batch):
@@ -78,7 +78,7 @@ class Watcher:
             self._look(t_s)
 
     def tick(self, now_s: float) -> None:
-        """Start what is due. Call from the publishing thread, with a clock that never goes back."""
+        """Start a diagnosis if one is due. Call it from the publishing thread, with a monotonic time."""
         seq = self._alarm_seq
         if seq is None or self._buffer.last_seq < self._due_seq:
             return
@@ -88,10 +88,11 @@ class Watcher:
         self._start("alarm", self._alarm_why, seq, now_s, "")
 
     def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Diagnose the recent samples now, in the background. Returns ``{"started": True, "job": N}``, or why not.
+        """Diagnose the recent samples now, in the background.
 
-        ``arguments``: ``recent_s`` (s, the configuration's by default), ``report`` (True: a full report too, into the
-        folder ``reports`` of the configuration). Raises InputError on anything else.
+        ``arguments``: ``recent_s`` (s, by default that of the configuration), ``report`` (True: also write a full
+        report into the folder ``reports`` of the configuration). Returns ``{"started": True, "job": N}``, or
+        ``{"started": False, "why": reason}``. Raises InputError on other arguments or values.
         """
         for key in arguments:
             if key not in _ARGUMENTS:
@@ -113,7 +114,7 @@ class Watcher:
         return self._start("request", "", first, time.monotonic(), out)
 
     def status(self) -> dict[str, Any]:
-        """For the status of the axis: counts, whether one runs, and the last verdicts, newest first."""
+        """For the status of the axis: counts, whether a diagnosis runs, and the last verdicts, newest first."""
         with self._lock:
             return {
                 "enabled": True,
@@ -126,7 +127,7 @@ class Watcher:
             }
 
     def close(self) -> None:
-        """End what runs; no verdict comes afterwards."""
+        """End a running diagnosis; it gives no verdict."""
         self._closed = True
         if self._job is not None:
             self._job.cancel()
@@ -151,7 +152,7 @@ class Watcher:
             return
         why = self._alarm.check(t_s, levels)
         if why:
-            # From here on is after: what raised the alarm had been there for hold_s.
+            # The diagnosis uses the samples from here on: the change is at least hold_s old.
             seq = self._buffer.last_seq
             self._alarm_why, self._due_seq, self._alarm_seq = why, seq + self._samples(self.config.collect_s), seq
             self._not_before_s = t_s + self.config.cooldown_s
@@ -160,7 +161,7 @@ class Watcher:
             self._axis.note("diagnosis_alarm", f"{why}; looking for the cause in {self.config.collect_s:g} s")
 
     def _moves(self, samples: FloatArray) -> bool:
-        """Whether there is enough motion to tell a gain by."""
+        """Whether there is enough motion to determine a gain."""
         low, high = np.nanquantile(samples[3], [0.02, 0.98]) if np.isfinite(samples[3]).any() else (0.0, 0.0)
         limits = self._axis.limits
         return bool(high - low > _LEAST_MOTION * (limits.y_max_um - limits.y_min_um))
@@ -205,21 +206,21 @@ class Watcher:
             self._history = [{key: verdict[key] for key in _TOLD}, *self._history][:_KEPT]
         self._axis.note("diagnosis_failed" if failed else "diagnosis", text)
         if about["cause"] == "alarm":
-            # What comes next is told from how the stage is now, as soon as enough of that has been seen.
+            # Later changes are relative to the present stage: take a new reference.
             self._alarm.arm(None)
             self._since_reference, self._renew = 0, True
 
     def _wait(self, about: dict[str, Any]) -> bool:
-        """Whether an alarm is looked into again, with more samples: as long as some from before it are still kept."""
+        """Diagnose an alarm again with more samples, if earlier samples are still kept; returns whether it will."""
         more = self._samples(self.config.collect_s)
         newest, first = self._buffer.last_seq, int(about["from_seq"])
-        # A stage that counts anew since, or another alarm: what was asked is over.
+        # A restarted count of the stage, or another alarm, supersedes this one.
         over = self._closed or newest < about["seq"] or self._alarm_seq is not None
         if over or newest + 2 * more - first > self._samples(self.config.history_s):
             return False
         with self._lock:
             self._counts["waited"] += 1
-        # What raised it is still there and would raise another one while this is looked into.
+        # The same change must not raise another alarm before this diagnosis ends.
         self._not_before_s = (newest + more) * self._dt_s + self.config.cooldown_s
         self._due_seq, self._alarm_seq = newest + more, first
         return True

@@ -1,7 +1,7 @@
-"""An adoption of hyper-parameters as an event at a definite sample: announced, written down, read again, applied.
+"""Adoptions of hyper-parameters, each at a definite sample: announced, stored, read and applied.
 
-The file ``retuned.jsonl`` beside a recording holds one line an adoption. Applied at the same samples again, a replay
-gives the same snapshots to the last bit, whenever the background work was done.
+The file ``retuned.jsonl`` beside a recording holds one line per adoption. A replay applies them at the same samples and
+gives the same snapshots bit by bit, however long the background work took.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FILE: Final = "retuned.jsonl"
 class Retuned:
     """Hyper-parameters that take effect right after the sample with the number ``seq``.
 
-    ``seq`` counts on where a stage began its count anew, as the learner's does.
+    ``seq`` continues when a stage restarts its count, as the number in the learner does.
     """
 
     seq: int
@@ -37,7 +37,7 @@ class Retuned:
         return Hyperparameters(self.gamma, self.widths)
 
     def to_json(self) -> dict[str, Any]:
-        """As it is written into the event and the file; numbers come back to the last bit."""
+        """As written into the event and the file; floating-point numbers are restored exactly."""
         return {"seq": self.seq, "gamma": self.gamma, "widths": list(self.widths)}
 
     @classmethod
@@ -57,22 +57,22 @@ class Retuned:
 
 
 class Adoptions:
-    """Adoptions that an axis has yet to make. Any thread may add; the one that handles samples applies."""
+    """Pending adoptions of an axis. Any thread may add; the thread that handles samples applies."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        # Replaced whole, so that the look at each sample takes no lock.
+        # Replaced as a whole, so that the check at each sample needs no lock.
         self._pending: tuple[Retuned, ...] = ()
         self.adopted = 0
         self.refused = 0
 
     @property
     def pending(self) -> tuple[Retuned, ...]:
-        """Those to come, in order."""
+        """Pending adoptions, in the order of their samples."""
         return self._pending
 
     def replace(self, pending: Sequence[Retuned]) -> None:
-        """Go on from another's ``pending``."""
+        """Continue with the pending adoptions of another axis or of a stored state."""
         with self._lock:
             self._pending = tuple(sorted(pending, key=lambda entry: entry.seq))
 
@@ -80,13 +80,13 @@ class Adoptions:
         return bool(self._pending)
 
     def add(self, *retuned: Retuned) -> None:
-        """Make these at their samples; one whose sample has passed is made at the next."""
+        """Schedule adoptions at their samples; one whose sample has passed is applied at the next sample."""
         with self._lock:
             merged = {entry.seq: entry for entry in (*self._pending, *retuned)}
             self._pending = tuple(merged[seq] for seq in sorted(merged))
 
     def apply(self, seq: int, learner: OnlineModel) -> list[tuple[Retuned, str]]:
-        """Make what is due after the sample ``seq``: each with "" or the reason why the learner refused it."""
+        """Apply the adoptions due after the sample ``seq``; returns each with "" or the reason for a refusal."""
         if not self._pending or self._pending[0].seq > seq:
             return []
         with self._lock:
@@ -102,7 +102,7 @@ class Adoptions:
 
 
 def append(folder: Path, retuned: Retuned) -> None:
-    """Write an adoption into the folder of a recording; on the disk when it returns. Raises OSError."""
+    """Append an adoption to the file in the folder of a recording and sync it to the disk. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder / FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     try:
@@ -114,7 +114,7 @@ def append(folder: Path, retuned: Retuned) -> None:
 
 
 def read(folder: Path | str) -> Sequence[Retuned]:
-    """The adoptions of a recording in order; none where there is no file. Raises InputError on a damaged line."""
+    """The adoptions of a recording, in order; empty without a file. Raises InputError on a damaged line."""
     path = Path(folder) / FILE
     if not path.is_file():
         return []
@@ -127,7 +127,7 @@ def read(folder: Path | str) -> Sequence[Retuned]:
             values = json.loads(line)
         except ValueError as error:
             if number == len(lines):
-                break  # cut off by a crash: it was never announced
+                break  # cut off by a crash
             raise FieldError(f"{path}:{number}", line[:80], "a line of JSON") from error
         found.append(Retuned.from_json(values, f"{path}:{number}"))
     return found

@@ -1,8 +1,8 @@
-"""Re-tunes an axis' learner in the background: propose, wait for fresh samples, try, announce, adopt.
+"""Re-tunes the learner of an axis in the background: propose, wait for fresh samples, try, announce, adopt.
 
-Everything long is done by a process of the lowest priority, one at a time. The thread that learns only copies the
-window (some tens of µs) and, at the announced sample, lets the learner adopt. What was decided is an event at a
-definite sample (``service.background.retuning.adoption``), so that a replay and a standby come to the same snapshots.
+A process of the lowest priority does the long work, one at a time. The thread that learns only copies the window (some
+tens of µs) and lets the learner adopt at the announced sample. An adoption belongs to a definite sample
+(`service.background.retuning.adoption`), so that a replay and a standby compute the same snapshots.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import Hyperparameters, OnlineModel, WindowData
+from service.background.job import BackgroundJob
 from service.background.retuning.adoption import Retuned, append
-from service.background.retuning.job import Job, pack
 from service.background.retuning.settings import RetuningConfig
+from service.background.retuning.worker import pack, start_job
 from service.protocol.errors import FieldError
 
-#: How often the window is looked at while something is due or waited for, s of samples; how many are then looked at.
+#: Interval at which the window is read while fresh samples are awaited, s of samples, and samples read each time.
 _LOOK_S: Final = 0.25
 _NEWEST: Final = 200
 IDLE, PROPOSING, WAITING, TRYING = "idle", "proposing", "waiting for fresh samples", "trying"
 
 
 class TunedAxis(Protocol):
-    """What is needed of an axis."""
+    """What a retuner needs of an axis."""
 
     dt_s: float
 
@@ -48,12 +49,12 @@ class TunedAxis(Protocol):
 
 
 class Retuner:
-    """The re-tuning of one axis. ``step`` is for the thread that handles samples; the rest for any.
+    """The re-tuning of one axis. Call `step` and `leave` in the thread that handles samples, the rest in any thread.
 
     Parameters
     ----------
-    config : when and how.
-    folder : of the recording, where adoptions are written down; None: nowhere.
+    config : when and how to re-tune.
+    folder : of the recording, where adoptions are stored; None: they are not stored.
     """
 
     def __init__(self, config: RetuningConfig, folder: Path | None = None) -> None:
@@ -63,14 +64,14 @@ class Retuner:
         self._state = IDLE
         self._asked = False
         self._number = 0
-        self._job: Job | None = None
+        self._job: BackgroundJob | None = None
         self._learner: OnlineModel | None = None
         self._before: WindowData | None = None
         self._proposed: dict[str, Any] = {}
         self._since_s, self._taught = math.nan, 0
         self._known: set[bytes] = set()
         self._fresh: list[bytes] = []
-        # Trials of this proposal so far; each takes twice the samples of the one before.
+        # Trials of this proposal so far; each needs twice the samples of the previous one.
         self._looks = 0
         self._look_s = -math.inf
         self._last: dict[str, Any] | None = None
@@ -79,7 +80,7 @@ class Retuner:
         )
 
     def request(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Ask for a re-tuning; it begins with the next samples. Returns at once. Raises InputError on any argument."""
+        """Request a re-tuning, which begins with the next samples. Raises InputError on any argument."""
         for name in arguments:
             raise FieldError(name, repr(arguments[name])[:80], "no arguments")
         with self._lock:
@@ -90,11 +91,11 @@ class Retuner:
             return {"started": True, "job": self._number + 1}
 
     def status(self) -> dict[str, Any]:
-        """For the status: what it does, counts, and how the last one ended."""
+        """For the status: the state, counts, and how the last re-tuning ended."""
         return {"state": self._state, "period_s": self.config.period_s, **self._counts, "last": self._last}
 
     def step(self, axis: TunedAxis) -> None:
-        """Go on with what is under way, and begin what is due. Never blocks; after each message of samples."""
+        """Continue a running re-tuning, or begin a due one. Never blocks; call it after each message of samples."""
         learner = axis.learner
         if learner is None or not axis.learning or learner.seq < 0:
             return
@@ -116,18 +117,13 @@ class Retuner:
                 self._take_trial(axis, learner, result, now_s)
 
     def leave(self) -> None:
-        """The axis stands by: let go of its learner. What was under way is dropped once it serves again.
-
-        From the thread that handles samples, as ``step``.
-        """
+        """Release the learner: the axis becomes a standby. A running re-tuning is dropped when it serves again."""
         self._learner = self._before = None
 
     def close(self) -> None:
-        """End what runs."""
+        """End a running process."""
         if self._job is not None:
             self._job.cancel()
-
-    # ---- step by step
 
     def _begin(self, axis: TunedAxis, learner: OnlineModel, now_s: float) -> None:
         due = self.config.period_s > 0.0 and now_s - self._since_s >= self.config.period_s
@@ -136,7 +132,7 @@ class Retuner:
         if not (self._asked or due) or axis.frozen or 0.0 <= now_s - self._look_s < _LOOK_S:
             return
         self._look_s = now_s
-        # A stage at rest has taught nothing since: there is nothing new to tune on, and nothing to try it on.
+        # A stage at rest has given no new samples to tune on or to try a proposal on.
         if not self._asked and _taught(learner) - self._taught < self.config.fresh:
             return
         data = learner.window_data()
@@ -150,7 +146,7 @@ class Retuner:
         self._known = set(_rows(data, np.arange(data.age.size)))
         self._fresh, self._looks = [], 0
         order = {"kind": "propose", "search": asdict(self.config.search), "torch": self.config.torch}
-        self._job = Job(order, pack("before", data), self.config.timeout_s)
+        self._job = start_job(order, pack("before", data), self.config.timeout_s)
 
     def _take_proposal(self, result: dict[str, Any], now_s: float) -> None:
         self._proposed = result
@@ -183,10 +179,10 @@ class Retuner:
         columns = np.frombuffer(b"".join(self._fresh)).reshape(len(self._fresh), -1)
         kernel, targets_V, weights = columns[:, :-2], columns[:, -2], columns[:, -1]
         after = WindowData(kernel, targets_V, weights, np.arange(len(columns), 0, -1.0) - 1.0, before.hyper)
-        self._job = Job(order, pack("before", before) | pack("after", after), self.config.timeout_s)
+        self._job = start_job(order, pack("before", before) | pack("after", after), self.config.timeout_s)
 
     def _collect(self, data: WindowData) -> None:
-        """Keep what the window has taken since the last look: in repeated motion one fresh sample replaces another."""
+        """Keep the samples that are new in the window: in periodic motion one fresh sample replaces another."""
         newest = np.flatnonzero(data.age < _NEWEST)
         for row in _rows(data, newest[np.argsort(-data.age[newest], kind="stable")]):
             if row not in self._known:
@@ -211,7 +207,7 @@ class Retuner:
         axis.adopt_at(retuned)
         axis.note("retuning_adopted", f"{told}; adopted after sample {seq}", retuned=retuned.to_json())
         if self._folder is not None:
-            # The disk may take its time; the thread that learns does not wait for it.
+            # A slow disk must not delay the thread that learns.
             threading.Thread(target=self._write, args=(self._folder, retuned), name="retuned", daemon=True).start()
         self._end(now_s, "better", told, {**result, "retuned": retuned.to_json()})
 
@@ -230,7 +226,7 @@ class Retuner:
         self._last = {"job": self._number, "outcome": count, "detail": why, **proposal, **(more or {})}
         self._proposed, self._before, self._learner = {}, None, None
         self._known, self._fresh = set(), []
-        # The next one counts from here on.
+        # The period until the next re-tuning starts now.
         self._since_s = math.nan
         with self._lock:
             self._state = IDLE
@@ -241,6 +237,6 @@ def _taught(learner: OnlineModel) -> int:
 
 
 def _rows(data: WindowData, which: NDArray[np.int64]) -> list[bytes]:
-    """Each sample as the bytes of its inputs, target and weight: equal where they are, to the last bit."""
+    """Each sample as the bytes of its inputs, target and weight: equal samples give equal bytes."""
     columns = np.ascontiguousarray(np.column_stack([data.kernel, data.targets_V, data.weights])[which])
     return [row.tobytes() for row in columns]

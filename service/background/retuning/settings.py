@@ -10,14 +10,17 @@ from adaptive.tuning.config import RetuneConfig
 
 @dataclass(frozen=True, slots=True)
 class RetuningConfig:
-    """When and how hyper-parameters are tuned anew.
+    """When and how to re-tune the hyper-parameters.
 
-    enabled : False: not even on request. period_s : from the end of one to the next, s of samples; 0: only on request.
-    fresh : samples of the window that a proposal is tried on, none of which it was tuned on. wait_s : how long they
-    may take to come, s of samples; a proposal older than that is dropped.
-    lead_s : how far ahead an adoption is announced, s of samples, so that a standby adopts at the same one.
-    timeout_s : of the working process, s. torch : look for starts with torch where it is installed.
-    search : how far is searched, and what is better; see ``adaptive.tuning.config``.
+    Attributes
+    ----------
+    enabled : False switches re-tuning off, also on request.
+    period_s : time from the end of a re-tuning to the next, s of samples; 0: only on request.
+    fresh : samples of the window that a proposal is tried on; it was not tuned on them.
+    wait_s : longest wait for the fresh samples, s of samples; then the proposal is dropped.
+    lead_s : time between announcement and adoption, s of samples, so that a standby adopts at the same sample.
+    timeout_s : longest time of the process, s. torch : find starting points with torch if it is installed.
+    search : range of the search and the criterion of a better model; see ``adaptive.tuning.config``.
     """
 
     enabled: bool = True

@@ -1,13 +1,40 @@
-"""The process that tunes (see `service.background.job`): ``-m service.background.retuning.worker FOLDER``."""
+"""The process that tunes, ``python -m service.background.retuning.worker FOLDER``, and how the service starts it.
+
+`start_job` and `pack` are the side of the service, `tuned` is the work of the process (see `service.background.job`).
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from adaptive.types import FloatArray
-from service.background.job import run_worker
+import numpy as np
+
+from adaptive.types import FloatArray, Hyperparameters, WindowData
+from service.background.job import BackgroundJob, run_worker
+
+
+def start_job(order: dict[str, Any], arrays: dict[str, FloatArray], timeout_s: float) -> BackgroundJob:
+    """Start the process with an ``order`` and the windows in ``arrays`` (see `tuned` and `pack`)."""
+    job = BackgroundJob("service.background.retuning.worker", order, arrays, timeout_s)
+    job.start()
+    return job
+
+
+def pack(name: str, data: WindowData) -> dict[str, FloatArray]:
+    """The samples of a window as arrays, which `unpack` finds under ``name``."""
+    hyper = np.array([data.hyper.gamma, *data.hyper.widths])
+    parts = {"kernel": data.kernel, "targets_V": data.targets_V, "weights": data.weights, "age": data.age}
+    return {f"{name}.{key}": value for key, value in {**parts, "hyper": hyper}.items()}
+
+
+def unpack(name: str, arrays: Mapping[str, FloatArray]) -> WindowData:
+    """Inverse of `pack`."""
+    hyper = arrays[f"{name}.hyper"]
+    kernel, targets_V, weights, age = (arrays[f"{name}.{key}"] for key in ("kernel", "targets_V", "weights", "age"))
+    return WindowData(kernel, targets_V, weights, age, Hyperparameters(float(hyper[0]), tuple(map(float, hyper[1:]))))
 
 
 def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
@@ -18,8 +45,6 @@ def tuned(order: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any
     """
     from adaptive.tuning.config import RetuneConfig
     from adaptive.tuning.retuning import compare, propose
-    from adaptive.types import Hyperparameters
-    from service.background.retuning.job import unpack
 
     data = {name: unpack(name, arrays) for name in ("before", "after") if f"{name}.kernel" in arrays}
     ranges = {name: tuple(order["search"][name]) for name in ("gamma_range", "width_range")}

@@ -20,10 +20,9 @@ from adaptive.tuning import retuning as retune
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, WindowData
 from service.answers.guard import Limits
-from service.background.retuning.job import Job, pack
 from service.background.retuning.retuner import Retuner
 from service.background.retuning.settings import RetuningConfig
-from service.background.retuning.worker import tuned
+from service.background.retuning.worker import pack, start_job, tuned
 from service.config.config import AxisConfig
 from service.protocol.samples import SampleBatch
 from service.server import models
@@ -54,7 +53,7 @@ def order(search: RetuneConfig, torch: bool = False) -> dict[str, Any]:
 
 def test_the_working_process_has_the_lowest_priority_and_one_thread() -> None:
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    job = Job(order(RetuneConfig(starts=8, rows=300)), pack("before", window_data(300)), 120.0)
+    job = start_job(order(RetuneConfig(starts=8, rows=300)), pack("before", window_data(300)), 120.0)
     seen: list[int] = []
     environment: dict[str, str] = {}
     try:
@@ -144,7 +143,7 @@ class Working:
 @pytest.fixture
 def retuner(monkeypatch: pytest.MonkeyPatch) -> Iterator[Retuner]:
     Working.made = 0
-    monkeypatch.setattr("service.background.retuning.retuner.Job", Working)
+    monkeypatch.setattr("service.background.retuning.retuner.start_job", Working)
     made = Retuner(RetuningConfig(period_s=0.0, fresh=100))
     yield made
     made.close()

@@ -21,9 +21,9 @@ from baselines.fit import fit_linear, fit_mpi
 from service.answers.guard import Limits
 from service.background.retuning import adoption
 from service.background.retuning.adoption import Adoptions, Retuned
-from service.background.retuning.job import Job
 from service.background.retuning.retuner import Retuner
 from service.background.retuning.settings import RetuningConfig
+from service.background.retuning.worker import start_job
 from service.config.config import AxisConfig, parse_config
 from service.protocol.errors import FieldError
 from service.protocol.query import FeedforwardQuery
@@ -276,9 +276,9 @@ def test_a_bad_proposal_is_found_out_by_its_trial(
         def cancel(self) -> None: ...
 
     def job(order: dict[str, Any], *rest: Any) -> Any:
-        return Misled() if order["kind"] == "propose" else Job(order, *rest)
+        return Misled() if order["kind"] == "propose" else start_job(order, *rest)
 
-    monkeypatch.setattr("service.background.retuning.retuner.Job", job)
+    monkeypatch.setattr("service.background.retuning.retuner.start_job", job)
     axis = tunable(bundle)
     before = hyper_of(axis)
     events = [event["event"] for event in retuned_from_7500(axis, recorded, retuner)]
@@ -329,7 +329,7 @@ def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Told(PROPOSED, OPEN, OPEN, OPEN)
-    monkeypatch.setattr("service.background.retuning.retuner.Job", told)
+    monkeypatch.setattr("service.background.retuning.retuner.start_job", told)
     axis = tunable(bundle)
     give(axis, recorded, 6000, 8000, retuner)
     retuner.request({})
@@ -399,7 +399,7 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
 
 
 def test_a_worker_that_dies_says_why() -> None:
-    job = Job({"kind": "nonsense"}, {}, 60.0)
+    job = start_job({"kind": "nonsense"}, {}, 60.0)
     until = time.monotonic() + 60.0
     while job.result is None and time.monotonic() < until:
         time.sleep(0.02)
