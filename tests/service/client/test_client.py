@@ -184,10 +184,13 @@ def test_commands_and_references_arrive(client: Client) -> None:
 
     def on_reference(sample: zenoh.Sample) -> None:
         got["reference"] = wire.decode_reference(sample.payload.to_bytes())
-        here.set()
+        if "command" in got:
+            here.set()
 
     def on_command(sample: zenoh.Sample) -> None:
         got["command"] = wire.decode_command(sample.payload.to_bytes())
+        if "reference" in got:
+            here.set()
 
     session.declare_subscriber(client.keys.command, on_command)
     session.declare_subscriber(client.keys.reference, on_reference)
