@@ -11,7 +11,6 @@ from adaptive.compiled import all_finite
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
-from adaptive.online.drift import DriftConfig, DriftFilter
 from adaptive.online.learner import Learner
 from adaptive.smoothing import smooth_recording
 from adaptive.types import Sample
@@ -39,7 +38,3 @@ def warm() -> None:
     snapshot.track(still, still, still, still, memory)
     features.run(still, still, still, memory)
     all_finite(still)
-    drift = DriftFilter(DriftConfig(), np.zeros(p), np.eye(p), 1e-3, 1.0)
-    for moving in (True, False):
-        drift.update(np.ones(p), 0.0, moving)
-    drift.expect_change()

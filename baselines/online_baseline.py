@@ -6,6 +6,7 @@ Outcomes have the names of ``adaptive.online.gates``, so the service counts the 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Any
 
 from adaptive.errors import InputError
@@ -32,7 +33,7 @@ _TIMING_TOLERANCE = 0.5
 _LARGEST = 1e9
 
 
-class OnlineBaseline:
+class OnlineBaseline(ABC):
     """Admission and bookkeeping of one axis; a model derives from it and implements ``_restart`` and ``_advance``.
 
     Deterministic, bounded in time and memory. Not thread-safe. The abilities of :class:`adaptive.types.OnlineModel`
@@ -147,18 +148,18 @@ class OnlineBaseline:
         expected = (sample.seq - self._seq) * self._dt
         return TIMING if abs(sample.t_s - self._t_s - expected) > _TIMING_TOLERANCE * expected else ""
 
+    @abstractmethod
     def _restart(self, u_V: float, y_um: float, first: bool) -> None:
         """Begin at the first sample or after a gap, where the time since the sample before is not one step."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _advance(self, u_V: float, y_um: float, settled: bool) -> str:
         """Take a good sample one step after the last. Returns the outcome. ``settled``: it may teach."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def from_state(cls, state: StateDict) -> OnlineModel:
         """Inverse of ``state_dict`` of the same class."""
-        raise NotImplementedError
 
     def restored(self, state: StateDict) -> OnlineModel:
         """A baseline of this class with ``state``. Raises InputError where a field is missing."""

@@ -9,6 +9,7 @@ forgets nothing.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import deque
 from dataclasses import asdict, dataclass
 
@@ -120,21 +121,21 @@ class LeastSquaresOnline(OnlineBaseline):
     def _step_memory(self, u_V: float, first: bool) -> None:
         """Advance the model's memory of the voltage."""
 
+    @abstractmethod
     def _regressors_now(self) -> FloatArray:
         """The part of a row that depends on the voltage, at this instant."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _row(self, pending: FloatArray, y_um: float, v_um_per_s: float) -> FloatArray:
         """The row of the voltage part ``pending`` and of displacement and speed at the same instant."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _residual(self, row: FloatArray) -> float:
         """Residual of a row with the present weights, µm."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _solve(self) -> bool:
         """Solve the normal matrix for new weights. Returns False, and changes nothing, where that fails."""
-        raise NotImplementedError
 
     @staticmethod
     def _minimum(normal: FloatArray, lower: FloatArray) -> FloatArray:

@@ -269,11 +269,11 @@ class DriftFilter:
             outcome = "burst"
         # The long-term level must not learn the change itself, or a second change would hide behind the first.
         s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
-        if moving and outcome == "updated":
+        if moving:
+            if outcome == "burst":
+                # It has widened the covariance.
+                innovation, variance = innovation_of(x, P, basis, target_V, self._row)
             take_in(x, P, basis, innovation, variance, noise_V2, self._k, self._row)
-        elif moving:
-            # The burst has opened the covariance since.
-            joseph(x, P, basis, target_V, noise_V2, self._k, self._row)
         else:
             update_constant(x, P, basis, target_V, noise_V2, self._row)
         s.updates += 1

@@ -10,10 +10,10 @@ The names are loaded on first use: `import service.client` alone loads neither z
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from adaptive.lazy_names import lazy_names
 
-# Not from typing: that would double the import time of this package. mypy knows the name.
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from service.client.client import Client
     from service.client.follower import Follower

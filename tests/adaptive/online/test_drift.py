@@ -126,7 +126,6 @@ def test_the_compiled_filter_agrees_with_filterpy_through_changes_and_rests(monk
         target = float(row @ truth) + 1e-4 * np.sin(37.0 * k)
         moving, weight = not 600 <= k < 700, 1.0 if k % 5 else 0.3
         with monkeypatch.context() as patched:
-            patched.setattr(drift, "joseph", by_filterpy)
             patched.setattr(
                 drift, "take_in", lambda x, P, h, e, v, noise, k, row, z=target: by_filterpy(x, P, h, z, noise, k, row)
             )
