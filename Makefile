@@ -13,9 +13,11 @@ PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/for
           protocol/test_container.py protocol/test_keys.py protocol/test_payloads.py runtime/test_logging_setup.py \
           server/test_axis.py server/test_competing.py server/test_model_watch.py server/test_status_counters.py \
           storage/test_atomic_write.py storage/test_checkpoint.py storage/test_model_file.py viewer/test_scene.py)
-# Tests of real processes that mostly wait and have no tight limits of time: two at a time. The rest time something.
-PAIRS  := $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
-          operating security server/test_process.py storage/test_recorder.py viewer/test_live.py viewer/test_sink.py)
+# Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
+PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \
+          $(addprefix tests/service/,background/test_diagnosing.py failover/test_restart.py failover/test_standby.py \
+          viewer/test_sink.py viewer/test_live.py operating security server/test_process.py storage/test_recorder.py \
+          stage_node)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build
 
@@ -55,7 +57,7 @@ test: ## lint, types, import contract, and all tests
 	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
 	@$(MAKE) --no-print-directory -j2 setup-test check
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PURE)
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(PAIRS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PAIRS)
 	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE) $(PAIRS))
 
 check: .setup-test ## ruff, mypy --strict, the import contract

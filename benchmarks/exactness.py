@@ -20,13 +20,13 @@ from benchmarks.latency_setup import CONNECT_S, LatencySetup, RunningSetup
 from benchmarks.sample_feed import AXIS, STAGE, sent
 from service.background.retuning.adoption import Retuned
 from service.client.client import Client
-from service.config.config import AxisConfig, read_config
+from service.config.settings import AxisConfig, read_config
 from service.failover.state_transfer import fetch_state
 from service.protocol.errors import ServiceError
 from service.protocol.samples import joined
 from service.server.axis import Axis
+from service.server.axis_loading import load_axis
 from service.server.learner_state import fingerprint
-from service.server.models import load_axis
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 #: Messages that the offline axis gets at a time; a live service never groups them so.

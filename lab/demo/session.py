@@ -19,9 +19,9 @@ from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
 from lab.demo.result import DemoRun
 from lab.testbed.identified_stage import write_service_config
 from lab.testbed.rig import Rig
-from service.config.config import read_config
+from service.config.settings import read_config
 from service.identification.identifying import NAMES, Stretch, identify_all
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import BundleMeta, write_bundle
 from service.storage.output_folder import clear_output
 from service.storage.recorder import Recorder, RecorderConfig

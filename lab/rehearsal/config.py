@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lab.rehearsal.reference import ReferenceMaker
-from service.config.config import COMPETE
+from service.config.settings import COMPETE
 from service.protocol.errors import FieldError
 
 

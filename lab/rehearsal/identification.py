@@ -14,7 +14,7 @@ from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
 from lab.rehearsal.config import RehearsalConfig
 from lab.rehearsal.plant import Plant, PlantFactory, check_numbers, run_checked
 from service.answers.guard import Limits
-from service.config.config import LEARN
+from service.config.settings import LEARN
 from service.protocol.errors import FieldError
 from sim.signals.voltages import CHAPTER_AMPLITUDE_V, training_input
 

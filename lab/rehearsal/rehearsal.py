@@ -21,9 +21,9 @@ from lab.rehearsal.loop import LoopRecord, idle_samples, run_adaptive, run_froze
 from lab.rehearsal.outcome import LARGE_PCT, SENSOR_FACTOR, SENSOR_PCT, Outcome, outcome
 from lab.rehearsal.plant import PlantFactory
 from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
-from service.config.config import LEARN, AxisConfig
+from service.config.settings import LEARN, AxisConfig
 from service.protocol.errors import FieldError
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 
 #: Stage and axis name of the rehearsed axis.

@@ -20,10 +20,10 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
 from service.answers.guard import Limits
 from service.client.pending import PendingCommands
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from sim.scenarios import Scenario
 from sim.signals.voltages import training_input

@@ -18,11 +18,11 @@ from lab.soak.verdict.observations import Counters, FaultRecord, Observations, S
 from lab.testbed.rig import SAMPLES_PER_MESSAGE
 from service.answers.guard import Limits
 from service.client.pending import PendingCommands
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.stage_node.faults import CHANGE, Fault, Injector
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage

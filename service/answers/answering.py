@@ -14,7 +14,7 @@ from adaptive.compiled import all_finite
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, check_voltages
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import StandIn

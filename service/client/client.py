@@ -82,7 +82,7 @@ class Client:
         wait_s : time to wait for the service to start, s.
         zenoh_config : configuration file of zenoh with TLS and passwords (docs/access.md); None without.
 
-        Raises SessionError if nobody listens at the endpoint, NoReplyError if the axis is not served there.
+        Raises SessionError if the endpoint does not answer, NoReplyError if the axis is not served there.
         """
         keys = Keys(stage, axis)
         until = time.monotonic() + max(wait_s, _SETTLE_S)

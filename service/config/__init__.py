@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.config.config import AxisConfig, ServeConfig, parse_config, read_config
     from service.config.learner import LearnerSettings, read_learner_settings
     from service.config.schema import Setting, build_settings
+    from service.config.settings import AxisConfig, ServeConfig, parse_config, read_config
 
 _MODULES = {
     "AxisConfig": "config",

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from adaptive.online.config import LearnerConfig
-from service.config.config import AxisConfig, parse_config
 from service.config.schema import build_settings, parse_toml, read_text
+from service.config.settings import AxisConfig, parse_config
 from service.protocol.errors import FieldError
 
 

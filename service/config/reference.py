@@ -17,8 +17,8 @@ from typing import Any, Literal, get_args, get_origin
 from baselines.competition.config import CompetitionConfig
 from service.background.diagnosing.settings import WatchConfig
 from service.background.retuning.settings import RetuningConfig
-from service.config.config import AxisConfig, ServeConfig
 from service.config.schema import Key, inline_keys, keys_of
+from service.config.settings import AxisConfig, ServeConfig
 
 _HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
 _WIDTH = 36

@@ -3,7 +3,7 @@
 ::
 
     ServiceError
-    ├── SessionError        a zenoh session cannot be opened: port in use, nobody listens, bad endpoint
+    ├── SessionError        a zenoh session cannot be opened: port in use, no answer, bad endpoint
     ├── NoReplyError        no service answered: not running, stopped meanwhile, or access refused
     ├── ReplyTimeoutError   the service is running but did not answer in time (also the built-in TimeoutError)
     ├── RefusedError        the service refused the request; has field, got and expected

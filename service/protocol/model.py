@@ -43,7 +43,7 @@ class Safety:
     blends : True if the stand-in also answers outside the domain of the model and by its trust; False if it answers
         only where the model is not finite.
     blend_share, trust : see :class:`service.answers.fallback.Rules`.
-    stale_s, last_good_s : see :class:`service.config.config.AxisConfig`.
+    stale_s, last_good_s : see :class:`service.config.settings.AxisConfig`.
     stand_in : None if there is none.
     """
 

@@ -1,8 +1,8 @@
-"""Opens zenoh sessions the way this project wants them: unicast, explicit endpoints, nothing beyond the machine.
+"""Opens zenoh sessions: unicast, explicit endpoints, no discovery, loopback unless configured otherwise.
 
-Client programs use mode ``client``, because two peers behind one hub do not see each other while clients do. Every
-session is to be closed by hand (``with``, or ``close()``): a callback left behind on an open session keeps the
-interpreter from ending, and ``atexit`` comes too late for it.
+Client programs use the mode ``client``: two peers connected to one hub do not see each other, clients do. Close every
+session (``with``, or ``close()``): a callback on an open session keeps the interpreter from exiting, and ``atexit``
+runs too late to close it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ import zenoh
 from service.protocol.errors import FieldError, SessionError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-#: No hand-over between thread pools: halves the round trip (docs/protocol.md, "Latency"). More than one network thread,
-#: because closing the connection of a receiver that was stopped holds one up for as long as ten seconds.
-#: Sending has a thread of its own: a service passes messages on between its clients, and a receiver that waits
-#: for room to send, on the very thread that would make that room, stops the whole service for good.
+#: No hand-over between thread pools: this halves the round trip (docs/protocol.md, "Latency"). Several network threads,
+#: because closing the connection to a stopped receiver blocks one of them for up to ten seconds. Sending has its own
+#: thread: a service forwards messages between its clients, and if the receiving thread also had to free the send
+#: queue it waits for, the service would deadlock.
 _RUNTIME: Final = (
     "(net:(worker_threads:3),app:(handover:net),acc:(handover:net),tx:(worker_threads:1),rx:(handover:net))"
 )
-#: A router reads from many and waits for many: who waits for one receiver must not keep the others from being read.
+#: A router serves many connections. Waiting for one slow receiver must not stop it from reading the others.
 _ROUTER_RUNTIME: Final = "(rx:(worker_threads:16),tx:(worker_threads:4))"
 _ENDPOINT = re.compile(
     r"(?P<proto>tcp|udp|tls|quic|ws)/(?P<host>\[[0-9a-fA-F:]+\]|[^/:\[\]]+):(?P<port>\d{1,5})(?:[?#].*)?\Z"
@@ -36,24 +36,24 @@ _ENDPOINT = re.compile(
 _LOCAL = re.compile(r"unixsock-stream/.+\Z")
 _RETRY_S: Final = 0.05
 _ROUTER_WAIT_S: Final = 10.0
-#: Silence after which the other end of a connection is taken for dead, and longest time for opening one, s.
+#: Silence after which a connection is closed as dead, and the longest time to open one, s.
 LEASE_S: Final = 1.0
 _OPEN_S: Final = 1.0
-#: Longest time that a receiver may take nothing at all, s.
+#: Longest time for which a receiver may read nothing, s.
 _STUCK_S: Final = 0.3
-#: By mode, s. A client has one other end only: nobody waits behind it. At a router it must be shorter than the lease,
-#: because everybody's signs of life wait behind one slow subscriber when another one comes or goes.
-_PATIENCE_S: Final = {"peer": _STUCK_S, "router": _STUCK_S, "client": 5.0}
-#: Packets of 64 KiB that may wait at the priority of a state on its way to a standby; zenoh's default of two is full,
-#: and the next part lost, where the thread that sends waits for a processor for a few milliseconds.
+#: The same by mode, s. A client has a single connection, so nothing else waits behind it. At a router the time must be
+#: shorter than the lease: when a subscriber comes or goes, all keep-alive messages wait behind a slow one.
+_BLOCKED_S: Final = {"peer": _STUCK_S, "router": _STUCK_S, "client": 5.0}
+#: Packets of 64 KiB that may wait at the priority of a state transfer to a standby. Zenoh's default of two is full, and
+#: the next part lost, as soon as the sending thread waits a few milliseconds for a processor.
 _STATE_PACKETS: Final = 16
-#: The longest message that is put together from its parts, bytes: the largest model, and some. Zenoh's own default of
-#: 1 GiB would let any sender ask for that much memory.
+#: Longest message that is reassembled from fragments, bytes: the largest model plus a margin. With zenoh's default of
+#: 1 GiB any sender could make the service allocate that much.
 MAX_MESSAGE_BYTES: Final = 72 * 2**20
 
 
 def check_endpoint(field: str, endpoint: object) -> str:
-    """``endpoint`` if zenoh can listen at or connect to it, else InputError naming ``field``."""
+    """Return ``endpoint`` if zenoh can listen at or connect to it. Raises InputError, naming ``field``, if not."""
     expected = "protocol/host:port such as tcp/127.0.0.1:7447"
     if not isinstance(endpoint, str):
         raise FieldError(field, repr(endpoint), expected)
@@ -82,11 +82,11 @@ def open_service(
 ) -> zenoh.Session:
     """A peer that listens at ``listen`` and connects to ``connect`` (routers, other services).
 
-    One that listens nowhere is a client of the first of ``connect`` that it reaches, and of another when that one
-    goes: behind a router clients see each other, peers do not, and a service is to see its standby.
-    ``zenoh_config`` is a JSON5 file of zenoh's own, for TLS, passwords and access control; what is given here goes
-    over it. Raises SessionError where an endpoint cannot be had, such as a port in use, or no router is reached
-    within ten seconds (hosts that start together may do so in any order).
+    Without ``listen`` the session is a client of the first endpoint of ``connect`` that answers, and changes to another
+    when that one fails: behind a router clients see each other and peers do not, and a service must see its standby.
+    ``zenoh_config`` is zenoh's own JSON5 file, for TLS, passwords and access control; the arguments override it.
+    Raises SessionError if an endpoint is not available, such as a port in use, or if no router answers within ten
+    seconds (hosts that start together may start in any order).
     """
     if listen:
         return _open("peer", listen, connect, zenoh_config, lease_s)
@@ -94,17 +94,17 @@ def open_service(
 
 
 def open_router(listen: Sequence[str], connect: Sequence[str] = (), zenoh_config: Path | None = None) -> zenoh.Session:
-    """A router: passes on between all that connect to it, and to the routers it connects to. Raises SessionError."""
+    """A router: forwards between its clients and to the routers of ``connect``. Raises SessionError."""
     return _open("router", listen, connect, zenoh_config)
 
 
 def open_client(
     endpoint: str | Sequence[str] = DEFAULT_ENDPOINT, wait_s: float = 0.0, zenoh_config: Path | None = None
 ) -> zenoh.Session:
-    """A client connected to ``endpoint``, tried for ``wait_s`` seconds. Raises SessionError if nobody is there.
+    """A client connected to ``endpoint``, retried for ``wait_s`` seconds. Raises SessionError if nothing answers.
 
-    Of several endpoints (a service and its standby) it is connected to the first that answers, and to another when
-    that one goes.
+    Of several endpoints (a service and its standby) it connects to the first that answers, and changes to another when
+    that one fails.
     """
     return _open_client((endpoint,) if isinstance(endpoint, str) else tuple(endpoint), wait_s, zenoh_config)
 
@@ -112,7 +112,7 @@ def open_client(
 def _open_client(
     connect: Sequence[str], wait_s: float, zenoh_config: Path | None, lease_s: float = LEASE_S
 ) -> zenoh.Session:
-    read_zenoh_config(zenoh_config)  # a file that cannot be read is no reason to wait
+    read_zenoh_config(zenoh_config)  # An unreadable file fails at once, before any wait.
     until = time.monotonic() + wait_s
     while True:
         try:
@@ -126,7 +126,7 @@ def _open_client(
 def read_zenoh_config(path: Path | None) -> zenoh.Config:
     """Zenoh's own configuration from a JSON5 file, or its defaults for None. Raises SessionError.
 
-    A relative path of the password file in it is taken from the folder of the file, not of the process.
+    A relative path of the password file is relative to the folder of ``path``, not to that of the process.
     """
     if path is None:
         return zenoh.Config()
@@ -144,7 +144,7 @@ def read_zenoh_config(path: Path | None) -> zenoh.Config:
 def _open(
     mode: str, listen: Sequence[str], connect: Sequence[str], zenoh_config: Path | None, lease_s: float = LEASE_S
 ) -> zenoh.Session:
-    # Read once, when zenoh starts its threads, hence before the first session of the process.
+    # Zenoh reads this once, when it starts its threads, so it must be set before the first session of the process.
     os.environ.setdefault("ZENOH_RUNTIME", _ROUTER_RUNTIME if mode == "router" else _RUNTIME)
     for endpoint in (*listen, *connect):
         check_endpoint("endpoint", endpoint)
@@ -156,14 +156,14 @@ def _open(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
-        # No faster here, and what a killed process had of it stays behind until /dev/shm is full.
+        # Not faster here, and segments of killed processes stay until /dev/shm is full.
         "transport/shared_memory/enabled": False,
-        # Who is silent for so long is taken for dead; who died is known at once, by its closed connections.
+        # After this silence a peer counts as dead. A process that exits is noticed at once by its closed connections.
         "transport/link/tx/lease": round(1e3 * lease_s),
-        # A process that is stopped still accepts connections, but says nothing on them.
+        # A stopped process still accepts connections but does not answer on them.
         "transport/unicast/open_timeout": round(1e3 * _OPEN_S),
-        # Who takes nothing for so long is let go, so that samples on their way to others do not wait behind it, µs.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * _PATIENCE_S[mode]),
+        # A receiver that reads nothing for this long is disconnected, so that others need not wait behind it; µs.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * _BLOCKED_S[mode]),
         "transport/link/tx/queue/size/data_low": _STATE_PACKETS,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2},
     }
@@ -177,15 +177,16 @@ def _open(
 
 def _advice(text: str, listen: Sequence[str], connect: Sequence[str]) -> str:
     if "Address already in use" in text:
-        return f"cannot listen at {', '.join(listen)}: the port is in use; stop what holds it or choose another port"
+        at = ", ".join(listen)
+        return f"cannot listen at {at}: the port is in use; stop the program that uses it, or choose another port"
     if "Unable to connect" in text:
         return (
-            f"nobody listens at {', '.join(connect)}, or who does refuses this certificate or password: "
-            "start 'dehyst serve' there, give its endpoint, or see docs/access.md"
+            f"no answer at {', '.join(connect)}, or the certificate or password was refused: start 'dehyst serve' "
+            "there, give its endpoint, or see docs/access.md"
         )
     return f"cannot open a zenoh session (listen {list(listen)}, connect {list(connect)}): {_plain(text)}"
 
 
 def _plain(error: object) -> str:
-    """A message of zenoh without the places in its sources."""
+    """A message of zenoh without its source locations."""
     return re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).strip()

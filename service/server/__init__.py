@@ -12,10 +12,10 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.server.axis import Axis
+    from service.server.axis_loading import load_axis
     from service.server.axis_loop import AxisLoop
     from service.server.axis_server import AxisServer
     from service.server.events import EventLog
-    from service.server.models import load_axis
     from service.server.process import Service
     from service.server.status import axis_status
 

@@ -23,9 +23,9 @@ from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits
 from service.answers.memory_tracking import MemoryTracker
 from service.background.retuning.adoption import Retuned
-from service.config.config import LEARN, AxisConfig
+from service.config.settings import LEARN, AxisConfig
 from service.intake.clock import SampleClock
-from service.intake.sequence import AHEAD, ANEW, REFUSED, RESTARTED, SequenceTracker
+from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
@@ -68,7 +68,7 @@ class Axis:
 
     Parameters
     ----------
-    config : limits, snapshots, names; see `service.config.config.AxisConfig`.
+    config : limits, snapshots, names; see `service.config.settings.AxisConfig`.
     models : by name, all of one sample time.
     learner : learns from the samples; its snapshots are served as ``config.learn``. None for no learning.
     limits : those of ``config``, with a displacement range filled in.
@@ -222,10 +222,10 @@ class Axis:
             if order in REFUSED:
                 verdicts.append(self._counted(self._refusal(order, seq)))
                 continue
-            if order in ANEW:
+            if order in NEW_COUNT:
                 self._begin_count(order, seq, before)
             number = self.sequence.number(seq)
-            sample = Sample(number, self._time_s(number, t_s, order in ANEW), u_V, y_um)
+            sample = Sample(number, self._time_s(number, t_s, order in NEW_COUNT), u_V, y_um)
             verdict = self._counted(self._teach(sample))
             verdicts.append(verdict)
             if self.supervisor.adoptions:

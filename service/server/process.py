@@ -14,7 +14,7 @@ from typing import Any, Final
 import zenoh
 from threadpoolctl import threadpool_limits
 
-from service.config.config import AxisConfig, ServeConfig
+from service.config.settings import AxisConfig, ServeConfig
 from service.failover.peer_files import PeerFiles, standby_folder
 from service.failover.reachability import Reachability
 from service.failover.role_control import RoleControl
@@ -23,9 +23,9 @@ from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import open_service
 from service.server.axis import Axis
+from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
-from service.server.models import LearnerFactory, load_axis, make_learner
 from service.storage.checkpoint_keeper import learn_again, restore_newest
 
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of

@@ -38,10 +38,10 @@ from lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, Mess
 from lab.rehearsal.identification import excitation_range, go_to_lowest
 from lab.rehearsal.reference import Excursion, Reference, SmoothStep
 from service.client.pending import PendingCommands
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.plants import StageFactory, issue_plant, random_plant, with_traits
 

@@ -50,7 +50,7 @@ from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.types import InverseModel
 from baselines.fit import fit_linear, fit_mpi
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.model import decode_model, encode_model
 from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
 from service.protocol.reply import Answer, decode_reply, encode_reply
@@ -64,7 +64,7 @@ from service.protocol.samples import (
 )
 from service.replay.replay import covered, replay
 from service.server.axis import Axis
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.stage_node.faults import CHANGE, DELIVERY, READING, Fault, Injector
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
 from service.storage.checkpoint_keeper import restore_newest

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli.options import add_epilog, add_shared
-from service.config.config import ServeConfig, read_config
+from service.config.settings import ServeConfig, read_config
 from service.protocol.errors import FieldError
 from service.runtime.memory import starting
 from service.runtime.session import check_endpoint, is_loopback

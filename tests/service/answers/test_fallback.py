@@ -16,7 +16,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answers.answering import trust_by_age
 from service.answers.fallback import Rules, answer_safely, domain_weight
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.model import StandIn, decode_model, encode_model
 from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import (

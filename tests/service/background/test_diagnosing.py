@@ -23,7 +23,7 @@ from service.background.diagnosing.watcher import WORKER, Watcher
 from service.background.diagnosing.worker import diagnose
 from service.background.job import BackgroundJob
 from service.client.client import Client
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.identification.identifying import identify_one
 from service.protocol import samples as wire
 from service.protocol.samples import SampleBatch

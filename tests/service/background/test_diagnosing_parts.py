@@ -11,7 +11,7 @@ import pytest
 from service.background.diagnosing.alarm import Alarm, Levels
 from service.background.diagnosing.buffer import SampleBuffer
 from service.background.diagnosing.settings import WatchConfig
-from service.config.config import parse_config
+from service.config.settings import parse_config
 from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 

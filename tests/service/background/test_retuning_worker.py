@@ -23,10 +23,10 @@ from service.answers.guard import Limits
 from service.background.retuning.retuner import Retuner
 from service.background.retuning.settings import RetuningConfig
 from service.background.retuning.worker import pack, start_job, tuned
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
-from service.server import models
 from service.server.axis import Axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.voltages import multitone, training_input
 from sim.stage.presets import preset
@@ -125,7 +125,7 @@ def axis(recorded: tuple[FloatArray, FloatArray, int]) -> Axis:
     u_V, y_um, n = recorded
     model = identify_lssvm(u_V[:n], y_um[:n], DT_S, config=IdentifyConfig(tune=False, n=500))[0]
     config = AxisConfig("x", Path("x.npz"), Limits(-2.0, 10.0, 4000.0), compete=())
-    return models.load_axis("demo", config, bundle=Bundle({"lssvm_adaptive": model}, BundleMeta("demo", "x", DT_S)))
+    return load_axis("demo", config, bundle=Bundle({"lssvm_adaptive": model}, BundleMeta("demo", "x", DT_S)))
 
 
 class Working:

@@ -16,7 +16,7 @@ from adaptive.types import FloatArray
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits
 from service.client.follower import Follower
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.model import Safety, decode_model, encode_model
 from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import (

@@ -14,14 +14,16 @@ from hypothesis import strategies as st
 from adaptive.types import InverseModel
 from service.intake.sequence import (
     AHEAD,
-    ANEW,
     IN_ORDER,
     JUMPED,
     LATE,
+    NEW_COUNT,
     RESTART_AFTER,
     RESTARTED,
-    WITNESSES,
     SequenceTracker,
+)
+from service.intake.sequence import (
+    MOST_CONFIRMATIONS as MOST,
 )
 from service.protocol.samples import MAX_SEQ, SampleBatch
 from service.replay.replay import sequence
@@ -59,7 +61,7 @@ def number(tracker: SequenceTracker) -> int:
 
 @pytest.mark.parametrize("ahead", [1002, 100_000, 2**53, MAX_SEQ - 1000])
 @pytest.mark.parametrize("time_of", ["the true number", "its number", "nothing"])
-@pytest.mark.parametrize("count", [1, WITNESSES - 1])
+@pytest.mark.parametrize("count", [1, MOST - 1])
 def test_numbers_far_ahead_are_refused_and_the_true_ones_go_on(ahead: int, time_of: str, count: int) -> None:
     tracker = begun()
     false = [(k + ahead, {"the true number": k, "its number": k + ahead, "nothing": math.nan}[time_of] * DT_S)
@@ -75,7 +77,7 @@ def test_a_gap_is_taken_at_once_where_the_time_tells_of_it_or_is_none() -> None:
         tracker = begun()
         assert tracker.take(2000, t_s) == IN_ORDER
         assert tracker.lost == 1000
-    for missing, expected in ((WITNESSES, IN_ORDER), (WITNESSES + 1, AHEAD)):
+    for missing, expected in ((MOST, IN_ORDER), (MOST + 1, AHEAD)):
         tracker = begun()
         assert tracker.take(1000 + missing, 1.0) == expected
 
@@ -84,7 +86,7 @@ def test_a_gap_is_taken_at_once_where_the_time_tells_of_it_or_is_none() -> None:
 def test_a_real_outage_is_borne_out_by_some_samples_and_its_numbers_are_lost(outage_s: float) -> None:
     tracker = begun()
     first = 1000 + round(outage_s / DT_S)
-    assert taken(tracker, rows(first, 100)) == [AHEAD] * (WITNESSES - 1) + [IN_ORDER] * (101 - WITNESSES)
+    assert taken(tracker, rows(first, 100)) == [AHEAD] * (MOST - 1) + [IN_ORDER] * (101 - MOST)
     assert tracker.counters() == {"received": 1100, "lost": first - 1000, "late": 0, "restarts": 0}
     assert number(tracker) == tracker.last == first + 99
 
@@ -94,7 +96,7 @@ def test_lossy_samples_bear_a_claim_out_too_and_doubled_ones_do_not() -> None:
     claim = [(k, k * DT_S) for k in range(50_000, 50_500, 5)]
     doubled = [row for row in claim for _ in range(2)]
     said = taken(tracker, doubled)
-    assert said.index(IN_ORDER) == 2 * (WITNESSES - 1)
+    assert said.index(IN_ORDER) == 2 * (MOST - 1)
     assert tracker.last == claim[-1][0]
     # Each number was received, is late, or was lost.
     assert tracker.received - tracker.late + tracker.lost == tracker.last + 1
@@ -105,7 +107,7 @@ def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to:
     tracker = begun()
     jumped = [(to + k, (1000 + k) * DT_S) for k in range(100)]
     said = taken(tracker, jumped)
-    assert said == [AHEAD] * (WITNESSES - 1) + [JUMPED] + [IN_ORDER] * (100 - WITNESSES)
+    assert said == [AHEAD] * (MOST - 1) + [JUMPED] + [IN_ORDER] * (100 - MOST)
     assert number(tracker) == 999 + 1000 + 99
     assert tracker.restarts == 1
     assert tracker.lost == 0
@@ -116,13 +118,13 @@ def test_a_count_that_really_jumps_goes_on_in_the_count_that_never_goes_back(to:
     assert number(tracker) == 2098 + 1000 + 599
 
 
-@pytest.mark.parametrize("count", [WITNESSES, 100, 1000])
+@pytest.mark.parametrize("count", [MOST, 100, 1000])
 def test_a_false_outage_that_was_believed_does_not_hold_for_long(count: int) -> None:
     tracker = begun()
     taken(tracker, rows(101_000, count))
     assert tracker.last == 101_000 + count - 1
     said = taken(tracker, rows(1000, 2000))
-    assert said.index(RESTARTED) + 1 == {WITNESSES: 200, 100: 4 * 85, 1000: 1501}[count]
+    assert said.index(RESTARTED) + 1 == {MOST: 200, 100: 4 * 85, 1000: 1501}[count]
     assert said[-1] == IN_ORDER
 
 
@@ -130,7 +132,7 @@ def test_a_first_number_that_is_absurd_gives_way_to_the_next_ones() -> None:
     tracker = SequenceTracker(DT_S)
     assert tracker.take(MAX_SEQ, 0.0) == IN_ORDER
     said = taken(tracker, rows(7, 100))
-    assert said == [LATE] * (WITNESSES - 1) + [RESTARTED] + [IN_ORDER] * (100 - WITNESSES)
+    assert said == [LATE] * (MOST - 1) + [RESTARTED] + [IN_ORDER] * (100 - MOST)
     assert number(tracker) == 1000 + 99
 
 
@@ -154,7 +156,7 @@ def test_a_stage_that_counts_anew_is_noticed_over_a_line_that_loses_samples() ->
 
 def test_it_goes_on_from_its_state_in_the_middle_of_a_claim() -> None:
     for claim in (
-        rows(100_000, WITNESSES - 1),
+        rows(100_000, MOST - 1),
         rows(0, RESTART_AFTER - 1),
         [(MAX_SEQ - 20 + k, 1.0) for k in range(15)],
     ):
@@ -286,14 +288,14 @@ def test_whatever_happened_good_samples_lead_back(events: list[tuple[Any, int, i
         if k >= cut:
             assert two.take(seq, t_s) == said
         assert one.received == k + 1
-        if said in ANEW:
+        if said in NEW_COUNT:
             accounted = None
-        if said in (IN_ORDER, *ANEW):
+        if said in (IN_ORDER, *NEW_COUNT):
             now = one.number(seq)
             # It never goes back, and goes on by what came and what was lost, or by the gap before another count.
             assert 0 <= now < 2**53
-            assert 0 < now - internal <= one.lost - lost + WITNESSES * RESTART_AFTER or internal < 0 or said in ANEW
-            assert internal < now <= internal + 1000 + WITNESSES * 1501 or internal < 0 or said not in ANEW
+            assert 0 < now - internal <= one.lost - lost + MOST * RESTART_AFTER or internal < 0 or said in NEW_COUNT
+            assert internal < now <= internal + 1000 + MOST * 1501 or internal < 0 or said not in NEW_COUNT
             internal = now
         if said == IN_ORDER:
             # Every number is accounted for: it was received, is late, or was lost.
@@ -371,8 +373,8 @@ def test_a_count_that_really_jumps_is_told_and_learnt_on(models: dict[str, Inver
     axis.handle(recording(2000))
     batch = recording(1000, first=2000)
     verdicts = axis.handle(SampleBatch(batch.seq + 2**61, batch.t_s, batch.u_V, batch.y_um))
-    assert verdicts[: WITNESSES - 1] == [AHEAD] * (WITNESSES - 1)
-    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[WITNESSES:]) > 900
+    assert verdicts[: MOST - 1] == [AHEAD] * (MOST - 1)
+    assert sum(verdict in ("learnt", "passed") for verdict in verdicts[MOST:]) > 900
     assert "timing" not in verdicts
     assert [e["event"] for e in axis.take_events()] == ["numbers_jumped"]
     assert axis.handled_seq == 2**61 + 2999
@@ -426,7 +428,11 @@ def test_an_outage_is_no_event(models: dict[str, InverseModel]) -> None:
     axis.handle(recording(1000))
     axis.handle(recording(1000, first=31_000))
     assert axis.take_events() == []
-    assert (axis.handled_seq, axis.counts.samples["lost"], axis.gates[AHEAD]) == (31_999, 30_000, WITNESSES - 1)
+    assert (axis.handled_seq, axis.counts.samples["lost"], axis.gates[AHEAD]) == (
+        31_999,
+        30_000,
+        MOST - 1,
+    )
 
 
 def test_a_standby_and_a_replay_make_the_same_of_it(models: dict[str, InverseModel]) -> None:

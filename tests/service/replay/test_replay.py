@@ -27,12 +27,12 @@ from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from lab.cli import main
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
 from service.config.learner import read_learner_settings
+from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
 from service.replay.replay import Replayed, covered, replay, sequence, summary, write_gates
 from service.server.axis import Axis
-from service.server.models import load_axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle
 from service.storage.recorder import Recorder, RecorderConfig
 from sim.recordings import Recording, read

@@ -15,13 +15,13 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, InverseModel, Sample
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.intake.sequence import RESTART_AFTER
 from service.protocol.query import FeedforwardQuery
 from service.protocol.reply import NOT_FINITE_REPLACED, Trajectory
 from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
 from service.server.axis import Axis
-from service.server.models import load_axis, make_learner
+from service.server.axis_loading import load_axis, make_learner
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.axes import loop_of

@@ -24,12 +24,13 @@ from service.background.retuning.adoption import Adoptions, Retuned
 from service.background.retuning.retuner import Retuner
 from service.background.retuning.settings import RetuningConfig
 from service.background.retuning.worker import start_job
-from service.config.config import AxisConfig, parse_config
+from service.config.settings import AxisConfig, parse_config
 from service.protocol.errors import FieldError
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
-from service.server import competing, models
+from service.server import competing
 from service.server.axis import Axis
+from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.voltages import training_input
 from sim.stage.presets import preset
@@ -67,7 +68,7 @@ def bundle(recorded: tuple[np.ndarray, np.ndarray]) -> Bundle:
 
 def axis_of(bundle: Bundle, **more: Any) -> Axis:
     config = AxisConfig("x", Path("x.npz"), LIMITS, learner={"window": 200}, **more)
-    return models.load_axis("demo", config, bundle=bundle)
+    return load_axis("demo", config, bundle=bundle)
 
 
 def give(
@@ -201,7 +202,7 @@ def rippled(recorded: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nda
 def tunable(bundle: Bundle) -> Axis:
     """An axis whose model was identified without tuning: the same wide kernel for all inputs."""
     config = AxisConfig("x", Path("x.npz"), LIMITS, learner={"window": 200, "learn_every": 5}, compete=())
-    return models.load_axis("demo", config, bundle=bundle)
+    return load_axis("demo", config, bundle=bundle)
 
 
 def hyper_of(axis: Axis) -> Hyperparameters:
@@ -389,7 +390,7 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
         "sys.meta_path.insert(0, Blocked())\n"
-        "import service.server.axis_server, service.server.models, service.background.retuning.retuner\n"
+        "import service.server.axis_server, service.server.axis_loading, service.background.retuning.retuner\n"
         "from service.background.retuning.worker import _search\n"
         "assert 'baselines.swarm.evidence' not in sys.modules\n"
         "print(_search(True)[1])"

@@ -11,12 +11,12 @@ import pytest
 
 from adaptive.types import InverseModel
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
+from service.server.axis_loading import load_axis
 from service.server.axis_loop import AxisLoop
 from service.server.latency import LatencyMeter
-from service.server.models import load_axis
 from service.server.status import axis_status
 from service.storage.model_file import Bundle, BundleMeta
 from tests.service.axes import loop_of

@@ -226,7 +226,7 @@ def test_both_axes_are_driven_hurt_on_command_and_count_from_where_they_are_told
         (("--preset", "bouc_wen", "--axis2", "y"), "has one axis"),
         (("--slew", "0"), "slew_V_per_s: got 0"),
         (("--first", "-4"), "first: got -4"),
-        (("--endpoint", "tcp/127.0.0.1:1", "--wait", "0"), "nobody listens"),
+        (("--endpoint", "tcp/127.0.0.1:1", "--wait", "0"), "no answer at"),
     ],
 )
 def test_bad_options_get_a_message_and_status_2(

@@ -15,13 +15,13 @@ import pytest
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
+from service.config.settings import AxisConfig
 from service.intake.sample_queue import SampleQueue
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
+from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
 from service.server.learner_state import fingerprint
-from service.server.models import load_axis, make_learner
 from service.storage import checkpoint
 from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, decode_checkpoint, encode_checkpoint, is_kept
 from service.storage.checkpoint_keeper import CheckpointKeeper, restore_newest

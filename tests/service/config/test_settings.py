@@ -10,9 +10,9 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.online.config import LearnerConfig
-from service.config.config import parse_config, read_config
 from service.config.reference import example, page
 from service.config.schema import build_settings
+from service.config.settings import parse_config, read_config
 from service.protocol.errors import FieldError
 from service.runtime.session import check_endpoint, is_loopback
 

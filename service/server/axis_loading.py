@@ -13,8 +13,8 @@ from adaptive.errors import ModelFileError
 from adaptive.types import InverseModel, OnlineModel, Sample
 from service.answers import guard
 from service.answers.guard import Limits
-from service.config.config import AxisConfig
 from service.config.schema import build_settings
+from service.config.settings import AxisConfig
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
 from service.server.competing import champion_of, compete
