@@ -15,7 +15,7 @@ PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/for
           storage/test_atomic_write.py storage/test_checkpoint.py storage/test_model_file.py viewer/test_scene.py)
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
 PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \
-          $(addprefix tests/service/,background/test_diagnosing.py failover/test_restart.py failover/test_standby.py \
+          $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
           viewer/test_sink.py viewer/test_live.py operating security server/test_process.py storage/test_recorder.py \
           stage_node)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
