@@ -15,7 +15,7 @@ from service.reports.plot_style import figure, label, legend, line, save
 from service.viewer import colours
 from service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
 from sim.diagnosis.export import export_stage
-from sim.diagnosis.result import Diagnosis, NamedCause
+from sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause
 from sim.stage.file import save_stage
 
 __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
@@ -23,17 +23,20 @@ __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
 _ROLES = {MEASURED: colours.MEASURED, WITHOUT: BEFORE, WITH: AFTER}
 
 
-def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool = True) -> dict[str, Any]:
+def write_report(
+    out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool = True, schema: int = SCHEMAS[-1]
+) -> dict[str, Any]:
     """Write all files into the folder ``out`` and return the content of report.json.
 
-    ``rrd``: also ``diagnosis.rrd`` for the Rerun viewer. Raises InputError if the folder cannot be written.
+    ``rrd``: also ``diagnosis.rrd`` for the Rerun viewer. ``schema``: that of report.json, one of `SCHEMAS`.
+    Raises InputError if the folder cannot be written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
         # Remove the pictures of an earlier diagnosis in this folder.
         for old in (*out.glob("[0-9]-*.png"), *out.glob("diagnosis.rrd")):
             old.unlink()
-        data = diagnosis.as_dict()
+        data = diagnosis.as_dict(schema)
         (out / "report.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
         exported = export_stage(diagnosis)
         save_stage(exported.config, out / "stage.toml")
@@ -52,17 +55,18 @@ def write_report(out: Path, diagnosis: Diagnosis, source: Source, *, rrd: bool =
 
 
 def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
-    """Voltage, and the residuals of the nominal and of the extended stage over time."""
-    data = diagnosis.nominal.model.data
+    """Voltage, and the residuals of both stages over time, on the test recording if there is one."""
+    nominal, extended = diagnosis.shown
+    data = nominal.model.data
     drawn, grid = figure(3, 1, (9.0, 6.4), title, sharex=True)
     axes = grid[:, 0]
     line(axes[0], data.t_s, data.u_V, color=DRIVE, lw=0.7)
     axes[0].set_ylabel("voltage / V")
     pairs = (
-        (diagnosis.nominal.residual_um, BEFORE, f"nominal stage, held out {length(diagnosis.nominal_heldout_um)}"),
-        (diagnosis.extended.residual_um, AFTER, f"extended stage, held out {length(diagnosis.extended_heldout_um)}"),
+        (nominal.residual_um, BEFORE, f"nominal stage, held out {length(diagnosis.nominal_heldout_um)}"),
+        (extended.residual_um, AFTER, f"extended stage, held out {length(diagnosis.extended_heldout_um)}"),
     )
-    size = float(np.quantile(np.abs(diagnosis.nominal.residual_um), 0.999))
+    size = float(np.quantile(np.abs(nominal.residual_um), 0.999))
     scale, unit = (1e3, "nm") if size < 1.0 else (1.0, "µm")
     for axis, (residual, colour, name) in zip(axes[1:], pairs, strict=True):
         band = 2.0 * scale * diagnosis.noise_floor_um

@@ -69,7 +69,7 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
     lines += ["![residual before and after](residual.png)", ""]
     for place, cause in enumerate(d.causes):
         lines += _section(place, cause)
-    if d.verdict == "unexplained":
+    if d.verdict in ("unexplained", "partly") or d.left:
         lines += _left(d)
     lines += _limits(d)
     lines += [
@@ -80,8 +80,9 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
         _file(d, exported) + (" `diagnosis.rrd` opens in the Rerun viewer." if viewer else ""),
         "",
     ]
-    if source.findings:
-        lines += ["## The recording itself", "", *(f"- {text}" for text in source.findings), ""]
+    findings = (*source.findings, *(defect.words for defect in d.defects))
+    if findings:
+        lines += ["## The recording itself", "", *(f"- {text}" for text in findings), ""]
     return "\n".join(lines)
 
 
@@ -106,8 +107,14 @@ def _summary(d: Diagnosis, source: Source) -> list[str]:
     verdict = {
         "adequate": f"{nominal[0].upper()}{nominal[1:]} explains this recording down to its noise.",
         "effects": f"Beside {nominal} there is **{_listed(d)}**.",
+        "partly": f"Beside {nominal} there is **{_listed(d)}**, but that explains only a part.",
         "unexplained": "Something is in this recording that no cause of the catalogue explains.",
     }[d.verdict]
+    if d.verdict == "adequate" and d.nominal_heldout_um > AT_THE_FLOOR * d.noise_floor_um:
+        verdict = f"What {nominal} leaves of this recording, a black box cannot predict either: it is noise."
+    if d.heldout_source == TEST and d.partial:
+        lost = ", ".join(spaced(n) for n in d.partial)
+        verdict = f"What was found in the recording ({lost}) does not carry over to the test recording. {verdict}"
     tested = f", tested on `{source.test}`" if source.test else ""
     return [
         f"**{d.verdict}.** {verdict} {_gain(d)}",
@@ -159,21 +166,47 @@ def _errors(d: Diagnosis) -> list[str]:
         f"| nominal stage, calibrated | {length(d.nominal_rmse_um)} | {length(d.nominal_heldout_um)} |",
         f"| extended stage | {length(d.extended_rmse_um)} | {length(d.extended_heldout_um)} |",
         f"| noise floor{bound}, from {d.floor_source} | {length(d.noise_floor_um)} | |",
+        f"| black box, beside the nominal stage | | {length(d.ceiling_um)} |",
+        "",
+        *_explainable(d),
+    ]
+
+
+def _explainable(d: Diagnosis) -> list[str]:
+    """The nominal error by what it is: noise, explained by named causes, by a black box only, by nothing."""
+    nominal, extended = d.nominal_heldout_um**2, d.extended_heldout_um**2
+    if nominal <= 0.0:
+        return []
+    floor = min(d.noise_floor_um**2, nominal)
+    reached = min(max(extended, floor), nominal) if d.causes else nominal
+    box = min(max(d.ceiling_um**2, floor), reached)
+    parts = [floor, box - floor, reached - box, nominal - reached]
+    noise, nothing, box_only, named = (100.0 * part / nominal for part in parts)
+    return [
+        "| of the nominal stage's squared error | noise floor | named causes | a black box, but no cause | nothing |",
+        "|---|---|---|---|---|",
+        f"| {length(d.nominal_heldout_um)} rms | {noise:.3g} % | {named:.3g} % | {box_only:.3g} % | {nothing:.3g} % |",
     ]
 
 
 def _causes(d: Diagnosis) -> list[str]:
-    lines = ["| cause | or | number | 95 % interval | removes | by chance |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| cause | or | number | 95 % interval | removes | by chance | direct test |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for c in d.causes:
         first = best_known_number(c)
         number = f"{first} = {with_unit(first, c.parameters[first])}" if first else ""
         low, high = c.intervals.get(first, (float("nan"), float("nan")))
         lines.append(
             f"| **{spaced(c.name)}** | {', '.join(spaced(a) for a in c.alternatives) or '-'} | {number} | {low:.4g} to "
-            f"{high:.4g} | {100.0 * c.heldout_gain:.3g} % | {100.0 * c.p_value:.2g} % |"
+            f"{high:.4g} | {100.0 * c.heldout_gain:.3g} % | {100.0 * c.p_value:.2g} % | {_sight(c)} |"
         )
-    lines += ["", "*Removes*: share of the held-out squared error left by those above it. *By chance*: how often noise "
-              "alone gains as much."]  # fmt: skip
+    lines += [
+        "",
+        "*Removes*: share of the held-out squared error left by those above it. *By chance*: how often noise alone "
+        "gains as much. *Direct test*: whether its signature is seen in the readings without any fit.",
+    ]
     return lines
 
 
@@ -188,6 +221,13 @@ def best_known_number(cause: NamedCause) -> str:
     return max(cause.parameters, key=certainty, default="")
 
 
+def _sight(cause: NamedCause) -> str:
+    """The direct test of a cause in a word."""
+    if cause.witness is None:
+        return "none exists"
+    return {True: "seen", False: "not seen", None: "not excited"}[cause.witness.seen]
+
+
 def _section(place: int, cause: NamedCause) -> list[str]:
     kind = EFFECTS.get(cause.name)
     lines = [f"## {place + 1}. {spaced(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
@@ -197,6 +237,13 @@ def _section(place: int, cause: NamedCause) -> list[str]:
         numbers.append(f"{name} = {with_unit(name, value)} ({low:.4g} to {high:.4g})")
     more = len(cause.parameters) - len(numbers)
     lines.append(f"{'; '.join(numbers)}{f'; and {more} more in report.json' if more > 0 else ''}.")
+    if cause.witness is not None:
+        told = {
+            True: f"Seen in the readings without a fit: {cause.witness.words}.",
+            False: f"**A direct test of the readings does not show it**: {cause.witness.words}.",
+            None: f"This recording does not excite a direct test of it: {cause.witness.words}. Only the fit names it.",
+        }
+        lines.append(told[cause.witness.seen])
     if kind is not None:
         lines.append(f"Its signature: {kind.signature}.")
         if kind.mistaken_for:
@@ -208,12 +255,19 @@ def _section(place: int, cause: NamedCause) -> list[str]:
 
 
 def _left(d: Diagnosis) -> list[str]:
-    lines = ["## What is left", "", "The residual above repeats with the drive and is far above the noise."]
-    if d.partial:
+    lines = ["## What is left", ""]
+    if d.left:
+        lines += [f"- {text}" for text in d.left]
+    if d.ceiling_um < 0.9 * d.extended_heldout_um:
         lines.append(
-            f"Of the causes tried, {', '.join(spaced(n) for n in d.partial)} came closest, but together they leave too "
-            "much of what stands above the noise: none of them is named."
+            f"- a black box brings the error to {length(d.ceiling_um)}: a part repeats with the drive, and no cause of "
+            "the catalogue has its form"
         )
+    elif d.left:
+        lines.append("- a black box does not predict it better: it does not repeat with the drive in a known form")
+    if d.partial:
+        names = ", ".join(spaced(n) for n in d.partial)
+        lines += ["", f"Tried and not named, because together they explain too little here: {names}."]
     return [*lines, ""]
 
 
@@ -227,7 +281,7 @@ def _limits(d: Diagnosis) -> list[str]:
     sets = [f"{spaced(c.name)} and {', '.join(spaced(a) for a in c.alternatives)}" for c in d.causes if c.alternatives]
     if sets:
         lines.append(f"Inseparable here: {'; '.join(sets)}.")
-    if d.verdict == "effects" and d.extended_heldout_um > AT_THE_FLOOR * d.noise_floor_um:
+    if d.causes and d.extended_heldout_um > AT_THE_FLOOR * d.noise_floor_um:
         lines.append(
             f"What is left after the extension is {d.extended_heldout_um / d.noise_floor_um:.2g} times the noise "
             "floor: the forms are approximations, or something small is still unnamed."

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
 from sim.diagnosis.causes.catalogue import NAMES
+from sim.diagnosis.ceiling import black_box_error
+from sim.diagnosis.defects import recording_defects
 from sim.diagnosis.model.calibration import (
     ModelFit,
     begins_at_rest,
     calibrate,
     calibrate_nominal,
+    fit_on_other_recording,
     with_new_columns,
     with_nominal_kind,
     with_other_axis,
@@ -22,17 +27,20 @@ from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.readings import (
     ConverterGrid,
     NoiseFloor,
-    RepeatedReadings,
     converter_grid,
     noise_floor,
     repeated_readings,
 )
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.prepare import Prepared
+from sim.diagnosis.rest import where_left
 from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
-from sim.diagnosis.search.held_out import HeldOut, error_on_other_recording, split
+from sim.diagnosis.search.held_out import HeldOut, split
 from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
+from sim.diagnosis.witnesses import Readings, Sight, witnesses
 from sim.stage.config import StageConfig
+
+T = TypeVar("T")
 
 
 def _silent(stage: str, share: float) -> None:
@@ -98,8 +106,8 @@ def diagnose(
     """Calibrate the nominal stage, search for causes, review them, and derive the verdict.
 
     ``mask`` (n,) is False where a sample was filled in. ``dropped`` is the number of samples that are missing or
-    doubled in the recorder's own time base; any is reported as a cause "timing". ``test``: another recording of the
-    stage; held-out errors are then measured on it and not by folds. Raises InputError if the recording cannot be
+    doubled in the recorder's own time base; they are listed as a defect of the recording. ``test``: another recording
+    of the stage; held-out errors and the verdict are then its own. Raises InputError if the recording cannot be
     diagnosed.
     """
     options = options or Options()
@@ -121,7 +129,12 @@ def diagnose(
         mask[doubles.where.astype(np.int64)] = False
         nominal = calibrate(nominal.model, nominal.p, mask, 4, 1e-4)
     nominal = with_new_columns(nominal, mask)
-    search = Search(mask, split(data), floor.sigma_um, options.thresholds, options.seed, progress, coarse)
+    progress("testing the readings for signatures", 0.08)
+    readings = Readings(data, mask, floor.sigma_um)
+    search = Search(
+        *(mask, split(data), floor.sigma_um, options.thresholds, options.seed, progress, coarse),
+        *(readings, witnesses(readings)),
+    )
     held_nominal = search.held(nominal)
     extended, held, steps = search.run(nominal)
     progress("removing each cause once more", 0.85)
@@ -129,18 +142,28 @@ def diagnose(
     extended, held = search.with_refitted_slips(extended, held)
     n = int(mask.sum())
     causes = named(search, nominal, extended, held, found)
-    causes += converter_causes(data, grid, doubles if doubled else None, floor, extended, n, dropped)
+    causes += quantisation(grid, floor, extended, n)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
-    verdict = verdict_of(causes, held_nominal, held, floor, n)
+    progress("fitting a black box", 0.92)
+    held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
+    ceiling_um = black_box_error(nominal, extended, mask, search.parts)
+    on_test: tuple[ModelFit, ModelFit] | None = None
+    shown_mask, shown_floor_um = mask, floor.sigma_um
+    if test is not None:
+        shown_mask = settled(usable(test.data, test.mask, options.nominal), nominal, test.data)
+        on_test = tuple_of_two(fit_on_other_recording(fit, test.data, shown_mask) for fit in (nominal, extended))
+        held_um = tuple_of_two(float(np.sqrt(np.mean(np.square(f.residual_um[shown_mask])))) for f in on_test)
+        ceiling_um = black_box_error(*on_test, shown_mask, split(test.data))
+        shown_floor_um = min(noise_floor(test.data).sigma_um, floor.sigma_um)
+    explained = explained_share(*held_um, ceiling_um, shown_floor_um)
+    verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)
     partial: tuple[str, ...] = ()
-    if verdict == "unexplained" and causes:
+    if verdict in ("unexplained", "adequate") and causes:
         partial, causes = tuple(c.name for c in causes), ()
     missing = not_excited(search, nominal, extended, floor)
     progress("simulating the next experiment", 0.95)
-    open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if verdict == "effects"]
-    held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
-    if test is not None:
-        held_um = _on_test(test, options, (nominal, extended))
+    is_named = verdict in ("effects", "partly")
+    open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if is_named]
     return Diagnosis(
         verdict=verdict,
         nominal_rmse_um=float(np.sqrt(nominal.sse_um2 / n)),
@@ -157,15 +180,18 @@ def diagnose(
         notes=notes,
         partial=partial,
         heldout_source=FOLDS if test is None else TEST,
+        ceiling_um=ceiling_um,
+        explained=explained,
+        defects=recording_defects(doubles, floor.sigma_um, grid.step_um, dropped, data.n),
+        left=where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um),
+        on_test=on_test,
     )
 
 
-def _on_test(test: Prepared, options: Options, fits: tuple[ModelFit, ModelFit]) -> tuple[float, float]:
-    """Free-run errors (RMS, µm) of the nominal and of the extended stage on the test recording."""
-    mask = settled(usable(test.data, test.mask, options.nominal), fits[0], test.data)
-    parts = split(test.data)
-    one, two = (error_on_other_recording(fit, test.data, mask, parts).sse_um2 / int(mask.sum()) for fit in fits)
-    return float(np.sqrt(one)), float(np.sqrt(two))
+def tuple_of_two(items: Iterable[T]) -> tuple[T, T]:
+    """Exactly two items, as a tuple of a type that says so."""
+    one, two = items
+    return one, two
 
 
 def named(
@@ -184,7 +210,18 @@ def named(
         share = own if len(found) == 1 else one.step.gain
         p = one.step.p_value
         causes.append(
-            NamedCause(one.name, also, values, spans, float(share), p, one.without.residual_um, extended.residual_um, i)
+            NamedCause(
+                one.name,
+                also,
+                values,
+                spans,
+                float(share),
+                p,
+                one.without.residual_um,
+                extended.residual_um,
+                i,
+                search.sights.get(one.name),
+            )
         )
     return tuple(causes)
 
@@ -218,14 +255,46 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
     return values, spans
 
 
-def verdict_of(causes: tuple[NamedCause, ...], nominal: HeldOut, extended: HeldOut, floor: NoiseFloor, n: int) -> str:
-    """The verdict: "adequate", "effects" or "unexplained"."""
-    base = n * floor.sigma_um**2
-    left, first = extended.sse_um2 - base, nominal.sse_um2 - base
-    structured = left > 0.5 * base
-    if causes and (not structured or left < 0.6 * first or any(c.index < 0 for c in causes)):
-        return "effects"
-    return "unexplained" if structured else "adequate"
+#: Share of the explainable squared error from which named causes explain a recording, or a part of it.
+EXPLAINED, IN_PART = 0.8, 0.1
+#: Share of the held-out squared error that must go on a test recording for the causes to carry over.
+CARRIES_OVER = 0.04
+
+
+def explained_share(nominal_um: float, extended_um: float, ceiling_um: float, floor_um: float) -> float:
+    """Share of the explainable squared error (nominal less the larger of noise floor and black box) that is explained.
+
+    All are RMS errors in µm on data that were not fitted. 1 where the causes do as well as the black box.
+    """
+    reachable_um = max(floor_um, min(ceiling_um, extended_um))
+    explainable_um2 = nominal_um**2 - reachable_um**2
+    gained_um2 = nominal_um**2 - extended_um**2
+    if explainable_um2 <= 0.0:
+        return 0.0 if gained_um2 <= 0.0 else 1.0
+    return float(min(gained_um2 / explainable_um2, 1.0))
+
+
+def verdict_of(
+    causes: tuple[NamedCause, ...],
+    nominal_um: float,
+    extended_um: float,
+    ceiling_um: float,
+    floor_um: float,
+    explained: float,
+) -> str:
+    """The verdict: "adequate", "effects", "partly" or "unexplained". Lengths are held-out RMS errors."""
+    structured = extended_um**2 > 1.5 * floor_um**2
+    if causes:
+        if any(c.index < 0 for c in causes) and not structured:
+            return "effects"
+        if extended_um**2 <= (1.0 - CARRIES_OVER) * nominal_um**2 or not structured:
+            if explained >= EXPLAINED:
+                return "effects"
+            if explained >= IN_PART:
+                return "partly"
+        return "unexplained"
+    # What a black box cannot predict either is noise, whatever its colour.
+    return "unexplained" if structured and nominal_um > 1.1 * ceiling_um else "adequate"
 
 
 def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: NoiseFloor) -> tuple[str, ...]:
@@ -239,34 +308,17 @@ def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: No
     return tuple(name for name in NAMES if not seen.get(name, False))
 
 
-def converter_causes(
-    data: FitData,
-    grid: ConverterGrid,
-    doubles: RepeatedReadings | None,
-    floor: NoiseFloor,
-    extended: ModelFit,
-    n: int,
-    dropped: int,
-) -> tuple[NamedCause, ...]:
-    """Quantisation and timing, as far as they are seen in the readings themselves and not fitted."""
-    out: list[NamedCause] = []
+def quantisation(grid: ConverterGrid, floor: NoiseFloor, extended: ModelFit, n: int) -> tuple[NamedCause, ...]:
+    """Quantisation, where the converter grid is coarser than the noise and makes a fifth of what is left."""
+    if grid.step_um <= 0.0:
+        return ()
+    own = grid.step_um**2 / 12.0
+    share = own / max(extended.sse_um2 / n, own)
+    if grid.step_um <= 1.2 * floor.sigma_um or share <= 0.2:
+        return ()
+    step = grid.step_um
+    rounding = 1e-3 * step
+    values, spans = {"step_um": step}, {"step_um": (step - rounding, step + rounding)}
+    seen = Sight("quantisation", True, f"all readings lie on a grid of {1e3 * step:.4g} nm ({grid.levels} levels)")
     flat = extended.residual_um
-    if grid.step_um > 0.0:
-        own = grid.step_um**2 / 12.0
-        share = own / max(extended.sse_um2 / n, own)
-        if grid.step_um > 1.2 * floor.sigma_um and share > 0.2:
-            step = grid.step_um
-            rounding = 1e-3 * step
-            values, spans = {"step_um": step}, {"step_um": (step - rounding, step + rounding)}
-            out.append(NamedCause("quantisation", (), values, spans, share, 0.001, flat, flat))
-    if doubles is not None:
-        p = doubles.probability
-        half = 1.96 * float(np.sqrt(p * (1.0 - p) / max(1, doubles.of)))
-        values, spans = {"repeat_probability": p}, {"repeat_probability": (max(0.0, p - half), p + half)}
-        out.append(NamedCause("timing", (), values, spans, 0.0, 0.001, flat, flat))
-    elif dropped > 0:
-        share = dropped / data.n
-        values, spans = {"lost_samples": float(dropped)}, {"lost_samples": (float(dropped), float(dropped))}
-        out.append(NamedCause("timing", (), values, spans, share, 0.001, flat, flat))
-    names = {f.name for f in extended.model.causes}
-    return tuple(c for c in out if c.name not in names)
+    return (NamedCause("quantisation", (), values, spans, share, 0.001, flat, flat, -1, seen),)

@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from adaptive.errors import InputError
 from adaptive.types import FloatArray
+from sim.diagnosis.defects import Defect
 from sim.diagnosis.model.calibration import ModelFit
+from sim.diagnosis.witnesses.sight import Sight
 
-SCHEMA = 1
+#: Schemas of report.json. 1 has no verdict "partly", no witnesses, no ceiling and no defects.
+SCHEMAS = (1, 2)
 FOLDS, TEST = "folds of the recording", "test recording"
 
 
@@ -23,7 +27,8 @@ class NamedCause:
     heldout_gain : share of the held-out squared error that it removes on top of those named before it.
     p_value : how often chance gains as much, corrected for the number of candidates.
     before_um, after_um : residual without it (all else refitted) and with it, (n,), for its picture.
-    index : index of its model in ``extended.model.causes``; -1 if it has none (quantisation, repeated readings).
+    index : index of its model in ``extended.model.causes``; -1 if it has none (quantisation).
+    witness : what the direct test of its signature says; None if there is no such test.
     """
 
     name: str
@@ -35,6 +40,7 @@ class NamedCause:
     before_um: FloatArray = field(repr=False)
     after_um: FloatArray = field(repr=False)
     index: int = -1
+    witness: Sight | None = None
 
 
 @dataclass(frozen=True)
@@ -58,11 +64,26 @@ class Diagnosis:
     partial: tuple[str, ...] = ()
     #: Source of the held-out errors: `FOLDS` or `TEST`.
     heldout_source: str = FOLDS
+    #: Held-out error of a black box, and the share of what is explainable that the named causes explain.
+    ceiling_um: float = float("nan")
+    explained: float = float("nan")
+    defects: tuple[Defect, ...] = ()
+    #: Where the remaining error lies, in sentences.
+    left: tuple[str, ...] = ()
+    #: Both models on the test recording, if there is one.
+    on_test: tuple[ModelFit, ModelFit] | None = field(default=None, repr=False)
 
-    def as_dict(self) -> dict[str, Any]:
-        """The content of report.json, schema 1."""
-        return {
-            "schema": SCHEMA,
+    @property
+    def shown(self) -> tuple[ModelFit, ModelFit]:
+        """Nominal and extended model on the recording that decides: the test recording, if there is one."""
+        return self.on_test or (self.nominal, self.extended)
+
+    def as_dict(self, schema: int = SCHEMAS[-1]) -> dict[str, Any]:
+        """The content of report.json. Raises InputError for a schema that is not one of `SCHEMAS`."""
+        if schema not in SCHEMAS:
+            raise InputError(f"schema: got {schema}, expected one of {', '.join(map(str, SCHEMAS))}")
+        out: dict[str, Any] = {
+            "schema": schema,
             "verdict": self.verdict,
             "nominal": {"rmse_um": self.nominal_rmse_um, "heldout_rmse_um": self.nominal_heldout_um},
             "extended": {"rmse_um": self.extended_rmse_um, "heldout_rmse_um": self.extended_heldout_um},
@@ -81,3 +102,18 @@ class Diagnosis:
             "not_excited": list(self.not_excited),
             "next_experiment": self.next_experiment,
         }
+        if schema == 1:
+            if self.verdict == "partly":
+                out["verdict"] = "effects" if self.explained > 0.4 else "unexplained"
+            return out
+        for effect, cause in zip(out["effects"], self.causes, strict=True):
+            w = cause.witness
+            effect["witness"] = None if w is None else {"seen": w.seen, "words": w.words}
+        out["explainable"] = {
+            "black_box_rmse_um": self.ceiling_um,
+            "explained_share": self.explained,
+        }
+        out["defects"] = [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects]
+        out["left"] = list(self.left)
+        out["tried_not_named"] = list(self.partial)
+        return out

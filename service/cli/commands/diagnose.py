@@ -13,7 +13,7 @@ from service.identification.recording_options import add_mapping_arguments, desc
 from service.protocol.errors import FieldError
 
 EPILOG = """\
-Writes DIR/report.md with its pictures, DIR/report.json (schema 1, see docs/diagnosis.md), DIR/stage.toml, the extended
+Writes DIR/report.md with its pictures, DIR/report.json (schema 2, see docs/diagnosis.md), DIR/stage.toml, the extended
 stage that `dehyst stage --file` and `dehyst demo --stage` run, and DIR/diagnosis.rrd for the Rerun viewer.
 Displacements are in µm, voltages in V, times in s. DATA may be the folder into which `dehyst serve` records.
 
@@ -40,10 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(
         parser,
         "test-range",
-        test={"help": "another recording of the same stage, same columns: only the held-out errors come from it"},
+        test={"help": "another recording of the stage, same columns: nothing is fitted, the verdict is its own"},
         seed={"help": "seed of the null distribution (%(default)s)"},
     )
     parser.add_argument("--no-rrd", action="store_true", help="write no diagnosis.rrd")
+    parser.add_argument(
+        "--schema",
+        type=int,
+        choices=(1, 2),
+        default=2,
+        help="schema of report.json: 1 has no verdict partly, no direct tests, no black box (%(default)s)",
+    )
     add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
     add_mapping_arguments(parser)
 
@@ -82,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         test="" if args.test is None else args.test.name,
         nominal=str(args.stage.name) if args.stage is not None else args.nominal,
     )
-    data = write_report(args.out, diagnosis, source, rrd=not args.no_rrd)
+    data = write_report(args.out, diagnosis, source, rrd=not args.no_rrd, schema=args.schema)
     say(f"[100 %] done in {time.perf_counter() - start:.1f} s")
     print(json.dumps(data) if args.json else summary(data, args.out))
     return 0

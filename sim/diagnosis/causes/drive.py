@@ -90,7 +90,7 @@ class SlewLimit(CauseModel):
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         top = self._fastest(data)
         low = self.parameters(data)[0].low
-        grid = data.swing_V / np.array([0.7e-3, 1.5e-3, 3e-3, 6e-3, 12e-3, 25e-3])
+        grid = data.swing_V / np.array([0.7e-3, 1.5e-3, 3e-3, 6e-3, 12e-3, 25e-3, 50e-3, 0.1])
         return single_guesses([float(v) for v in grid if low < v < top])
 
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:

@@ -69,10 +69,27 @@ def noise_floor(data: FitData) -> NoiseFloor:
         pieces = pieces - pieces.mean(axis=1, keepdims=True)
         pieces -= (pieces @ t)[:, None] * t / (t @ t)
         variance = np.sum(pieces**2, axis=1) / (window - 2)
-        return NoiseFloor(float(np.sqrt(np.median(variance))), "rests")
+        return NoiseFloor(max(float(np.sqrt(np.median(variance))), _of_whole_rests(data, quiet)), "rests")
     # Fourth differences remove the motion in the smoothest quarter of the record.
     d = np.diff(data.y_um, n=4) / np.sqrt(70.0)
     return NoiseFloor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")
+
+
+def _of_whole_rests(data: FitData, quiet: BoolArray) -> float:
+    """Standard deviation (µm) in whole rests of at least a second about a line and the logarithm of time; 0 if few.
+
+    Windows of a tenth of a second miss noise that is correlated over longer. The logarithm takes creep out.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(np.int8), [0]])))
+    spreads = []
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        if (b - a) * data.dt_s < 1.0:
+            continue
+        t = np.arange(1, b - a + 1) * data.dt_s
+        columns = np.stack([np.ones(b - a), t, np.log(t + 0.3), np.log(t + 3.0)])
+        left = data.y_um[a:b] - np.linalg.lstsq(columns.T, data.y_um[a:b], rcond=None)[0] @ columns
+        spreads.append(float(np.sqrt(left @ left / (b - a - 4))))
+    return float(np.median(spreads)) if len(spreads) >= 3 else 0.0
 
 
 def _spread(d: FloatArray, block: int) -> FloatArray:

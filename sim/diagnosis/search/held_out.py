@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.calibration import ModelFit, fit_on_other_recording
+from sim.diagnosis.model.calibration import ModelFit
 from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.readings import monitor_noise_V
 
@@ -130,14 +130,6 @@ def worse_by(one: HeldOut, other: HeldOut) -> tuple[float, float]:
     spread = float(np.std(d) * np.sqrt(d.size))
     total = float(d.sum())
     return total, total / spread if spread > 0.0 else 0.0
-
-
-def error_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray, parts: Split) -> HeldOut:
-    """Squared error of the fitted model on another recording, per block and in total."""
-    there = fit_on_other_recording(fit, data, mask)
-    residual: FloatArray = np.where(mask, there.residual_um, 0.0)
-    per_block = parts.blocks(np.square(residual))
-    return HeldOut(per_block, float(per_block.sum()))
 
 
 def monitor_misfit(fit: ModelFit, mask: BoolArray) -> float:

@@ -23,6 +23,9 @@ from sim.diagnosis.model.stage_model import CauseModel, StageModel
 from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
+from sim.diagnosis.witnesses.other import slips_are_borne_out
+from sim.diagnosis.witnesses.readings import Readings
+from sim.diagnosis.witnesses.sight import Sight
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,24 @@ class Thresholds:
     #: Number of linearised guesses that are fitted in full.
     refits: int = 6
     most_causes: int = 5
+    #: Least share of the nominal's squared error that a cause must remove whose signature is not seen in the readings.
+    least_of_nominal: float = 1e-3
+    #: The excess that a cause must remove is this many times smaller where its signature is seen.
+    seen_eases: float = 4.0
     #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative.
     close_share: float = 0.02
     close_sigmas: float = 2.5
+
+
+#: Causes whose direct test also answers to others: it supports a name but does not replace the null distribution.
+_WEAK = frozenset({"amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing"})
+#: Causes that are not named where their direct test is excited and sees nothing.
+_VETOED = frozenset(
+    {
+        *("creep", "thermal_drift", "gain_drift", "delay", "resonance", "slew_limit", "saturation", "cross_talk"),
+        *("mains_hum", "asymmetry", "amplifier_lag", "sensor_lag"),
+    }
+)
 
 
 def first_fits(
@@ -132,10 +150,25 @@ class Search:
     progress: Progress
     #: The converter grid of the readings is coarser than their noise.
     coarse: bool = False
+    #: The readings, and what their direct tests say, by cause.
+    readings: Readings | None = None
+    sights: dict[str, Sight] = field(default_factory=dict)
     causes: tuple[CauseModel, ...] = CAUSE_MODELS
     first_looks: list[ScreenedCause] = field(default_factory=list)
     #: Parameters of the nominal stage calibrated without causes.
     nominal_p: FloatArray | None = None
+    #: Held-out squared error of the nominal stage (µm²).
+    nominal_um2: float = 0.0
+
+    def seen(self, name: str) -> bool:
+        """Whether a direct test that answers to this cause alone sees it."""
+        sight = self.sights.get(name)
+        return sight is not None and sight.seen is True and name not in _WEAK
+
+    def vetoed(self, name: str) -> bool:
+        """Whether the readings excite the direct test of this cause, and it sees nothing."""
+        sight = self.sights.get(name)
+        return sight is not None and sight.seen is False and name in _VETOED
 
     def cost(self, fit: ModelFit, held: HeldOut, base: ModelFit) -> float:
         """Held-out squared error with the cost of the parameters that ``base`` lacks, and the monitor's error (µm²)."""
@@ -173,9 +206,10 @@ class Search:
             cause = self.causes[look.index]
             # These are fitted even with a small linearised gain: mains hum, because a spectral line is specific; a loop
             # in the restoring force, because it shows only when the mode is fitted with it; slips beside a timing
-            # guess, because several of them look like a clock error at first.
+            # guess, because several of them look like a clock error at first; and what a direct test sees.
             line = cause.name == "mains_hum" and self.is_line(look, base)
             own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
+            own = own or (self.seen(cause.name) and all(self.causes[c.index].name != cause.name for c in chosen))
             if own and all(look is not c for c in chosen):
                 chosen.append(look)
 
@@ -199,7 +233,13 @@ class Search:
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
     def plausible(self, candidate: CauseCandidate) -> bool:
-        """Whether the fitted parameters have a plausible size and sign."""
+        """Whether the fitted parameters have a plausible size and sign, and the readings do not speak against it."""
+        if self.vetoed(candidate.cause.name):
+            return False
+        if isinstance(candidate.cause, Slips) and self.readings is not None:
+            slips = next(f.found for f in candidate.fit.model.causes if isinstance(f, Slips))
+            if not slips_are_borne_out(self.readings, slips):
+                return False
         model = candidate.fit.model
         return candidate.cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
 
@@ -207,7 +247,10 @@ class Search:
         """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
         thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
-        if p > thresholds.level or gain <= 0.0:
+        seen = self.seen(best.cause.name)
+        if gain <= 0.0 or (p > thresholds.level and not seen):
+            return False
+        if not seen and gain < thresholds.least_of_nominal * self.nominal_um2:
             return False
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
@@ -226,9 +269,10 @@ class Search:
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
         need = thresholds.least_excess_first if first else thresholds.least_excess_next
+        need /= thresholds.seen_eases if seen else 1.0
         # With a coarse grid, rounding errors repeat wherever the stage rests and could look like a cause.
         least = max(
-            thresholds.least_gain * float(now.sum()),
+            thresholds.least_gain / (thresholds.seen_eases if seen else 1.0) * float(now.sum()),
             (0.5 if self.coarse else thresholds.least_of_floor) * float(floor.sum()),
         )
         # A model error of earlier causes is never explained almost completely by another cause.
@@ -239,7 +283,7 @@ class Search:
     def run(self, nominal: ModelFit) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Add causes to the calibrated nominal stage, one per round, until none is acceptable."""
         current, held = nominal, self.held(nominal)
-        self.nominal_p = nominal.p
+        self.nominal_p, self.nominal_um2 = nominal.p, held.sse_um2
         left_um2 = np.zeros_like(held.per_block_um2)
         steps: list[AcceptedCause] = []
         for round_ in range(self.thresholds.most_causes):
@@ -252,7 +296,7 @@ class Search:
             )
             accepted: CauseCandidate | None = None
             p = 1.0
-            fitting = [c for c in ranked if self.plausible(c)]
+            fitting = sorted((c for c in ranked if self.plausible(c)), key=self._with_witness)
             for candidate in fitting[:3]:
                 best = self.polish(candidate, current)
                 gain = held.sse_um2 - best.held.sse_um2
@@ -269,6 +313,10 @@ class Search:
             current, held = accepted.fit, accepted.held
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
+
+    def _with_witness(self, candidate: CauseCandidate) -> float:
+        """The cost, halved where the signature of the cause is seen: flexible forms imitate many causes."""
+        return candidate.cost * (0.5 if self.seen(candidate.cause.name) else 1.0)
 
     def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the other hold between samples, if that fits better: a large cause can hide it."""
@@ -350,7 +398,8 @@ def review(
         less = search.without(fit, index)
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
-        keep = thresholds.least_gain if cause.name != "mains_hum" else 0.0
+        keep = thresholds.least_gain / (thresholds.seen_eases if search.seen(cause.name) else 1.0)
+        keep = keep if cause.name != "mains_hum" else 0.0
         if gain <= keep * held_less.sse_um2:
             fit, held = less, held_less
             found, index = [], 0

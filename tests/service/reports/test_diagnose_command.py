@@ -82,11 +82,12 @@ def test_the_command_names_the_cause_and_shows_progress(report: tuple[Path, dict
     assert data == json.loads((out / "report.json").read_text())
     assert list(data) == [
         "schema", "verdict", "nominal", "extended", "noise_floor_um", "effects", "not_excited", "next_experiment",
+        "explainable", "defects", "left", "tried_not_named",
     ]  # fmt: skip
-    assert (data["schema"], data["verdict"]) == (1, "effects")
+    assert (data["schema"], data["verdict"]) == (2, "effects")
     assert data["effects"][0]["name"] == "mains_hum"
     assert set(data["effects"][0]) == {
-        "name", "alternatives", "parameters", "intervals", "heldout_gain", "p_value",
+        "name", "alternatives", "parameters", "intervals", "heldout_gain", "p_value", "witness",
     }  # fmt: skip
     assert data["effects"][0]["parameters"]["amplitude_um"] == pytest.approx(0.05, rel=0.1)
     assert data["extended"]["heldout_rmse_um"] < 0.8 * data["nominal"]["heldout_rmse_um"]
@@ -205,11 +206,12 @@ def test_the_page_of_a_record_without_a_named_cause(tmp_path: Path) -> None:
     write_report(tmp_path, adequate, Source("healthy", nominal="linear"), rrd=False)
     assert "explains this recording down to its noise" in (tmp_path / "report.md").read_text()
     assert not (tmp_path / "diagnosis.rrd").exists()
-    strange = replace(adequate, verdict="unexplained", partial=("creep", "stick_slip"))
+    strange = replace(adequate, verdict="unexplained", partial=("creep", "stick_slip"), left=("time: everywhere",))
     write_report(tmp_path, strange, Source("strange", nominal="linear"))
     page = (tmp_path / "report.md").read_text()
     assert "no cause of the catalogue explains" in page
-    assert "creep, stick slip came closest" in page
+    assert "Tried and not named, because together they explain too little here: creep, stick slip" in page
+    assert "time: everywhere" in page
     assert (tmp_path / "diagnosis.rrd").stat().st_size > 10_000
 
 

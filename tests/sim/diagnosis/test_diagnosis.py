@@ -118,7 +118,8 @@ def test_the_same_recording_gives_the_same_report() -> None:
     two = diagnose(data, options=Options(seed=3)).as_dict()
     assert one == two
     assert set(one) == {
-        "schema", "verdict", "nominal", "extended", "noise_floor_um", "effects", "not_excited", "next_experiment"
+        "schema", "verdict", "nominal", "extended", "noise_floor_um", "effects", "not_excited", "next_experiment",
+        "explainable", "defects", "left", "tried_not_named",
     }  # fmt: skip
 
 
