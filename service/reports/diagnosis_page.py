@@ -167,6 +167,7 @@ def _errors(d: Diagnosis) -> list[str]:
         f"| extended stage | {length(d.extended_rmse_um)} | {length(d.extended_heldout_um)} |",
         f"| noise floor{bound}, from {d.floor_source} | {length(d.noise_floor_um)} | |",
         f"| black box, beside the nominal stage | | {length(d.ceiling_um)} |",
+        *([] if d.taught_um is None else [f"| black box that knows the recording only | | {length(d.taught_um)} |"]),
         "",
         *_explainable(d),
     ]
@@ -265,6 +266,11 @@ def _left(d: Diagnosis) -> list[str]:
         )
     elif d.left:
         lines.append("- a black box does not predict it better: it does not repeat with the drive in a known form")
+    if d.taught_um is not None and d.taught_um > 1.2 * d.ceiling_um:
+        lines.append(
+            f"- a black box that was fitted to the recording leaves {length(d.taught_um)} on the test recording: what "
+            f"lies between that and {length(d.ceiling_um)} cannot be learnt from this recording; record more motions"
+        )
     if d.partial:
         names = ", ".join(spaced(n) for n in d.partial)
         lines += ["", f"Tried and not named, because together they explain too little here: {names}."]

@@ -8,15 +8,17 @@ fold is predicted from the others. What it leaves bounds what a named cause can 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.causes.drive import lag_ends
 from sim.diagnosis.causes.motion import slow_poles
 from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.hysteresis_loops import play_of
 from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.search.held_out import Split
+
+IntArray = NDArray[np.int64]
 
 _RADII = np.array([0.01, 0.025, 0.045, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5, 0.62, 0.76, 0.9])
 _TAUS_S = (0.1, 1.0, 10.0, 100.0)
@@ -33,55 +35,94 @@ def black_box_error(nominal: ModelFit, extended: ModelFit, mask: BoolArray, part
     ``nominal`` and ``extended`` are two models on one recording; ``mask`` (n,) is False where a sample does not count;
     ``parts`` holds the folds.
     """
-    data = nominal.model.data
-    target = nominal.residual_um
-    models = [target - extended.residual_um, nominal.signals.reading_um - data.middle_um]
-    # Dead zones of the displacement, behind the mechanics and before them.
-    still = nominal.signals.static_um[:: nominal.model.substeps]
-    for moved in (nominal.signals.reading_um, still):
-        knees = np.linspace(float(np.min(moved)), float(np.max(moved)), 8)[1:-1]
-        models += [np.maximum(moved - knee, 0.0) for knee in knees]
-    models += [np.gradient(nominal.signals.reading_um), np.gradient(np.gradient(nominal.signals.reading_um))]
-    fold = np.repeat(parts.fold, np.diff(parts.edges))
-    thin = max(1, int(mask.sum()) // _MOST)
-    use = np.flatnonzero(mask)[::thin]
-    fold, y = fold[use], target[use]
+    use = _some(mask)
+    own = [nominal.residual_um - extended.residual_um, *_of_time(nominal)]
+    return min(side_by_side(lambda lag_s: _folded(nominal, own, use, parts, lag_s)[0], _LAGS_S))
 
-    def error(lag_s: float) -> float:
-        columns = np.array([row[use] for row in (*_columns(data, lag_s), *models)])
-        columns /= np.maximum(np.sqrt(np.mean(np.square(columns), axis=1)), 1e-300)[:, None]
-        grams, slopes = [], []
+
+def black_box_on_other(
+    nominal: ModelFit, there: ModelFit, mask: BoolArray, mask_there: BoolArray, parts: Split
+) -> float:
+    """RMS error (µm) on another recording of the black box fitted to this one: what this one can teach at most.
+
+    ``there`` is the nominal stage on the other recording; lag and ridge are chosen by the folds of this one.
+    """
+    use = _some(mask)
+    tried = side_by_side(lambda lag_s: (*_folded(nominal, [], use, parts, lag_s), lag_s), _LAGS_S)
+    _, ridge, lag_s = min(tried, key=lambda one: one[0])
+    columns = np.array([row[use] for row in _columns(nominal, lag_s)])
+    scale = _scale(columns)
+    columns /= scale
+    system = columns @ columns.T + ridge * use.size * np.eye(columns.shape[0])
+    weights = np.linalg.solve(system, columns @ nominal.residual_um[use])
+    at = np.flatnonzero(mask_there)
+    rows = np.array([row[at] for row in _columns(there, lag_s)]) / scale
+    left = there.residual_um[at] - weights @ rows
+    # A constant belongs to one recording.
+    return float(np.std(left))
+
+
+def _some(mask: BoolArray) -> IntArray:
+    """Indices of at most `_MOST` samples that count."""
+    return np.flatnonzero(mask)[:: max(1, int(mask.sum()) // _MOST)]
+
+
+def _scale(columns: FloatArray) -> FloatArray:
+    return np.asarray(np.maximum(np.sqrt(np.mean(np.square(columns), axis=1)), 1e-300)[:, None])
+
+
+def _folded(
+    nominal: ModelFit, more: list[FloatArray], use: IntArray, parts: Split, lag_s: float
+) -> tuple[float, float]:
+    """RMS error (µm) over the folds behind one lag, and the ridge that it was reached with."""
+    fold = np.repeat(parts.fold, np.diff(parts.edges))[use]
+    y = nominal.residual_um[use]
+    columns = np.array([row[use] for row in (*_columns(nominal, lag_s), *more)])
+    columns /= _scale(columns)
+    grams, slopes = [], []
+    for k in range(parts.n_folds):
+        part = columns[:, fold == k]
+        grams.append(part @ part.T)
+        slopes.append(part @ y[fold == k])
+    gram, slope = np.sum(np.array(grams), axis=0), np.sum(np.array(slopes), axis=0)
+    tried = []
+    for ridge in _RIDGES:
+        left = 0.0
         for k in range(parts.n_folds):
-            part = columns[:, fold == k]
-            grams.append(part @ part.T)
-            slopes.append(part @ y[fold == k])
-        gram, slope = np.sum(np.array(grams), axis=0), np.sum(np.array(slopes), axis=0)
-        best = np.inf
-        for ridge in _RIDGES:
-            left = 0.0
-            for k in range(parts.n_folds):
-                inside = fold == k
-                system = gram - grams[k] + ridge * use.size * np.eye(gram.shape[0])
-                weights = np.linalg.solve(system, slope - slopes[k])
-                left += float(np.sum(np.square(y[inside] - weights @ columns[:, inside])))
-            best = min(best, left)
-        return float(np.sqrt(best / use.size))
-
-    return min(side_by_side(error, _LAGS_S))
+            inside = fold == k
+            system = gram - grams[k] + ridge * use.size * np.eye(gram.shape[0])
+            weights = np.linalg.solve(system, slope - slopes[k])
+            left += float(np.sum(np.square(y[inside] - weights @ columns[:, inside])))
+        tried.append((float(np.sqrt(left / use.size)), ridge))
+    return min(tried)
 
 
-def _columns(data: FitData, lag_s: float) -> list[FloatArray]:
+def _of_time(fit: ModelFit) -> list[FloatArray]:
+    """What changes with time alone, (n,) each: it belongs to one recording."""
+    t = np.linspace(-1.0, 1.0, fit.model.data.n)
+    return [t, t**2, t * (fit.model.data.u_V - fit.model.data.u_low_V) / max(fit.model.data.swing_V, 1e-12)]
+
+
+def _columns(fit: ModelFit, lag_s: float) -> list[FloatArray]:
     """Columns of the black box behind one lag, (n,) each."""
+    data = fit.model.data
     u = data.u_V if lag_s == 0.0 else np.asarray(lag_ends(data.u_V, lag_s / data.dt_s, False))
     u = np.ascontiguousarray(u)
     x = (u - 0.5 * (data.u_low_V + data.u_high_V)) / max(0.5 * data.swing_V, 1e-12)
     plays = [play_of(u, float(r) * data.swing_V) / max(data.swing_V, 1e-12) for r in _RADII]
     rows = [np.ones(data.n), x, x**2, x**3, *plays, *(x * p for p in plays[::2])]
-    # The readings of neighbouring samples: latency, and the rate.
+    # The voltages of samples before: latency, and the rate.
     rows += [np.concatenate([np.full(k, x[0]), x[: data.n - k]]) for k in (1, 2, 4, 8)]
     rows += list(slow_poles(x, data.dt_s / np.array(_TAUS_S)))
     for other in (data.u2_V, data.u3_V):
         if other is not None:
             rows.append((other - other.mean()) / max(float(np.ptp(other)), 1e-12))
-    t = np.linspace(-1.0, 1.0, data.n)
-    return [*rows, t, t**2, t * x]
+    # Dead zones of the displacement, behind the mechanics and before them; speed and acceleration.
+    signals = fit.signals
+    zero_um = fit.model.nominal.offset_um(fit.model.parameters_of(fit.p, -1))
+    moved_um = signals.reading_um - zero_um
+    for moved in (moved_um, signals.static_um[:: fit.model.substeps]):
+        knees = data.range_um * np.linspace(0.0, 1.0, 8)[1:-1] + min(0.0, data.u_low_V * data.gain_um_per_V)
+        rows += [np.maximum(moved - knee, 0.0) for knee in knees]
+    speed = np.gradient(moved_um)
+    return [*rows, moved_um, speed, np.gradient(speed)]

@@ -11,7 +11,7 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
 from sim.diagnosis.causes.catalogue import NAMES
-from sim.diagnosis.ceiling import black_box_error
+from sim.diagnosis.ceiling import black_box_error, black_box_on_other
 from sim.diagnosis.defects import recording_defects
 from sim.diagnosis.model.calibration import (
     ModelFit,
@@ -148,12 +148,13 @@ def diagnose(
     held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
     ceiling_um = black_box_error(nominal, extended, mask, search.parts)
     on_test: tuple[ModelFit, ModelFit] | None = None
-    shown_mask, shown_floor_um = mask, floor.sigma_um
+    shown_mask, shown_floor_um, taught_um = mask, floor.sigma_um, None
     if test is not None:
         shown_mask = settled(usable(test.data, test.mask, options.nominal), nominal, test.data)
         on_test = tuple_of_two(fit_on_other_recording(fit, test.data, shown_mask) for fit in (nominal, extended))
         held_um = tuple_of_two(float(np.sqrt(np.mean(np.square(f.residual_um[shown_mask])))) for f in on_test)
         ceiling_um = black_box_error(*on_test, shown_mask, split(test.data))
+        taught_um = black_box_on_other(nominal, on_test[0], mask, shown_mask, search.parts)
         shown_floor_um = min(noise_floor(test.data).sigma_um, floor.sigma_um)
     explained = explained_share(*held_um, ceiling_um, shown_floor_um)
     verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)
@@ -181,6 +182,7 @@ def diagnose(
         partial=partial,
         heldout_source=FOLDS if test is None else TEST,
         ceiling_um=ceiling_um,
+        taught_um=taught_um,
         explained=explained,
         defects=recording_defects(doubles, floor.sigma_um, grid.step_um, dropped, data.n),
         left=where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um),

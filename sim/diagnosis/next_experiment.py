@@ -59,6 +59,9 @@ def experiments(data: FitData) -> list[Experiment]:
     ]
     out = [Experiment(words, np.ascontiguousarray(low + swing * s), zero) for words, s in shapes]
     out.append(Experiment("the same record once more after a minute at zero input", data.u_V, zero))
+    if data.u2_V is None and data.y2_um is None:
+        # Nothing says that this rig has another axis.
+        return out
     out.append(Experiment("the other axis driven alone over its range, this one at zero", zero, low + swing * medium))
     return out
 

@@ -66,6 +66,8 @@ class Diagnosis:
     heldout_source: str = FOLDS
     #: Held-out error of a black box, and the share of what is explainable that the named causes explain.
     ceiling_um: float = float("nan")
+    #: Error on the test recording of a black box that was fitted to the recording itself; None without a test.
+    taught_um: float | None = None
     explained: float = float("nan")
     defects: tuple[Defect, ...] = ()
     #: Where the remaining error lies, in sentences.
@@ -112,6 +114,7 @@ class Diagnosis:
         out["explainable"] = {
             "black_box_rmse_um": self.ceiling_um,
             "explained_share": self.explained,
+            "black_box_from_recording_rmse_um": self.taught_um,
         }
         out["defects"] = [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects]
         out["left"] = list(self.left)

@@ -79,7 +79,7 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
     if not stepped:
         out.append(Sight("creep", None, "no rest follows a move of a tenth of the swing"))
     else:
-        seen = g > _SIGMAS * e and g > 4e-4
+        seen = _judged(g, e, 4e-4, 4e-3)
         words = f"the rests rise by {100 * g:.2g} ± {196 * e:.1g} % of the step before them per decade of time"
         out.append(Sight("creep", seen, words))
     for name, of_what in (("thermal_drift", "µm"), ("gain_drift", "% of the motion")):
@@ -90,13 +90,20 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
         best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
         v, e = values[best], errors[best]
         least = max(2.0 * readings.sigma_um, 1e-4 * data.range_um) if name == "thermal_drift" else 5e-4
-        seen = abs(v) > _SIGMAS * e and abs(v) > least
+        seen = _judged(abs(v), e, least, 2e-3 * (data.range_um if name == "thermal_drift" else 1.0))
         size = 1.0 if name == "thermal_drift" else 100.0
         when = {"": "over the record", "early": "in its first half", "late": "in its second half"}[
             best[len(name) + 1 :]
         ]
         out.append(Sight(name, seen, f"the rests move by {size * v:.3g} ± {1.96 * size * e:.1g} {of_what} {when}"))
     return out
+
+
+def _judged(value: float, error: float, least: float, usual: float) -> bool | None:
+    """Whether a value counts as seen; None between, and where its error is as large as a ``usual`` value."""
+    if value > _SIGMAS * error and value > least:
+        return True
+    return False if value < max(2.5 * error, least) and 2.0 * error < usual else None
 
 
 def _per_decade(slowest_s: float) -> FloatArray:

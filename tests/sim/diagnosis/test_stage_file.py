@@ -165,7 +165,7 @@ def test_the_mirrors_modes_and_cross_talk_are_found_unaided() -> None:
         assert min(abs(f - known) for f in seen) < 0.02 * known
 
 
-def test_the_measured_stack_creeps_and_lags_and_nothing_doubtful_is_said() -> None:
+def test_the_measured_stack_creeps_and_nothing_doubtful_is_said() -> None:
     folder = DATA / "picma_stack"
     if not folder.exists():
         pytest.skip("measured data missing: picma_stack; set DEHYST_DATA to the folder that holds it")
@@ -173,5 +173,7 @@ def test_the_measured_stack_creeps_and_lags_and_nothing_doubtful_is_said() -> No
     found = set(names(diagnosis))
     assert diagnosis.verdict == "effects"
     assert "creep" in found
-    assert found & {"sensor_lag", "amplifier_lag", "delay"}
-    assert "timing" not in found
+    # One sine at one frequency excites no test of a lag, and its height settles: neither may be named.
+    assert not found & {"gain_drift", "thermal_drift", "timing"}
+    seen = {c.name: c.witness.seen for c in diagnosis.causes if c.witness is not None}
+    assert seen["creep"] is True
