@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-rrd", action="store_true", help="write no diagnosis.rrd")
     add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
-    add_mapping_arguments(parser)
+    add_mapping_arguments(parser, test=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     nominal = load_stage(args.stage) if args.stage is not None else args.nominal
     recording = load(args.data, args, args.range)
-    test = None if args.test is None else load(args.test, args, args.test_range)
+    test = None if args.test is None else load(args.test, args, args.test_range, test=True)
     prepared = prepare(recording, nominal=nominal, test=test)
     say(describe(recording, list(prepared.findings)))
     for note in prepared.notes:
