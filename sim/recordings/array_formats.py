@@ -208,8 +208,8 @@ def read_tdms(path: Path, content: bytes) -> Table:
     and ``wf_start_offset`` the start.
     """
     nptdms = _library("nptdms", path)
-    # The library logs what it skips in a damaged file; the refusal below says it.
-    logging.getLogger("nptdms").setLevel(logging.CRITICAL)
+    # The library prints by handlers of its own what it skips in a damaged file; the refusals below say it.
+    nptdms.log.log_manager.set_level(logging.CRITICAL)
     try:
         file = nptdms.TdmsFile.read(io.BytesIO(content))
         channels = [channel for group in file.groups() for channel in group.channels()]

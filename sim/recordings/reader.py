@@ -268,18 +268,21 @@ class _Reading:
         return np.asarray(t_s[sample % len(t_s)] + (sample // len(t_s)) * (len(t_s) * dt_s))
 
     def _time_name(self, table: Table) -> str | None:
+        """The array of the time in a table, if it has one."""
         said = self.mapping.columns.get("t")
         if said is None:
-            return default_column(table.source, "t", list(table.arrays))
+            return (
+                self._name("t", table) if table is self.main else default_column(table.source, "t", list(table.arrays))
+            )
         try:
             name = table.named("t", said)
         except InputError:
-            if table is self.main and len(self.tables) == 1:
+            if len(self.tables) == 1:
                 raise
             return None
-        # A position in a file that has another quantity there is none of the time.
-        taken = [self.names[q] for q in self.names if q != "t" and self.by_quantity.get(q, self.main) is table]
-        return None if said not in table.arrays and name in taken else name
+        # The position of the time in one file may be that of another quantity in the next one.
+        taken = [self.names[q] for q in self.names if self.by_quantity.get(q, self.main) is table]
+        return None if name in taken and "t" not in self.mapping.index else name
 
     def _stated_dt(self) -> float | None:
         """Sample time by a sample time or rate in a file, where the user names it or it has its canonical name."""
@@ -315,8 +318,8 @@ class _Reading:
             # Times since 1970 are good to a microsecond.
             if dt_s is not None and abs(start_s - starts[0][1]) > max(CLOCK_TOLERANCE * dt_s, 2e-6):
                 raise InputError(
-                    f"{where}: starts {start_s - starts[0][1]:+.6g} s after {starts[0][0]}, expected the same start: "
-                    "cut them to the same times; or if the samples belong together, add --dt-s SECONDS"
+                    f"{where}: starts {round(start_s - starts[0][1], 6):+g} s after {starts[0][0]}, expected the same "
+                    "start: cut them to the same times; or if the samples belong together, add --dt-s SECONDS"
                 )
         if dt_s is not None and self.main.dt_s is None:
             self.notes.append(f"sample time {dt_s:g} s as the file states it")

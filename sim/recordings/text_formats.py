@@ -81,7 +81,7 @@ def _top(path: Path, lines: list[str], mapping: ColumnMap) -> _Top:
         start = first + 1
         names = different(cells)
         below = split_cells(lines[start], delimiter) if start < len(lines) else []
-        if len(below) == len(names) and (stated := units_row(names, below)):
+        if stated := units_row(names, below):
             start += 1
             notes = (f"units from line {start}: {', '.join(f'{name} in {unit}' for name, unit in stated.items())}",)
             return _Top(names, start, delimiter, stated, notes)
@@ -110,7 +110,8 @@ def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, numb
     if filled and len(numbers) == len(filled):
         if numbers in ([str(k + origin) for k in range(len(cells))] for origin in (0, 1)):
             raise InputError(
-                f"{source}: got {', '.join(numbers)} in {kind} {number}, which may be names of columns or a sample: {settle}"
+                f"{source}: got {', '.join(numbers)} in {kind} {number}, which may be names of columns or a sample: "
+                f"{settle}"
             )
         return False
     if numbers:
@@ -137,7 +138,7 @@ def different(names: list[str]) -> list[str]:
 def units_row(names: list[str], cells: list[str]) -> dict[str, str]:
     """name -> unit from the row below the names; empty unless every cell is a unit, or empty, and one is a unit."""
     bare = [cell.strip("[]() ") for cell in cells]
-    if not all(is_unit(cell) for cell in bare if cell):
+    if len(bare) != len(names) or not all(is_unit(cell) for cell in bare if cell):
         return {}
     return {name: cell for name, cell in zip(names, bare, strict=True) if cell}
 
