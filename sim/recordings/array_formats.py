@@ -34,7 +34,7 @@ def read_parquet(path: Path, content: bytes) -> Table:
     try:
         # No thread pool: pyarrow aborts a process that ends right after the pool was started.
         table = parquet.ParquetFile(io.BytesIO(content), pre_buffer=False).read(use_threads=False)
-    except (pa.ArrowInvalid, OSError) as error:
+    except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: is not a whole Parquet file ({error})") from error
     columns = {name: from_arrow(table.column(name)) for name in table.column_names}
     units = {name: "s" for name, (_, stamped) in columns.items() if stamped}
@@ -182,7 +182,7 @@ def read_npz(path: Path, content: bytes) -> Table:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays, units = plain_arrays({name: archive[name] for name in archive.files})
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, AttributeError, TypeError) as error:
+    except Exception as error:  # numpy raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .npz file of plain arrays ({_line(error)})") from error
     return Table(str(path), arrays, units=units)
 
@@ -194,7 +194,7 @@ def read_npy(path: Path, content: bytes) -> Table:
     """
     try:
         array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, OSError, EOFError, KeyError, AttributeError, TypeError, MemoryError) as error:
+    except Exception as error:  # numpy raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .npy file of a plain array ({_line(error)})") from error
     fields = array.dtype.names
     arrays, units = plain_arrays({path.stem: array} if fields is None else {name: array[name] for name in fields})
@@ -263,11 +263,18 @@ def read_xlsx(path: Path, content: bytes, mapping: ColumnMap) -> Table:
     _require_unpacked_size(path, content)
     try:
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-        sheets = {sheet.title: [list(row) for row in sheet.iter_rows(values_only=True)] for sheet in book.worksheets}
+        sheets = {}
+        for sheet in book.worksheets:
+            # The size that the file announces may be that of the largest sheet there can be.
+            sheet.reset_dimensions()
+            sheets[sheet.title] = [list(row) for row in sheet.iter_rows(values_only=True)]
         book.close()
     except Exception as error:  # the library raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .xlsx file ({_line(error)})") from error
-    filled = {title: rows for title, rows in sheets.items() if any(cell is not None for row in rows for cell in row)}
+    for rows in sheets.values():
+        while rows and all(cell is None for cell in rows[-1]):  # formatted and empty
+            rows.pop()
+    filled = {title: rows for title, rows in sheets.items() if rows}
     if not filled:
         raise InputError(f"{path}: got a workbook without values, expected one row per sample")
     arrays: dict[str, NDArray[Any]] = {}

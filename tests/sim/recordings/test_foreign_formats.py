@@ -639,6 +639,16 @@ def test_xlsx_that_holds_no_recording(tmp_path: Path) -> None:
         read(tmp_path / "d.xls")
 
 
+def test_xlsx_whose_formatted_empty_rows_are_no_samples(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    sheet = book.active
+    for row in [["t_s", "u_V", "y_um"], *TABLE.tolist()]:
+        sheet.append(row)
+    sheet.cell(row=5000, column=9).font = openpyxl.styles.Font(bold=True)
+    book.save(tmp_path / "a.xlsx")
+    same(read(tmp_path / "a.xlsx"))
+
+
 # All of them.
 
 
