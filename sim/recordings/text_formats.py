@@ -363,5 +363,11 @@ def _lvm_table(
     steps = [text.replace(",", ".") if decimal == "," else text for text in tags.get("Delta_X", [])]
     if over_time and len(steps) == len(channels) and all(is_number(step, ".") for step in steps):
         clocks = {name: (float(step), None) for name, step in zip(channels, steps, strict=True)}
+    if segments > 1:
+        # Programs pause between segments: Delta_X is the clock of all only where the times go on without a pause.
+        times = [arrays[name] for name in called if name in arrays and name not in channels]
+        dt_s = max((clock[0] for clock in clocks.values()), default=np.inf)
+        if not times or any((np.abs(np.diff(t_s) - dt_s) > 0.5 * dt_s).any() for t_s in times):
+            clocks = {}
     notes = (f"{segments} segments put one after another",) if segments > 1 else ()
     return Table(str(path), arrays, notes=notes, units=units, clocks=clocks, positional=True)

@@ -20,6 +20,8 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
   dehyst diagnose recording.parquet --out out/diagnosis
   dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
   dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 5e-4 --out out/diagnosis
+  dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
+      --out out/diagnosis
   dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
 """
 

@@ -549,16 +549,37 @@ def _index(path: Path) -> Path:
 # LVM.
 
 
+LVM_COLUMNS = {"u": "drive", "y": "sensor"}
+
+
 @pytest.mark.parametrize("columns", ["One", "No"])
 @pytest.mark.parametrize("cut", [N, 100])
 @pytest.mark.parametrize("decimal", [".", ","])
 def test_lvm(tmp_path: Path, columns: str, cut: int, decimal: str) -> None:
     path = write_lvm(tmp_path / "a.lvm", columns=columns, cut=cut, decimal=decimal)
-    recording = read(path, ColumnMap(columns={"u": "drive", "y": "sensor"}))
+    # Without times, the pause between two segments is unknown.
+    unknown = columns == "No" and cut < N
+    recording = read(path, ColumnMap(columns=LVM_COLUMNS, dt_s=DT_S if unknown else None))
     same(recording)
     assert ("2 segments put one after another" in recording.notes) == (cut < N)
     if columns == "One":
-        same(read(path, ColumnMap(columns={"t": "X_Value", "u": "drive", "y": "sensor"})))
+        same(read(path, ColumnMap(columns={"t": "X_Value", **LVM_COLUMNS})))
+
+
+@pytest.mark.parametrize("columns", ["One", "No"])
+def test_lvm_segments_with_a_pause_need_a_time(tmp_path: Path, columns: str) -> None:
+    path = write_lvm(tmp_path / "a.lvm", columns=columns, cut=100)
+    if columns == "One":  # the second one begins a second later
+        lines = path.read_text().splitlines()
+        rows = [k for k, line in enumerate(lines) if line[:1].isdigit()]
+        for k in rows[100:]:
+            t, rest = lines[k].split("\t", 1)
+            lines[k] = f"{float(t) + 1.0!r}\t{rest}"
+        path.write_text("\n".join(lines))
+        recording = read(path, ColumnMap(columns={"t": "X_Value", **LVM_COLUMNS}))
+        assert [finding.kind for finding in check(recording) if finding.kind == "gap"] == ["gap"]
+    with pytest.raises(InputError, match=r"and no time, expected a column t_s: add --column t=NAME"):
+        read(path, ColumnMap(columns=LVM_COLUMNS))
 
 
 @pytest.mark.parametrize(
