@@ -33,8 +33,9 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     """Read a file, or a folder of Parquet segments in the order of their names.
 
     The ending selects the format: ``.parquet``, ``.mat``, ``.h5``/``.hdf5``, ``.npz``, ``.npy``, ``.tdms``, ``.xlsx``.
-    Any other file is text: a controller's array file or a LabVIEW measurement file where it begins as one, otherwise
-    delimited text. ``mapping.files`` names further files for single quantities; ``sha256`` then covers all of them.
+    Other endings: by the first bytes. Any other file is text: a controller's array file or a LabVIEW measurement file
+    where it begins as one, otherwise delimited text. ``mapping.files`` names further files for single quantities;
+    ``sha256`` then covers all of them.
 
     Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
@@ -80,6 +81,14 @@ _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
     ".npy": arrays.read_npy,
     ".tdms": arrays.read_tdms,
 }
+#: First bytes of a file -> its reader, for files with another ending.
+_BY_FIRST_BYTES: dict[bytes, Callable[[Path, bytes], Table]] = {
+    arrays.HDF5_SIGNATURE: arrays.read_hdf5,
+    b"TDSm": arrays.read_tdms,
+    b"\x93NUMPY": arrays.read_npy,
+    b"PAR1": arrays.read_parquet,
+    b"MATLAB ": arrays.read_mat,
+}
 #: Formats to be saved as another one, with what to do.
 _REFUSED = {
     ".xls": "an old Excel workbook, expected .xlsx or .csv: save it as one of these",
@@ -96,6 +105,10 @@ def _table(path: Path, content: bytes, mapping: ColumnMap) -> Table:
         return arrays.read_xlsx(path, content, mapping)
     if ending in _REFUSED:
         raise InputError(f"{path}: is {_REFUSED[ending]}")
+    for first, reader in _BY_FIRST_BYTES.items():
+        # A text may begin with the same letters, and holds no zero bytes.
+        if content.startswith(first) and b"\x00" in content[:4096]:
+            return reader(path, content)
     if text.is_gcs(content):
         return text.read_gcs(path, content, mapping)
     if text.is_lvm(content):

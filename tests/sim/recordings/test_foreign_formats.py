@@ -714,6 +714,17 @@ def test_whole_and_cut_files(contents: dict[str, bytes], name: str, tmp_path: Pa
             read(path)
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if name[2:] not in ("npz", "xlsx")])
+def test_a_file_with_another_ending_is_known_by_its_first_bytes(
+    contents: dict[str, bytes], name: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.dat"
+    path.write_bytes(contents[name])
+    same(read(path))
+    path.write_bytes(b"MATLAB u_V,y_um\n1,2\n3,4\n")
+    assert len(read(path, ColumnMap(columns={"u": "1"}, units={"u": "V"}, dt_s=DT_S))) == 2
+
+
 @settings(max_examples=200, deadline=None)
 @given(data=st.data(), name=st.sampled_from([*NAMES, "a.lvm"]))
 def test_a_damaged_file_gives_samples_or_an_input_error(
