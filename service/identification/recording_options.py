@@ -13,13 +13,16 @@ from sim.recordings.columns import QUANTITIES
 READING = """\
 Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
 options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
-text with a header line, .parquet (or a folder of a recorder's segments), .mat up to version 7, .npz, and the array
-files of piezo controllers.
+text with or without a header line, .lvm and .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
+(or a folder of a recorder's segments), and the array files of piezo controllers. Examples: docs/recordings.md.
 """
 
 
-def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--map --column --unit --scale --index --dt-s --sensor-late --delimiter --decimal``."""
+def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False) -> None:
+    """Add the options from ``--map`` to ``--decimal`` that say how to read a recording.
+
+    ``test`` adds ``--test-file``, for a command that reads a second recording by ``--test``.
+    """
     quantities = ", ".join(QUANTITIES)
     units = "; ".join(f"{quantity}: {' '.join(factors)}" for quantity, (_, factors) in QUANTITIES.items())
     group = parser.add_argument_group("what the file's columns mean", READING)
@@ -27,23 +30,59 @@ def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
         "--map", type=Path, metavar="FILE.toml", help="read these options from a file; the command line overrides it"
     )
     group.add_argument(
-        "--column", action="append", default=[], metavar="Q=NAME", help=f"column of a quantity ({quantities})"
+        "--column",
+        action="append",
+        default=[],
+        metavar="Q=NAME",
+        help=f"column of a quantity ({quantities}): its name or, in text and workbooks, its position from 1",
     )
     group.add_argument("--unit", action="append", default=[], metavar="Q=UNIT", help=f"its unit ({units})")
     group.add_argument(
         "--scale", action="append", default=[], metavar="Q=FACTOR", help="factor to V, µm or s in place of a unit"
     )
     group.add_argument(
-        "--index", action="append", default=[], metavar="Q=:,0,2", help="part of an array of several dimensions"
+        "--index",
+        action="append",
+        default=[],
+        metavar="Q=:,0,2",
+        help="part of an array of several dimensions; '*' puts periods one after another: y=*,:",
+    )
+    group.add_argument(
+        "--file",
+        action="append",
+        default=[],
+        metavar="Q=FILE",
+        help="the quantity is in this file, not in the first one",
+    )
+    if test:
+        group.add_argument(
+            "--test-file", action="append", default=[], metavar="Q=FILE", help="the same for the recording of --test"
+        )
+    else:
+        parser.set_defaults(test=None, test_file=[])
+    group.add_argument(
+        "--repeat",
+        action="append",
+        default=[],
+        metavar="Q",
+        help="the file holds one period of this quantity, to be repeated as long as the other columns last: u",
     )
     group.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
     group.add_argument("--sensor-late", type=int, metavar="N", help="the sensor column is N samples late in the file")
+    group.add_argument(
+        "--header",
+        metavar="LINE",
+        help="line with the columns' names, from 1, or none (default: as the first line shows)",
+    )
     group.add_argument("--delimiter", help="between the columns of a text file (default: as its header line shows)")
     group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default .)")
 
 
-def mapping_from(args: argparse.Namespace) -> ColumnMap:
-    """The column mapping from the options and the file ``--map``. Raises InputError."""
+def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
+    """The column mapping from the options and the file ``--map``, for the recording or for that of ``--test``.
+
+    Raises InputError.
+    """
     base = load_map(args.map) if args.map is not None else ColumnMap()
     scale: dict[str, float] = {}
     for quantity, text in _pairs("--scale", args.scale).items():
@@ -57,11 +96,24 @@ def mapping_from(args: argparse.Namespace) -> ColumnMap:
     kept_scale = {q: factor for q, factor in base.scale.items() if q not in units}
     scalars = {
         name: value
-        for name in ("dt_s", "sensor_late", "delimiter", "decimal")
+        for name in ("dt_s", "sensor_late", "delimiter", "decimal", "header")
         if (value := getattr(args, name)) is not None
     }
+    files = base.files | {quantity: Path(name) for quantity, name in _pairs("--file", args.file).items()}
+    if test:
+        tested = {quantity: Path(name) for quantity, name in _pairs("--test-file", args.test_file).items()}
+        if tested.keys() != files.keys():
+            raise FieldError(
+                "--test-file",
+                ", ".join(tested) or "nothing",
+                f"a file for {', '.join(files) or 'no quantity'}, as the recording has",
+                "the test recording is read like the recording itself",
+            )
+        files = tested
     return replace(
         base,
+        files=files,
+        repeat=tuple(args.repeat) or base.repeat,
         columns=base.columns | _pairs("--column", args.column),
         units=kept_units | units,
         scale=kept_scale | scale,
@@ -98,9 +150,14 @@ def parse_range(option: str, text: str | None) -> tuple[float | None, float | No
     return ends
 
 
-def load(path: Path, args: argparse.Namespace, range_option: str | None = None) -> Recording:
-    """Read ``path`` with the options of :func:`add_mapping_arguments`, cut to ``range_option``. Raises InputError."""
-    recording = read(path, mapping_from(args))
+def load(path: Path, args: argparse.Namespace, range_option: str | None = None, *, test: bool = False) -> Recording:
+    """Read ``path`` with the options of :func:`add_mapping_arguments`, cut to ``range_option``.
+
+    ``test`` says that it is the recording of ``--test``. Raises InputError.
+    """
+    if args.test_file and args.test is None:
+        raise FieldError("--test-file", args.test_file[0], "a test recording", "give it by --test")
+    recording = read(path, mapping_from(args, test=test))
     start_s, stop_s = parse_range("--range", range_option)
     return recording if start_s is None and stop_s is None else recording.between(start_s, stop_s)
 

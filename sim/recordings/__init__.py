@@ -1,4 +1,4 @@
-"""Recordings from files: one reader per format, units only as stated, problems reported as data.
+"""Recordings from files: one reader per format, units and periods only as stated, problems reported as data.
 
 ``read(path, mapping)`` gives a `Recording` in the project's columns, ``check`` lists its problems, ``require_usable``
 refuses what cannot be used, and ``repaired`` puts the rest on a regular time grid.

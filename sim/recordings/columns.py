@@ -1,7 +1,7 @@
 """The meaning of a file's columns: names and units as the user states them, never guessed.
 
-A unit comes from the end of the column's own name (``y_nm``) or from an option. A column without either is refused
-with the option that adds it.
+A unit comes from an option, from the file's own entry for the column (TDMS, LVM, HDF5), or from the end of the
+column's name (``y_nm``). A column without any of them is refused with the option that adds it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,21 @@ _RATE = {"Hz": 1.0, "hz": 1.0, "kHz": 1e3}
 _TEMPERATURE = {"C": 1.0, "degC": 1.0, "K": 1.0}
 KELVIN_AT_0_C = 273.15
 
+#: Names of units that acquisition programs write into their files, in lower case.
+_UNIT_WORDS = {
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("millivolt", "millivolts"), "mV"),
+    **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres", "micron", "microns"), "um"),
+    **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
+    **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("sec", "second", "seconds"), "s"),
+    **dict.fromkeys(("millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("°c", "deg c", "celsius"), "C"),
+    **dict.fromkeys(("kelvin",), "K"),
+    **dict.fromkeys(("hertz",), "Hz"),
+}
+
 #: quantity -> (canonical column, factors to its unit by unit name)
 QUANTITIES: dict[str, tuple[str, dict[str, float]]] = {
     "t": ("t_s", _TIME),
@@ -36,6 +51,9 @@ QUANTITIES: dict[str, tuple[str, dict[str, float]]] = {
     "rate": ("rate_Hz", _RATE),
 }
 
+#: Quantities with one value per sample.
+SAMPLED = tuple(quantity for quantity in QUANTITIES if quantity not in ("dt", "rate"))
+
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
@@ -44,15 +62,21 @@ class ColumnMap:
     Attributes
     ----------
     columns : quantity -> name of the column or array in the file (quantities: ``t u y u2 y2 u3 monitor temperature``,
-        and the scalars ``dt`` and ``rate``).
+        and the scalars ``dt`` and ``rate``); in text and workbooks also its position from 1 (``"2"``), or several
+        neighbours as one array (``"2:6"``).
     units : quantity -> unit of that column (``V mV kV``; ``um nm pm mm m``; ``s ms us ns min``; ``C K``; ``Hz kHz``).
     scale : quantity -> factor from the file's number to the canonical unit, in place of a unit, for a column in
         another quantity (10 for a sensor of 10 µm per volt).
-    index : quantity -> part of an array of several dimensions, with one ``:`` for the samples (``":,0,2"``).
+    index : quantity -> part of an array of several dimensions, with one ``:`` for the samples (``":,0,2"``), and
+        ``*`` for the dimension whose entries are put one after another (``"*,:"``: periods of samples).
+    files : quantity -> file that holds it, where that is not the recording's main file.
+    repeat : quantities whose samples are one period, repeated for as long as ``u`` or ``y``, the longer one, lasts.
     dt_s : sample time, s, where the file has no time column.
     sensor_late : samples by which the sensor's column is late in the file. The readings are moved back by as many
         samples, and as many samples at the end are dropped.
     delimiter, decimal : of a text file, where its header line does not show them.
+    header : number of the text line (or row of a workbook's sheet) that holds the columns' names, from 1, or ``none``
+        where the columns have no names. Without it, the first line decides, if it can.
 
     Raises InputError on an unknown quantity or unit, and on values out of range.
     """
@@ -61,16 +85,20 @@ class ColumnMap:
     units: dict[str, str] = field(default_factory=dict)
     scale: dict[str, float] = field(default_factory=dict)
     index: dict[str, str] = field(default_factory=dict)
+    files: dict[str, Path] = field(default_factory=dict)
+    repeat: tuple[str, ...] = ()
     dt_s: float | None = None
     sensor_late: int = 0
     delimiter: str | None = None
     decimal: str = "."
+    header: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("columns", "units", "scale", "index"):
+        for name in ("columns", "units", "scale", "index", "files"):
             for quantity in getattr(self, name):
                 if quantity not in QUANTITIES:
                     raise InputError(f"{name}: got quantity {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        self._check_layout()
         for quantity, unit in self.units.items():
             factors = QUANTITIES[quantity][1]
             if unit not in factors:
@@ -87,15 +115,26 @@ class ColumnMap:
         if self.decimal not in (".", ","):
             raise InputError(f"decimal: got {self.decimal!r}, expected '.' or ','")
 
+    def _check_layout(self) -> None:
+        for quantity in self.repeat:
+            if quantity not in SAMPLED or quantity == "t":
+                expected = ", ".join(name for name in SAMPLED if name != "t")
+                raise InputError(
+                    f"repeat: got {quantity!r}, expected a quantity of one period: {expected} (time goes on by itself)"
+                )
+        if self.header is not None and self.header != "none" and not (self.header.isdecimal() and int(self.header)):
+            raise InputError(f"header: got {self.header!r}, expected the number of a line, from 1, or none")
 
-_SECTIONS: dict[str, type] = {"columns": str, "units": str, "scale": float, "index": str}
-_SCALARS: dict[str, type] = {"dt_s": float, "sensor_late": int, "delimiter": str, "decimal": str}
+
+_SECTIONS: dict[str, type] = {"columns": str, "units": str, "scale": float, "index": str, "files": str}
+_SCALARS: dict[str, type] = {"dt_s": float, "sensor_late": int, "delimiter": str, "decimal": str, "repeat": list}
 
 
 def load_map(path: Path) -> ColumnMap:
     """Read a :class:`ColumnMap` from a TOML file with its field names as keys and tables.
 
-    Raises InputError where the file is missing, is not TOML, or has an unknown key.
+    Columns may be given by number, and files relative to the map's folder. Raises InputError where the file is
+    missing, is not TOML, or has an unknown key.
     """
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -107,20 +146,33 @@ def load_map(path: Path) -> ColumnMap:
     for key, value in table.items():
         if key in _SECTIONS and isinstance(value, dict):
             values[key] = {q: _typed(path, f"{key}.{q}", v, _SECTIONS[key]) for q, v in value.items()}
+        elif key == "header":
+            values[key] = _typed(path, key, str(value) if type(value) is int else value, str)
         elif key in _SCALARS:
             values[key] = _typed(path, key, value, _SCALARS[key])
         else:
-            known = ", ".join([f"[{name}]" for name in _SECTIONS] + list(_SCALARS))
+            known = ", ".join([f"[{name}]" for name in _SECTIONS] + [*_SCALARS, "header"])
             raise InputError(f"map {path}: got unknown key {key!r}, expected {known}")
+    if "files" in values:
+        values["files"] = {quantity: path.parent / name for quantity, name in values["files"].items()}
+    if "repeat" in values:
+        values["repeat"] = tuple(str(_typed(path, "repeat", name, str)) for name in values["repeat"])
     return ColumnMap(**values)
 
 
 def _typed(path: Path, key: str, value: object, kind: type) -> object:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if key.startswith("columns.") and type(value) is int:
+        return str(value)
     if not isinstance(value, kind) or isinstance(value, bool):
         raise InputError(f"map {path}: {key}: got {value!r}, expected {kind.__name__}")
     return value
+
+
+def is_unit(text: str) -> bool:
+    """Whether ``text`` is a unit of any quantity."""
+    return text.casefold() in _UNIT_WORDS or any(text in factors for _, factors in QUANTITIES.values())
 
 
 def unit_of_name(quantity: str, column: str) -> str | None:
@@ -146,20 +198,39 @@ def default_column(source: str, quantity: str, names: list[str]) -> str | None:
     return with_unit[0] if with_unit else (quantity if quantity in names else None)
 
 
-def factor_and_unit(source: str, quantity: str, column: str, mapping: ColumnMap) -> tuple[float, str]:
+def factor_and_unit(
+    source: str, quantity: str, column: str, mapping: ColumnMap, stated: str | None = None
+) -> tuple[float, str]:
     """Factor from the file's numbers to the canonical unit, and the name of the unit.
 
-    Raises InputError where no unit is known, naming the file, the column, the accepted units and the option to add.
+    ``stated`` is the unit that the file itself states for the column, apart from its name. Raises InputError where no
+    unit is known, or the file's statement contradicts the name or the quantity, naming the file, the column, the
+    accepted units and the option to add.
     """
     if quantity in mapping.scale:
         return mapping.scale[quantity], "scaled"
     canonical, factors = QUANTITIES[quantity]
-    unit = mapping.units.get(quantity) or unit_of_name(quantity, column)
+    own = canonical.rsplit("_", 1)[1]
+    accepted = f"expected one of {', '.join(factors)}: add --unit {quantity}={own} if it is in {own}" + (
+        ", or --scale if it is of another kind" if quantity not in ("t", "dt", "rate") else ""
+    )
+    unit = mapping.units.get(quantity)
+    if unit is None and stated:
+        unit = stated if stated in factors else _UNIT_WORDS.get(stated.casefold(), stated)
+        if unit not in factors:
+            raise InputError(
+                f"{source}: column {column!r} for {quantity}: the file states the unit {stated!r}, {accepted}"
+            )
+        named = unit_of_name(quantity, column)
+        if named is not None and factors[named] != factors[unit]:
+            raise InputError(
+                f"{source}: column {column!r} for {quantity}: the file states the unit {stated!r} and its name says "
+                f"{named}, expected the same: settle it with --unit {quantity}={unit} or {quantity}={named}"
+            )
+    unit = unit or unit_of_name(quantity, column)
     if unit is None:
-        own = canonical.rsplit("_", 1)[1]
         raise InputError(
             f"{source}: column {column!r} for {quantity} has no unit in its name, and units are never guessed; "
-            f"expected one of {', '.join(factors)}: add --unit {quantity}={own} if it is in {own}"
-            + (", or --scale if it is of another kind" if quantity not in ("t", "dt", "rate") else "")
+            f"{accepted}"
         )
     return factors[unit], unit

@@ -1,8 +1,9 @@
-"""Reads a file into a recording with the project's columns and units."""
+"""Reads one or several files into a recording with the project's columns and units."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,39 +12,52 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.recordings.columns import KELVIN_AT_0_C, QUANTITIES, ColumnMap, default_column, factor_and_unit
-from sim.recordings.formats import Table, is_gcs, read_gcs, read_mat, read_npz, read_parquet, read_text
+from sim.recordings import array_formats as arrays
+from sim.recordings import text_formats as text
+from sim.recordings.columns import (
+    KELVIN_AT_0_C,
+    QUANTITIES,
+    SAMPLED,
+    ColumnMap,
+    default_column,
+    factor_and_unit,
+)
 from sim.recordings.recording import Recording
+from sim.recordings.table import MAX_BYTES, Table
 
-#: Largest file, bytes; larger ones do not fit into the memory of common machines.
-MAX_BYTES = 2_000_000_000
+#: Two clocks agree within this share of a sample time.
+CLOCK_TOLERANCE = 0.01
 
 
 def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     """Read a file, or a folder of Parquet segments in the order of their names.
 
-    The ending selects the format: ``.parquet``, ``.mat``, ``.npz``. Any other file is text: a controller's array file
-    where it begins as one, otherwise delimited text with a header line.
+    The ending selects the format: ``.parquet``, ``.mat``, ``.h5``/``.hdf5``, ``.npz``, ``.npy``, ``.tdms``, ``.xlsx``.
+    Other endings: by the first bytes. Any other file is text: a controller's array file or a LabVIEW measurement file
+    where it begins as one, otherwise delimited text. ``mapping.files`` names further files for single quantities;
+    ``sha256`` then covers all of them.
 
     Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
     path, mapping = Path(path), mapping or ColumnMap()
     if path.is_dir():
-        files = sorted(path.glob("*.parquet"))
-        if not files:
+        segments = sorted(path.glob("*.parquet"))
+        if not segments:
             raise InputError(f"{path}: got a folder without .parquet files, expected a recording")
     else:
-        files = [path]
-    contents = [_bytes(file) for file in files]
+        segments = [path]
     digest = hashlib.sha256()
-    for content in contents:
-        digest.update(content)
-    tables = [_table(file, content, mapping) for file, content in zip(files, contents, strict=True)]
-    table = tables[0] if len(tables) == 1 else _joined(path, tables)
-    return _recording(table, mapping, str(path), digest.hexdigest())
+    tables = [_table(segment, _bytes(segment, digest), mapping) for segment in segments]
+    main = tables[0] if len(tables) == 1 else _joined(path, tables)
+    others: dict[Path, Table] = {}
+    for file in mapping.files.values():
+        if file not in others:
+            others[file] = main if file == path else _table(file, _bytes(file, digest), mapping)
+    by_quantity = {quantity: others[file] for quantity, file in mapping.files.items()}
+    return _Reading(main, by_quantity, mapping).recording(str(path), digest.hexdigest())
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(path: Path, digest: Any) -> bytes:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -53,20 +67,53 @@ def _bytes(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a recording") from error
     if not content:
         raise InputError(f"{path}: got an empty file, expected a recording")
+    digest.update(content)
     return content
+
+
+_BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
+    ".parquet": arrays.read_parquet,
+    ".pq": arrays.read_parquet,
+    ".mat": arrays.read_mat,
+    ".h5": arrays.read_hdf5,
+    ".hdf5": arrays.read_hdf5,
+    ".npz": arrays.read_npz,
+    ".npy": arrays.read_npy,
+    ".tdms": arrays.read_tdms,
+}
+#: First bytes of a file -> its reader, for files with another ending.
+_BY_FIRST_BYTES: dict[bytes, Callable[[Path, bytes], Table]] = {
+    arrays.HDF5_SIGNATURE: arrays.read_hdf5,
+    b"TDSm": arrays.read_tdms,
+    b"\x93NUMPY": arrays.read_npy,
+    b"PAR1": arrays.read_parquet,
+    b"MATLAB ": arrays.read_mat,
+}
+#: Formats to be saved as another one, with what to do.
+_REFUSED = {
+    ".xls": "an old Excel workbook, expected .xlsx or .csv: save it as one of these",
+    ".tdms_index": "the index of a TDMS file, expected the .tdms file beside it",
+    ".ods": "an OpenDocument sheet, expected .xlsx or .csv: save it as one of these",
+}
 
 
 def _table(path: Path, content: bytes, mapping: ColumnMap) -> Table:
     ending = path.suffix.lower()
-    if ending in (".parquet", ".pq"):
-        return read_parquet(path, content)
-    if ending == ".mat":
-        return read_mat(path, content)
-    if ending == ".npz":
-        return read_npz(path, content)
-    if is_gcs(content):
-        return read_gcs(path, content, mapping)
-    return read_text(path, content, mapping)
+    if ending in _BY_ENDING:
+        return _BY_ENDING[ending](path, content)
+    if ending in (".xlsx", ".xlsm"):
+        return arrays.read_xlsx(path, content, mapping)
+    if ending in _REFUSED:
+        raise InputError(f"{path}: is {_REFUSED[ending]}")
+    for first, reader in _BY_FIRST_BYTES.items():
+        # A text may begin with the same letters, and holds no zero bytes.
+        if content.startswith(first) and b"\x00" in content[:4096]:
+            return reader(path, content)
+    if text.is_gcs(content):
+        return text.read_gcs(path, content, mapping)
+    if text.is_lvm(content):
+        return text.read_lvm(path, content, mapping)
+    return text.read_text(path, content, mapping)
 
 
 def _joined(path: Path, tables: list[Table]) -> Table:
@@ -76,60 +123,229 @@ def _joined(path: Path, tables: list[Table]) -> Table:
             raise InputError(
                 f"{table.source}: got columns {table.describe()}, expected {', '.join(names)} as before it"
             )
-    arrays = {name: np.concatenate([table.arrays[name] for table in tables]) for name in names}
-    return Table(str(path), arrays, notes=(f"{len(tables)} segments",))
+    joined = {name: np.concatenate([table.arrays[name] for table in tables]) for name in names}
+    return Table(str(path), joined, notes=(f"{len(tables)} segments",), units=tables[0].units)
 
 
-def _column(table: Table, quantity: str, mapping: ColumnMap, *, needed: bool) -> FloatArray | None:
-    name = mapping.columns.get(quantity) or default_column(table.source, quantity, list(table.arrays))
-    if name is None:
-        if not needed:
+class _Reading:
+    """One recording on its way from tables to columns: which array is which quantity, and what was done to it."""
+
+    def __init__(self, main: Table, by_quantity: dict[str, Table], mapping: ColumnMap) -> None:
+        self.main = main
+        self.by_quantity = by_quantity
+        self.mapping = mapping
+        #: All tables, the main one first, each once.
+        self.tables = list({id(table): table for table in (main, *by_quantity.values())}.values())
+        self.notes = [note for table in self.tables for note in table.notes]
+        #: quantity -> name of its array in its table, for the columns that were read.
+        self.names: dict[str, str] = {}
+
+    def recording(self, source: str, sha256: str) -> Recording:
+        """The columns under their names, all of one length. Raises InputError."""
+        columns: dict[str, NDArray[Any] | None] = {}
+        for quantity in SAMPLED:
+            if quantity != "t":
+                columns[quantity] = self._column(quantity, needed=quantity in ("u", "y"))
+        n, periods = self._repeat(source, columns)
+        named = {QUANTITIES[quantity][0]: values for quantity, values in columns.items()}
+        named["t_s"], dt_s = self._time(source, n, periods)
+        if "seq" in self.main.arrays and self.main.arrays["seq"].dtype.kind in "iu":
+            named["seq"] = self.main.arrays["seq"].astype(np.int64)
+        if "reason" in self.main.arrays:
+            named["reason"] = self.main.arrays["reason"].astype(np.str_)
+        for name, values in named.items():
+            if values is not None and len(values) != n:
+                raise InputError(f"{source}: {name}: got {len(values)} samples, expected {n} as u_V and y_um")
+        if self.mapping.sensor_late:
+            named = _sensor_moved(source, named, self.mapping.sensor_late, n)
+            self.notes.append(f"sensor's column moved back by {self.mapping.sensor_late} samples (sensor_late)")
+        return Recording(dt_s=dt_s, source=source, sha256=sha256, notes=tuple(self.notes), **named)  # type: ignore[arg-type]
+
+    def _name(self, quantity: str, table: Table) -> str | None:
+        """The array of a quantity in its table: as the user says, by its name, or the only one that it can be."""
+        said = self.mapping.columns.get(quantity)
+        if said is not None:
+            return table.named(quantity, said)
+        name = default_column(table.source, quantity, list(table.arrays))
+        if name is None and len(table.arrays) == 1:
+            # Quantities that can only mean this array: the user names the file or the part of the array for them, or
+            # the other one of u and y is in another file.
+            sharing = [q for q, other in self.by_quantity.items() if other is table and q not in self.mapping.columns]
+            rest = [q for q in ("u", "y") if q not in self.by_quantity]
+            if quantity in self.mapping.index or sharing == [quantity] or (table is self.main and rest == [quantity]):
+                return next(iter(table.arrays))
+        return name
+
+    def _column(self, quantity: str, *, needed: bool) -> FloatArray | None:
+        table = self.by_quantity.get(quantity, self.main)
+        name = self._name(quantity, table)
+        if name is None:
+            if not needed and quantity not in self.by_quantity:
+                return None
+            canonical, factors = QUANTITIES[quantity]
+            way = "NAME (or its position from 1)" if table.positional else "NAME"
+            raise InputError(
+                f"{table.source}: got columns {table.describe()}, expected {canonical}: add --column {quantity}={way} "
+                f"and, unless the name ends in one, its unit (--unit {quantity}=...: {', '.join(factors)}); if it is "
+                f"in another file, --file {quantity}=FILE"
+            )
+        self.names[quantity] = name
+        return self._values(quantity, table, name)
+
+    def _values(self, quantity: str, table: Table, name: str) -> FloatArray:
+        factor, unit = factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
+        values, done = table.column(quantity, name, self.mapping.index.get(quantity))
+        if done:
+            self.notes.append(done)
+        if unit == "K":
+            return values - KELVIN_AT_0_C
+        return values if factor == 1.0 else values * factor
+
+    def _repeat(self, source: str, columns: dict[str, NDArray[Any] | None]) -> tuple[int, list[int]]:
+        """Repeat the periods in ``columns``. Returns the number of samples, and the lengths of the periods."""
+        u, y = columns["u"], columns["y"]
+        assert u is not None
+        assert y is not None
+        n, periods = max(len(u), len(y)), []
+        for quantity in self.mapping.repeat:
+            period = columns[quantity]
+            if period is None or not 0 < len(period) <= n:
+                got = "no such column" if period is None else f"{len(period)} samples"
+                raise InputError(f"{source}: repeat {quantity}: got {got}, expected one period of at most {n} samples")
+            if len(period) < n:
+                times = f"{n / len(period):.4g} times" + (", the last one in part" if n % len(period) else "")
+                self.notes.append(f"{quantity}: its {len(period)} samples are one period and are repeated {times}")
+                periods.append(len(period))
+                columns[quantity] = np.resize(period, n)
+        u_n, y_n = len(columns["u"]), len(columns["y"])  # type: ignore[arg-type]
+        if u_n != y_n:
+            short, long, quantity = (u_n, y_n, "u") if u_n < y_n else (y_n, u_n, "y")
+            whole = f", 1/{long // short} of the other" if short and long % short == 0 else ""
+            raise InputError(
+                f"{source}: got {u_n} samples of u_V and {y_n} of y_um, expected the same number: add --repeat "
+                f"{quantity} if its {short} samples{whole} are one period of a periodic recording; otherwise cut or "
+                "resample one of them"
+            )
+        return n, periods
+
+    def _time(self, source: str, n: int, periods: list[int]) -> tuple[FloatArray, float]:
+        """Time of each sample and the nominal sample time, s, from an option, a column, or the format."""
+        dt_s = self.mapping.dt_s
+        if dt_s is None:
+            t_s = self._clock_column(source, n, periods)
+            if t_s is not None:
+                return t_s, nominal_dt(source, t_s)
+            dt_s = self._stated_dt() or self._format_dt()
+        if dt_s is None:
+            raise InputError(
+                f"{self.main.source}: got columns {self.main.describe()} and no time, expected a column t_s: add "
+                "--column t=NAME --unit t=..., or the sample time as --dt-s SECONDS, or --column rate=NAME where the "
+                "file holds a rate"
+            )
+        return np.arange(n, dtype=np.float64) * dt_s, float(dt_s)
+
+    def _clock_column(self, source: str, n: int, periods: list[int]) -> FloatArray | None:
+        """The time column (n,), s, of one of the files; all that there are must agree."""
+        found: list[tuple[str, FloatArray]] = []
+        if "t" in self.by_quantity:
+            t_s = self._column("t", needed=True)
+            assert t_s is not None
+            found.append((self.by_quantity["t"].source, t_s))
+        else:
+            for table in self.tables:
+                if (name := self._time_name(table)) is not None:
+                    found.append((table.source, self._values("t", table, name)))
+            if not found and "t" in self.mapping.columns:
+                self.main.named("t", self.mapping.columns["t"])
+        if not found:
             return None
-        canonical, factors = QUANTITIES[quantity]
-        raise InputError(
-            f"{table.source}: got columns {table.describe()}, expected {canonical}: add --column {quantity}=NAME "
-            f"and, unless the name ends in one, its unit (--unit {quantity}=...: {', '.join(factors)})"
-        )
-    factor, unit = factor_and_unit(table.source, quantity, name, mapping)
-    values = table.column(quantity, name, mapping.index.get(quantity))
-    if unit == "K":
-        return values - KELVIN_AT_0_C
-    return values if factor == 1.0 else values * factor
+        whole = [(where, t_s) for where, t_s in found if len(t_s) == n]
+        for where, t_s in whole[1:]:
+            dt_s = nominal_dt(whole[0][0], whole[0][1])
+            apart = np.abs(t_s - whole[0][1])
+            if np.nanmax(apart, initial=0.0) > CLOCK_TOLERANCE * dt_s:
+                k = int(np.nanargmax(apart))
+                raise InputError(
+                    f"{where}: got the time {t_s[k]:.9g} s for sample {k + 1}, expected {whole[0][1][k]:.9g} s as in "
+                    f"{whole[0][0]}: resample one of them; or if the samples belong together, say whose time is right "
+                    "with --file t=FILE"
+                )
+        if whole:
+            return whole[0][1]
+        where, t_s = found[0]
+        if len(t_s) not in periods:
+            raise InputError(f"{where}: t_s: got {len(t_s)} samples, expected {n} as u_V and y_um")
+        dt_s = nominal_dt(where, t_s)
+        sample = np.arange(n)
+        self.notes.append(f"time: continued by {len(t_s) * dt_s:.6g} s with every period")
+        return np.asarray(t_s[sample % len(t_s)] + (sample // len(t_s)) * (len(t_s) * dt_s))
 
-
-def _scalar(table: Table, quantity: str, mapping: ColumnMap) -> float | None:
-    """Sample time or rate stored in the file; only where the user names it or it has its canonical name."""
-    name = mapping.columns.get(quantity)
-    if name is None:
-        canonical = QUANTITIES[quantity][0]
-        if canonical not in table.arrays:
+    def _time_name(self, table: Table) -> str | None:
+        """The array of the time in a table, if it has one."""
+        said = self.mapping.columns.get("t")
+        if said is None:
+            return (
+                self._name("t", table) if table is self.main else default_column(table.source, "t", list(table.arrays))
+            )
+        try:
+            name = table.named("t", said)
+        except InputError:
+            if len(self.tables) == 1:
+                raise
             return None
-        name = canonical
-    factor, _ = factor_and_unit(table.source, quantity, name, mapping)
-    return table.scalar(quantity, name) * factor
+        # The position of the time in one file may be that of another quantity in the next one.
+        taken = [self.names[q] for q in self.names if self.by_quantity.get(q, self.main) is table]
+        return None if name in taken and "t" not in self.mapping.index else name
 
+    def _stated_dt(self) -> float | None:
+        """Sample time by a sample time or rate in a file, where the user names it or it has its canonical name."""
+        found: list[tuple[str, float]] = []
+        for quantity in ("dt", "rate"):
+            said, canonical = self.mapping.columns.get(quantity), QUANTITIES[quantity][0]
+            tables = [self.by_quantity[quantity]] if quantity in self.by_quantity else self.tables
+            holding = [table for table in tables if (said or canonical) in table.arrays]
+            if said is not None and not holding:
+                tables[0].named(quantity, said)
+            for table in holding or (tables if said is not None or quantity in self.by_quantity else []):
+                name = self._name(quantity, table) or said or canonical
+                value = table.scalar(quantity, name)
+                value *= factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))[0]
+                if not 0.0 < value < 1e9:
+                    raise InputError(f"{table.source}: {name}: got {value:g}, expected a positive number")
+                found.append((f"{name} of {table.source}", value if quantity == "dt" else 1.0 / value))
+        return self._agreed(found)
 
-def _recording(table: Table, mapping: ColumnMap, source: str, sha256: str) -> Recording:
-    u_V = _column(table, "u", mapping, needed=True)
-    y_um = _column(table, "y", mapping, needed=True)
-    assert u_V is not None
-    assert y_um is not None
-    t_s, dt_s = _time(table, mapping, len(u_V))
-    columns: dict[str, NDArray[Any] | None] = {"t_s": t_s, "u_V": u_V, "y_um": y_um}
-    for quantity in ("u2", "y2", "u3", "monitor", "temperature"):
-        columns[QUANTITIES[quantity][0]] = _column(table, quantity, mapping, needed=False)
-    if "seq" in table.arrays and table.arrays["seq"].dtype.kind in "iu":
-        columns["seq"] = table.arrays["seq"].astype(np.int64)
-    if "reason" in table.arrays:
-        columns["reason"] = table.arrays["reason"].astype(np.str_)
-    for name, values in columns.items():
-        if values is not None and len(values) != len(t_s):
-            raise InputError(f"{source}: {name}: got {len(values)} samples, expected {len(t_s)} as t_s")
-    notes = list(table.notes)
-    if mapping.sensor_late:
-        columns = _sensor_moved(source, columns, mapping.sensor_late, len(t_s))
-        notes.append(f"sensor's column moved back by {mapping.sensor_late} samples (sensor_late)")
-    return Recording(dt_s=dt_s, source=source, sha256=sha256, notes=tuple(notes), **columns)  # type: ignore[arg-type]
+    def _format_dt(self) -> float | None:
+        """Sample time by the formats; all channels must have the same, and start together."""
+        found: list[tuple[str, float]] = []
+        starts: list[tuple[str, float]] = []
+        for quantity, name in self.names.items():
+            table = self.by_quantity.get(quantity, self.main)
+            dt_s, start_s = table.clocks.get(name, (table.dt_s, None))
+            if dt_s is not None:
+                found.append((f"{name} of {table.source}", dt_s))
+            if start_s is not None and quantity not in self.mapping.repeat:
+                starts.append((f"{name} of {table.source}", start_s))
+        dt_s = self._agreed(found)
+        for where, start_s in starts[1:]:
+            # Times since 1970 are good to a microsecond.
+            if dt_s is not None and abs(start_s - starts[0][1]) > max(CLOCK_TOLERANCE * dt_s, 2e-6):
+                raise InputError(
+                    f"{where}: starts {round(start_s - starts[0][1], 6):+g} s after {starts[0][0]}, expected the same "
+                    "start: cut them to the same times; or if the samples belong together, add --dt-s SECONDS"
+                )
+        if dt_s is not None and self.main.dt_s is None:
+            self.notes.append(f"sample time {dt_s:g} s as the file states it")
+        return dt_s
+
+    def _agreed(self, found: list[tuple[str, float]]) -> float | None:
+        for where, dt_s in found[1:]:
+            if abs(dt_s / found[0][1] - 1.0) > 1e-6:
+                raise InputError(
+                    f"{where}: got a sample time of {dt_s:.9g} s, expected {found[0][1]:.9g} s as {found[0][0]}: "
+                    "resample one of them, or add --dt-s SECONDS if one of the two is wrong"
+                )
+        return found[0][1] if found else None
 
 
 def _sensor_moved(
@@ -142,24 +358,6 @@ def _sensor_moved(
         name: None if values is None else (values[late:] if name in sensors else values[:-late])
         for name, values in columns.items()
     }
-
-
-def _time(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
-    """Time of each sample and the nominal sample time, from a column, an option, or the format."""
-    t_s = _column(table, "t", mapping, needed=False)
-    rate_hz = _scalar(table, "rate", mapping)
-    stated = mapping.dt_s or _scalar(table, "dt", mapping) or (1.0 / rate_hz if rate_hz else None)
-    if t_s is not None and mapping.dt_s is None:
-        return t_s, nominal_dt(table.source, t_s)
-    dt_s = stated or table.dt_s
-    if dt_s is None:
-        raise InputError(
-            f"{table.source}: got columns {table.describe()} and no time, expected a column t_s: add --column t=NAME "
-            "--unit t=..., or the sample time as --dt-s SECONDS, or --column rate=NAME where the file holds a rate"
-        )
-    if not (0.0 < dt_s < 1e6):
-        raise InputError(f"{table.source}: sample time: got {dt_s:g} s, expected a positive number")
-    return np.arange(n, dtype=np.float64) * dt_s, float(dt_s)
 
 
 def nominal_dt(source: str, t_s: FloatArray) -> float:

@@ -20,6 +20,8 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
   dehyst diagnose recording.parquet --out out/diagnosis
   dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
   dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 5e-4 --out out/diagnosis
+  dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
+      --out out/diagnosis
   dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
 """
 
@@ -52,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="schema of report.json: 1 has no verdict partly, no direct tests, no black box (%(default)s)",
     )
     add_shared(parser, "quiet", json={"help": "print report.json in place of the summary"})
-    add_mapping_arguments(parser)
+    add_mapping_arguments(parser, test=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     nominal = load_stage(args.stage) if args.stage is not None else args.nominal
     recording = load(args.data, args, args.range)
-    test = None if args.test is None else load(args.test, args, args.test_range)
+    test = None if args.test is None else load(args.test, args, args.test_range, test=True)
     prepared = prepare(recording, nominal=nominal, test=test)
     say(describe(recording, list(prepared.findings)))
     for note in prepared.notes:

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="file for the picture (beside the models)")
     add_shared(parser, "no-pictures", "quiet", "json")
-    add_mapping_arguments(parser)
+    add_mapping_arguments(parser, test=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     whole = Stretch.of(whole_repaired)
     dt_s = recording.dt_s
     if args.test is not None:
-        tested = load(args.test, args, args.test_range)
+        tested = load(args.test, args, args.test_range, test=True)
         if abs(tested.dt_s / dt_s - 1.0) > 1e-3:
             raise InputError(
                 f"{args.test}: sample time: got {tested.dt_s:g} s, expected {dt_s:g} s as in {args.data}: resample it"

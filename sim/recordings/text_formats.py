@@ -1,0 +1,373 @@
+"""Readers of text: delimited columns with or without names, LabVIEW's .lvm, and array files of piezo controllers."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.errors import InputError
+from sim.recordings.columns import ColumnMap, is_unit
+from sim.recordings.table import Table, seconds
+
+
+def read_text(path: Path, content: bytes, mapping: ColumnMap) -> Table:
+    """Delimited text: one row per sample, below a line with the columns' names if it has one.
+
+    Empty lines and lines that start with ``#`` or ``%`` before the data are comments; the last of them gives the names
+    where it has one for each column. A line of units below the names is used. Columns without names are called by
+    their position from 1. Raises InputError where the first line may be names as well as a sample.
+    """
+    import pyarrow as pa
+    from pyarrow import csv
+
+    lines = decode(path, content).splitlines()
+    top = _top(path, lines, mapping)
+    body = lines[top.start :]
+    delimiter = top.delimiter
+    if delimiter == " ":
+        body, delimiter = ["\t".join(line.split()) for line in body], "\t"
+    try:
+        table = csv.read_csv(
+            io.BytesIO("\n".join(body).encode()),
+            read_options=csv.ReadOptions(column_names=top.names),
+            parse_options=csv.ParseOptions(delimiter=delimiter),
+            convert_options=csv.ConvertOptions(decimal_point=mapping.decimal, strings_can_be_null=True),
+        )
+    except pa.ArrowInvalid as error:
+        hint = "" if "Empty" not in str(error) else ": the file has a header line and no samples"
+        raise InputError(f"{path}: is not a table of {len(top.names)} columns{hint} ({error})") from error
+    arrays, units = {}, dict(top.units)
+    for name in top.names:
+        arrays[name], stamped = from_arrow(table.column(name))
+        if stamped:
+            units[name] = "s"
+    return Table(str(path), arrays, notes=top.notes, units=units, positional=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Top:
+    """What stands above the samples: the columns' names and units, and the line on which the samples start."""
+
+    names: list[str]
+    start: int
+    delimiter: str
+    units: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def _top(path: Path, lines: list[str], mapping: ColumnMap) -> _Top:
+    first = next((k for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] not in "#%"), None)
+    if mapping.header is not None and mapping.header != "none":
+        first = int(mapping.header) - 1
+        if first >= len(lines) or not lines[first].strip():
+            raise InputError(
+                f"{path}: header: got line {mapping.header}, which is "
+                f"{'empty' if first < len(lines) else f'beyond the {len(lines)} lines of the file'}, expected the "
+                "line with the columns' names"
+            )
+    if first is None:
+        raise InputError(f"{path}: got no data, expected a header line and one row per sample")
+    line = lines[first].lstrip("#% \t") if mapping.header not in (None, "none") else lines[first]
+    delimiter = mapping.delimiter or next((d for d in "\t;," if d in line), " ")
+    cells = split_cells(line, delimiter)
+    notes: tuple[str, ...] = ()
+    if has_names(str(path), cells, mapping, "line", first + 1):
+        start = first + 1
+        names = different(cells)
+        below = split_cells(lines[start], delimiter) if start < len(lines) else []
+        if stated := units_row(names, below):
+            start += 1
+            notes = (f"units from line {start}: {', '.join(f'{name} in {unit}' for name, unit in stated.items())}",)
+            return _Top(names, start, delimiter, stated, notes)
+        return _Top(names, start, delimiter, {}, notes)
+    above = next((line for line in reversed(lines[:first]) if line.strip()), "")
+    names = split_cells(above.lstrip("#% \t"), delimiter)
+    is_header = len(names) == len(cells) == len(set(names)) and not any(is_number(name, ".") for name in names)
+    if mapping.header is None and is_header and "" not in names:
+        notes = (f"columns named by the comment above the samples: {', '.join(names)}",)
+    else:
+        names = [str(k) for k in range(1, len(cells) + 1)]
+        notes = ("no names of columns in the file: they are called by their position, from 1",)
+    return _Top(names, first, delimiter, {}, notes)
+
+
+def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, number: int) -> bool:
+    """Whether the first ``kind`` ("line" or "row") of a table holds names; False where it is a sample.
+
+    ``number`` is its number in the file. Raises InputError where it may be both.
+    """
+    if mapping.header is not None:
+        return mapping.header != "none"
+    filled = [cell for cell in cells if cell]
+    numbers = [cell for cell in filled if is_number(cell, mapping.decimal)]
+    settle = f"add --header {number} if this {kind} holds the columns' names, or --header none if it is a sample"
+    if filled and len(numbers) == len(filled):
+        if numbers in ([str(k + origin) for k in range(len(cells))] for origin in (0, 1)):
+            raise InputError(
+                f"{source}: got {', '.join(numbers)} in {kind} {number}, which may be names of columns or a sample: "
+                f"{settle}"
+            )
+        return False
+    if numbers:
+        raise InputError(
+            f"{source}: got names and numbers in {kind} {number} ({', '.join(filled)[:80]}), expected one of the two: "
+            f"{settle}"
+        )
+    if mapping.decimal == "." and filled and all(is_number(cell, ",") for cell in filled):
+        raise InputError(
+            f"{source}: got {', '.join(filled)[:80]!r} in {kind} {number}, expected names or numbers: if the comma is "
+            f"the decimal sign, add --decimal , ; if these are names, --header {number}"
+        )
+    return True
+
+
+def different(names: list[str]) -> list[str]:
+    """``names``, each that stands there several times with its position, so that none hides another."""
+    return [
+        name if name and names.count(name) == 1 else f"{name or 'unnamed'} (column {k})"
+        for k, name in enumerate(names, 1)
+    ]
+
+
+def units_row(names: list[str], cells: list[str]) -> dict[str, str]:
+    """name -> unit from the row below the names; empty unless every cell is a unit, or empty, and one is a unit."""
+    bare = [cell.strip("[]() ") for cell in cells]
+    if len(bare) != len(names) or not all(is_unit(cell) for cell in bare if cell):
+        return {}
+    return {name: cell for name, cell in zip(names, bare, strict=True) if cell}
+
+
+def split_cells(line: str, delimiter: str) -> list[str]:
+    """The cells of a line of text, without blanks and quotes around them; a blank delimiter means any blanks."""
+    cells = line.split() if delimiter == " " else line.split(delimiter)
+    return [cell.strip().strip('"') for cell in cells]
+
+
+def decode(path: Path, content: bytes) -> str:
+    """Text in UTF-8 (with or without mark), UTF-16 with mark, or Latin-1 (µ and ° of old controllers)."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
+    if b"\x00" in content[:4096]:
+        raise InputError(f"{path}: is not text, expected text, .parquet, .mat, .h5, .npy, .npz, .tdms or .xlsx")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def is_number(text: str, decimal: str) -> bool:
+    """Whether a cell of text is a number with this decimal sign."""
+    try:
+        float(text.replace(decimal, ".") if decimal == "," else text)
+    except ValueError:
+        return False
+    return True
+
+
+def from_arrow(column: Any) -> tuple[NDArray[Any], bool]:
+    """A column of pyarrow as an array, and whether it held timestamps, which become seconds since the first."""
+    import pyarrow as pa
+
+    if pa.types.is_timestamp(column.type):
+        return seconds(column.cast(pa.timestamp("ns")).to_numpy().astype("datetime64[ns]")), True
+    if pa.types.is_decimal(column.type):
+        column = column.cast(pa.float64())
+    if pa.types.is_null(column.type):
+        return np.full(len(column), np.nan), False
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    return np.asarray(column.to_numpy()), False
+
+
+_GCS_LINE = re.compile(r"#\s*([A-Za-z_]+\d*)\s*=\s*(.*?)\s*$")
+
+
+def is_gcs(content: bytes) -> bool:
+    """Whether a file begins as a controller's array file."""
+    head = content[:8192].lstrip(b"\xef\xbb\xbf \r\n\t")
+    return head.startswith(b"#") and (b"END_HEADER" in head or re.search(rb"#\s*NDATA\s*=", head) is not None)
+
+
+def read_gcs(path: Path, content: bytes, mapping: ColumnMap) -> Table:
+    """Array file of a piezo controller ("GCS array"): ``#`` header lines, then columns::
+
+        # SEPARATOR = 32            ASCII code of the character between the columns
+        # DIM = 2
+        # SAMPLE_TIME = 0.000200
+        # NDATA = 1024
+        # NAME0 = Voltage Channel 1
+        # NAME1 = Current Position Axis 1
+        # END_HEADER
+        1.2345 0.5678
+
+    The names carry no units, so the mapping must say what they are. ``SAMPLE_TIME`` is in seconds by definition of the
+    format. Raises InputError where header and data do not fit each other.
+    """
+    lines = decode(path, content).splitlines()
+    header: dict[str, str] = {}
+    start = None
+    for number, line in enumerate(lines):
+        if "END_HEADER" in line:
+            start = number + 1
+            break
+        if match := _GCS_LINE.match(line.strip()):
+            header[match.group(1).upper()] = match.group(2)
+    if start is None:
+        raise InputError(f"{path}: got no line '# END_HEADER', expected one before the data")
+    columns = _gcs_integer(path, header, "DIM", 1)
+    separator = mapping.delimiter or chr(_gcs_integer(path, header, "SEPARATOR", 1, default=32))
+    rows = [line for line in lines[start:] if line.strip() and not line.lstrip().startswith("#")]
+    values = np.empty((len(rows), columns))
+    for number, line in enumerate(rows):
+        cells = line.split() if separator in " \t" else line.split(separator)
+        cells = [cell for cell in cells if cell.strip()]
+        try:
+            values[number] = [float(cell.replace(",", ".") if mapping.decimal == "," else cell) for cell in cells]
+        except ValueError as error:
+            raise InputError(
+                f"{path}: data row {number + 1}: got {line.strip()[:60]!r}, expected DIM = {columns} numbers"
+            ) from error
+    notes = []
+    declared = _gcs_integer(path, header, "NDATA", 0, default=len(rows))
+    if declared != len(rows):
+        notes.append(f"header announces NDATA = {declared} samples, the file holds {len(rows)}")
+    dt_s = None
+    if "SAMPLE_TIME" in header:
+        try:
+            dt_s = float(header["SAMPLE_TIME"])
+        except ValueError:
+            dt_s = float("nan")
+        if not (0.0 < dt_s < 1e3):
+            raise InputError(
+                f"{path}: SAMPLE_TIME: got {header['SAMPLE_TIME']!r}, expected a positive time in s; or give --dt-s"
+            )
+        notes.append(f"sample time {dt_s:g} s from SAMPLE_TIME, in seconds by definition of the format")
+    names = [header.get(f"NAME{k}", f"NAME{k}") for k in range(columns)]
+    if len(set(names)) < len(names):
+        names = [f"NAME{k}" for k in range(columns)]
+    arrays = {name: values[:, k] for k, name in enumerate(names)}
+    return Table(str(path), arrays, dt_s=dt_s, notes=tuple(notes), positional=True)
+
+
+def _gcs_integer(path: Path, header: dict[str, str], key: str, least: int, default: int | None = None) -> int:
+    text = header.get(key)
+    if text is None and default is not None:
+        return default
+    if text is None or not text.isdigit() or int(text) < least:
+        raise InputError(f"{path}: header line {key}: got {text!r}, expected a whole number of at least {least}")
+    return int(text)
+
+
+def is_lvm(content: bytes) -> bool:
+    """Whether a file begins as a LabVIEW measurement file."""
+    return content.lstrip(b"\xef\xbb\xbf").startswith(b"LabVIEW Measurement")
+
+
+def read_lvm(path: Path, content: bytes, mapping: ColumnMap) -> Table:
+    """LabVIEW measurement file (.lvm): tagged lines up to ``***End_of_Header***``, then segments of channels::
+
+        LabVIEW Measurement
+        Separator   Tab
+        X_Columns   One
+        ***End_of_Header***
+        Channels        2
+        Y_Unit_Label    Volts   Microns
+        Delta_X         0.001   0.001
+        ***End_of_Header***
+        X_Value drive   sensor  Comment
+        0.000   1.25    12.5
+
+    ``Y_Unit_Label`` gives the units, ``Delta_X`` the sample time in s where ``X_Dimension`` is Time. Segments of the
+    same channels are put one after another. Raises InputError where header and data do not fit each other.
+    """
+    lines = decode(path, content).splitlines()
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    if not ends:
+        raise InputError(f"{path}: got no line '***End_of_Header***', expected one before the data: is the file whole?")
+    file_tags = _lvm_tags(lines[: ends[0]], None)
+    separator = mapping.delimiter or {"Comma": ","}.get(file_tags.get("Separator", ["Tab"])[0], "\t")
+    decimal = "," if file_tags.get("Decimal_Separator", ["."])[0] == "," else mapping.decimal
+    names: list[str] = []
+    tags: dict[str, list[str]] = {}
+    rows: list[list[float]] = []
+    segments = 0
+    for start, stop in zip(ends[1:] or ends, [*ends[2:], len(lines)], strict=True):
+        before = max(end for end in [*ends, -1] if end < start) if start != ends[0] else -1
+        found = _lvm_tags(lines[before + 1 : start], separator)
+        table = [(k, line) for k, line in enumerate(lines[start + 1 : stop], start + 2) if line.strip()]
+        if not table:
+            raise InputError(f"{path}: got no data after line {start + 1}, expected the channels' names and samples")
+        cells = split_cells(table[0][1], separator)
+        if segments and cells != names:
+            raise InputError(
+                f"{path}: line {table[0][0]}: got channels {', '.join(cells)}, expected {', '.join(names)} as in the "
+                "first segment: cut the file"
+            )
+        if segments and found.get("Delta_X") != tags.get("Delta_X"):
+            raise InputError(
+                f"{path}: line {start + 1}: got Delta_X {found.get('Delta_X')}, expected {tags.get('Delta_X')} as in "
+                "the first segment: cut the file"
+            )
+        names, tags, segments = cells, tags or found, segments + 1
+        rows += _lvm_rows(path, table[1:], len([name for name in names if name != "Comment"]), separator, decimal)
+    return _lvm_table(path, names, tags, np.asarray(rows), segments, decimal)
+
+
+def _lvm_tags(lines: list[str], separator: str | None) -> dict[str, list[str]]:
+    """Tag -> its values, of a header."""
+    found = {}
+    for line in lines:
+        tag, *values = split_cells(line, separator or ("\t" if "\t" in line else ","))
+        found[tag] = [value for value in values if value]
+    return found
+
+
+def _lvm_rows(path: Path, table: list[tuple[int, str]], width: int, separator: str, decimal: str) -> list[list[float]]:
+    rows = []
+    for number, line in table:
+        cells = [cell.strip() for cell in line.split(separator)]
+        if cells[0] == "Channels" or cells[0].startswith("***"):
+            break  # the header of the next segment, or a special block
+        cells = (cells + [""] * width)[:width]
+        try:
+            rows.append([float(c.replace(",", ".") if decimal == "," else c) if c else np.nan for c in cells])
+        except ValueError as error:
+            raise InputError(f"{path}: line {number}: got {line.strip()[:60]!r}, expected {width} numbers") from error
+    return rows
+
+
+def _lvm_table(
+    path: Path, names: list[str], tags: dict[str, list[str]], rows: NDArray[np.float64], segments: int, decimal: str
+) -> Table:
+    names = [name for name in names if name != "Comment"]
+    if not len(rows):
+        raise InputError(f"{path}: got no samples below the channels' names, expected one row per sample")
+    called = different(names)
+    # Where X_Columns is No, the column of the times stays empty.
+    arrays = {
+        name: rows[:, k] for k, name in enumerate(called) if names[k] != "X_Value" or not np.isnan(rows[:, k]).all()
+    }
+    channels = [name for k, name in enumerate(called) if names[k] != "X_Value"]
+    over_time = set(tags.get("X_Dimension", ["Time"])) == {"Time"}
+    units = {name: "s" for k, name in enumerate(called) if names[k] == "X_Value" and over_time}
+    labels = tags.get("Y_Unit_Label", [])
+    if len(labels) == len(channels):
+        units |= dict(zip(channels, labels, strict=True))
+    clocks: dict[str, tuple[float, float | None]] = {}
+    steps = [text.replace(",", ".") if decimal == "," else text for text in tags.get("Delta_X", [])]
+    if over_time and len(steps) == len(channels) and all(is_number(step, ".") for step in steps):
+        clocks = {name: (float(step), None) for name, step in zip(channels, steps, strict=True)}
+    if segments > 1:
+        # Programs pause between segments: Delta_X is the clock of all only where the times go on without a pause.
+        times = [arrays[name] for name in called if name in arrays and name not in channels]
+        dt_s = max((clock[0] for clock in clocks.values()), default=np.inf)
+        if not times or any((np.abs(np.diff(t_s) - dt_s) > 0.5 * dt_s).any() for t_s in times):
+            clocks = {}
+    notes = (f"{segments} segments put one after another",) if segments > 1 else ()
+    return Table(str(path), arrays, notes=notes, units=units, clocks=clocks, positional=True)
