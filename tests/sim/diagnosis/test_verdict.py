@@ -1,0 +1,171 @@
+"""What decides the verdict: the black box, the share that is explained, defects, and where the rest lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from sim.diagnosis import diagnose
+from sim.diagnosis.ceiling import black_box_error, black_box_on_other
+from sim.diagnosis.defects import recording_defects
+from sim.diagnosis.diagnose import Options, explained_share, verdict_of
+from sim.diagnosis.model.calibration import ModelFit, calibrate_nominal, fit_on_other_recording
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.model.readings import RepeatedReadings, noise_floor, repeated_readings
+from sim.diagnosis.rest import where_left
+from sim.diagnosis.result import Diagnosis, NamedCause
+from sim.diagnosis.search.held_out import split
+
+DT = 1e-3
+SIGMA_UM = 0.01
+sizes = st.floats(1e-3, 10.0)
+
+
+@given(nominal=sizes, extended=sizes, ceiling=sizes, floor=sizes)
+def test_the_explained_share_is_a_share(nominal: float, extended: float, ceiling: float, floor: float) -> None:
+    share = explained_share(nominal, extended, ceiling, floor)
+    assert share <= 1.0
+    assert (share > 0.0) == (extended < nominal) or share == pytest.approx(0.0, abs=1e-12)
+    # Nothing can be explained below the noise, nor better than by causes that beat the black box.
+    if extended <= min(ceiling, nominal) and extended < nominal and extended >= floor:
+        assert share == pytest.approx(1.0)
+
+
+def cause(index: int = 0) -> NamedCause:
+    none = np.zeros(1)
+    return NamedCause("creep", (), {}, {}, 0.5, 0.001, none, none, index)
+
+
+@pytest.mark.parametrize(
+    ("causes", "nominal", "extended", "ceiling", "verdict"),
+    [
+        ((), 0.0102, 0.0102, 0.01, "adequate"),
+        ((), 0.1, 0.1, 0.02, "unexplained"),
+        # Coloured noise: above the floor, but a black box does not predict it either.
+        ((), 0.1, 0.1, 0.095, "adequate"),
+        ((cause(),), 0.5, 0.01, 0.01, "effects"),
+        ((cause(),), 0.5, 0.3, 0.02, "partly"),
+        ((cause(),), 0.5, 0.49, 0.02, "unexplained"),
+        # On a test record the error grew: nothing carries over.
+        ((cause(),), 2.19, 4.42, 1.0, "unexplained"),
+        ((cause(-1),), 0.011, 0.011, 0.011, "effects"),
+    ],
+)
+def test_the_verdict_can_fail(
+    causes: tuple[NamedCause, ...], nominal: float, extended: float, ceiling: float, verdict: str
+) -> None:
+    explained = explained_share(nominal, extended, ceiling, 0.01)
+    assert verdict_of(causes, nominal, extended, ceiling, 0.01, explained) == verdict
+
+
+def linear_record(seed: int, extra: FloatArray | float = 0.0, seconds: float = 20.0) -> FitData:
+    """A linear stage under triangles of three rates, with white noise and what is added to its readings."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds / DT)
+    t = np.arange(n) * DT
+    phase = np.cumsum(np.where((t % 9.0) < 3.0, 0.3, np.where((t % 9.0) < 6.0, 1.0, 3.0))) * DT
+    u = 4.0 * (1.0 - np.abs(2.0 * (phase % 1.0) - 1.0)) * np.where((t % 7.0) < 3.5, 1.0, 0.6)
+    return FitData(DT, u, 10.0 * u + extra + SIGMA_UM * rng.normal(size=n))
+
+
+def nominal_fit(data: FitData) -> ModelFit:
+    return calibrate_nominal("linear", data, np.ones(data.n, dtype=np.bool_))
+
+
+def play(u: FloatArray, radius: float) -> FloatArray:
+    out, at = np.empty_like(u), u[0]
+    for k, v in enumerate(u):
+        at = min(max(at, v - radius), v + radius)
+        out[k] = at
+    return out
+
+
+def test_the_black_box_predicts_a_loop_and_not_noise() -> None:
+    whole = np.ones(20_000, dtype=np.bool_)
+    quiet = nominal_fit(linear_record(1))
+    assert black_box_error(quiet, quiet, whole, split(quiet.model.data)) == pytest.approx(SIGMA_UM, rel=0.05)
+    u = linear_record(2).u_V
+    looped = nominal_fit(linear_record(2, 0.8 * play(u, 0.7)))
+    before = float(np.sqrt(np.mean(looped.residual_um**2)))
+    found = black_box_error(looped, looped, whole, split(looped.model.data))
+    assert before > 10.0 * SIGMA_UM
+    assert found < 2.5 * SIGMA_UM
+    there = fit_on_other_recording(looped, replace(looped.model.data, y_um=looped.model.data.y_um), whole)
+    assert black_box_on_other(looped, there, whole, whole, split(looped.model.data)) < 2.5 * SIGMA_UM
+
+
+@pytest.mark.parametrize("correlation_s", [0.05, 0.3])
+def test_coloured_noise_alone_is_adequate(correlation_s: float) -> None:
+    """First-order noise: correlated over far longer than the windows from which white noise would be known."""
+    rng = np.random.default_rng(6)
+    levels = np.repeat(rng.permutation([0.0, 3.0, 5.0, 1.0, 8.0, 2.0]), 2500)
+    u = np.concatenate([levels, linear_record(0).u_V])
+    keep = math.exp(-DT / correlation_s)
+    coloured, white = np.zeros(u.size), rng.normal(size=u.size) * 0.03 * math.sqrt(1.0 - keep**2)
+    for k in range(1, u.size):
+        coloured[k] = keep * coloured[k - 1] + white[k]
+    diagnosis = diagnose(FitData(DT, u, 10.0 * u + coloured), None, Options(nominal="linear"))
+    assert diagnosis.verdict == "adequate", [c.name for c in diagnosis.causes]
+
+
+def test_the_floor_of_coloured_noise_comes_from_whole_rests() -> None:
+    rng = np.random.default_rng(7)
+    u = np.repeat([0.0, 3.0, 5.0, 1.0], 4000)
+    keep = math.exp(-DT / 0.1)
+    y, white = np.zeros(u.size), rng.normal(size=u.size) * 0.03 * math.sqrt(1.0 - keep**2)
+    for k in range(1, u.size):
+        y[k] = keep * y[k - 1] + white[k]
+    floor = noise_floor(FitData(DT, u, 10.0 * u + y))
+    assert floor.source == "rests"
+    assert floor.sigma_um == pytest.approx(0.03, rel=0.25)
+
+
+def test_one_repeat_in_many_readings_is_chance_and_listed() -> None:
+    y = np.cumsum(np.full(132_000, 0.5))
+    y[60_000] = y[59_999]
+    doubles = repeated_readings(y, 0.003, 0.001)
+    (defect,) = recording_defects(doubles, 0.003, 0.001, 0, y.size)
+    assert (defect.kind, defect.count) == ("repeats", 1)
+    assert "repeat the one before" in defect.words
+    assert recording_defects(RepeatedReadings(0, 100, np.empty(0)), 0.003, 0.0, 0, 100) == ()
+    (gap,) = recording_defects(RepeatedReadings(0, 100, np.empty(0)), 0.003, 0.0, 3, 100)
+    assert (gap.kind, gap.count) == ("gaps", 3)
+
+
+def test_what_is_left_is_located() -> None:
+    event = np.zeros(20_000)
+    event[8000:8050] = 2.0 * np.sin(np.arange(50) * 2.0)
+    fit = nominal_fit(linear_record(3, event))
+    said = where_left(fit, np.ones(20_000, dtype=np.bool_), SIGMA_UM)
+    assert said[0].startswith("time: half of it lies in")
+    assert "about 8 s" in said[0]
+    assert {text.split(":")[0] for text in said} == {"time", "frequency", "direction", "position"}
+    assert where_left(nominal_fit(linear_record(4)), np.ones(20_000, dtype=np.bool_), SIGMA_UM) == ()
+
+
+@pytest.fixture(scope="module")
+def healthy() -> Diagnosis:
+    return diagnose(linear_record(5), None, Options(nominal="linear"))
+
+
+def test_both_schemas_are_served(healthy: Diagnosis) -> None:
+    assert healthy.verdict == "adequate"
+    one, two = healthy.as_dict(1), healthy.as_dict(2)
+    assert {k: v for k, v in two.items() if k in one} == {**one, "schema": 2}
+    assert set(two) - set(one) == {"explainable", "defects", "left", "tried_not_named"}
+    with pytest.raises(InputError, match=r"schema: got 3, expected one of 1, 2"):
+        healthy.as_dict(3)
+
+
+@pytest.mark.parametrize(("explained", "old"), [(0.6, "effects"), (0.2, "unexplained")])
+def test_schema_one_has_no_verdict_partly(healthy: Diagnosis, explained: float, old: str) -> None:
+    partly = replace(healthy, verdict="partly", explained=explained)
+    assert partly.as_dict(1)["verdict"] == old
+    assert partly.as_dict(2)["verdict"] == "partly"

@@ -1,0 +1,144 @@
+"""The direct tests of the readings: each sees its own cause, made by a generator that shares no formula with them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from adaptive.types import FloatArray
+from sim.diagnosis.causes.catalogue import NAMES
+from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.witnesses import Readings, Sight, witnesses
+from sim.diagnosis.witnesses.other import slips_are_borne_out
+from tests.hidden.excitation import FS_HZ, excitation
+from tests.hidden.stage import Truth, record
+
+DT = 1.0 / FS_HZ
+SIGMA_UM = 0.005
+
+#: Sizes that a stage can have, in the units of the hidden generator.
+HIDDEN: dict[str, dict[str, float]] = {
+    "creep": {"per_decade": 0.012},
+    "thermal_drift": {"total_um": -0.6, "tau_s": 40.0},
+    "gain_drift": {"total": 0.012},
+    "resonance": {"f_Hz": 400.0, "damping": 0.02},
+    "amplifier_lag": {"f_Hz": 250.0},
+    "sensor_lag": {"f_Hz": 250.0},
+    "delay": {"tau_s": 1.5e-3},
+    "slew_limit": {"rate_V_per_s": 300.0},
+    "saturation": {"top_V": 7.2},
+    "asymmetry": {"share": 0.02},
+    "sensor_nonlinearity": {"share": 0.0008},
+    "cross_talk": {"share": 0.006},
+    "mains_hum": {"f_Hz": 50.0, "amplitude_um": 0.006},
+    "timing": {"ppm": 80.0},
+}
+#: Causes that show in one another's tests: one voltage and one sensor see their sum, or their shape.
+ALIKE = (
+    {"amplifier_lag", "sensor_lag"},
+    {"asymmetry", "sensor_nonlinearity", "saturation"},
+)
+
+
+@lru_cache(maxsize=32)
+def sights(name: str, seed: int = 5) -> dict[str, Sight]:
+    effects = {name: HIDDEN[name]} if name else {}
+    columns = record(Truth(seed, noise_um=SIGMA_UM, effects=effects), *excitation(np.random.default_rng(seed)))
+    data = FitData(DT, columns["u_V"], columns["y_um"], u2_V=columns["u2_V"], y2_um=columns["y2_um"])
+    return witnesses(Readings(data, np.ones(data.n, dtype=np.bool_), SIGMA_UM))
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_each_test_sees_its_cause_and_no_other(name: str) -> None:
+    found = sights(name)
+    assert found[name].seen is True, found[name].words
+    allowed = {name, "hysteresis_shape"}.union(*(group for group in ALIKE if name in group))
+    others = {other for other, sight in found.items() if sight.seen}
+    assert others <= allowed, [found[other].words for other in others - allowed]
+
+
+def test_on_a_healthy_stage_nothing_but_the_loop_is_seen() -> None:
+    found = sights("")
+    assert {name for name, sight in found.items() if sight.seen} == {"hysteresis_shape"}
+    assert set(found) <= set(NAMES)
+    assert all(any(c.isdigit() for c in s.words) for s in found.values() if s.seen is not None)
+
+
+def test_a_record_that_excites_nothing_decides_nothing() -> None:
+    t = np.arange(8000) * DT
+    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 0.5 * t)
+    y = 10.0 * u + SIGMA_UM * np.random.default_rng(0).normal(size=u.size)
+    found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+    for name in ("creep", "thermal_drift", "gain_drift", "resonance", "delay", "cross_talk", "mains_hum", "timing"):
+        assert found[name].seen is None, found[name].words
+
+
+def staircase(seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Time, a staircase of holds of 2 s, and noise."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.permutation(np.tile([0.0, 2.0, 5.0, 8.0], 3)), 4000)
+    return np.arange(u.size) * DT, u, SIGMA_UM * rng.normal(size=u.size)
+
+
+@pytest.mark.parametrize("per_decade", [0.006, 0.02])
+def test_the_size_of_creep_is_that_of_the_law(per_decade: float) -> None:
+    """y = g u (1 + c log10(1 + t/t0)) for each step, in closed form: the test reads c from the holds."""
+    t, u, noise = staircase(1)
+    y = 10.0 * u + noise
+    for k in np.flatnonzero(np.diff(u, prepend=0.0)):
+        step = u[k] - (u[k - 1] if k else 0.0)
+        y[k:] += 10.0 * step * per_decade * np.log10(1.0 + (t[k:] - t[k]) / 0.05)
+    sight = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))["creep"]
+    assert sight.seen is True
+    said = float(sight.words.split("rise by ")[1].split()[0])
+    assert said == pytest.approx(100.0 * per_decade, rel=0.25)
+
+
+def test_a_drift_in_time_is_no_creep_and_no_gain_drift() -> None:
+    t, u, noise = staircase(2)
+    found = witnesses(Readings(FitData(DT, u, 10.0 * u + 0.02 * t + noise), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+    assert found["thermal_drift"].seen is True
+    assert found["creep"].seen is not True
+    assert found["gain_drift"].seen is not True
+
+
+def test_cycles_tell_a_mean_that_creeps_from_one_that_drifts() -> None:
+    t = np.arange(60_000) * DT
+    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 1.0 * t)
+    noise = SIGMA_UM * np.random.default_rng(3).normal(size=t.size)
+    whole = np.ones(t.size, dtype=np.bool_)
+    creeps = witnesses(Readings(FitData(DT, u, 10.0 * u + 0.3 * np.log10(0.2 + t) + noise), whole, SIGMA_UM))
+    drifts = witnesses(Readings(FitData(DT, u, 10.0 * u + 0.02 * t + noise), whole, SIGMA_UM))
+    assert (creeps["creep"].seen, creeps["thermal_drift"].seen) == (True, None)
+    assert (drifts["creep"].seen, drifts["thermal_drift"].seen) == (None, True)
+    grows = witnesses(Readings(FitData(DT, u, 10.0 * u * (1.0 + 4e-4 * t) + noise), whole, SIGMA_UM))
+    assert grows["gain_drift"].seen is True
+    assert grows["thermal_drift"].seen is not True
+
+
+def test_slips_must_be_borne_out_by_the_lateness_of_the_readings() -> None:
+    rng = np.random.default_rng(4)
+    t = np.arange(40_000) * DT
+    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 3.0 * t)
+    clean = 10.0 * u
+    slipped = np.concatenate([clean[:20_000], clean[20_002:], clean[-2:]]) + SIGMA_UM * rng.normal(size=t.size)
+    whole = np.ones(t.size, dtype=np.bool_)
+    readings = Readings(FitData(DT, u, slipped), whole, SIGMA_UM)
+    assert slips_are_borne_out(readings, ((20_000, 2),))
+    # A lag that comes and goes wanders by more than any count of slips.
+    wandering = np.interp(t - 8.0 * DT * (1.0 + np.sin(2.0 * np.pi * 0.2 * t)), t, clean)
+    assert not slips_are_borne_out(Readings(FitData(DT, u, wandering), whole, SIGMA_UM), ((20_000, 1),))
+
+
+def test_rests_and_cycles_are_found_where_they_are() -> None:
+    u = np.concatenate([np.zeros(2000), np.linspace(0, 5, 1000), np.linspace(5, 0, 1000), np.full(3000, 0.0)])
+    readings = Readings(FitData(DT, u, 10.0 * u), np.ones(u.size, dtype=np.bool_), SIGMA_UM)
+    (cycle,) = readings.cycles
+    assert (cycle.start, cycle.top) == (pytest.approx(2000, abs=1), pytest.approx(2999, abs=1))
+    assert cycle.stop == pytest.approx(3999, abs=1)
+    first, last = readings.rests
+    settled = round(0.15 / DT)
+    assert (first.last, last.first, last.last) == (2001, pytest.approx(3999 + settled, abs=1), u.size)
+    assert first.level_V == last.level_V == 0.0
