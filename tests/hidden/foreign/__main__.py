@@ -25,7 +25,7 @@ def outcomes_of(cases: list[tuple[str, int]], jobs: int) -> Iterator[tuple[str, 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the cases and print the table. Returns 1 if a case raised an error, else 0: the numbers say how good it is."""
+    """Run the cases and print the table. Returns 1 if a case raised an error."""
     parser = argparse.ArgumentParser(prog="python -m tests.hidden.foreign", description=__doc__)
     parser.add_argument("--single", type=int, default=38, help="cases with one cause (38: each cause twice)")
     parser.add_argument("--pair", type=int, default=20, help="cases with two (20)")
@@ -49,7 +49,8 @@ def main(argv: list[str] | None = None) -> int:
         named = ", ".join(" or ".join(group) for group in outcome.named) or "nothing"
         print(
             f"[{at}/{len(cases)}] {kind}/{seed} {word}: hidden {', '.join(outcome.hidden) or 'nothing'} on "
-            f"{outcome.base}; {outcome.verdict}: {named} ({outcome.seconds:.0f} s, error left {outcome.error_left:.2f} x)",
+            f"{outcome.base}; {outcome.verdict}: {named} ({outcome.seconds:.0f} s, "
+            f"error left {outcome.error_left:.2f} x)",
             file=sys.stderr,
             flush=True,
         )

@@ -33,7 +33,9 @@ def _cumulative(c: Array, low: float, step: float, a: float, b: float) -> float:
     i = min(max(int(p), 0), c.shape[0] - 2)
     j = min(max(int(q), 0), c.shape[0] - 2)
     f, g = p - i, q - j
-    return (1 - f) * ((1 - g) * c[i, j] + g * c[i, j + 1]) + f * ((1 - g) * c[i + 1, j] + g * c[i + 1, j + 1])
+    left = (1 - g) * c[i, j] + g * c[i, j + 1]
+    right = (1 - g) * c[i + 1, j] + g * c[i + 1, j + 1]
+    return float((1 - f) * left + f * right)
 
 
 @loop

@@ -6,6 +6,8 @@ shows the effects of `SHOWS`.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from tests.hidden.excitation import FS_HZ, excitation
@@ -140,7 +142,7 @@ def multisine(n: int, fs: float, rng: np.random.Generator) -> Array:
 
 def _split(n: int, shares: tuple[float, ...]) -> list[int]:
     at = np.round(np.cumsum([0.0, *shares]) / sum(shares) * n).astype(int)
-    return [int(b - a) for a, b in zip(at[:-1], at[1:], strict=True)]
+    return [int(b - a) for a, b in itertools.pairwise(at)]
 
 
 def _closed(x: Array, fs: float) -> Array:
@@ -169,8 +171,8 @@ def drive(kind: str, n: int, fs: float, rng: np.random.Generator) -> tuple[Array
         case "mixed":
             one, two, three = _split(n, (0.4, 0.35, 0.25))
             x3, other = raster(three, fs, rng)
-            x = [_closed(staircase(one, fs, rng), fs), _closed(triangles(two, fs, rng), fs), _closed(x3, fs)]
-            return np.concatenate(x), np.concatenate([np.zeros(one + two), _closed(other, fs)])
+            parts = [_closed(staircase(one, fs, rng), fs), _closed(triangles(two, fs, rng), fs), _closed(x3, fs)]
+            return np.concatenate(parts), np.concatenate([np.zeros(one + two), _closed(other, fs)])
         case "steps_and_sines":
             one, two, three = _split(n, (0.35, 0.45, 0.2))
             t = np.arange(two) / fs
@@ -182,8 +184,8 @@ def drive(kind: str, n: int, fs: float, rng: np.random.Generator) -> tuple[Array
             x3 = np.zeros(three)
             t3 = np.arange(three) / fs
             other = 0.5 * (1.0 - np.cos(2 * np.pi * 1.5 * (t3 - 0.5))) * (t3 > 0.5) * (t3 < t3[-1] - 0.9)
-            x = [_closed(staircase(one, fs, rng), fs), _closed(sines, fs), x3]
-            return np.concatenate(x), np.concatenate([np.zeros(one + two), other])
+            parts = [_closed(staircase(one, fs, rng), fs), _closed(sines, fs), x3]
+            return np.concatenate(parts), np.concatenate([np.zeros(one + two), other])
         case "excitation":
             u, u2 = excitation(rng)
             # Its own samples, played at this rate: the levels stay, the frequencies scale.

@@ -171,8 +171,8 @@ def _dahl(y: Array, reach: float) -> Array:  # pragma: no cover - compiled
             move = y[k] - y[k - 1]
             if move != 0.0:
                 sign = 1.0 if move > 0.0 else -1.0
-                # dz = (1 - sign z / reach) dy, exact over the move.
-                z = sign * reach + (z - sign * reach) * np.exp(-abs(move) / reach)
+                # dz = (1 - sign z / reach) dy / 2, exact over the move: right after a reversal dz = dy, all sticks.
+                z = sign * reach + (z - sign * reach) * np.exp(-0.5 * abs(move) / reach)
         out[k] = y[k] - z
     return out
 

@@ -107,7 +107,7 @@ def _static(x: Array, case: Case, fs: float) -> Array:
     u = span * x
     if "saturation" in what:
         own = what["saturation"]
-        u = fx.saturation(u, own["top_V"], 5e-4 * span)
+        u = fx.saturation(u, own["top_V"], 1e-4 * span)
     if "slew_limit" in what:
         u = fx.slew_limit(u, what["slew_limit"]["rate_V_per_s"], fs)
     if "amplifier_lag" in what:

@@ -9,6 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.diagnosis import diagnose_prepared, prepare
+from sim.effects import Chain, effect
+from sim.recordings import Recording
+from sim.stage.config import StageConfig
 from tests.hidden.cases import same
 from tests.hidden.foreign.cases import healthy, pair, single, triple
 from tests.hidden.foreign.record import Case, record
@@ -140,14 +144,11 @@ def covered(case: Case, causes: Sequence[tuple[str, dict[str, tuple[float, float
     return tuple(out)
 
 
-def _nominal(case: Case):  # type: ignore[no-untyped-def]  # the project is imported only where it is scored
+def _nominal(case: Case) -> str | StageConfig:
     """The simulation to judge: the Bouc-Wen stage, or a stage file that states the mode a payload moves."""
     own = case.effects.get("payload_change")
     if own is None:
         return "bouc_wen"
-    from sim.effects import Chain, effect
-    from sim.stage.config import StageConfig
-
     span, rig = case.rig.span_V, case.rig
     loop = effect(
         "bouc_wen",
@@ -162,14 +163,19 @@ def _nominal(case: Case):  # type: ignore[no-untyped-def]  # the project is impo
 
 def run_case(kind: str, seed: int) -> Outcome:
     """Draw the case, make its recording, diagnose it as `dehyst diagnose` does, and judge the answer."""
-    from sim.diagnosis import diagnose_prepared, prepare
-    from sim.recordings import Recording
-
     case = KINDS[kind](seed)
     columns = record(case)
     rig = case.rig
     start = time.perf_counter()
-    recording = Recording(**columns, dt_s=1.0 / rig.fs_hz, source=f"{kind}/{seed}")
+    recording = Recording(
+        t_s=columns["t_s"],
+        u_V=columns["u_V"],
+        y_um=columns["y_um"],
+        dt_s=1.0 / rig.fs_hz,
+        source=f"{kind}/{seed}",
+        u2_V=columns.get("u2_V"),
+        y2_um=columns.get("y2_um"),
+    )
     prepared = prepare(recording, nominal=_nominal(case))
     said = diagnose_prepared(prepared)
     seconds = time.perf_counter() - start

@@ -43,10 +43,8 @@ def true_numbers(case: Case) -> TrueNumbers:
                 if "second_Hz" not in own:
                     out[name] = {"f0_hz": (own["f_Hz"],), "damping": (own["damping"],)}
             case "payload_change":
-                numbers: dict[str, tuple[float, ...]] = {"payload_ratio": (own["ratio"],)}
-                if own["from_share"] > 0.0:
-                    numbers["change_s"] = (own["from_share"] * rig.duration_s,)
-                out[name] = numbers
+                # Its moment has no counterpart: during a rest nothing shows it.
+                out[name] = {"payload_ratio": (own["ratio"],)}
             case "amplifier_lag" | "sensor_lag":
                 # Behind a weak loop the stage's own lag and this one may change places.
                 out[name] = {"tau_s": (own["tau_s"], rig.lag_s)}
@@ -55,9 +53,11 @@ def true_numbers(case: Case) -> TrueNumbers:
             case "saturation":
                 out[name] = {"u_max_V": (own["top_V"],)}
             case "delay":
-                # Dead time from the voltage to the reading, so the early reading is a part of it.
+                # Dead time from the voltage to the reading, so the early reading is a part of it. A held voltage
+                # rises over the simulated step before its sample, half a step early.
                 fine = rig.fs_hz * rig.over
-                out[name] = {"tau_s": ((round(own["tau_s"] * fine) + rig.early_steps) / fine,)}
+                steps = round(own["tau_s"] * fine) + rig.early_steps - (0.0 if rig.straight else 0.5)
+                out[name] = {"tau_s": (steps / fine,)}
             case "cross_talk":
                 out[name] = {"static": (own["share"],)}
             case "mains_hum":
