@@ -64,12 +64,17 @@ def test_the_generators_import_nothing_of_the_project() -> None:
 def test_a_base_rises_to_one_with_a_loop_symmetric_about_its_middle(base: str) -> None:
     x = path(0.0, 1.0, 0.0, 1.0, 0.0)
     for seed in range(3):
-        w = BASES[base](x, np.random.default_rng(seed))
+        w = bases.displacement(base, x, False, np.random.default_rng(seed))
         assert w[0] == pytest.approx(0.0, abs=1e-12)
-        assert float(w.max()) == pytest.approx(1.0, abs=0.06)
+        assert float(w.max()) == pytest.approx(1.0, abs=0.08)
         up, down = w[1000:1501], w[1500:2001]
         width = float(np.max(down[::-1] - up)) / float(np.ptp(up))
         assert 0.05 < width < 0.2
+        # A depolarised stage does not come back to where it began; one that was used before does.
+        assert 0.01 < float(w[-1]) < 0.15
+        again = bases.displacement(base, x, True, np.random.default_rng(seed))
+        assert again[0] == pytest.approx(0.0, abs=1e-3)
+        assert float(again[-1]) == pytest.approx(0.0, abs=1e-3)
         # Turned about its centre the loop is the same.
         assert down - down[0] == pytest.approx(-(up - up[0]), abs=1e-3)
 
@@ -110,23 +115,22 @@ def test_relays_switch_where_the_density_says() -> None:
     # Up at alpha (rows), down at beta < alpha (columns). On the diagonal half of a square counts.
     weight = np.kron(density, np.ones((4, 4)))
     weight = np.tril(weight, -1) + 0.5 * np.diag(np.diag(weight))
-    total = float(weight.sum())
-    # Relays that switch down below 0 never do so here: the model leaves them out.
-    weight[:, threshold < 0.0] = 0.0
-    up = np.zeros(weight.shape, dtype=bool)
+    # Depolarised: up where alpha + beta < 0. A relay of the line itself is neither.
+    up = threshold[:, None] + threshold[None, :] < 0.0
     levels = np.abs((np.cumsum(0.15 * np.random.default_rng(1).standard_normal(60)) % 2.0) - 1.0)
     levels[0] = 0.0
-    expected = []
+    start, expected = float(weight[up].sum()), []
     for level in levels.tolist():
         up[threshold <= level, :] = True
         up[:, threshold >= level] = False
-        expected.append(float(weight[up].sum()) / total)
+        expected.append(float(weight[up].sum()) - start)
     step = float(grid[1] - grid[0])
     cumulative = np.zeros((grid.size, grid.size))
-    cumulative[1:, 1:] = np.cumsum(np.cumsum(density, axis=0), axis=1) * step * step
-    got = bases._preisach(levels, cumulative / (0.5 * cumulative[-1, -1]), float(grid[0]), step)
-    assert got == pytest.approx(np.array(expected), abs=0.008)
-    assert float(np.ptp(got)) > 0.8
+    # Each cell of the density counts as the sixteen relays in it.
+    cumulative[1:, 1:] = 16.0 * np.cumsum(np.cumsum(density, axis=0), axis=1)
+    got = bases._preisach(levels, cumulative, float(grid[0]), step)
+    assert got == pytest.approx(np.array(expected), abs=0.015 * float(np.max(got)))
+    assert float(np.ptp(got)) > 0.6 * float(np.max(got))
 
 
 def test_a_reversal_of_friction_elements_is_the_first_rise_twice_as_large() -> None:
@@ -315,6 +319,7 @@ def rig(**changes: object) -> Rig:
     known = {
         "seed": 5,
         "base": "play_sum",
+        "used_before": False,
         "drive": "mixed",
         "noise": "white",
         "fs_hz": 1000.0,

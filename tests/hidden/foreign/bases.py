@@ -1,8 +1,9 @@
 """Six kinds of hysteresis, each with formulas of its own: displacement over voltage, both as shares of their range.
 
 Every function takes ``x`` (n,), the voltage from 0 (lowest) to 1 (highest), and returns ``w`` (n,), the displacement:
-0 at rest, about 1 at x = 1. All loops are symmetric about the middle of the range once it has been reached, so that
-none of them is an asymmetry. Constants are drawn from a seed; the major loop is 6 to 16 % wide.
+0 at rest, about 1 at x = 1. They begin depolarised, as the nominal stage does. Full loops are symmetric about the
+middle of the range, so that none of them is an asymmetry. Constants are drawn from a seed; the major loop is 6 to 16 %
+wide. A nominal loop and a sum of plays leave 0.01 % (plays, friction) to 0.6 % (Jiles-Atherton) of the range.
 """
 
 from __future__ import annotations
@@ -50,14 +51,23 @@ def _everett(c: Array, low: float, step: float, a: float, b: float) -> float:  #
 
 
 @loop
+def _first_rise(c: Array, low: float, step: float, top: float) -> float:  # pragma: no cover - compiled
+    """Weight of the relays that a depolarised stage switches up to ``top``: |beta| <= alpha <= top."""
+    return float(0.5 * _everett(c, low, step, top, -top))
+
+
+@loop
 def _preisach(x: Array, c: Array, low: float, step: float) -> Array:  # pragma: no cover - compiled
-    """Share of relays that are up. The boundary between up and down is kept as the list of past extremes."""
+    """Relays that the input has switched up, from the depolarised state at 0 on.
+
+    The boundary between up and down is kept as the list of past extremes.
+    """
     n = x.shape[0]
     out = np.empty(n)
     most = 4096
     tops, floors = np.empty(most), np.empty(most)
-    # All relays are down at the start. Corner k: input rose to tops[k], then fell to floors[k].
-    count, start = 0, x[0]
+    # Corner k: the input rose to tops[k], then fell to floors[k].
+    count = 0
     held, rising, value, previous = 0.0, True, 0.0, x[0]
     for k in range(n):
         now = x[k]
@@ -71,10 +81,15 @@ def _preisach(x: Array, c: Array, low: float, step: float) -> Array:  # pragma: 
                     count -= 1
                 held = 0.0
                 for j in range(count):
-                    base = start if j == 0 else floors[j - 1]
-                    held += _everett(c, low, step, tops[j], base) - _everett(c, low, step, tops[j], floors[j])
-                base = start if count == 0 else floors[count - 1]
-                value = held + _everett(c, low, step, now, base)
+                    if j == 0:
+                        held += _first_rise(c, low, step, tops[j])
+                    else:
+                        held += _everett(c, low, step, tops[j], floors[j - 1])
+                    held -= _everett(c, low, step, tops[j], floors[j])
+                if count == 0:
+                    value = _first_rise(c, low, step, now)
+                else:
+                    value = held + _everett(c, low, step, now, floors[count - 1])
             else:
                 if rising:
                     rising = False
@@ -89,37 +104,41 @@ def _preisach(x: Array, c: Array, low: float, step: float) -> Array:  # pragma: 
                 floors[count - 1] = now
                 held = 0.0
                 for j in range(count):
-                    base = start if j == 0 else floors[j - 1]
-                    held += _everett(c, low, step, tops[j], base) - _everett(c, low, step, tops[j], floors[j])
+                    if j == 0:
+                        held += _first_rise(c, low, step, tops[j])
+                    else:
+                        held += _everett(c, low, step, tops[j], floors[j - 1])
+                    held -= _everett(c, low, step, tops[j], floors[j])
                 value = held
             previous = now
         out[k] = value
     return out
 
 
-def preisach_density(spread: float, coercive: float, interaction: float, cells: int = 160) -> tuple[Array, Array]:
+def preisach_density(spread: float, coercive: float, interaction: float, cells: int = 300) -> tuple[Array, Array]:
     """Grid (cells + 1,) and relay density (cells, cells) as measured on soft ceramics.
 
     A Gaussian ridge along the diagonal, highest where the half width (alpha - beta) / 2 is ``coercive`` and the centre
-    (alpha + beta) / 2 is the middle of the range. ``spread`` and ``interaction`` are its standard deviations.
+    (alpha + beta) / 2 is the middle of the range. ``spread`` and ``interaction`` are its standard deviations. It is
+    the same on both sides of 0, so that the depolarised state is the line alpha = -beta.
     """
-    grid = np.linspace(-0.02, 1.02, cells + 1)
+    grid = np.linspace(-1.05, 1.05, cells + 1)
     mid = 0.5 * (grid[1:] + grid[:-1])
     half, centre = 0.5 * np.abs(mid[:, None] - mid[None, :]), 0.5 * (mid[:, None] + mid[None, :])
-    density = np.exp(-0.5 * ((half - coercive) / spread) ** 2 - 0.5 * ((centre - 0.5) / interaction) ** 2)
+    density = np.exp(-0.5 * ((half - coercive) / spread) ** 2 - 0.5 * ((np.abs(centre) - 0.5) / interaction) ** 2)
     return grid, density
 
 
 def preisach(x: Array, rng: np.random.Generator) -> Array:
     """Relays with a measured-like density, and a reversible share (Preisach 1935, Mayergoyz's form)."""
     u = rng.uniform
-    grid, density = preisach_density(u(0.07, 0.1), u(0.04, 0.09), u(0.7, 1.0))
+    grid, density = preisach_density(u(0.07, 0.1), u(0.04, 0.09), u(0.9, 1.3))
     step = float(grid[1] - grid[0])
     c = np.zeros((grid.size, grid.size))
     c[1:, 1:] = np.cumsum(np.cumsum(density, axis=0), axis=1) * step * step
-    total = 0.5 * (c[-1, -1])
-    relays = _preisach(np.ascontiguousarray(x), c / total, float(grid[0]), step)
-    share = u(0.45, 0.6)
+    c /= _everett(c, float(grid[0]), step, 1.0, 0.0)
+    relays = _preisach(np.ascontiguousarray(x), c, float(grid[0]), step)
+    share = u(0.35, 0.5)
     return np.asarray((1.0 - share) * x + share * relays)
 
 
@@ -220,16 +239,17 @@ def _jiles(  # pragma: no cover - compiled
 def jiles_atherton(x: Array, rng: np.random.Generator) -> Array:
     """Polarisation that lags behind an anhysteretic curve (Jiles and Atherton 1986), beside a linear share."""
     u = rng.uniform
-    numbers = (u(0.9, 1.2), u(0.02, 0.1), u(0.22, 0.32), u(0.1, 0.25))
-    # Two full cycles first: the record begins at the lower end of the closed loop.
+    numbers = (u(1.4, 2.0), u(0.02, 0.1), u(0.3, 0.4), u(0.1, 0.25))
+    # Two full cycles give the ends of the closed loop. A depolarised stage begins below it.
     cycle = np.concatenate(
         [np.linspace(0, -1, 400), np.tile(np.r_[np.linspace(-1, 1, 800), np.linspace(1, -1, 800)], 2)]
     )
     before = _jiles(cycle, 0.0, *numbers)
-    polarised = _jiles(2.0 * np.ascontiguousarray(x) - 1.0, float(before[-1]), *numbers)
     low, high = float(before[-1]), float(before[-801])
-    share = u(0.35, 0.5)
-    return np.asarray((1.0 - share) * x + share * (polarised - low) / (high - low))
+    start = low - u(0.08, 0.12) * (high - low)
+    polarised = _jiles(2.0 * np.ascontiguousarray(x) - 1.0, start, *numbers)
+    share = u(0.2, 0.28)
+    return np.asarray((1.0 - share) * x + share * (polarised - start) / (high - low))
 
 
 # Coleman-Hodgdon -----------------------------------------------------------------------------------------------------
@@ -263,13 +283,14 @@ def _coleman(  # pragma: no cover - compiled
 def coleman_hodgdon(x: Array, rng: np.random.Generator) -> Array:
     """A Duhem model (Coleman and Hodgdon 1986) with an S-shaped middle line."""
     u = rng.uniform
-    numbers = (u(4.0, 7.0), u(0.8, 0.9), u(0.06, 0.12), u(0.25, 0.45))
+    numbers = (u(4.0, 7.0), u(0.8, 0.9), u(0.02, 0.05), u(0.25, 0.45))
     cycle = np.tile(np.r_[np.linspace(0, 1, 500), np.linspace(1, 0, 500)], 3)
     before = _coleman(cycle, 0.0, *numbers)
     low, high = float(before[-1]), float(before[-501])
-    w = _coleman(np.ascontiguousarray(x), low, *numbers)
+    start = low - u(0.08, 0.12) * (high - low)
+    w = _coleman(np.ascontiguousarray(x), start, *numbers)
     share = u(0.35, 0.45)
-    return np.asarray((1.0 - share) * x + share * (w - low) / (high - low))
+    return np.asarray((1.0 - share) * x + share * (w - start) / (high - low))
 
 
 # Plays ---------------------------------------------------------------------------------------------------------------
@@ -345,3 +366,13 @@ BASES: dict[str, Callable[[Array, np.random.Generator], Array]] = {
 }
 #: Bases of another class than the nominal stage: `hysteresis_shape` may be named beside the truth.
 OTHER_CLASS = tuple(name for name in BASES if name != "bouc_wen")
+
+
+def displacement(base: str, x: Array, used_before: bool, rng: np.random.Generator) -> Array:
+    """(n,) displacement of one of `BASES`. ``used_before``: two full cycles went before, and their memory is there."""
+    if not used_before:
+        return BASES[base](x, rng)
+    ramp = np.linspace(0.0, 1.0, 300)
+    before = np.tile(np.r_[ramp, ramp[::-1]], 2)
+    w = BASES[base](np.r_[before, x], rng)
+    return np.asarray(w[before.size :] - w[before.size - 1])

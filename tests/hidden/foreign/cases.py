@@ -44,6 +44,8 @@ LEAST_RMS = 5.0
 LEAST_OWN = 3.0
 #: Range of the noise, share of the stroke. Where an effect is small it is less, down to the last.
 NOISE_FROM, NOISE_TO, NOISE_LEAST = 2e-5, 1e-4, 3e-6
+#: Share of the records (healthy ones excepted) that begin with the memory of earlier cycles.
+USED_BEFORE = 0.25
 #: Most samples of a recording that the diagnosis uses.
 MOST_SAMPLES = 200_000
 
@@ -63,6 +65,7 @@ def draw_rig(seed: int, rng: np.random.Generator, kinds: list[str], base: str, n
     return Rig(
         seed=seed,
         base=base,
+        used_before=bool(rng.random() < USED_BEFORE),
         drive=kind,
         noise=noise_kind,
         fs_hz=fs,
@@ -252,4 +255,4 @@ def healthy(seed: int) -> Case:
     turn = seed // len(NOISES)
     base = "bouc_wen" if turn % 2 == 0 else str(rng.choice(OTHER_CLASS))
     rig = draw_rig(1000 * seed, rng, list(SHOWS), base, NOISES[seed % len(NOISES)])
-    return Case("healthy", seed, rig)
+    return Case("healthy", seed, replace(rig, used_before=False))

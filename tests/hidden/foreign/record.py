@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tests.hidden.foreign import effects as fx
-from tests.hidden.foreign.bases import BASES, Array
+from tests.hidden.foreign.bases import BASES, Array, displacement
 from tests.hidden.foreign.drives import drive
 from tests.hidden.foreign.noise import noise
 
@@ -21,7 +21,8 @@ class Rig:
 
     Attributes
     ----------
-    base : a name of `bases.BASES`. drive : a name of `drives.SHOWS`. noise : a name of `noise.KINDS`.
+    base : a name of `bases.BASES`. used_before : full cycles went before the record.
+    drive : a name of `drives.SHOWS`. noise : a name of `noise.KINDS`.
     fs_hz, duration_s : of the recording. span_V, stroke_um : full range of the drive (from 0 V) and of the stage.
     lag_s : the stage's own first-order lag, which the nominal stage has too.
     straight : the voltage runs linearly between samples; else it is held.
@@ -31,6 +32,7 @@ class Rig:
 
     seed: int
     base: str
+    used_before: bool
     drive: str
     noise: str
     fs_hz: float
@@ -113,7 +115,7 @@ def _static(x: Array, case: Case, fs: float) -> Array:
     if "amplifier_lag" in what:
         u = fx.first_order(u, what["amplifier_lag"]["tau_s"], fs)
     x = u / span
-    w = BASES[rig.base](x, _generator(rig.seed, 0))
+    w = displacement(rig.base, x, rig.used_before, _generator(rig.seed, 0))
     if "rate_dependence" in what:
         own = what["rate_dependence"]
         w = fx.rate_dependence(x, w, own["per_decade"], own["corner_per_s"], fs)

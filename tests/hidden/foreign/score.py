@@ -106,6 +106,7 @@ class Outcome:
     kind: str
     seed: int
     base: str
+    start: str
     drive: str
     noise: str
     samples: int
@@ -189,6 +190,7 @@ def run_case(kind: str, seed: int) -> Outcome:
         kind=kind,
         seed=seed,
         base=rig.base,
+        start="used before" if rig.used_before else "depolarised",
         drive=rig.drive,
         noise=rig.noise,
         samples=len(columns["t_s"]),
@@ -249,7 +251,7 @@ def table(outcomes: list[Outcome]) -> str:
     if any(o.kind == "healthy" for o in outcomes):
         lines += ["", *_alarms(outcomes)]
     lines += ["", *_by_cause(outcomes)]
-    for key in ("base", "drive", "noise"):
+    for key in ("base", "start", "drive", "noise"):
         lines += ["", *_by(outcomes, key)]
     lines += ["", "not right, or with too much error left:"]
     lines += [_what_went_wrong(o) for o in outcomes if not o.judgement.right or o.error_left > ERROR_GOAL]
@@ -316,6 +318,6 @@ def _what_went_wrong(o: Outcome) -> str:
         words.append(f"error left {o.error_left:.1f} x ({o.nominal_um:.4g} to {o.heldout_um:.4g} um)")
     named = "; ".join(" or ".join(group) for group in o.named) or "nothing"
     return (
-        f"  {o.kind}/{o.seed} on {o.base}, {o.drive}, {o.noise}: hidden {' + '.join(o.hidden) or 'nothing'}, "
-        f"said {o.verdict}: {named} [{', '.join(words) or 'unexplained'}]"
+        f"  {o.kind}/{o.seed} on {o.base}, {o.start}, {o.drive}, {o.noise}: "
+        f"hidden {' + '.join(o.hidden) or 'nothing'}, said {o.verdict}: {named} [{', '.join(words) or 'unexplained'}]"
     )
