@@ -167,6 +167,32 @@ def test_the_nominal_class_rises_by_its_exponential() -> None:
     assert h == pytest.approx(0.46 / 14.7 * (1.0 - np.exp(-14.7 * x)), abs=1e-7)
 
 
+@pytest.mark.parametrize("base", OTHER_CLASS)
+def test_a_foreign_base_is_neither_nominal_nor_far_from_it(base: str) -> None:
+    """What the best nominal loop leaves, and what plays leave beside it, as shares of the range.
+
+    Plays hold the bases that wipe out; those with local memory are beyond them by a few tenths of a per cent.
+    """
+    x, _ = drive("mixed", 30_000, 1000.0, np.random.default_rng(2))
+    w = BASES[base](x, np.random.default_rng(1))
+
+    def left(columns: list[Array]) -> float:
+        matrix = np.column_stack([np.ones(x.size), x, *columns])
+        return float(np.std(w - matrix @ np.linalg.lstsq(matrix, w, rcond=1e-9)[0]))
+
+    nominal = [
+        bases._bouc_wen(x, 0.46, rise, rise + bend) for rise in (0.5, 1.5, 3.0, 5.0, 8.0, 13.0) for bend in (-0.4, 1.0)
+    ]
+    plays = [bases._plays(x, np.array([r]), np.ones(1)) for r in np.geomspace(0.01, 0.5, 24)]
+    alone = min(left([h]) for h in nominal)
+    assert alone > 1e-3
+    beside = left([nominal[-1], *plays])
+    if base in ("jiles_atherton", "coleman_hodgdon"):
+        assert 1e-3 < beside < 6e-3
+    else:
+        assert beside < min(0.5 * alone, 2e-3)
+
+
 # Noise ---------------------------------------------------------------------------------------------------------------
 
 

@@ -3,7 +3,8 @@
 Every function takes ``x`` (n,), the voltage from 0 (lowest) to 1 (highest), and returns ``w`` (n,), the displacement:
 0 at rest, about 1 at x = 1. They begin depolarised, as the nominal stage does. Full loops are symmetric about the
 middle of the range, so that none of them is an asymmetry. Constants are drawn from a seed; the major loop is 6 to 16 %
-wide. A nominal loop and a sum of plays leave 0.01 % (plays, friction) to 0.6 % (Jiles-Atherton) of the range.
+wide. A nominal loop and a sum of plays leave 0.01 % of the range (plays, friction), 0.1 % (relays) or 0.2 to
+0.6 % (the two differential equations, whose memory is local).
 """
 
 from __future__ import annotations
