@@ -181,6 +181,7 @@ def record(case: Case) -> dict[str, Array]:
         y = fx.first_order(y, what["sensor_lag"]["tau_s"], fine)
     stretch = 1.0 + 1e-6 * what.get("timing", {}).get("ppm", 0.0)
     read_at = np.clip(stretch * t - rig.early_steps / fine, 0.0, t_fine[-1])
+    # Both sensors are read at once.
     y = rig.offset_um + np.interp(read_at, t_fine, y)
     own_noise = noise(rig.noise, n, 1.0 / rig.fs_hz, rig.sigma_um, _generator(rig.seed, 3))
     if "sensor_lag" in what:
@@ -193,7 +194,7 @@ def record(case: Case) -> dict[str, Array]:
     columns = {"t_s": t, "u_V": rig.span_V * x, "y_um": y}
     if np.any(x2):
         noise2 = noise("white", n, 1.0 / rig.fs_hz, rig.sigma_um, _generator(rig.seed, 4))
-        columns |= {"u2_V": rig.span_V * x2, "y2_um": y2 + noise2}
+        columns |= {"u2_V": rig.span_V * x2, "y2_um": np.interp(read_at, t, y2) + noise2}
     return _with_timing(columns, case)
 
 
