@@ -253,7 +253,7 @@ def test_lags_delays_and_limits() -> None:
     assert int(np.argmax(late > 0.5)) == 2007
     slow = effects.slew_limit(5.0 * STEP, 50.0, FS)
     assert float(np.max(np.diff(slow))) * FS == pytest.approx(50.0, rel=1e-3)
-    assert float(slow[2000 + 100]) == pytest.approx(50.0 * 101 / FS, rel=0.01)
+    assert float(slow[2000 + 100]) == pytest.approx(50.0 * 100 / FS, rel=0.01)
     ramp = np.linspace(0.0, 10.0, 1000)
     flat = effects.saturation(ramp, 8.0, 0.005)
     assert float(flat[-1]) == pytest.approx(8.0, abs=1e-6)
@@ -487,8 +487,7 @@ def test_a_healthy_record_is_left_alone() -> None:
 
 def test_intervals_are_held_against_true_numbers() -> None:
     case = Case("single", 0, rig(early=0.5), {"delay": {"tau_s": 0.004}, "gain_drift": {"total": -0.01}})
-    # Half a sample of early reading, less half a simulated step for the held voltage.
-    assert true_numbers(case)["delay"]["tau_s"][0] == pytest.approx(0.0045 - 0.5 / 16_000.0)
+    assert true_numbers(case)["delay"]["tau_s"][0] == pytest.approx(0.0045)
     said = [("gain_drift", {"gain": (-0.012, -0.009), "rate_per_s": (0.0, 1.0)}), ("delay", {"tau_s": (0.005, 0.006)})]
     gain, delay = covered(case, said)
     assert gain.held
@@ -497,17 +496,16 @@ def test_intervals_are_held_against_true_numbers() -> None:
 
 
 def test_the_dead_time_of_a_record_is_the_stated_one() -> None:
-    """The delay, the early reading, and half a simulated step by which a held voltage rises early."""
+    """The delay and the early reading; a held voltage steps at its sample, not before it."""
     for straight in (False, True):
         case = Case("single", 0, rig(early=0.5, straight=straight), {"delay": {"tau_s": 0.004}})
         plain, late = record(case.without("delay"))["y_um"], record(case)["y_um"]
         assert late[4:] == pytest.approx(plain[:-4], abs=1e-9)
-        own_s = 0.5e-3 - (0.0 if straight else 0.5 / 16_000.0)
-        assert true_numbers(case)["delay"]["tau_s"][0] == pytest.approx(0.004 + own_s, abs=1e-9)
+        assert true_numbers(case)["delay"]["tau_s"][0] == pytest.approx(0.0045, abs=1e-9)
     # Step response of the stage's lag of 1 ms, read early: the part still missing is exp(-(t - early) / lag).
     columns = record(Case("single", 0, rig(early=0.5)))
     edge = int(np.flatnonzero(np.diff(columns["u_V"]))[0]) + 1
     step = columns["y_um"][edge : edge + 12] - columns["y_um"][edge - 2]
     settled = float(columns["y_um"][edge + 40] - columns["y_um"][edge - 2])
-    missing = np.exp(-np.maximum(np.arange(12) - (0.5 - 0.5 / 16.0), 0.0))
-    assert 1.0 - step / settled == pytest.approx(missing, abs=2e-3)
+    missing = np.exp(-np.maximum(np.arange(12) - 0.5, 0.0))
+    assert 1.0 - step / settled == pytest.approx(missing, abs=1e-3)

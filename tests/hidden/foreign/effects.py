@@ -26,8 +26,8 @@ def _current_limited(u: Array, rate: float, dt: float) -> Array:  # pragma: no c
     # The limited amplifier follows with a loop of two steps: far from its goal at full rate, near it as a lag.
     reach = rate * 2.0 * dt
     for k in range(u.shape[0]):
-        v += dt * rate * np.tanh((u[k] - v) / reach)
         out[k] = v
+        v += dt * rate * np.tanh((u[k] - v) / reach)
     return out
 
 
@@ -36,9 +36,9 @@ def slew_limit(u_V: Array, rate_V_per_s: float, fs: float) -> Array:
     return np.asarray(_current_limited(np.ascontiguousarray(u_V), rate_V_per_s, 1.0 / fs))
 
 
-def first_order(x: Array, tau_s: float, fs: float) -> Array:
-    """A lag, exact for an input that is linear between the points of the grid. It starts settled."""
-    b, a, _ = signal.cont2discrete(([1.0], [tau_s, 1.0]), 1.0 / fs, method="foh")
+def first_order(x: Array, tau_s: float, fs: float, held: bool = False) -> Array:
+    """A lag that starts settled, exact for an input that is linear between the points of the grid, or ``held``."""
+    b, a, _ = signal.cont2discrete(([1.0], [tau_s, 1.0]), 1.0 / fs, method="zoh" if held else "foh")
     b = np.ravel(b)
     return np.asarray(signal.lfilter(b, a, x, zi=signal.lfilter_zi(b, a) * x[0])[0])
 
@@ -91,14 +91,15 @@ def dead_zone(w: Array, knee: float, slope: float) -> Array:
 
 
 @loop
-def _oscillator(x: Array, w2: Array, damping: Array, dt: float) -> Array:  # pragma: no cover - compiled
+def _oscillator(x: Array, w2: Array, damping: Array, dt: float, held: bool) -> Array:  # pragma: no cover - compiled
     """q'' + 2 z w q' + w² q = w² x by the trapezoidal rule; ``w2`` (n,): square of the pre-warped frequency."""
     out = np.empty_like(x)
     q, v = x[0], 0.0
     half = 0.5 * dt
     for k in range(x.shape[0]):
         s, c = w2[k], 2.0 * damping[k] * np.sqrt(w2[k])
-        drive = s * (x[k] + x[max(k - 1, 0)])
+        before = x[max(k - 1, 0)]
+        drive = s * (2.0 * before if held else x[k] + before)
         # v+ = v + half (drive - s (q + q+) - c (v + v+)), q+ = q + half (v + v+)
         new = (v * (1.0 - half * c - half * half * s) + half * drive - 2.0 * half * s * q) / (
             1.0 + half * c + half * half * s
@@ -118,16 +119,19 @@ def modes(x: Array, f_hz: list[float], damping: list[float], shares: list[float]
     out = np.zeros_like(x)
     for f, z, share in zip(f_hz, damping, shares, strict=True):
         w2 = np.full(x.size, float(_warped(f, fs)))
-        out += share * _oscillator(np.ascontiguousarray(x), w2, np.full(x.size, z), 1.0 / fs)
+        out += share * _oscillator(np.ascontiguousarray(x), w2, np.full(x.size, z), 1.0 / fs, False)
     return out
 
 
-def loaded_mode(x: Array, f_hz: float, damping: float, ratio: float, from_sample: int, fs: float) -> Array:
+def loaded_mode(
+    x: Array, f_hz: float, damping: float, ratio: float, from_sample: int, fs: float, held: bool = False
+) -> Array:
     """A mode whose moving mass grows by ``ratio`` at a sample. The dashpot stays: the damping ratio falls as f does."""
     slower = 1.0 / np.sqrt(1.0 + ratio)
     late = np.arange(x.size) >= from_sample
     w2 = _warped(np.where(late, f_hz * slower, f_hz), fs)
-    return np.asarray(_oscillator(np.ascontiguousarray(x), w2, np.where(late, damping * slower, damping), 1.0 / fs))
+    z = np.where(late, damping * slower, damping)
+    return np.asarray(_oscillator(np.ascontiguousarray(x), w2, z, 1.0 / fs, held))
 
 
 def delayed(x: Array, tau_s: float, fs: float) -> Array:

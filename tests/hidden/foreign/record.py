@@ -113,7 +113,7 @@ def _static(x: Array, case: Case, fs: float) -> Array:
     if "slew_limit" in what:
         u = fx.slew_limit(u, what["slew_limit"]["rate_V_per_s"], fs)
     if "amplifier_lag" in what:
-        u = fx.first_order(u, what["amplifier_lag"]["tau_s"], fs)
+        u = fx.first_order(u, what["amplifier_lag"]["tau_s"], fs, held=not rig.straight and "slew_limit" not in what)
     x = u / span
     w = displacement(rig.base, x, rig.used_before, _generator(rig.seed, 0))
     if "rate_dependence" in what:
@@ -127,8 +127,10 @@ def _static(x: Array, case: Case, fs: float) -> Array:
 
 def _mechanics(y: Array, case: Case, fs: float) -> Array:
     rig, what = case.rig, case.effects
+    # A held voltage steps; what an amplifier has passed on is continuous, and so is what a lag has.
+    held = not rig.straight and not {"amplifier_lag", "slew_limit"} & set(what)
     if rig.lag_s > 0.0:
-        y = fx.first_order(y, rig.lag_s, fs)
+        y = fx.first_order(y, rig.lag_s, fs, held)
     if "resonance" in what:
         own = what["resonance"]
         if "second_Hz" in own:
@@ -139,7 +141,7 @@ def _mechanics(y: Array, case: Case, fs: float) -> Array:
     if "known_Hz" in what.get("payload_change", {}):
         own = what["payload_change"]
         start = round(own["from_share"] * y.size)
-        y = fx.loaded_mode(y, own["known_Hz"], own["damping"], own["ratio"], start, fs)
+        y = fx.loaded_mode(y, own["known_Hz"], own["damping"], own["ratio"], start, fs, held and rig.lag_s == 0.0)
     if "delay" in what:
         y = fx.delayed(y, what["delay"]["tau_s"], fs)
     return y

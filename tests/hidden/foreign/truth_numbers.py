@@ -53,11 +53,9 @@ def true_numbers(case: Case) -> TrueNumbers:
             case "saturation":
                 out[name] = {"u_max_V": (own["top_V"],)}
             case "delay":
-                # Dead time from the voltage to the reading, so the early reading is a part of it. A held voltage
-                # rises over the simulated step before its sample, half a step early.
+                # Dead time from the voltage to the reading, so the early reading is a part of it.
                 fine = rig.fs_hz * rig.over
-                steps = round(own["tau_s"] * fine) + rig.early_steps - (0.0 if rig.straight else 0.5)
-                out[name] = {"tau_s": (steps / fine,)}
+                out[name] = {"tau_s": ((round(own["tau_s"] * fine) + rig.early_steps) / fine,)}
             case "cross_talk":
                 out[name] = {"static": (own["share"],)}
             case "mains_hum":
