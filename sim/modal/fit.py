@@ -29,8 +29,18 @@ from sim.modal.response import FrequencyResponse
 DIRECT: Final = 4
 #: Range of damping ratios of a mode; outside of it a pair is no resonance.
 DAMPING: Final = (1e-5, 0.95)
+#: Least damping of a pair beyond the excited band, where no line would show a peak.
+DAMPING_BEYOND: Final = 0.02
+#: A residue may be this many times as large as the measured response before it costs as much as one equation's error.
+#: It keeps pairs close to each other from cancelling with enormous residues.
+LARGEST_SHARE: Final = 10.0
+#: Steps of a search that only prepares the next one.
+SHORT: Final = 8
 #: The search ends where a step lowers the cost by less than this share.
-CONVERGED: Final = 1e-7
+CONVERGED: Final = 1e-4
+#: Expected size of the change of a pole over the fitted amplitudes, 1 standard deviation: of log frequency, of log
+#: damping and of the log rate of a real pole. It keeps weak modes from wandering, and is wide for those that matter.
+EXPECTED_CHANGE: Final = (0.02, 0.3, 0.3)
 #: Two-sided 95 % quantile of the normal distribution.
 QUANTILE_95: Final = 1.959964
 
@@ -40,7 +50,8 @@ class FitSettings:
     """Settings of the fit.
 
     ``start_modes``: mode pairs of the vector fit, more than expected. ``degree``: of the polynomials in the amplitude;
-    None takes 1, or 0 for a single amplitude. ``most_steps``: of each Levenberg-Marquardt search.
+    None takes 2, or as many as the
+    amplitudes determine. ``most_steps``: of each Levenberg-Marquardt search.
     ``prune``: take out modes that the information criterion does not pay for.
     """
 
@@ -126,7 +137,22 @@ class _Problem:
             target = stacked(weight[:, None] * scaled.reshape(len(scaled), -1))
             self.levels.append(_Level(response.spectra.z, target, weight, powers_of(x, degree), x))
         self.target = np.concatenate([level.target for level in self.levels])
+        lines_hz = np.concatenate([response.spectra.freq_hz for response in responses])
+        self.band_hz = (float(lines_hz.min()), float(lines_hz.max()))
+        #: Weight of the squares of the residues' shares.
+        self.ridge = 1.0 / (LARGEST_SHARE * float(np.sqrt(np.mean(np.sum(self.target**2, axis=0)))))
         self.shape = responses[0].g.shape[1:]
+        self.span = max(1e-9, max(abs(level.x) for level in self.levels))
+
+    def prior(self, theta: FloatArray, modes: int) -> FloatArray:
+        """Weights (as ``theta``) of the squares of the polynomials' coefficients: 1 / expected variance; 0 for x⁰."""
+        expected = np.concatenate(
+            [np.full(modes, EXPECTED_CHANGE[0]), np.full(modes, EXPECTED_CHANGE[1])]
+            + [np.full(len(theta) - 2 * modes, EXPECTED_CHANGE[2])]
+        )
+        weights = (self.span ** np.arange(theta.shape[1]) / expected[:, None]) ** 2
+        weights[:, 0] = 0.0
+        return np.asarray(weights, dtype=np.float64)
 
     def evaluate(self, theta: FloatArray, modes: int) -> _State:
         """Residues by least squares, and the residual."""
@@ -137,14 +163,17 @@ class _Problem:
             blocks.append(np.concatenate([power * own for power in level.powers], axis=1))
         columns = np.concatenate(blocks)
         scale = np.linalg.norm(columns, axis=0)
-        q, r = np.linalg.qr(columns / scale)
-        diagonal = np.abs(np.diag(r))
-        if not diagonal.min() > 1e-13 * diagonal.max():
-            return _State(theta, q, r, scale, np.zeros((0, 0)), self.target, np.inf)
+        if not np.all(np.isfinite(scale)):
+            return _State(theta, columns, columns, scale, np.zeros((0, 0)), self.target, np.inf)
+        count = len(scale)
+        whole, r = np.linalg.qr(np.concatenate([columns / scale, self.ridge * np.eye(count)]))
+        q = whole[:-count]
         along = q.T @ self.target
         left = self.target - q @ along
-        coefficients = solve_triangular(r, along) / scale[:, None]
-        return _State(theta, q, r, scale, coefficients, left, float(np.sum(left**2)))
+        shares = solve_triangular(r, along)
+        coefficients = shares / scale[:, None]
+        penalty = float(np.sum(self.prior(theta, modes) * theta**2) + np.sum((self.ridge * shares) ** 2))
+        return _State(theta, q, r, scale, coefficients, left, float(np.sum(left**2)) + penalty)
 
     def sensitivities(self, state: _State, modes: int) -> list[FloatArray]:
         """For each level (2F, E, 2N + Q): change of the fitted entries with each row of theta, residues held."""
@@ -196,7 +225,9 @@ class _Problem:
             along += part[..., None] * power
             start = stop
         flat_along = along.reshape(-1, rows * size)
-        return squares.reshape(rows * size, -1) - flat_along.T @ flat_along, gradient.ravel()
+        prior = self.prior(state.theta, modes)
+        whole = squares.reshape(rows * size, -1) - flat_along.T @ flat_along + np.diag(prior.ravel())
+        return whole, (gradient - prior * state.theta).ravel()
 
     def covariance(self, state: _State, modes: int) -> FloatArray:
         """Sandwich covariance of ``theta.ravel()``, one cluster a line."""
@@ -235,6 +266,7 @@ def _weights(responses: Sequence[FrequencyResponse]) -> tuple[FloatArray, list[F
     One weight for all entries of a line keeps one triangle for all of them. Where no variance is known, or it is 0,
     all lines weigh the same.
     """
+    responses = [_with_distortion(response, responses) for response in responses]
     totals = np.concatenate([response.total for response in responses])
     signal = np.concatenate([np.mean(np.abs(response.g) ** 2, axis=2) for response in responses]).mean(axis=0)
     known = bool(np.isfinite(totals).all() and (totals.mean(axis=0) > 1e-16 * signal).all())
@@ -243,56 +275,67 @@ def _weights(responses: Sequence[FrequencyResponse]) -> tuple[FloatArray, list[F
     for response in responses:
         if known:
             variance = np.mean(response.total * scale**2, axis=1)
-            weights.append(np.sqrt(response.power / variance))
+            # Of a complex variance, half is in the real and half in the imaginary part.
+            weights.append(np.sqrt(2.0 * response.power / variance))
         else:
             weights.append(np.ones(response.power.size))
     return scale, weights
 
 
-def _search(
-    problem: _Problem, theta: FloatArray, modes: int, most_steps: int, say: Callable[[str], None]
-) -> tuple[_State, bool]:
+def _with_distortion(response: FrequencyResponse, others: Sequence[FrequencyResponse]) -> FrequencyResponse:
+    """With as many realisations as drives nothing shows the distortion: the nearest amplitude's, scaled to this one."""
+    if response.knows_distortion:
+        return response
+    known = [other for other in others if other.knows_distortion]
+    if not known:
+        return response
+    amplitude = response.spectra.amplitude_V
+    nearest = min(known, key=lambda other: abs(np.log(other.spectra.amplitude_V / amplitude)))
+    ratio = (amplitude / nearest.spectra.amplitude_V) ** 2
+    at = response.spectra.freq_hz
+    total = np.column_stack([ratio * np.interp(at, nearest.spectra.freq_hz, column) for column in nearest.total.T])
+    return replace(response, total=total)
+
+
+def _search(problem: _Problem, theta: FloatArray, modes: int, most_steps: int) -> tuple[_State, bool]:
     """Levenberg-Marquardt from ``theta``. Returns the last state and whether it is a minimum."""
     state = problem.evaluate(theta, modes)
     damping, quiet = 1e-3, 0
-    low, high = np.log(DAMPING)
-    for step in range(most_steps):
+    # A step of more than a tenth in frequency or a factor of e in damping leaves the region of the expansion.
+    limit = np.full(len(theta), 1.0)
+    limit[:modes] = 0.1
+    for _ in range(most_steps):
         squares, gradient = problem.normal_equations(state, modes)
         diagonal = np.maximum(np.diag(squares), 1e-12 * np.diag(squares).max())
         before = state.cost
-        for _ in range(8):
+        for _ in range(10):
             change = np.linalg.solve(squares + damping * np.diag(diagonal), gradient).reshape(theta.shape)
-            # A step of more than a tenth in frequency or a factor of e in damping leaves the region of the expansion.
-            limit = np.full(len(theta), 1.0)
-            limit[:modes] = 0.1
-            shrink = min(1.0, 1.0 / max(1e-300, float(np.max(np.abs(change).max(axis=1) / limit))))
-            tried = state.theta + shrink * change
-            tried[modes : 2 * modes, 0] = np.clip(tried[modes : 2 * modes, 0], low, high)
-            if _in_range(problem, tried, modes):
-                new = problem.evaluate(tried, modes)
-                if new.cost < state.cost:
-                    state, damping = new, max(1e-9, damping / 5.0)
-                    break
+            change *= np.minimum(1.0, limit / np.maximum(1e-300, np.abs(change).max(axis=1)))[:, None]
+            new = problem.evaluate(_kept_in_range(problem, state.theta, state.theta + change, modes), modes)
+            if new.cost < state.cost:
+                state, damping = new, max(1e-9, damping / 5.0)
+                break
             damping *= 4.0
         gain = (before - state.cost) / max(before, 1e-300)
-        say(f"step {step + 1}: cost {state.cost:.6g}")
         quiet = quiet + 1 if gain < CONVERGED else 0
         if quiet >= 2 or gain == 0.0:
             return state, True
     return state, False
 
 
-def _in_range(problem: _Problem, theta: FloatArray, modes: int) -> bool:
-    """The dampings of all levels are those of oscillations, and the frequencies are below half the sample rate."""
-    nyquist_hz = 0.5 / problem.dt_s
-    for level in problem.levels:
-        values = theta @ level.powers
-        if values[:modes].size and values[:modes].max() > np.log(nyquist_hz):
-            return False
-        damping = values[modes : 2 * modes]
-        if damping.size and (damping.max() > np.log(0.98) or damping.min() < np.log(1e-7)):
-            return False
-    return True
+def _kept_in_range(problem: _Problem, old: FloatArray, new: FloatArray, modes: int) -> FloatArray:
+    """``new`` with the old rows where a pair would be no oscillation below half the sample rate at some amplitude."""
+    kept = new.copy()
+    values = new @ np.column_stack([level.powers for level in problem.levels])
+    frequency, damping = values[:modes], values[modes : 2 * modes]
+    low, high = np.log(DAMPING)
+    beyond = (frequency < np.log(problem.band_hz[0])) | (frequency > np.log(problem.band_hz[1]))
+    crossing = beyond & ((old[:modes, 0] >= np.log(problem.band_hz[0])) & (old[:modes, 0] <= np.log(problem.band_hz[1])))[:, None]
+    bad = (frequency > np.log(0.5 / problem.dt_s)) | (damping > high) | crossing
+    bad |= damping < np.where(beyond, np.log(DAMPING_BEYOND), low)
+    rows = np.flatnonzero(bad.any(axis=1))
+    kept[rows], kept[modes + rows] = old[rows], old[modes + rows]
+    return kept
 
 
 def _prices(problem: _Problem, state: _State, modes: int) -> FloatArray:
@@ -308,24 +351,83 @@ def _prices(problem: _Problem, state: _State, modes: int) -> FloatArray:
     return rises
 
 
-def _without(theta: FloatArray, modes: int, dropped: int) -> FloatArray:
-    return np.delete(theta, [dropped, modes + dropped], axis=0)
-
-
-def _start(response: FrequencyResponse, problem: _Problem, index: int, settings: FitSettings) -> tuple[FloatArray, int]:
-    """Poles' polynomials, constant in the amplitude, from vector fitting at one level."""
-    level = problem.levels[index]
+def _start(response: FrequencyResponse, settings: FitSettings) -> tuple[FloatArray, int]:
+    """Poles of one amplitude from vector fitting, as a column (2N + Q, 1) of ``theta``, and N."""
+    problem = _Problem([response], response.spectra.amplitude_V, 0, settings.direct)
     z = response.spectra.z
     scaled = (response.g * problem.output_scale[None, :, None]).reshape(z.size, -1)
     band = (float(np.angle(z[0])), float(np.angle(z[-1])))
-    pairs, reals = vector_fit(z, scaled, level.weight, pairs=settings.start_modes, direct=settings.direct, band=band)
+    weight = problem.levels[0].weight
+    pairs, reals = vector_fit(z, scaled, weight, pairs=settings.start_modes, direct=settings.direct, band=band)
+    # Beyond the excited band one pair on either side is enough for what reaches into it.
+    angle = np.angle(pairs)
+    below, above = np.flatnonzero(angle < band[0])[:-1], np.flatnonzero(angle > band[1])[1:]
+    pairs = np.delete(pairs, np.concatenate([below, above]))
     s = np.log(pairs) / problem.dt_s
-    damping = np.clip(-s.real / np.abs(s), *DAMPING)
     rates = -np.log(reals[(reals > 1e-3) & (reals < 1.0 - 1e-9)]) / problem.dt_s
-    theta = np.zeros((2 * pairs.size + rates.size, problem.degree + 1))
-    theta[:, 0] = np.log(np.concatenate([np.abs(s) / (2.0 * np.pi), damping, rates]))
-    theta[: pairs.size, 0] = np.minimum(theta[: pairs.size, 0], np.log(0.499 / problem.dt_s))
-    return theta, pairs.size
+    frequency = np.minimum(np.abs(s) / (2.0 * np.pi), 0.499 / problem.dt_s)
+    beyond = (frequency < problem.band_hz[0]) | (frequency > problem.band_hz[1])
+    least = np.where(beyond, DAMPING_BEYOND, DAMPING[0])
+    damping = np.clip(-s.real / np.abs(s), 1.01 * least, 0.99 * DAMPING[1])
+    return np.log(np.concatenate([frequency, damping, rates]))[:, None], pairs.size
+
+
+def _pruned(
+    problem: _Problem, theta: FloatArray, modes: int, settings: FitSettings, say: Callable[[str], None]
+) -> tuple[_State, int, bool]:
+    """Search, and take out, weakest first, the pairs that do not pay. Returns the state, N and whether it converged."""
+    if not settings.prune:
+        state, converged = _search(problem, theta, modes, settings.most_steps)
+        return state, modes, converged
+    equations = problem.target.size
+    price = (2 * problem.target.shape[1] + 2) * (problem.degree + 1) * np.log(equations)
+    # A short search suffices to tell what is useless; the full one follows when nothing is left to take out.
+    state, converged = _search(problem, theta, modes, SHORT)
+    while True:
+        before = modes
+        while modes > 1:
+            rises = _prices(problem, state, modes)
+            level = state.cost / (equations - state.coefficients.size)
+            weakest = int(np.argmin(rises))
+            if rises[weakest] > price * level:
+                break
+            say(f"take out the pair at {np.exp(state.theta[weakest, 0]):.1f} Hz: it does not pay for its parameters")
+            state = problem.evaluate(np.delete(state.theta, [weakest, modes + weakest], axis=0), modes - 1)
+            modes -= 1
+        if modes == before and converged:
+            return state, modes, converged
+        steps = settings.most_steps if modes == before else SHORT
+        state, converged = _search(problem, state.theta, modes, steps)
+        if modes == before and not converged:
+            return state, modes, converged
+
+
+def _across(
+    problem: _Problem, responses: Sequence[FrequencyResponse], theta: FloatArray, modes: int, settings: FitSettings
+) -> FloatArray:
+    """Polynomials from fits of each amplitude alone, each started at the poles of its neighbour nearer to the middle.
+
+    A row whose change is far beyond the expected one starts without a change.
+    """
+    middle = len(responses) // 2
+    columns = {middle: theta}
+    for k in [*range(middle + 1, len(responses)), *range(middle - 1, -1, -1)]:
+        response = responses[k]
+        alone = _Problem([response], response.spectra.amplitude_V, 0, settings.direct)
+        state, _ = _search(alone, columns[k - 1 if k > middle else k + 1], modes, SHORT)
+        columns[k] = state.theta
+    values = np.column_stack([columns[k] for k in range(len(responses))])
+    powers = np.vstack([level.powers for level in problem.levels])
+    polynomials = np.linalg.lstsq(powers, values.T, rcond=None)[0].T
+    wild = np.sum(problem.prior(polynomials, modes) * polynomials**2, axis=1) > 9.0
+    rows = np.flatnonzero(wild | np.concatenate([wild[modes : 2 * modes], wild[:modes], wild[2 * modes :]]))
+    polynomials[rows] = 0.0
+    polynomials[rows, 0] = theta[rows, 0]
+    return np.asarray(_kept_in_range(problem, _constant(theta, problem.degree), polynomials, modes), dtype=np.float64)
+
+
+def _constant(theta: FloatArray, degree: int) -> FloatArray:
+    return np.hstack([theta, np.zeros((len(theta), degree))])
 
 
 def fit_modes(
@@ -342,32 +444,22 @@ def fit_modes(
     _check(responses, settings)
     ordered = sorted(responses, key=lambda response: response.spectra.amplitude_V)
     amplitudes = [response.spectra.amplitude_V for response in ordered]
-    degree = settings.degree if settings.degree is not None else min(1, len(ordered) - 1)
+    degree = settings.degree if settings.degree is not None else min(2, len(ordered) - 1)
     reference_V = float(np.mean(amplitudes))
     problem = _Problem(ordered, reference_V, degree, settings.direct)
-    middle = len(ordered) // 2
-    theta, modes = _start(ordered[middle], problem, middle, settings)
-    say(f"vector fitting: {modes} pairs, {len(theta) - 2 * modes} real poles")
+    middle = ordered[len(ordered) // 2]
+    theta, modes = _start(middle, settings)
+    say(f"vector fitting at {middle.spectra.amplitude_V:.4g} V: {modes} pairs, {len(theta) - 2 * modes} real poles")
+    alone = _Problem([middle], middle.spectra.amplitude_V, 0, settings.direct)
+    state, modes, converged = _pruned(alone, theta, modes, settings, say)
+    say(f"{modes} pairs at {middle.spectra.amplitude_V:.4g} V")
+    if len(ordered) > 1:
+        theta = _across(problem, ordered, state.theta, modes, settings)
+        state, modes, converged = _pruned(problem, theta, modes, settings, say)
+        say(f"{modes} pairs at all {len(ordered)} amplitudes together")
+    else:
+        state = problem.evaluate(state.theta, modes)
     equations = int(problem.target.size)
-    price = (2 * problem.target.shape[1] + 2) * (degree + 1) * np.log(equations)
-    state, converged = _search(problem, theta, modes, settings.most_steps if not settings.prune else 6, say)
-    while settings.prune and modes > 1:
-        rises = _prices(problem, state, modes)
-        level = max(1.0, state.cost / (equations - state.coefficients.size))
-        weakest = int(np.argmin(rises))
-        if rises[weakest] > price * level:
-            if converged:
-                break
-            state, converged = _search(problem, state.theta, modes, settings.most_steps, say)
-            continue
-        while modes > 1 and rises[weakest] <= price * level:
-            hz = float(np.exp(state.theta[weakest, 0]))
-            say(f"take out the pair at {hz:.1f} Hz: pays {rises[weakest] / level:.0f} of {price:.0f}")
-            state = problem.evaluate(_without(state.theta, modes, weakest), modes - 1)
-            modes -= 1
-            rises = _prices(problem, state, modes)
-            weakest = int(np.argmin(rises))
-        state, converged = _search(problem, state.theta, modes, 6, say)
     covariance = problem.covariance(state, modes)
     model = ModalModel(
         dt_s=problem.dt_s,

@@ -41,6 +41,11 @@ class FrequencyResponse:
     power: FloatArray
 
     @property
+    def knows_distortion(self) -> bool:
+        """There are more realisations than drives, so that their spread shows the distortion."""
+        return self.spectra.u.shape[2] > self.spectra.u.shape[1]
+
+    @property
     def distortion_um(self) -> FloatArray:
         """(p,) rms of noise and distortion in one realisation, µm: no linear model of this amplitude is below it."""
         return np.asarray(np.sqrt(2.0 * self.total.sum(axis=0)), dtype=np.float64)
