@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from adaptive.errors import InputError
-from adaptive.types import FloatArray
+from adaptive.types import FloatArray, IntArray
 from sim.modal.model import ModalModel, poles_at, powers_of
 from sim.modal.periods import ComplexArray
 from sim.modal.poles import basis, stacked, vector_fit
@@ -330,7 +330,10 @@ def _kept_in_range(problem: _Problem, old: FloatArray, new: FloatArray, modes: i
     frequency, damping = values[:modes], values[modes : 2 * modes]
     low, high = np.log(DAMPING)
     beyond = (frequency < np.log(problem.band_hz[0])) | (frequency > np.log(problem.band_hz[1]))
-    crossing = beyond & ((old[:modes, 0] >= np.log(problem.band_hz[0])) & (old[:modes, 0] <= np.log(problem.band_hz[1])))[:, None]
+    crossing = (
+        beyond
+        & ((old[:modes, 0] >= np.log(problem.band_hz[0])) & (old[:modes, 0] <= np.log(problem.band_hz[1])))[:, None]
+    )
     bad = (frequency > np.log(0.5 / problem.dt_s)) | (damping > high) | crossing
     bad |= damping < np.where(beyond, np.log(DAMPING_BEYOND), low)
     rows = np.flatnonzero(bad.any(axis=1))
@@ -518,3 +521,24 @@ def _check(responses: Sequence[FrequencyResponse], settings: FitSettings) -> Non
             f"modes: got {settings.start_modes} to start from with {fewest} excited lines, expected 1 to "
             f"{max(1, (fewest - settings.direct - 4) // 4)}: start from fewer modes, or record longer periods"
         )
+
+
+def refitted(
+    fit: ModalFit, responses: Sequence[FrequencyResponse], held: IntArray, degree: int | None = None
+) -> ModalModel:
+    """The model with the rows ``held`` of ``theta`` at their mean over the amplitudes, and all residues fitted again.
+
+    ``degree`` 0 makes the residues constant as well: one linear model for all amplitudes (all rows are held then).
+    """
+    model = fit.model
+    ordered = sorted(responses, key=lambda response: response.spectra.amplitude_V)
+    powers = np.vstack([powers_of(model.position(r.spectra.amplitude_V), model.degree) for r in ordered])
+    theta = model.theta.copy()
+    mean = theta[held] @ powers.mean(axis=0)
+    theta[held] = 0.0
+    theta[held, 0] = mean
+    if degree is not None:
+        theta = theta[:, : degree + 1]
+    problem = _Problem(ordered, model.reference_V, theta.shape[1] - 1, model.direct)
+    state = problem.evaluate(theta, model.modes)
+    return replace(model, theta=theta, coefficients=_in_um(problem, state))

@@ -109,20 +109,20 @@ class ModalModel:
             )
         return np.asarray(self.response(spectra.z, spectra.amplitude_V) @ spectra.u, dtype=np.complex128)
 
-    def participation(self, amplitude_V: float) -> FloatArray:
-        """(N, p) rms contribution of each mode to each output for a flat drive of this rms on all drives, µm.
+    def participation(self, z: ComplexArray, amplitude_V: float) -> FloatArray:
+        """(N, p) rms contribution of each pair to each output for a drive with flat lines at ``z``, µm.
 
-        By Parseval's theorem over the whole circle; contributions of close modes do not add up.
+        Each drive has this rms. The contributions of close modes overlap: they do not add up to the output.
         """
         pairs, _ = poles_at(self.theta, self.modes, self.position(amplitude_V), self.dt_s)
-        r = self.residues(amplitude_V)
-        own = np.abs(r) ** 2 / (1.0 - np.abs(pairs) ** 2)[:, None, None]
-        cross = (r**2 / (1.0 - pairs**2)[:, None, None]).real
-        energy = 2.0 * (own + cross).sum(axis=2)
-        return np.asarray(amplitude_V * np.sqrt(np.maximum(energy, 0.0)), dtype=np.float64)
+        shares = np.empty((self.modes, self.coefficients.shape[2]))
+        for i, (pole, residue) in enumerate(zip(pairs, self.residues(amplitude_V), strict=True)):
+            own = residue / (z[:, None, None] - pole) + residue.conj() / (z[:, None, None] - pole.conj())
+            shares[i] = np.sqrt(np.mean(np.sum(np.abs(own) ** 2, axis=2), axis=0))
+        return np.asarray(amplitude_V * shares, dtype=np.float64)
 
 
 def output_errors(model: ModalModel, spectra: LineSpectra) -> FloatArray:
-    """(p, R) rms of measured minus predicted mean period at the excited lines, µm."""
+    """(p, R) rms of measured minus predicted mean period about its mean value, µm."""
     left = spectra.y - model.predict(spectra)
-    return np.asarray(np.sqrt(2.0 * np.sum(np.abs(left) ** 2, axis=0)), dtype=np.float64)
+    return np.asarray(np.sqrt(2.0 * np.sum(np.abs(left) ** 2, axis=0) + spectra.unexcited), dtype=np.float64)

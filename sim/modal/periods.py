@@ -6,7 +6,8 @@ of a signal is the sum of ``2 |X|²`` over its lines.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,7 @@ class LineSpectra:
     lines : (F,), indices of the excited lines, ascending; line k is at ``k / (samples dt_s)`` Hz.
     u, y : (F, m, R) and (F, p, R), complex amplitudes of the mean period, V and µm.
     noise : (F, p), variance of the noise of ``y``, µm², mean of the realisations; nan for a single period.
+    unexcited : (p, R), mean square of the mean period at all other lines but line 0, µm².
     noise_um : (p,), rms of the noise of a single reading, µm; nan for a single period.
     periods : P.
     """
@@ -113,6 +115,7 @@ class LineSpectra:
     u: ComplexArray
     y: ComplexArray
     noise: FloatArray
+    unexcited: FloatArray
     noise_um: FloatArray
     periods: int
 
@@ -127,9 +130,70 @@ class LineSpectra:
         return np.asarray(np.exp(2j * np.pi * self.lines / self.samples), dtype=np.complex128)
 
     @property
+    def signal_um(self) -> FloatArray:
+        """(p,) rms of the output's mean period about its mean value, µm."""
+        squares = 2.0 * np.sum(np.abs(self.y) ** 2, axis=0) + self.unexcited
+        return np.asarray(np.sqrt(squares.mean(axis=1)), dtype=np.float64)
+
+    @property
     def floor_um(self) -> FloatArray:
         """(p,) rms of the noise of the mean period, µm: no model can come below it."""
         return np.asarray(self.noise_um / np.sqrt(self.periods), dtype=np.float64)
+
+
+def joined(parts: Sequence[LineSpectra]) -> LineSpectra:
+    """The realisations of several records of the same amplitude and period as one. Raises InputError."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    for part in parts[1:]:
+        for name, got, expected in (
+            ("period, samples", part.samples, first.samples),
+            ("sample time, s", part.dt_s, first.dt_s),
+            ("periods", part.periods, first.periods),
+            ("drives and outputs", _channels(part), _channels(first)),
+        ):
+            if got != expected:
+                raise InputError(
+                    f"{part.name}: {name}: got {got}, expected {expected} as in {first.name}, a record of the same "
+                    "amplitude: cut both alike"
+                )
+    lines = first.lines
+    for part in parts[1:]:
+        lines = np.intersect1d(lines, part.lines)
+    if lines.size == 0:
+        raise InputError(f"{first.name}: excited lines: got none in common with the records of the same amplitude")
+    counts = np.array([part.u.shape[2] for part in parts], dtype=np.float64)
+    chosen = [np.searchsorted(part.lines, lines) for part in parts]
+    share = counts / counts.sum()
+    unexcited = [
+        part.unexcited + 2.0 * (np.sum(np.abs(part.y) ** 2, axis=0) - np.sum(np.abs(part.y[at]) ** 2, axis=0))
+        for part, at in zip(parts, chosen, strict=True)
+    ]
+    return LineSpectra(
+        name=", ".join(part.name for part in parts),
+        amplitude_V=float(np.sqrt(np.sum(share * np.array([part.amplitude_V for part in parts]) ** 2))),
+        samples=first.samples,
+        dt_s=first.dt_s,
+        lines=lines,
+        u=np.concatenate([part.u[at] for part, at in zip(parts, chosen, strict=True)], axis=2),
+        y=np.concatenate([part.y[at] for part, at in zip(parts, chosen, strict=True)], axis=2),
+        noise=np.sum([s * part.noise[at] for s, part, at in zip(share, parts, chosen, strict=True)], axis=0),
+        unexcited=np.concatenate(unexcited, axis=1),
+        noise_um=np.sqrt(np.sum([s * part.noise_um**2 for s, part in zip(share, parts, strict=True)], axis=0)),
+        periods=first.periods,
+    )
+
+
+def _channels(spectra: LineSpectra) -> tuple[int, int]:
+    return spectra.u.shape[1], spectra.y.shape[1]
+
+
+def realisations(spectra: LineSpectra, chosen: slice) -> LineSpectra:
+    """Some of the realisations."""
+    return replace(
+        spectra, u=spectra.u[:, :, chosen], y=spectra.y[:, :, chosen], unexcited=spectra.unexcited[:, chosen]
+    )
 
 
 def excited_lines(u_V: FloatArray, share: float = EXCITED_SHARE) -> IntArray:
@@ -158,6 +222,11 @@ def average(record: PeriodicRecord) -> LineSpectra:
         noise_um = np.sqrt(2.0 * spread[1:].sum(axis=0) - (spread[-1] if n % 2 == 0 else 0.0))
     else:
         noise, noise_um = np.full((lines.size, outputs), np.nan), np.full(outputs, np.nan)
+    mean = y.mean(axis=3)
+    squares = 2.0 * np.abs(mean) ** 2
+    squares[0] = 0.0
+    if n % 2 == 0:
+        squares[-1] /= 2.0
     return LineSpectra(
         name=record.name,
         amplitude_V=record.amplitude_V,
@@ -165,8 +234,9 @@ def average(record: PeriodicRecord) -> LineSpectra:
         dt_s=record.dt_s,
         lines=lines,
         u=u[lines],
-        y=y.mean(axis=3)[lines],
+        y=mean[lines],
         noise=noise,
+        unexcited=squares.sum(axis=0) - squares[lines].sum(axis=0),
         noise_um=noise_um,
         periods=periods,
     )
