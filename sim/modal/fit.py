@@ -96,7 +96,7 @@ class ModalFit:
     def _half_width(self, row: int, direction: FloatArray) -> float:
         size = self.model.degree + 1
         part = self.covariance[row * size : (row + 1) * size, row * size : (row + 1) * size]
-        return float(QUANTILE_95 * np.sqrt(max(0.0, direction @ part @ direction)))
+        return QUANTILE_95 * float(np.sqrt(max(0.0, float(direction @ part @ direction))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +146,7 @@ class _Problem:
 
     def prior(self, theta: FloatArray, modes: int) -> FloatArray:
         """Weights (as ``theta``) of the squares of the polynomials' coefficients: 1 / expected variance; 0 for x⁰."""
-        expected = np.concatenate(
-            [np.full(modes, EXPECTED_CHANGE[0]), np.full(modes, EXPECTED_CHANGE[1])]
-            + [np.full(len(theta) - 2 * modes, EXPECTED_CHANGE[2])]
-        )
+        expected = np.repeat(EXPECTED_CHANGE, [modes, modes, len(theta) - 2 * modes])
         weights = (self.span ** np.arange(theta.shape[1]) / expected[:, None]) ** 2
         weights[:, 0] = 0.0
         return np.asarray(weights, dtype=np.float64)
@@ -330,10 +327,8 @@ def _kept_in_range(problem: _Problem, old: FloatArray, new: FloatArray, modes: i
     frequency, damping = values[:modes], values[modes : 2 * modes]
     low, high = np.log(DAMPING)
     beyond = (frequency < np.log(problem.band_hz[0])) | (frequency > np.log(problem.band_hz[1]))
-    crossing = (
-        beyond
-        & ((old[:modes, 0] >= np.log(problem.band_hz[0])) & (old[:modes, 0] <= np.log(problem.band_hz[1])))[:, None]
-    )
+    inside = (old[:modes, 0] >= np.log(problem.band_hz[0])) & (old[:modes, 0] <= np.log(problem.band_hz[1]))
+    crossing = beyond & inside[:, None]
     bad = (frequency > np.log(0.5 / problem.dt_s)) | (damping > high) | crossing
     bad |= damping < np.where(beyond, np.log(DAMPING_BEYOND), low)
     rows = np.flatnonzero(bad.any(axis=1))
@@ -421,7 +416,7 @@ def _across(
         columns[k] = state.theta
     values = np.column_stack([columns[k] for k in range(len(responses))])
     powers = np.vstack([level.powers for level in problem.levels])
-    polynomials = np.linalg.lstsq(powers, values.T, rcond=None)[0].T
+    polynomials: FloatArray = np.asarray(np.linalg.lstsq(powers, values.T, rcond=None)[0].T, dtype=np.float64)
     wild = np.sum(problem.prior(polynomials, modes) * polynomials**2, axis=1) > 9.0
     rows = np.flatnonzero(wild | np.concatenate([wild[modes : 2 * modes], wild[:modes], wild[2 * modes :]]))
     polynomials[rows] = 0.0
@@ -516,7 +511,7 @@ def _check(responses: Sequence[FrequencyResponse], settings: FitSettings) -> Non
             f"degree: got {settings.degree} with {len(responses)} amplitudes, expected 0 to {len(responses) - 1}"
         )
     fewest = min(response.spectra.lines.size for response in responses)
-    if not 1 <= settings.start_modes or fewest < 4 * settings.start_modes + settings.direct + 4:
+    if settings.start_modes < 1 or fewest < 4 * settings.start_modes + settings.direct + 4:
         raise InputError(
             f"modes: got {settings.start_modes} to start from with {fewest} excited lines, expected 1 to "
             f"{max(1, (fewest - settings.direct - 4) // 4)}: start from fewer modes, or record longer periods"

@@ -2,7 +2,8 @@
 
 At the amplitude ``a``, with ``x = a / reference - 1``,
 
-    G(z) = Σ_i [R_i / (z - p_i) + conj] + Σ_q R_q / (z - p_q) + Σ_d D_d z^-d,    p_i = exp(2πf_i (-ζ_i + j√(1-ζ_i²)) dt).
+    G(z) = Σ_i [R_i / (z - p_i) + conj] + Σ_q R_q / (z - p_q) + Σ_d D_d z^-d
+    p_i = exp(2πf_i (-ζ_i + j√(1-ζ_i²)) dt)
 
 ``log f_i``, ``log ζ_i``, the logarithms of the real poles' rates and all residues are polynomials in ``x``. For a
 periodic drive in steady state the output's lines are ``G u``, without any approximation in time.
@@ -63,7 +64,7 @@ class ModalModel:
     @property
     def degree(self) -> int:
         """Degree of the polynomials in the amplitude."""
-        return self.theta.shape[1] - 1
+        return int(self.theta.shape[1]) - 1
 
     def position(self, amplitude_V: float) -> float:
         """The polynomials' variable ``x`` at an amplitude, held at the ends of the fitted range."""
@@ -95,7 +96,7 @@ class ModalModel:
         return np.asarray(np.tensordot(basis(z, pairs, reals, self.direct), c, axes=1), dtype=np.complex128)
 
     def predict(self, spectra: LineSpectra) -> ComplexArray:
-        """(F, p, R) lines of the output to the drive of ``spectra``, µm. Raises InputError for other shapes or times."""
+        """(F, p, R) lines of the output, µm. Raises InputError on other channels or another sample time."""
         outputs, drives = self.coefficients.shape[2:]
         if spectra.u.shape[1] != drives or spectra.y.shape[1] != outputs:
             raise InputError(

@@ -208,8 +208,8 @@ def excited_lines(u_V: FloatArray, share: float = EXCITED_SHARE) -> IntArray:
 def average(record: PeriodicRecord) -> LineSpectra:
     """The mean period's spectra at the excited lines, and the noise from the spread between the periods.
 
-    With P periods the noise of a line is the sample variance over periods divided by P. A drift of the mean value is not
-    noise of the lines and is left out. Source: Pintelon and Schoukens, System Identification: A Frequency Domain
+    With P periods the noise of a line is the sample variance over periods divided by P. A drift of the mean value
+    is not noise of the lines and is left out. Source: Pintelon and Schoukens, System Identification: A Frequency Domain
     Approach (2012), section 2.5.
     """
     n, outputs, _, periods = record.y_um.shape

@@ -69,7 +69,7 @@ def _relocated(
         joint = np.concatenate(
             [numerator, -weight[:, None] * denominator * entry[:, None], (weight * entry)[:, None]], axis=1
         )
-        triangle = np.linalg.qr(stacked(joint), mode="r")[columns.shape[1] : columns.shape[1] + count]
+        triangle = np.asarray(np.linalg.qr(stacked(joint), mode="r"))[columns.shape[1] : columns.shape[1] + count]
         rows.append(triangle[:, columns.shape[1] : -1])
         values.append(triangle[:, -1])
     coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]

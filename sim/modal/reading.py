@@ -92,8 +92,8 @@ def _periods(path: Path, values: FloatArray, period: int | None, skip: int) -> F
     samples, _, realisations, periods = values.shape
     if period is None and periods == 1:
         raise InputError(
-            f"{path}: period: got none, expected the length of a period in samples: add --period N, where N = {samples} "
-            "takes the whole recording as one period"
+            f"{path}: period: got none, expected the length of a period in samples: add --period N; "
+            f"N = {samples} takes the whole recording as one period"
         )
     if period is None or period == samples:
         if skip >= periods:

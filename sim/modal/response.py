@@ -43,7 +43,7 @@ class FrequencyResponse:
     @property
     def knows_distortion(self) -> bool:
         """There are more realisations than drives, so that their spread shows the distortion."""
-        return self.spectra.u.shape[2] > self.spectra.u.shape[1]
+        return bool(self.spectra.u.shape[2] > self.spectra.u.shape[1])
 
     @property
     def distortion_um(self) -> FloatArray:

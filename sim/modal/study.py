@@ -72,8 +72,11 @@ class Mode:
         )
         kind = {
             "loop inside the mode": ": as a hysteresis loop in its stiffness does",
-            "softens elastically": ": the loss does not grow with it, so this is no loop in its stiffness",
+            "softens elastically": ": the loss does not grow with it, as it would with a loop in its stiffness",
         }.get(self.finding, "")
+        if self.finding == "softens" and self.ratio_half < 0.5 * RAYLEIGH_RATIO:
+            share = 100.0 * self.ratio / RAYLEIGH_RATIO
+            kind = f": {share:.2g} % of the loss that a loop of this softening brings"
         return f"{text}{kind}. Held constant, the held-out error rises by {100.0 * self.error_share:.3g} %."
 
 
@@ -261,7 +264,7 @@ def _modes(fit: ModalFit, responses: Sequence[FrequencyResponse], levels: Sequen
                 finding=_finding(change, change_half, ratio, ratio_half),
             )
         )
-    return found
+    return sorted(found, key=lambda mode: float(mode.frequency_hz[0]))
 
 
 def _change(fit: ModalFit, i: int, low_V: float, high_V: float) -> tuple[float, float, float, float, float, float]:

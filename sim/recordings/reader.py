@@ -28,6 +28,12 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
     path, mapping = Path(path), mapping or ColumnMap()
+    table, digest = read_table(path, mapping)
+    return _recording(table, mapping, str(path), digest)
+
+
+def read_table(path: Path, mapping: ColumnMap) -> tuple[Table, str]:
+    """The arrays of a file or a folder of segments, and its SHA-256, before their meaning is known. As `read`."""
     if path.is_dir():
         files = sorted(path.glob("*.parquet"))
         if not files:
@@ -39,8 +45,7 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     for content in contents:
         digest.update(content)
     tables = [_table(file, content, mapping) for file, content in zip(files, contents, strict=True)]
-    table = tables[0] if len(tables) == 1 else _joined(path, tables)
-    return _recording(table, mapping, str(path), digest.hexdigest())
+    return tables[0] if len(tables) == 1 else _joined(path, tables), digest.hexdigest()
 
 
 def _bytes(path: Path) -> bytes:
@@ -114,7 +119,7 @@ def _recording(table: Table, mapping: ColumnMap, source: str, sha256: str) -> Re
     y_um = _column(table, "y", mapping, needed=True)
     assert u_V is not None
     assert y_um is not None
-    t_s, dt_s = _time(table, mapping, len(u_V))
+    t_s, dt_s = sample_times(table, mapping, len(u_V))
     columns: dict[str, NDArray[Any] | None] = {"t_s": t_s, "u_V": u_V, "y_um": y_um}
     for quantity in ("u2", "y2", "u3", "monitor", "temperature"):
         columns[QUANTITIES[quantity][0]] = _column(table, quantity, mapping, needed=False)
@@ -144,7 +149,7 @@ def _sensor_moved(
     }
 
 
-def _time(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
+def sample_times(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
     """Time of each sample and the nominal sample time, from a column, an option, or the format."""
     t_s = _column(table, "t", mapping, needed=False)
     rate_hz = _scalar(table, "rate", mapping)
