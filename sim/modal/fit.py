@@ -6,7 +6,8 @@ the Bayesian information criterion does not pay for are taken out, one by one.
 
 Sources: Golub and Pereyra, Inverse Problems 19 (2003) R1 (variable projection, with Kaufman's Jacobian); Pintelon and
 Schoukens (2012), chapter 9 (weights from noise and distortion). The intervals are those of the sandwich estimator with
-one cluster a line (White, Econometrica 50 (1982) 1), which stays right where the weights or the model are not exact.
+one cluster a line (White, Econometrica 50 (1982) 1), which stays right where the weights or the model are not exact,
+and not narrower than those of the weights.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ DIRECT: Final = 4
 DAMPING: Final = (1e-5, 0.95)
 #: Least damping of a pair beyond the excited band, where no line would show a peak.
 DAMPING_BEYOND: Final = 0.02
+#: Error of an entry as a share of the response's rms, where neither noise nor distortion is known.
+ASSUMED_ERROR: Final = 1e-3
 #: A residue may be this many times as large as the measured response before it costs as much as one equation's error.
 #: It keeps pairs close to each other from cancelling with enormous residues.
 LARGEST_SHARE: Final = 10.0
@@ -227,7 +230,11 @@ class _Problem:
         return whole, (gradient - prior * state.theta).ravel()
 
     def covariance(self, state: _State, modes: int) -> FloatArray:
-        """Sandwich covariance of ``theta.ravel()``, one cluster a line."""
+        """Sandwich covariance of ``theta.ravel()``, one cluster a line.
+
+        The residual of a line that the residues follow closely is too small; it is divided by one minus the leverage
+        (HC3 of MacKinnon and White, Journal of Econometrics 29 (1985) 305).
+        """
         rows, size = len(state.theta), self.degree + 1
         squares, _ = self.normal_equations(state, modes)
         changes = self.sensitivities(state, modes)
@@ -241,7 +248,8 @@ class _Problem:
         start, scores = 0, []
         for level, change in zip(self.levels, changes, strict=True):
             stop = start + len(change)
-            left = state.left[start:stop]
+            leverage = np.sum(state.q[start:stop] ** 2, axis=1)
+            left = state.left[start:stop] / np.maximum(1e-3, 1.0 - leverage)[:, None]
             own = np.einsum("fe,fer->fr", left, change)[:, :, None] * level.powers
             # Σ_e left[f, e] (q along)[f, e, ...] without the large product.
             outer = np.einsum("fc,fe->fce", state.q[start:stop], left).reshape(len(left), -1)
@@ -252,16 +260,19 @@ class _Problem:
             start = stop
         score = np.concatenate(scores)
         inverse = np.linalg.pinv(squares, hermitian=True)
-        used = state.q.shape[1] + rows * size / entries
-        freedom = self.target.shape[0] / max(1.0, self.target.shape[0] - used)
-        return np.asarray(inverse @ (score.T @ score) @ inverse * freedom, dtype=np.float64)
+        sandwich = inverse @ (score.T @ score) @ inverse
+        # A narrow mode has few lines, and their scatter is a poor estimate: not below what the weights alone say.
+        freedom = self.target.size - state.coefficients.size - rows * size
+        by_weights = np.diag(inverse) * state.cost / max(1, freedom)
+        raised = np.sqrt(np.maximum(1.0, by_weights / np.maximum(1e-300, np.diag(sandwich))))
+        return np.asarray(sandwich * np.outer(raised, raised), dtype=np.float64)
 
 
 def _weights(responses: Sequence[FrequencyResponse]) -> tuple[FloatArray, list[FloatArray]]:
     """A scale for each output, and a weight for each line: 1 over the standard deviation of a scaled entry.
 
     One weight for all entries of a line keeps one triangle for all of them. Where no variance is known, or it is 0,
-    all lines weigh the same.
+    all lines weigh the same, as with errors of `ASSUMED_ERROR`.
     """
     responses = [_with_distortion(response, responses) for response in responses]
     totals = np.concatenate([response.total for response in responses])
@@ -275,7 +286,7 @@ def _weights(responses: Sequence[FrequencyResponse]) -> tuple[FloatArray, list[F
             # Of a complex variance, half is in the real and half in the imaginary part.
             weights.append(np.sqrt(2.0 * response.power / variance))
         else:
-            weights.append(np.ones(response.power.size))
+            weights.append(np.full(response.power.size, 1.0 / ASSUMED_ERROR))
     return scale, weights
 
 

@@ -21,6 +21,8 @@ SAME_AMPLITUDE: Final = 0.02
 MOST_DAMPING: Final = 0.1
 #: ... and moves an output by at least this share of the output's rms.
 LEAST_SHARE: Final = 0.01
+#: A change is named where it is this many times as large as half of its 95 % interval: many modes are looked at.
+CLEAR: Final = 2.0
 #: Rise of the damping ratio over the relative fall of the frequency, for a loop of Rayleigh's kind in the stiffness:
 #: a stiffness ``k - αX`` at the amplitude X loses ``4/3 αX³`` a cycle, hence 4 / (3π).
 RAYLEIGH_RATIO: Final = 4.0 / (3.0 * np.pi)
@@ -40,8 +42,9 @@ class Mode:
     ratio, ratio_half : rise of the damping over the relative fall of the frequency; nan for a single amplitude.
     error_share : rise of the held-out error, relative, if this mode's frequency and damping were held at those of the
         middle amplitude and all residues fitted again; 0 for a single amplitude.
-    finding : ``steady``, ``softens``, ``stiffens``; ``loop inside the mode`` where it softens and the ratio is that of
-        a loop in the stiffness and not 0; ``softens elastically`` where it is 0 and not that of a loop.
+    finding : ``steady``; ``damping`` where only that changes; ``softens``, ``stiffens``; ``loop inside the mode`` where
+        it softens and the ratio is that of a loop in the stiffness and not 0; ``softens elastically`` where it is 0 and
+        not that of a loop.
     """
 
     frequency_hz: FloatArray
@@ -64,6 +67,13 @@ class Mode:
         where = f"The mode at {self.frequency_hz[0]:.5g} Hz"
         if self.finding == "steady":
             return f"{where} does not change measurably from {low_V:.3g} to {high_V:.3g} V rms."
+        if self.finding == "damping":
+            return (
+                f"{where} keeps its frequency from {low_V:.3g} to {high_V:.3g} V rms, its damping goes from "
+                f"{100.0 * self.damping[0]:.3g} to {100.0 * self.damping[-1]:.3g} % "
+                f"(± {100.0 * self.damping_change_half:.2g}). Held constant, the held-out error rises by "
+                f"{100.0 * self.error_share:.2g} %."
+            )
         verb = "softens" if self.frequency_change < 0.0 else "stiffens"
         text = (
             f"{where} {verb} by {100.0 * abs(self.frequency_change):.3g} ± {100.0 * self.frequency_change_half:.2g} % "
@@ -77,7 +87,7 @@ class Mode:
         if self.finding == "softens" and self.ratio_half < 0.5 * RAYLEIGH_RATIO:
             share = 100.0 * self.ratio / RAYLEIGH_RATIO
             kind = f": {share:.2g} % of the loss that a loop of this softening brings"
-        return f"{text}{kind}. Held constant, the held-out error rises by {100.0 * self.error_share:.3g} %."
+        return f"{text}{kind}. Held constant, the held-out error rises by {100.0 * self.error_share:.2g} %."
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +271,7 @@ def _modes(fit: ModalFit, responses: Sequence[FrequencyResponse], levels: Sequen
                 ratio=ratio,
                 ratio_half=ratio_half,
                 error_share=error_share,
-                finding=_finding(change, change_half, ratio, ratio_half),
+                finding=_finding(change, change_half, rise, rise_half, ratio, ratio_half),
             )
         )
     return sorted(found, key=lambda mode: float(mode.frequency_hz[0]))
@@ -295,9 +305,9 @@ def _change(fit: ModalFit, i: int, low_V: float, high_V: float) -> tuple[float, 
     return float(change), float(halves[0]), float(rise), float(halves[1]), float(ratio), float(ratio_half)
 
 
-def _finding(change: float, change_half: float, ratio: float, ratio_half: float) -> str:
-    if abs(change) <= change_half:
-        return "steady"
+def _finding(change: float, change_half: float, rise: float, rise_half: float, ratio: float, ratio_half: float) -> str:
+    if abs(change) <= CLEAR * change_half:
+        return "damping" if abs(rise) > CLEAR * rise_half else "steady"
     if change > 0.0:
         return "stiffens"
     with_loss = abs(ratio - RAYLEIGH_RATIO) <= ratio_half
