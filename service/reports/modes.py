@@ -167,7 +167,8 @@ def _changes(modes: Sequence[Mode], low_V: float, high_V: float) -> list[str]:
         "",
         "A hysteresis loop in a mode's stiffness makes it softer and more damped: for Rayleigh's loop the damping "
         f"ratio rises by 4/(3π) = {RAYLEIGH_RATIO:.2f} of the relative fall of the frequency. An elastic softening "
-        "adds no damping. A loop in front of the modes (in the actuator) changes their gain and leaves frequency and damping.",
+        "adds no damping. A loop in front of the modes (in the actuator) changes their gain and leaves frequency and "
+        "damping.",
         "",
     ]
 
