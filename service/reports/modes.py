@@ -74,6 +74,7 @@ def page(study: ModalStudy, *, pictures: bool = True) -> str:
         ),
         "",
     ]
+    lines += _verdict(levels)
     if pictures:
         lines += ["![measured and computed response](response.png)", "", "![what is left, and the noise](left.png)", ""]
     lines += ["## Modes", "", *modes_table(study.modes), ""]
@@ -82,6 +83,39 @@ def page(study: ModalStudy, *, pictures: bool = True) -> str:
     if study.notes:
         lines += ["## The recordings", "", *(f"- {note}" for note in study.notes), ""]
     return "\n".join(lines)
+
+
+#: A held-out error within this factor of noise and distortion is at the limit of linear models.
+AT_THE_LIMIT = 1.25
+
+
+def _verdict(levels: Sequence[Level]) -> list[str]:
+    """What the remaining error is, where the realisations show it; as lines of Markdown."""
+    judged = [level for level in levels if level.test_um is not None and level.response.knows_distortion]
+    if not judged:
+        return []
+    ratios = [
+        float(level.test_um.mean() / level.response.distortion_um.mean())
+        for level in judged
+        if level.test_um is not None
+    ]
+    text = f"Held-out error over noise and distortion: {', '.join(f'{ratio:.2f}' for ratio in ratios)}. "
+    text += (
+        "The modes explain all that a linear model of each amplitude can explain."
+        if max(ratios) <= AT_THE_LIMIT
+        else "There is more to explain by linear dynamics: start from more modes, or record more realisations."
+    )
+    over = [
+        float(level.response.distortion_um.mean() / level.response.spectra.floor_um.mean())
+        for level in judged
+        if np.isfinite(level.response.spectra.floor_um).all()
+    ]
+    if over and max(over) > 2.0:
+        text += (
+            f" Noise and distortion are up to {max(over):.2g} times the noise alone: this part is nonlinear within one "
+            "amplitude, and only a nonlinear model can explain it."
+        )
+    return [text, ""]
 
 
 def _plural(word: str, count: int) -> str:
