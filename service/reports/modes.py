@@ -42,10 +42,11 @@ def page(study: ModalStudy, *, pictures: bool = True) -> str:
     low, high = levels[0].response.spectra.amplitude_V, levels[-1].response.spectra.amplitude_V
     outputs, drives = model.coefficients.shape[2:]
     several = len(levels) > 1
+    reals = len(model.theta) - 2 * model.modes
     lines = [
         f"# {len(study.modes)} modes of {drives} {_plural('drive', drives)} and {outputs} {_plural('output', outputs)}",
         "",
-        f"One model for all recordings: {model.modes} pole pairs and {len(model.theta) - 2 * model.modes} real poles, "
+        f"One model for all recordings: {model.modes} pole pairs and {reals} real {_plural('pole', reals)}, "
         "common to all drives and outputs."
         + (
             f" Poles and residues are polynomials of degree {model.degree} in the rms of the drive, {low:.3g} to "

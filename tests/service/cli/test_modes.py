@@ -61,6 +61,7 @@ def test_modes_writes_a_report(recordings: list[str], tmp_path: Path, capsys: py
     assert np.allclose(data["levels"][0]["noise_of_a_reading_um"], 1e-3, rtol=0.1)
     page = (out / "report.md").read_text()
     assert "| frequency / Hz |" in page
+    assert "Held-out error over noise and distortion: " in page
     for name in ("response.png", "left.png"):
         assert f"({name})" in page
         assert (out / name).stat().st_size > 10_000
