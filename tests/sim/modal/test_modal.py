@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 
@@ -15,19 +10,7 @@ from adaptive.types import FloatArray
 from sim.modal import FitSettings, PeriodicRecord, average, fit_modes, frequency_response, output_errors, study
 from sim.modal.periods import joined, realisations
 from sim.modal.study import RAYLEIGH_RATIO
-
-
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-simulated = _load("simulated")
+from tests.sim.modal import simulated
 
 DT_S = 1e-3
 FREQUENCIES_HZ = np.array([37.0, 81.5, 84.0, 190.0, 333.0])
