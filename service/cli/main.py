@@ -63,6 +63,9 @@ COMMANDS: Final[dict[str, Command]] = {
     "diagnose": _command(
         "diagnose", IDENTIFICATION, "name the effects in a recording that the simulation lacks, and what each explains"
     ),
+    "modes": _command(
+        "modes", IDENTIFICATION, "find the modes of a stage in periodic recordings, and how they soften with amplitude"
+    ),
     "completion": _command("completion", OTHER, "print the completion script of a shell"),
 }
 

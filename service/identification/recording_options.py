@@ -59,7 +59,9 @@ def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False
             "--test-file", action="append", default=[], metavar="Q=FILE", help="the same for the recording of --test"
         )
     else:
-        parser.set_defaults(test=None, test_file=[])
+        parser.set_defaults(test_file=[])
+        if parser.get_default("test") is None:
+            parser.set_defaults(test=None)
     group.add_argument(
         "--repeat",
         action="append",

@@ -40,21 +40,37 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     Raises InputError naming the file, what was found, what was expected, and the option that corrects it.
     """
     path, mapping = Path(path), mapping or ColumnMap()
-    if path.is_dir():
-        segments = sorted(path.glob("*.parquet"))
-        if not segments:
-            raise InputError(f"{path}: got a folder without .parquet files, expected a recording")
-    else:
-        segments = [path]
     digest = hashlib.sha256()
-    tables = [_table(segment, _bytes(segment, digest), mapping) for segment in segments]
-    main = tables[0] if len(tables) == 1 else _joined(path, tables)
+    main = _main_table(path, mapping, digest)
     others: dict[Path, Table] = {}
     for file in mapping.files.values():
         if file not in others:
             others[file] = main if file == path else _table(file, _bytes(file, digest), mapping)
     by_quantity = {quantity: others[file] for quantity, file in mapping.files.items()}
     return _Reading(main, by_quantity, mapping).recording(str(path), digest.hexdigest())
+
+
+def read_table(path: Path, mapping: ColumnMap) -> Table:
+    """The arrays of a file or a folder of segments, before their meaning is known. As `read`."""
+    return _main_table(path, mapping, hashlib.sha256())
+
+
+def sample_times(table: Table, mapping: ColumnMap, n: int) -> tuple[FloatArray, float]:
+    """Time of each of ``n`` samples and the nominal sample time, s, from an option, a column, or the format."""
+    reading = _Reading(table, {}, mapping)
+    reading.names = {name: name for name in table.arrays}
+    return reading._time(table.source, n, [])
+
+
+def _main_table(path: Path, mapping: ColumnMap, digest: Any) -> Table:
+    if path.is_dir():
+        segments = sorted(path.glob("*.parquet"))
+        if not segments:
+            raise InputError(f"{path}: got a folder without .parquet files, expected a recording")
+    else:
+        segments = [path]
+    tables = [_table(segment, _bytes(segment, digest), mapping) for segment in segments]
+    return tables[0] if len(tables) == 1 else _joined(path, tables)
 
 
 def _bytes(path: Path, digest: Any) -> bytes:

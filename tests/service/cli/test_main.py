@@ -16,8 +16,8 @@ from service.cli.main import GROUPS, build_parser
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCUMENTED = """
-identify serve diagnose stage query replay status freeze thaw rollback checkpoints select retune ask-diagnosis access
-router view demo rehearse scenarios soak bench reproduce
+identify serve diagnose modes stage query replay status freeze thaw rollback checkpoints select retune ask-diagnosis
+access router view demo rehearse scenarios soak bench reproduce
 """.split()  # noqa: SIM905
 
 
