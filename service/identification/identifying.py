@@ -19,9 +19,9 @@ from sim.recordings import Recording, Repaired
 
 #: Names of the models, in the order in which they are identified and shown.
 NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
-#: First share of a separate test recording that only settles the models' memory and is not scored.
+#: Share at the beginning of a separate test recording that is not scored: it only settles the models' memory.
 SETTLE_SHARE = 0.05
-#: Least number of samples to identify from, and to score on.
+#: Fewest samples for identification, and for scoring.
 LEAST_TRAIN, LEAST_TEST = 200, 50
 
 
@@ -29,9 +29,9 @@ LEAST_TRAIN, LEAST_TEST = 200, 50
 class Score:
     """Free-run error of an inverse model on held-out data.
 
-    The model turns the measured motion (smoothed with zero phase) into a voltage; the error is that voltage less the
-    applied one. ``_um``: the same times the mean gain of the training data. ``_pct``: in percent of the displacement
-    range of the training data.
+    The model computes a voltage from the measured motion (smoothed with zero phase). The error is this voltage minus
+    the applied one. ``_um`` : the error times the mean gain of the training data. ``_pct`` : that, in percent of the
+    displacement range of the training data.
     """
 
     mae_V: float
@@ -47,9 +47,9 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """One model with its held-out score and the time that its identification took.
+    """One model with its held-out score and the duration of its identification.
 
-    ``error_V`` is (n_test,) V, NaN where a sample is not scored. ``failed`` is the reason if there is no model.
+    error_V : (n_test,) V, NaN where a sample is not scored. failed : the reason if there is no model.
     """
 
     name: str
@@ -92,7 +92,7 @@ def motion_of(recording: Recording) -> FloatArray:
 
 
 def split_at(n: int, holdout: float) -> int:
-    """Index where the held-out last part begins. Raises InputError if either part is too short."""
+    """Index of the first sample of the held-out last part. Raises InputError if one part is too short."""
     if not 0.0 < holdout < 0.9:
         raise FieldError("--holdout", holdout, "a share of the recording above 0 and below 0.9")
     split = round(n * (1.0 - holdout))
@@ -125,10 +125,10 @@ def identify_one(name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: i
 
 
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
-    """(n_test,) voltages, V, that the model gives for the test's measured motion.
+    """(n_test,) voltages, V, of the model for the measured motion of the test.
 
-    ``before`` are the samples just before the test; they only settle the memory. Without them the memory is that of a
-    stage at rest at the first test sample.
+    ``before`` : the samples just before the test; they only settle the memory. Without them, the memory starts as that
+    of a stage at rest at the first test sample.
     """
     first = before if before is not None and len(before) else test
     memory = model.rest_memory(float(first.motion[0, 0]))
@@ -145,7 +145,7 @@ def _columns(stretch: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Score:
-    """The score of (n,) voltage errors, without NaN entries."""
+    """Score of (n,) voltage errors, V; NaN entries are ignored."""
     size = np.abs(error_V[np.isfinite(error_V)])
     in_V = (float(np.mean(size)), float(np.sqrt(np.mean(size**2))), float(np.max(size)))
     in_um = tuple(abs(gain_um_per_V) * value for value in in_V)
@@ -163,11 +163,11 @@ def identify_all(
     n: int = 500,
     progress: Callable[[str], None] = lambda _: None,
 ) -> list[Identified]:
-    """Identify every model on ``train`` and score it on ``test``; with ``whole``, identify it again on all data.
+    """Identify every model from ``train`` and score it on ``test``.
 
-    ``follows``: the test continues the training data in time. Otherwise it is a separate recording, whose first
-    ``SETTLE_SHARE`` only settles the memories. With ``whole`` the returned model is identified from it. A model that
-    cannot be identified is returned with ``failed``; the others are not affected.
+    ``follows`` : the test continues the training data in time. Otherwise it is a separate recording, and its first
+    ``SETTLE_SHARE`` only settles the memory. ``whole`` : if given, the returned models are identified again from this
+    data. If a model cannot be identified, its result has ``failed`` set; the other models are not affected.
     """
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     range_um = float(np.ptp(train.motion[:, 0]))

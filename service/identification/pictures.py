@@ -31,7 +31,7 @@ def draw_identification(
 ) -> None:
     """Write one PNG: measured loop, remaining loops on held-out data, held-out residual over time, errors.
 
-    Residuals are voltage errors seen as displacement through the mean gain, µm. Raises OSError from the disk.
+    Residuals are voltage errors times the mean gain, µm. Raises OSError if the file cannot be written.
     """
     shown = [result for result in results if result.score is not None]
     drawn, axes = figure(2, 2, (12.0, 8.0), title, width_ratios=[1.0, 1.4])
@@ -52,7 +52,7 @@ def draw_identification(
     legend(remaining, loc="best")
 
     t_s = np.arange(len(test)) * dt_s
-    # The error of a straight line is many times larger and would hide the others; the plot above shows it.
+    # Without the linear model: its error is many times larger and is visible in the plot above.
     compared = [result for result in shown if result.name != "linear"] or shown
     for result in compared:
         error = result.error_V * abs(gain_um_per_V)
