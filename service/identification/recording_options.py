@@ -11,8 +11,8 @@ from sim.recordings import ColumnMap, Finding, Recording, load_map, read
 from sim.recordings.columns import QUANTITIES
 
 READING = """\
-Columns: t_s, u_V, y_um and, if present, u2_V, y2_um, monitor_V, temperature_C. Give other names and units by these
-options, or in a TOML file with the same names; they are never guessed. The ending selects the format: .csv and other
+Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
+options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
 text with a header line, .parquet (or a folder of a recorder's segments), .mat up to version 7, .npz, and the array
 files of piezo controllers.
 """
@@ -37,7 +37,7 @@ def add_mapping_arguments(parser: argparse.ArgumentParser) -> None:
         "--index", action="append", default=[], metavar="Q=:,0,2", help="part of an array of several dimensions"
     )
     group.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
-    group.add_argument("--sensor-late", type=int, metavar="N", help="the sensor column lags by N samples in the file")
+    group.add_argument("--sensor-late", type=int, metavar="N", help="the sensor column is N samples late in the file")
     group.add_argument("--delimiter", help="between the columns of a text file (default: as its header line shows)")
     group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default .)")
 
@@ -81,7 +81,7 @@ def _pairs(option: str, texts: list[str]) -> dict[str, str]:
 
 
 def parse_range(option: str, text: str | None) -> tuple[float | None, float | None]:
-    """(start, stop) in s from ``"2:40"``; an empty end gives None. Raises InputError."""
+    """``"2:40"`` as (2.0, 40.0) s; either end may be empty (None). Raises InputError."""
     if text is None:
         return None, None
     start, colon, stop = text.partition(":")
