@@ -26,7 +26,7 @@ _MODULES = {
     "EventLog": "events",
     "Service": "process",
     "axis_status": "status",
-    "load_axis": "models",
+    "load_axis": "axis_loading",
 }
 __all__ = [
     "Axis",
