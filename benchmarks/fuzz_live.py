@@ -25,8 +25,7 @@ from lab.testbed.rig import Rig
 from service.client.client import Client
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.storage.model_file import BundleMeta, write_bundle
 
 _STAGE, _AXIS = "fuzz", "x"

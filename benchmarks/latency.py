@@ -22,8 +22,7 @@ from benchmarks.sample_feed import AXIS, STAGE
 from lab.testbed.identified_stage import WINDOW
 from lab.testbed.side_processes import ECHO_KEY
 from service.client.client import Client
-from service.protocol.query import encode_query
-from service.protocol.reply import Answer, Trajectory, encode_reply
+from service.protocol.query import Answer, Trajectory, encode_query, encode_reply
 from service.runtime.session import open_client
 
 TRAJECTORY = 100

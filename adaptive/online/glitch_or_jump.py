@@ -23,11 +23,9 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.features import FeatureMap
 from adaptive.online.dead_reckoning import SLOPES, Reckoning
-from adaptive.online.envelope import EnvelopeConfig
-from adaptive.online.gates import REPEATED, AdmissionConfig
+from adaptive.online.gates import REPEATED, AdmissionConfig, EnvelopeConfig
 from adaptive.online.track import Step
-from adaptive.state_codec import prefixed, under
-from adaptive.types import BoolArray, FloatArray, StateDict
+from adaptive.types import BoolArray, FloatArray, StateDict, prefixed, under
 
 # --- The level at which readings settle. The distances r(k) of the readings from the dead-reckoned position are fitted:
 #

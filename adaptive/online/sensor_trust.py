@@ -34,8 +34,7 @@ import numpy as np
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, slope_of, tolerance_um
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, StateDict, prefixed, under
 
 # --- The check that always runs.
 

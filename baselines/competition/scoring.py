@@ -17,8 +17,7 @@ import numpy as np
 
 from adaptive.online import gates
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.config import CompetitionConfig
 

@@ -21,8 +21,7 @@ from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY, wait_followed
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client, wait_followed
 from service.storage.recorder import Recorder
 
 #: A process may end so much later than planned, s.

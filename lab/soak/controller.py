@@ -24,9 +24,8 @@ from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.protocol.reply import Trajectory
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.protocol.query import Trajectory
+from service.runtime.session import SURELY, open_client
 from service.runtime.stopping import StopSignal
 from service.stage_node.node import status_key
 

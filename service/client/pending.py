@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
-from service.protocol.query import MAX_PENDING, Pending
-from service.protocol.reply import Point, Trajectory
+from service.protocol.query import MAX_PENDING, Pending, Point, Trajectory
 
 #: Fewest samples under way that are kept. Only those after the newest snapshot matter, some tens of samples.
 #: While no samples arrive, all since that snapshot are kept, up to MAX_PENDING, because the stage may have turned.

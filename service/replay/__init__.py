@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.replay.pictures import draw_errors, draw_gates
-    from service.replay.replay import Replayed, covered, summary, write_gates
+    from service.replay.replay import Replayed, covered, draw_errors, draw_gates, summary, write_gates
 
 _MODULES = {
     "Replayed": "replay",
     "covered": "replay",
-    "draw_errors": "pictures",
-    "draw_gates": "pictures",
+    "draw_errors": "replay",
+    "draw_gates": "replay",
     "summary": "replay",
     "write_gates": "replay",
 }

@@ -17,8 +17,7 @@ import numpy as np
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits
 from service.answers.memory_tracking import MemoryTracker
@@ -29,13 +28,11 @@ from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, Sequen
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import Trajectory
+from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.competing import champion_of
 from service.server.events import EventLimiter, EventLog
-from service.server.learner_state import fingerprint
-from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive
+from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, fingerprint
 from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
 
 #: Baselines that may stand in for the model that learns, the best first: the one with hysteresis, whose form bounds it

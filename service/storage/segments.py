@@ -21,7 +21,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from service.background.priority import step_back
+from service.background.job import step_back
 from service.storage.atomic_write import PART, atomic_write
 from service.storage.journal import INDEX_MODULUS, Rows, read_journal
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from adaptive.scaling import MinMaxScaling
+from sim.chapter.forward_lssvm import MinMaxScaling
 
 
 def test_range_maps_to_zero_and_one() -> None:

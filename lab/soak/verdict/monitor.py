@@ -15,8 +15,7 @@ from lab.soak.task import AXIS, STAGE, ControlTask
 from lab.soak.verdict.observations import SampleSecond, SampleTracker
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.stage_node.node import status_key
 
 #: Events are kept up to this number, which lasts for months.

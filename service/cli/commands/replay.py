@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     write_gates(args.out / "gates.csv", done)
     write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
     if not args.no_pictures:
-        from service.replay.pictures import draw_errors, draw_gates
+        from service.replay.replay import draw_errors, draw_gates
 
         draw_errors(args.out / "errors.png", f"{args.data.name}: foretold, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)

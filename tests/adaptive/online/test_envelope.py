@@ -13,8 +13,7 @@ from adaptive.errors import InputError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
-from adaptive.online.envelope import EnvelopeConfig
-from adaptive.online.gates import AdmissionConfig
+from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL, Learner
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
 from adaptive.types import FloatArray, Sample, StateDict

@@ -17,8 +17,7 @@ import pytest
 
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning
-from adaptive.online.envelope import EnvelopeConfig
-from adaptive.online.gates import AdmissionConfig
+from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from adaptive.online.glitch_or_jump import Circumstances, Hold, Verdict, judge
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample, StateDict

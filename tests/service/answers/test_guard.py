@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from adaptive.errors import InputError
 from service.answers.guard import Limits, check_domain, guard
-from service.protocol.reply import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 
 LIMITS = Limits(-1.0, 9.0, 500.0, 0.0, 90.0)
 DT_S = 1e-3

@@ -15,13 +15,12 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
+from service.protocol import query as wire_flags
 from service.protocol import query as wire_query
-from service.protocol import reply as wire_flags
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError
 from service.protocol.model import decode_model, encode_model
-from service.protocol.query import decode_query, encode_query
-from service.protocol.reply import Answer, decode_reply, encode_reply
+from service.protocol.query import Answer, decode_query, decode_reply, encode_query, encode_reply
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 ANY = st.floats()

@@ -17,8 +17,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel, Sample
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sequence import RESTART_AFTER
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import NOT_FINITE_REPLACED, Trajectory
+from service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner

@@ -16,7 +16,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
 from service.server.axis_loading import load_axis
 from service.server.axis_loop import AxisLoop
-from service.server.latency import LatencyMeter
+from service.server.query_answers import LatencyMeter
 from service.server.status import axis_status
 from service.storage.model_file import Bundle, BundleMeta
 from tests.service.axes import loop_of

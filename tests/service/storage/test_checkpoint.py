@@ -21,10 +21,17 @@ from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
-from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import fingerprint
 from service.storage import checkpoint
-from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, decode_checkpoint, encode_checkpoint, is_kept
-from service.storage.checkpoint_keeper import CheckpointKeeper, restore_newest
+from service.storage.checkpoint import (
+    CheckpointFolder,
+    CheckpointKeeper,
+    CheckpointMeta,
+    decode_checkpoint,
+    encode_checkpoint,
+    is_kept,
+    restore_newest,
+)
 from service.storage.model_file import UNITS, Bundle, BundleMeta
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually

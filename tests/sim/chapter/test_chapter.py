@@ -15,8 +15,7 @@ from sim.chapter import published
 from sim.chapter.characterisation import characterise, loop_width
 from sim.chapter.experiments import DT_S, EVERY, Experiments, Score, experiments
 from sim.chapter.forward_lssvm import fit_memory, fit_two_inputs, posterior_mean
-from sim.chapter.modelling import ForwardRun, identify_forward, predict
-from sim.chapter.refine import refine_bouc_wen
+from sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
 from sim.signals.voltages import training_input
 
 DATA = Path(os.environ.get("DEHYST_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))

@@ -11,9 +11,17 @@ from baselines.bouc_wen.model import TABLE_2_1
 from baselines.fit import fit_bouc_wen
 from baselines.fit_report import Domain
 from sim.chapter.adaptive_loop import BlockConfig, replay, track_learning
-from sim.chapter.control import changing, learner_of, moving_mae, run_control
+from sim.chapter.control import (
+    changing,
+    chapter_reference,
+    control_references,
+    learner_of,
+    moving_mae,
+    run_control,
+    sine_reference,
+    training_reference,
+)
 from sim.chapter.experiments import DT_S, Score, experiments
-from sim.chapter.references import chapter_reference, control_references, sine_reference, training_reference
 from sim.stage.closed_loop import track
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
