@@ -27,7 +27,7 @@ from service.server.axis_loop import AxisLoop
 from service.storage.checkpoint import encode_checkpoint, restore_newest
 from service.storage.recorder import Recorder, RecorderConfig
 from tests.service.axes import loop_of
-from tests.service.storage.test_checkpoint import folder, make_axis, meta, recording, same
+from tests.service.storage.test_stored_files import folder, make_axis, meta, recording, same
 
 
 class Sink:
