@@ -1,6 +1,6 @@
 """Several online models learn from the same samples, and the one that predicts best is served.
 
-Every contestant is scored on fresh samples (`baselines.competition.scoring`). The champion is replaced only by a
+Every contestant is scored on fresh samples (`baselines.competition.contestants`). The champion is replaced only by a
 contestant that has been clearly better for a while (`baselines.competition.competition`), and callers pass to the
 new champion without a jump (`baselines.competition.champion`).
 
@@ -35,13 +35,15 @@ from adaptive.types import (
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.config import CompetitionConfig
 from baselines.competition.contestants import (
+    NOT_SCORED,
     ONLINE_KINDS,
+    Judge,
     Restart,
+    SmoothedMotion,
     fingerprint,
     online_form,
     with_deviation_of_at_least,
 )
-from baselines.competition.scoring import NOT_SCORED, Judge, SmoothedMotion
 
 # --- The rules by which a competition replaces its champion.
 

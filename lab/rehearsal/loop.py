@@ -22,7 +22,7 @@ from adaptive.types import FloatArray, InverseModel
 from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
 from lab.rehearsal.reference import Motion
 from service.answers.guard import Limits, guard
-from service.client.pending import PendingCommands
+from service.client.client import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.server.axis import Axis
 

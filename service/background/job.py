@@ -22,7 +22,7 @@ import numpy as np
 
 from adaptive.errors import DehystError
 from adaptive.types import FloatArray
-from service.storage.atomic_write import atomic_write
+from service.storage.output import atomic_write
 
 # --- Priority of processes: background jobs run at low priority, behind the process that answers queries.
 

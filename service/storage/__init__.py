@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         restore_newest,
     )
     from service.storage.model_file import Bundle, BundleMeta, read_bundle, write_bundle
-    from service.storage.output_folder import clear_output
+    from service.storage.output import clear_output
     from service.storage.recorder import Recorder, RecorderConfig
 
 _MODULES = {
@@ -32,7 +32,7 @@ _MODULES = {
     "CheckpointMeta": "checkpoint",
     "Recorder": "recorder",
     "RecorderConfig": "recorder",
-    "clear_output": "output_folder",
+    "clear_output": "output",
     "learn_again": "checkpoint",
     "read_bundle": "model_file",
     "restore_newest": "checkpoint",

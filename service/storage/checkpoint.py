@@ -25,7 +25,7 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
-from service.storage.atomic_write import atomic_write
+from service.storage.output import atomic_write
 from service.storage.segments import rows_behind
 
 # --- Files.

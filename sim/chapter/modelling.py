@@ -19,8 +19,7 @@ from baselines.bouc_wen.identify import identify_bouc_wen
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.prandtl_ishlinskii.identify import identify_mpi
 from baselines.prandtl_ishlinskii.model import MpiParameters
-from baselines.swarm.identification import swarm_bouc_wen, swarm_mpi
-from baselines.swarm.particle_swarm import SwarmConfig
+from baselines.swarm.identification import SwarmConfig, swarm_bouc_wen, swarm_mpi
 from sim.chapter import published
 from sim.chapter.experiments import DT_S, EVERY, Experiments, Record, Score
 from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm, fit_memory, fit_two_inputs

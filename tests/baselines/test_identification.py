@@ -22,8 +22,7 @@ from baselines.linear import identify_linear
 from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
 from baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights
 from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from baselines.swarm.identification import swarm_bouc_wen, swarm_mpi
-from baselines.swarm.particle_swarm import MissingTorchError, SwarmConfig, minimise
+from baselines.swarm.identification import MissingTorchError, SwarmConfig, minimise, swarm_bouc_wen, swarm_mpi
 
 # --- Identification: known parameters come back, scale and offset hold, bad recordings are refused by name.
 

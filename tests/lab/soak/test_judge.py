@@ -14,9 +14,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from lab.soak.controller import ControlTask
 from lab.soak.fault_plan import FAULT_KINDS, make_plan
 from lab.soak.session import unrecordable
-from lab.soak.task import ControlTask
 from lab.soak.verdict import outcome
 from lab.soak.verdict.interim import EVERY_S, InterimJudge
 from lab.soak.verdict.invariants import TRACKING_PCT
@@ -31,7 +31,7 @@ from lab.soak.verdict.observations import (
 )
 from lab.soak.verdict.outcome import report, verdict_line
 from service.protocol.samples import SampleBatch
-from service.storage import atomic_write
+from service.storage import output as storage_output
 from tests.lab.soak.soaked import broken, healthy, verdict
 
 # --- The judge of a soak, and the track that it judges from: every invariant is broken by what it is there for.
@@ -508,7 +508,7 @@ def test_a_file_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(atomic_write.os, "replace", fail)
+    monkeypatch.setattr(storage_output.os, "replace", fail)
     with pytest.raises(OSError, match="no space"):
         outcome.write_summary(path, {"verdict": "held"})
     assert json.loads(path.read_text()) == {"verdict": "running"}

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
+from lab.soak.controller import ControlTask
 from lab.soak.prober import OverlappingQueries, Prober
-from lab.soak.task import ControlTask
 from lab.soak.verdict.observations import FaultRecord, Observations
 from lab.soak.verdict.outcome import COLUMNS, write_seconds
 from service.protocol.errors import NoReplyError

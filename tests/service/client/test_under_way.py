@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import FADE_S
-from service.client.client import Client
-from service.client.pending import UNDER_WAY, continued, pending_before, with_pending
+from service.client.client import UNDER_WAY, Client, continued, pending_before, with_pending
 from service.protocol.errors import FieldError
 from service.protocol.query import (
     MAX_PENDING,

@@ -24,10 +24,9 @@ from service.intake.sequence import RESTART_AFTER
 from service.protocol.keys import Keys
 from service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
-from service.server.axis import Axis
+from service.server.axis import Axis, EventLimiter, EventLog
 from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
-from service.server.events import EventLimiter, EventLog
 from service.server.query_answers import LatencyMeter
 from service.server.status import axis_status
 from service.storage.model_file import Bundle, BundleMeta
@@ -454,6 +453,6 @@ def test_a_flood_keeps_the_newest() -> None:
 
 
 def test_a_program_without_logging_stays_quiet() -> None:
-    program = "from service.server.events import EventLog; EventLog('demo', 'x').note(1, 'learner_failed', 'no')"
+    program = "from service.server.axis import EventLog; EventLog('demo', 'x').note(1, 'learner_failed', 'no')"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

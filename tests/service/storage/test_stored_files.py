@@ -25,7 +25,6 @@ from service.server.axis_loop import AxisLoop
 from service.server.learner_supervisor import fingerprint
 from service.storage import checkpoint
 from service.storage import model_file as modelfile
-from service.storage.atomic_write import atomic_write
 from service.storage.checkpoint import (
     CheckpointFolder,
     CheckpointKeeper,
@@ -36,6 +35,7 @@ from service.storage.checkpoint import (
     restore_newest,
 )
 from service.storage.model_file import UNITS, Bundle, BundleMeta, read_bundle, write_bundle
+from service.storage.output import atomic_write
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually
 

@@ -18,7 +18,6 @@ from baselines.fit import fit_bouc_wen
 from baselines.fit_report import Domain
 from sim.chapter import published
 from sim.chapter.adaptive_loop import BlockConfig, replay, track_learning
-from sim.chapter.characterisation import characterise, loop_width
 from sim.chapter.control import (
     changing,
     chapter_reference,
@@ -29,7 +28,7 @@ from sim.chapter.control import (
     sine_reference,
     training_reference,
 )
-from sim.chapter.experiments import DT_S, EVERY, Experiments, Score, experiments
+from sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width
 from sim.chapter.forward_lssvm import MinMaxScaling, fit_memory, fit_two_inputs, posterior_mean
 from sim.chapter.modelling import ForwardRun, identify_forward, predict, refine_bouc_wen
 from sim.signals.voltages import training_input
