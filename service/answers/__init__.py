@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.answers.answering import Served, answer, derivatives, trust_by_age
+    from service.answers.answering import MemoryTracker, Served, answer, derivatives, trust_by_age
     from service.answers.fallback import Rules, answer_safely
     from service.answers.guard import Limits
-    from service.answers.memory_tracking import MemoryTracker
 
 _MODULES = {
     "Limits": "guard",
-    "MemoryTracker": "memory_tracking",
+    "MemoryTracker": "answering",
     "Rules": "fallback",
     "Served": "answering",
     "answer": "answering",

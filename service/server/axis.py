@@ -21,9 +21,8 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
-from service.answers.answering import Served, answer, blends, learns
+from service.answers.answering import MemoryTracker, Served, answer, blends, learns
 from service.answers.guard import Limits
-from service.answers.memory_tracking import MemoryTracker
 from service.background.retuning.adoption import Retuned
 from service.config.settings import LEARN, AxisConfig
 from service.intake.clock import SampleClock

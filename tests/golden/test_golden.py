@@ -69,7 +69,7 @@ from service.protocol.samples import (
     encode_samples,
     joined,
 )
-from service.replay.replay import covered, replay
+from service.replay import covered, replay
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.stage_node.faults import CHANGE, DELIVERY, READING, Fault, Injector

@@ -26,7 +26,7 @@ from service.intake.sequence import (
     MOST_CONFIRMATIONS as MOST,
 )
 from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.replay.replay import sequence
+from service.replay import sequence
 from service.server.axis import Axis
 from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
