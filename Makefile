@@ -7,12 +7,12 @@ SEED   ?= 0
 # Tests that only compute, which may share all cores.
 PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
           tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/benchmarks/test_house_bench.py \
-          $(addprefix tests/lab/soak/,test_interim.py test_judge.py test_schedule.py test_voltages.py) \
+          $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_voltages.py) \
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
-          protocol/test_container.py protocol/test_keys.py protocol/test_payloads.py runtime/test_logging_setup.py \
-          server/test_axis.py server/test_competing.py server/test_model_watch.py server/test_status_counters.py \
-          storage/test_atomic_write.py storage/test_checkpoint.py storage/test_model_file.py viewer/test_scene.py)
+          protocol/test_payloads.py runtime/test_logging_setup.py \
+          server/test_axis.py server/test_competing.py server/test_model_watch.py \
+          storage/test_stored_files.py viewer/test_scene.py)
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
 PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \
           $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \

@@ -1,9 +1,9 @@
-"""Identification: from a recording to an inverse LSSVM and a report of its errors.
+"""Identification of an inverse LSSVM from a recording, with a report of its errors.
 
-``inputs="two"`` is the chapter: displacement and its backward difference after a zero-phase 50 Hz low-pass, a bias,
-a radial kernel. ``inputs="memory"`` is what is served by default: a linear part over motion, play operators and slow
-states with a Gaussian prior, so that a short recording determines some twenty coefficients safely, and a kernel for the
-residual.
+``inputs="two"`` is the chapter's model: displacement and its backward difference after a zero-phase 50 Hz low-pass, a
+bias, and a radial kernel. ``inputs="memory"`` is the default of the service: a linear part of motion, play operators
+and slow states, plus a kernel for its residual. A Gaussian prior makes sure that a short recording determines the
+coefficients of the linear part.
 """
 
 from __future__ import annotations
@@ -28,10 +28,15 @@ from adaptive.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class IdentifyConfig:
-    """n: support vectors. plays, slow: number of play operators and of slow states (0.1 s and up, log-spaced).
+    """Settings of `identify_lssvm`.
 
-    kernel_plays : how many plays the kernel sees. heldout : share of the recording, its end, that is kept for judging.
-    cutoff_hz : of the smoother. tune : whether gamma and widths come from the evidence; else ``gamma``, ``width``.
+    n : number of support vectors. plays : number of play operators, with log-spaced thresholds.
+    slow, slow_max_s : number of slow states, and the largest of their log-spaced time constants, s (smallest: 0.1 s).
+    arcs : path lengths of the arc states, as shares of the displacement range.
+    asymmetric : add the products of plays and displacement.
+    kernel_plays : number of plays among the kernel inputs.
+    heldout : share of the recording, at its end, that is used for the scores only.
+    cutoff_hz : of the smoother. tune : choose gamma and widths by the evidence; otherwise use ``gamma`` and ``width``.
     """
 
     n: int = 500
@@ -56,20 +61,20 @@ class IdentifyConfig:
             raise InputError(f"kernel_plays: got {self.kernel_plays}, expected 0 to {self.plays}")
 
 
-# --- Fit: the linear part with its Gaussian prior, then the kernel on the residual at spread-out rows, with the
-# regularisation and widths of the best evidence.
+# --- Fit: first the linear part with its Gaussian prior, then the kernel on the residual of a subset of the samples.
+# Gamma and the widths maximise the evidence.
 
 
-#: Prior standard deviations of the linear part as shares of the voltage range.
+#: Prior standard deviations of the linear part, as shares of the voltage range.
 PRIOR_FREE, PRIOR_MOTION, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRIOR_SLOW = (
     10.0, 0.3, 0.1, 0.05, 0.01, 0.03, 0.03,
 )  # fmt: skip
-#: Correlation time of a model's error, s: the samples within it count as one.
+#: Correlation time of the model error, s: samples within this time count as one measurement.
 CORRELATION_S = 0.02
 #: Smallest model error assumed for the linear part, as a share of the voltage range.
 ERROR_FLOOR = 5e-4
-#: Rows for the evidence, and the range of the search: above a gamma of 1e5 only digits are lost, below a width of 0.3
-#: the kernel does not interpolate between its samples.
+#: Number of rows for the evidence, and the search ranges. A gamma above 1e5 only loses precision; with a width below
+#: 0.3 the kernel does not interpolate between the samples.
 EVIDENCE_ROWS = 240
 SEARCH = InferenceConfig(
     starts=((100.0, 1.0), (100.0, 4.0)), gamma_range=(1.0, 1e5), width_range=(0.3, 12.0), iterations=20
@@ -87,7 +92,12 @@ def prior_deviations(features: FeatureMap, u_range_V: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Result of a fit: linear part with its covariance, support vectors with their weights, variances in V²."""
+    """Fitted coefficients.
+
+    beta (p,), covariance (p, p) : linear part, V per normalised input, and its covariance, V².
+    support (n, d), alpha (n,) : support vectors and their weights.
+    noise_variance : mean square leave-one-out error, V². kernel_variance : scale of the kernel, V².
+    """
 
     beta: FloatArray
     covariance: FloatArray
@@ -100,7 +110,7 @@ class Fit:
 def _linear(
     features: FeatureMap, basis: FloatArray, target: FloatArray, u_range_V: float, dt_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Posterior mean (p,) and covariance (p, p) of the linear part; its noise level from its own residual."""
+    """Posterior mean (p,) and covariance (p, p) of the linear part; the noise level is the rms of its residual."""
     precision = np.diag(prior_deviations(features, u_range_V) ** -2.0)
     gram, moment = basis.T @ basis, basis.T @ target
     repeats = max(1.0, CORRELATION_S / dt_s)
@@ -116,13 +126,16 @@ def _linear(
 
 
 def select(kernel: FloatArray, widths: FloatArray, n: int) -> NDArray[np.int64]:
-    """Indices of n spread-out rows: farthest-point sampling in scaled kernel inputs (m, d), deterministic."""
+    """Indices of at most n rows of the kernel inputs (m, d), evenly in time and by farthest-point sampling.
+
+    Deterministic. ``widths`` (d,) scale the distances.
+    """
     m = kernel.shape[0]
     if n >= m:
         return np.arange(m)
     scaled = kernel / widths
     chosen = np.empty(n, dtype=np.int64)
-    # Half evenly in time, so that their density follows the recording; the others by largest distance.
+    # The first half evenly in time, so that their density follows the recording; the others by largest distance.
     chosen[: n // 2] = np.linspace(0, m - 1, n // 2).astype(np.int64)
     distance = np.full(m, np.inf)
     for k in range(n):
@@ -141,7 +154,7 @@ def tune(
     dt_s: float,
     config: IdentifyConfig,
 ) -> tuple[float, FloatArray]:
-    """(gamma, widths (d,)) by the evidence on the targets of the kernel."""
+    """(gamma, widths (d,)) that maximise the evidence of the kernel part: basis (n, p), inputs (n, d), u_V (n,)."""
     target = u_V
     if features.linear:
         beta, _ = _linear(features, basis, u_V, float(np.ptp(u_V)), dt_s)
@@ -160,7 +173,7 @@ def fit_model(
     gamma: float,
     widths: FloatArray,
 ) -> Fit:
-    """The model of basis (n, p), kernel inputs (n, d) and voltages (n,) with these hyper-parameters."""
+    """Fit the model to basis (n, p), kernel inputs (n, d) and voltages (n,), V, with given gamma and widths (d,)."""
     u_range = float(np.ptp(u))
     rows = select(kernel, widths, config.n)
     if not features.linear:
@@ -183,9 +196,10 @@ def fit_model(
 
 
 def evidence_search(kernel: FloatArray, target: FloatArray) -> tuple[float, FloatArray]:
-    """(gamma, widths (d,)) of the best evidence for kernel inputs (n, d) and targets (n,), on ``EVIDENCE_ROWS`` rows.
+    """(gamma, widths (d,)) with the largest evidence for kernel inputs (n, d) and targets (n,).
 
-    Targets are normalised, so that the search is the same whatever the voltage.
+    At most ``EVIDENCE_ROWS`` evenly spaced rows are used. The targets are normalised, so that the search ranges do not
+    depend on the voltage range.
     """
     step = max(1, -(-target.size // EVIDENCE_ROWS))
     spread = float(np.std(target)) or 1.0
@@ -199,10 +213,11 @@ def evidence_search(kernel: FloatArray, target: FloatArray) -> tuple[float, Floa
 
 @dataclass(frozen=True, slots=True)
 class IdentificationReport:
-    """Result of an identification. Errors are those of the inverse model: voltages in V, percent of the voltage range.
+    """Result of an identification. Errors are voltage errors of the inverse model; ``_pct`` : of the voltage range.
 
-    train : on the first part of the recording. heldout : free run over its last part, which was not learnt;
-    ``heldout_rmse_um`` is that voltage error as a displacement, by the mean gain.
+    train : errors on the first part of the recording. heldout : errors of a free run over the last part, with a model
+    that was fitted to the first part only. heldout_rmse_um : the rms voltage error times the mean gain.
+    heldout_u_V, heldout_model_V : (m,) applied and modelled voltage of the last part.
     """
 
     samples: int
@@ -221,9 +236,9 @@ class IdentificationReport:
 
 Inputs = Literal["two", "memory"]
 
-#: Dead band of the arc states' path, in standard deviations of what the smoother takes out.
+#: Dead band of the arc states, in standard deviations of the noise that the smoother removes.
 DEAD_SIGMA = 4.0
-#: Play thresholds as shares of the displacement range: log-spaced between these.
+#: Smallest and largest play threshold, as shares of the displacement range.
 THRESHOLD_MIN, THRESHOLD_MAX = 0.006, 0.45
 
 
@@ -235,9 +250,9 @@ def identify_lssvm(
     config: IdentifyConfig | None = None,
     name: str | None = None,
 ) -> tuple[LssvmInverse, IdentificationReport]:
-    """Identify the inverse model of a stage from (n,) voltages and displacements ``dt_s`` apart.
+    """Identify the inverse model of a stage from (n,) voltages and displacements, ``dt_s`` apart.
 
-    Raises InputError on shapes, non-finite values, too short a recording, or a stage that did not move.
+    Raises InputError on wrong shapes, non-finite values, fewer than 100 samples, or a stage that did not move.
     """
     config = config or IdentifyConfig()
     u, y = np.ascontiguousarray(u_V, dtype=np.float64), np.ascontiguousarray(y_um, dtype=np.float64)
@@ -303,7 +318,7 @@ def identify_lssvm(
 
 
 def design_features(motion: FloatArray, dt_s: float, config: IdentifyConfig, memory: bool) -> FeatureMap:
-    """The map for a recording: ranges from its (n, 3) motion, thresholds as shares of the displacement range."""
+    """Feature map for a recording: ranges from its (n, 3) motion, thresholds as shares of the displacement range."""
     y = motion[:, 0]
     span = float(np.ptp(y))
     plain = FeatureMap(
@@ -311,7 +326,7 @@ def design_features(motion: FloatArray, dt_s: float, config: IdentifyConfig, mem
         y_min_um=float(y.min()),
         y_max_um=float(y.max()),
         v_scale_um_per_s=max(float(np.abs(motion[:, 1]).max()), 1e-9 * span),
-        # Not a share of the peak, which follows the noise. 10 Hz over the whole range is a scale, not a limit.
+        # The measured peak depends on the noise. Therefore: the acceleration of a 10 Hz sine over the whole range.
         a_scale_um_per_s2=0.5 * span * (2.0 * np.pi * min(10.0, 0.05 / dt_s)) ** 2,
         linear=False,
         y_rest_um=float(y[0]),

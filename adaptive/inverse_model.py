@@ -19,8 +19,7 @@ from adaptive.compiled import compiled, compiled_reassociating, dot
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
-from adaptive.state_codec import prefixed, under
-from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
+from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict, prefixed, under
 
 # --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
 

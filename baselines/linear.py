@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adaptive.errors import InputError
-from adaptive.state_codec import prefixed, under
-from adaptive.types import Feedforward, FloatArray, StateDict
+from adaptive.types import Feedforward, FloatArray, StateDict, prefixed, under
 from baselines.bounded_least_squares import SLOPE_FLOOR
 from baselines.fit_report import Domain, FitReport
 from baselines.online_baseline import field_of

@@ -23,8 +23,16 @@ from adaptive.online.gates import (
     TIMING,
     UNEXCITED,
 )
-from adaptive.state_codec import prefixed
-from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
+from adaptive.types import (
+    FloatArray,
+    Hyperparameters,
+    InverseModel,
+    OnlineModel,
+    Sample,
+    StateDict,
+    WindowData,
+    prefixed,
+)
 
 REASONS = (NOT_FINITE, DUPLICATE, OUT_OF_ORDER, TIMING, GAP, SETTLING, UNEXCITED, OUTLIER, NUMERICS)
 #: Relative error of a time step above which the sample is refused.

@@ -18,8 +18,7 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.online.gates import LEARNT, NUMERICS, PASSED, SETTLING, UNEXCITED
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, StateDict, prefixed, under
 from baselines.bounded_least_squares import bounded_minimum
 from baselines.online_baseline import OnlineBaseline, field_of
 

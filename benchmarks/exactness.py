@@ -26,7 +26,7 @@ from service.protocol.errors import ServiceError
 from service.protocol.samples import joined
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
-from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 
 #: Messages that the offline axis gets at a time; a live service never groups them so.

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.rehearsal.events import CLASSES, SENSOR, draw
+from lab.rehearsal.disturbance import CLASSES, SENSOR, draw
 
 PRESETS = ("random", "issue")
 #: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.

@@ -27,8 +27,8 @@ from typing import Any
 #: Modules whose branches guide the mutations; everything else runs at full speed. No modules with compiled functions:
 #: numba cannot compile what the fuzzer inserts.
 INSTRUMENTED = [
-    "service.protocol.samples", "service.protocol.reply", "service.protocol.query", "service.protocol.model",
-    "service.protocol.container", "service.storage.model_file", "service.operating.request", "service.protocol.errors",
+    "service.protocol.samples", "service.protocol.query", "service.protocol.query", "service.protocol.model",
+    "service.protocol.container", "service.storage.model_file", "service.operating.verbs", "service.protocol.errors",
     "service.storage.checkpoint", "service.stage_node.faults", "service.failover.state_transfer",
 ]  # fmt: skip
 _MAX_BYTES = 4096

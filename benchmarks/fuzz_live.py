@@ -20,13 +20,11 @@ import psutil
 from adaptive.errors import DehystError
 from benchmarks.fuzz_targets import models, seeds
 from benchmarks.mutations import mutated
-from lab.testbed.identified_stage import write_service_config
-from lab.testbed.rig import Rig
+from lab.testbed.identified_stage import Rig, write_service_config
 from service.client.client import Client
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.storage.model_file import BundleMeta, write_bundle
 
 _STAGE, _AXIS = "fuzz", "x"

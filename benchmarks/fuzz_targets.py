@@ -21,10 +21,10 @@ from adaptive.types import InverseModel
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from service.failover.state_transfer import join_parts
-from service.operating.request import Request, decode_request, encode_request
+from service.operating.verbs import Request, decode_request, encode_request
 from service.protocol import model as wire_model
 from service.protocol import query as wire_query
-from service.protocol import reply as wire_reply
+from service.protocol import query as wire_reply
 from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
 from service.stage_node.faults import decode_fault

@@ -20,10 +20,9 @@ from benchmarks.exactness import Adopted, exactness
 from benchmarks.latency_setup import CONNECT_S, RunningSetup, running_setup
 from benchmarks.sample_feed import AXIS, STAGE
 from lab.testbed.identified_stage import WINDOW
-from lab.testbed.side_processes import ECHO_KEY
+from lab.testbed.processes import ECHO_KEY
 from service.client.client import Client
-from service.protocol.query import encode_query
-from service.protocol.reply import Answer, Trajectory, encode_reply
+from service.protocol.query import Answer, Trajectory, encode_query, encode_reply
 from service.runtime.session import open_client
 
 TRAJECTORY = 100

@@ -13,9 +13,8 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from benchmarks.sample_feed import AXIS, STAGE
-from lab.testbed.identified_stage import WINDOW, identify_stage, write_service_config
+from lab.testbed.identified_stage import WINDOW, Rig, identify_stage, write_service_config
 from lab.testbed.processes import Child, free_port
-from lab.testbed.rig import Rig
 from sim.signals.references import demo_reference
 from sim.stage.presets import preset
 from sim.stage.stage import Stage

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.latency_setup import CONNECT_S, prepare
 from benchmarks.sample_feed import AXIS, STAGE
-from lab.testbed.rig import Rig
+from lab.testbed.identified_stage import Rig
 from service.client.client import Client
 from sim.recordings import read
 

@@ -16,8 +16,7 @@ from adaptive.types import FloatArray
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
-from service.runtime.delivery import SURELY, wait_followed
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client, wait_followed
 from service.runtime.stopping import StopSignal
 
 STAGE, AXIS = "bench", "x"

@@ -17,7 +17,7 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.signals.references import DemoReference, Motion, Reference, Sequenced, Shifted, Tones, in_band, strokes
-from sim.signals.sample_times import sample_times
+from sim.signals.voltages import sample_times
 from sim.stage.config import ParameterChange, StageConfig
 from sim.stage.presets import preset
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
@@ -45,6 +46,17 @@ def test_an_ability_is_a_protocol_not_a_string(measures: dict[str, Any]) -> None
 
 def test_nothing_frozen_is_changed(measures: dict[str, Any]) -> None:
     assert not measures["frozen changed"]
+
+
+def test_every_name_that_a_package_offers_can_be_imported() -> None:
+    """Names that are loaded on first use name their module by a string, which no type checker sees."""
+    missing = []
+    for folder in (p.parent for top in house.PACKAGES for p in (ROOT / top).rglob("__init__.py")):
+        package = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
+        offered = vars(package).get("__all__", ())
+        modules = {file.stem for file in folder.glob("*.py")} | {inner.name for inner in folder.iterdir()}
+        missing += [f"{package.__name__}.{name}" for name in {*offered} - modules if not hasattr(package, name)]
+    assert not missing
 
 
 @pytest.mark.parametrize("name", ["requirements.txt", "requirements-test.txt"])

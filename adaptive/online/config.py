@@ -6,12 +6,10 @@ from dataclasses import asdict, dataclass, field, replace
 
 from adaptive.errors import InputError
 from adaptive.online.drift import DriftConfig
-from adaptive.online.envelope import EnvelopeConfig
-from adaptive.online.gates import AdmissionConfig
+from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from adaptive.online.kernel_window import Eviction, WeightConfig
 from adaptive.smoothing import SmootherConfig
-from adaptive.state_codec import joined, under
-from adaptive.types import StateDict
+from adaptive.types import StateDict, joined, under
 from adaptive.window.config import SolverConfig
 
 

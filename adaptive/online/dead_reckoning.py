@@ -27,8 +27,7 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.features import FeatureMap, advance
 from adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, IntArray, StateDict
+from adaptive.types import FloatArray, IntArray, StateDict, prefixed, under
 
 #: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
 STEPS, SLOPE_SHARE = 2, 1e-5

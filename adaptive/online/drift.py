@@ -1,13 +1,13 @@
 """Drift of the stage: a Kalman filter on the model's linear part, detection of sudden changes, and creep at rest.
 
-The linear part ``beta`` is a random walk. Its process noise makes it fast without forgetting: large along beta itself
-(a change of the gain), in the constant (an offset), and in velocity and acceleration (a lag, a payload); small in every
-other coefficient. A gain drop of 6 % is one direction to find instead of twenty, so it is found within tens of
+The linear part ``beta`` is modelled as a random walk. The process noise is large in the directions of usual changes:
+along beta itself (gain), in the constant (offset), and in velocity and acceleration (lag, payload). It is small in all
+other coefficients. A gain drop of 6 % is therefore one unknown instead of twenty: the filter finds it within tens of
 milliseconds, and the play coefficients keep the shape of the loop.
 
-The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form), compiled: the library's calls and copies cost
-70 µs an update of 63 coefficients, as much as the rest of the learner. Tests and ``dehyst bench`` compare the two. The
-measurement is the voltage minus the kernel part of the model, so that filter and window learn one model together.
+The algebra is that of ``filterpy.kalman.KalmanFilter`` (Joseph form), compiled. The library takes 70 µs for one update
+of 63 coefficients, as much as the rest of the learner. Tests and ``dehyst bench`` compare the two. The measurement is
+the voltage minus the kernel part of the model, so that filter and window together fit one model.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from adaptive.types import FloatArray, StateDict
 
 # --- The drift filter's algebra, compiled: one scalar measurement of a random walk, in O(p²).
 #
-# The same filter as ``filterpy.kalman.KalmanFilter.update`` with one measurement, in Joseph's form and to rounding; the
-# tests hold it to that. Its products with (I - K h') are of rank one: worked out entry by entry they cost p² operations
-# instead of p³, without a copy or a call between them, at a twentieth of the time.
+# Equals ``filterpy.kalman.KalmanFilter.update`` with one measurement, in Joseph's form, up to rounding; a test compares
+# them. (I - K h') is the identity minus a matrix of rank one, so its products need p² operations instead of p³, without
+# copies. This takes a twentieth of the time.
 
 
 @compiled
 def open_gain(x: FloatArray, P: FloatArray, variance: float) -> None:  # pragma: no cover - compiled
-    """P <- P + variance x x': the direction of a change of the gain. ``x`` (p,), ``P`` (p, p)."""
+    """P <- P + variance x x': variance along x, the direction of a change of the gain. ``x`` (p,), ``P`` (p, p)."""
     for i in range(x.shape[0]):
         scaled = variance * x[i]
         for j in range(x.shape[0]):
@@ -40,7 +40,7 @@ def open_gain(x: FloatArray, P: FloatArray, variance: float) -> None:  # pragma:
 
 @compiled
 def walk(x: FloatArray, P: FloatArray, walks: FloatArray, gain_variance: float) -> None:  # pragma: no cover - compiled
-    """Prediction of a random walk: ``walks`` (p,) on the diagonal of P, and a walk of the gain along x."""
+    """Prediction step: add ``walks`` (p,) to the diagonal of P, and ``gain_variance`` along x."""
     for i in range(x.shape[0]):
         P[i, i] += walks[i]
     open_gain(x, P, gain_variance)
@@ -50,7 +50,7 @@ def walk(x: FloatArray, P: FloatArray, walks: FloatArray, gain_variance: float) 
 def innovation_of(
     x: FloatArray, P: FloatArray, h: FloatArray, z: float, towards: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """(z - h'x, h'Ph) of a measurement ``z`` along ``h`` (p,); ``towards`` (p,) becomes P h."""
+    """(z - h'x, h'Ph) of a measurement ``z`` of h'x; writes P h into ``towards`` (p,)."""
     p = x.shape[0]
     predicted = variance = 0.0
     for i in range(p):
@@ -78,7 +78,7 @@ def joseph(
 ) -> None:  # pragma: no cover - compiled
     """x <- x + K (z - h'x), P <- (I - K h') P (I - K h')' + noise K K', made exactly symmetric.
 
-    ``k`` and ``row`` are (p,) of scratch.
+    ``k`` and ``row`` are scratch arrays (p,).
     """
     innovation, variance = innovation_of(x, P, h, z, row)
     take_in(x, P, h, innovation, variance, noise, k, row)
@@ -101,7 +101,7 @@ def take_in(
         k[i] = row[i] / (variance + noise)
     for i in range(p):
         x[i] += k[i] * innovation
-    # P is symmetric, so that h'P is the row that P h is the column of.
+    # P is symmetric, so h'P is the transpose of P h.
     for i in range(p):
         s = 0.0
         for j in range(p):
@@ -121,7 +121,7 @@ def take_in(
 def update_constant(
     x: FloatArray, P: FloatArray, h: FloatArray, z: float, noise: float, row: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    """Joseph's form with a gain that is zero but for the first entry (Schmidt's filter: the rest is considered)."""
+    """Update of the first coefficient only: the gain of all others is set to zero (Schmidt-Kalman filter)."""
     p = x.shape[0]
     innovation, variance = innovation_of(x, P, h, z, row)
     variance += noise
@@ -140,19 +140,19 @@ def update_constant(
 
 @dataclass(frozen=True, slots=True)
 class DriftConfig:
-    """How fast each direction may walk (per square root of a second), and how much one measurement is trusted.
+    """Process noise of each direction (standard deviation after one second), measurement noise, and detection limits.
 
-    All but ``gain_*``, ``burst_ratio`` and the gate are shares of the model's voltage span.
+    All but ``gain_*``, ``burst_ratio`` and ``gate_*`` are shares of the model's voltage span.
 
-    gain_walk : relative change of the whole linear part. offset_walk : of the constant.
-    motion_walk : of the velocity and acceleration coefficients, at full scale of the feature map.
-    shape_walk : of all other coefficients.
-    noise : standard deviation of one measurement; larger than the sensor's, because errors of the model last.
-    burst_gain, burst_offset, burst_motion : deviations opened at once when a change is detected.
-    burst_ratio : detection threshold, short-term over long-term mean square innovation.
-    burst_floor : rms innovations below this are never a change.
-    gate_sigma : innovations beyond this many standard deviations are refused ...
-    gate_persistence : ... unless this many in a row are.
+    gain_walk : relative change of the whole linear part. offset_walk : change of the constant.
+    motion_walk : change of the velocity and acceleration coefficients, at full scale of the feature map.
+    shape_walk : change of all other coefficients.
+    noise : standard deviation of one measurement; larger than the sensor's, since model errors are correlated in time.
+    burst_gain, burst_offset, burst_motion : standard deviations that are added when a sudden change is detected.
+    burst_ratio : detection threshold: short-term over long-term mean square innovation.
+    burst_floor : an rms innovation below this is never a change.
+    gate_sigma : an innovation beyond this many standard deviations is refused ...
+    gate_persistence : ... but after this many refusals in a row the next one is used.
     """
 
     gain_walk: float = 0.005
@@ -179,7 +179,10 @@ class DriftConfig:
 
 @dataclass(slots=True)
 class DriftState:
-    """fast, slow : short and long-term mean square innovation, V². rejected : in a row. quiet : steps since a burst."""
+    """Counters of the filter. fast_V2, slow_V2 : short-term and long-term mean square innovation, V².
+
+    rejected : refused measurements in a row. quiet : updates since the last burst. bursts, updates : totals.
+    """
 
     fast_V2: float = 0.0
     slow_V2: float = 0.0
@@ -189,10 +192,10 @@ class DriftState:
     updates: int = 0
 
 
-#: Time constants of the innovation's short and long-term mean square, s.
+#: Time constants of the short-term and long-term mean square innovation, s.
 FAST_S = 0.008
 SLOW_S = 2.0
-#: No second burst within this time, s: the first one needs it to be used up.
+#: Shortest time between two bursts, s: the estimate needs this time to settle after one.
 DEAD_S = 0.25
 
 
@@ -202,7 +205,7 @@ class DriftFilter:
     Parameters
     ----------
     config : frozen configuration.
-    beta : (p,) starting value. covariance : (p, p) of it, V².
+    beta : (p,) initial estimate, and covariance : (p, p) its covariance, V².
     step_s : time between two updates, s. span_V : the model's voltage span, V.
     """
 
@@ -240,12 +243,14 @@ class DriftFilter:
         return self._P.copy()
 
     def update(self, basis: FloatArray, target_V: float, moving: bool, weight: float = 1.0) -> str:
-        """One measurement of ``basis' beta``. Returns "updated", "outlier" or "burst" (a change was detected).
+        """Update with one measurement ``target_V`` of ``basis' beta``; ``basis`` (p,).
 
-        At rest (``moving`` False) only the constant walks and only it is estimated: nothing else can be told apart
-        there. The rest of the covariance is considered, not learnt from (Schmidt's filter), so that minutes in one
-        place neither bend what is known of the others nor make the next motion's first samples count for too much.
-        ``weight`` : of the measurement, above 0; its noise variance is 1/weight of the ordinary.
+        Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
+
+        At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the
+        same basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at
+        one position would change the model at all others, and would give too much weight to the next motion's first
+        samples. ``weight`` : of the measurement, above 0; its noise variance is divided by it.
         """
         c, s, x, P = self.config, self.state, self._x, self._P
         if moving:
@@ -267,11 +272,11 @@ class DriftFilter:
         if s.fast_V2 > threshold and s.quiet * self.step_s > DEAD_S and moving:
             self.expect_change()
             outcome = "burst"
-        # The long-term level must not learn the change itself, or a second change would hide behind the first.
+        # Limited, so that a change does not raise the long-term level and hide the next change.
         s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
         if moving:
             if outcome == "burst":
-                # It has widened the covariance.
+                # The burst has changed the covariance.
                 innovation, variance = innovation_of(x, P, basis, target_V, self._row)
             take_in(x, P, basis, innovation, variance, noise_V2, self._k, self._row)
         else:
@@ -280,27 +285,27 @@ class DriftFilter:
         return outcome
 
     def expect_change(self) -> None:
-        """Open the directions in which a sudden change of the stage shows: gain, offset, velocity, acceleration."""
+        """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""
         walk(self._x, self._P, self._burst, self.config.burst_gain**2)
         self.state.quiet = 0
         self.state.bursts += 1
 
     def mark(self) -> tuple[FloatArray, FloatArray]:
-        """What ``go_back`` needs to return to the present estimate."""
+        """(beta, covariance) as copies, for `restore` and `go_back`."""
         return self.beta, self.covariance
 
     def restore(self, mark: tuple[FloatArray, FloatArray]) -> None:
-        """Return to a marked estimate as it was."""
+        """Return to a marked estimate."""
         self._x[:], self._P[:] = mark
 
     def go_back(self, mark: tuple[FloatArray, FloatArray]) -> None:
-        """Return to a marked estimate, ready for what may have changed since."""
+        """Return to a marked estimate, and add variance for changes since then."""
         self.restore(mark)
         self.state.rejected = 0
         self.expect_change()
 
     def shift_constant(self, by_V: float) -> None:
-        """Add to the constant, V: what another part of the model gives up."""
+        """Add ``by_V`` to the constant, V; another part of the model has lost as much."""
         self._x[0] += by_V
 
     def state_dict(self) -> StateDict:
@@ -338,27 +343,26 @@ class DriftFilter:
 
 # --- Creep at rest.
 
-#: Steps of the filter between two moves of the frame: a new feature map costs as much as a step.
+#: Updates of the filter between two moves of the frame: a new feature map takes as long as an update.
 _FRAME_EVERY = 10
-#: Largest move of the frame, as a share of the range a second: creep is slow.
+#: Fastest move of the frame, as a share of the range per second: creep is slow.
 _FASTEST_PER_S = 0.02
-#: Largest move of a voltage that holds a stage in place, as a share of the span a second. A stuck sensor shows a stage
-#: at rest too, but with a voltage that moves on.
+#: Fastest change of a voltage that holds a stage in place, as a share of the span per second. With a stuck sensor the
+#: stage seems to rest too, but the voltage changes faster.
 _STILL_PER_S = 0.1
 
 
 @dataclass(slots=True)
 class RestCreep:
-    """Creep of a stage at rest, and the move of the frame that follows from it.
+    """Creep of a stage at rest, and the move of the frame that compensates it.
 
-    To hold a creeping stage in place the voltage must creep back, and this small reversal enters the stage's
-    hysteresis. If the constant of the linear part took up the difference, the hysteresis of the model would stay as it
-    was, which shows as soon as the stage moves. Creep is a displacement without a voltage. As an offset of the feature
-    map's frame (``adaptive.features``) it lets the modelled hysteresis reverse as the voltage does.
+    To hold a creeping stage in place, the controller slowly reverses the voltage, and this reversal changes the stage's
+    hysteresis. If the constant of the linear part absorbed the change, the modelled hysteresis would not reverse, and
+    the model would be wrong as soon as the stage moves. Creep is a displacement without a change of voltage. Therefore
+    it becomes an offset of the feature map's frame (``adaptive.features``), and the modelled hysteresis reverses too.
 
-    constant_V : constant of the linear part when the rest began, NaN while the stage moves. steps : of the filter
-    since.
-    u_V : voltage at the last step that could move the frame.
+    constant_V : constant of the linear part when the rest began, NaN while the stage moves.
+    steps : updates of the filter since then. u_V : voltage at the last possible move of the frame.
     """
 
     constant_V: float = nan
@@ -366,16 +370,16 @@ class RestCreep:
     u_V: float = nan
 
     def leave(self) -> None:
-        """The stage moves: the constant keeps its value."""
+        """End the rest: the stage moves. The constant keeps its value."""
         self.constant_V, self.steps, self.u_V = nan, 0, nan
 
     def shift_um(
         self, constant_V: float, u_V: float, span_V: float, range_um: float, step_s: float, creep_s: float
     ) -> float:
-        """Move of the frame's offset, µm, after one more step of the filter at rest; mostly 0.
+        """Move of the frame's offset, µm, after one more update of the filter at rest; 0 for most updates.
 
-        ``constant_V`` is that of the linear part now, ``u_V`` the voltage; ``span_V`` and ``range_um`` those of the
-        model. The gain of the constant since the rest began moves to the frame with the time constant ``creep_s``
+        ``constant_V`` : present constant of the linear part. ``u_V`` : applied voltage. ``span_V``, ``range_um`` : of
+        the model. The change of the constant since the rest began moves to the frame with the time constant ``creep_s``
         (0: never).
         """
         if isnan(self.constant_V):
@@ -383,8 +387,8 @@ class RestCreep:
         self.steps += 1
         if creep_s <= 0.0 or self.steps % _FRAME_EVERY:
             return 0.0
-        went_V, self.u_V = abs(u_V - self.u_V), u_V
-        if went_V > _STILL_PER_S * span_V * _FRAME_EVERY * step_s:
+        change_V, self.u_V = abs(u_V - self.u_V), u_V
+        if change_V > _STILL_PER_S * span_V * _FRAME_EVERY * step_s:
             self.leave()
             return 0.0
         gained_um = (constant_V - self.constant_V) * range_um / span_V
@@ -396,7 +400,7 @@ class RestCreep:
 
     @classmethod
     def from_state(cls, values: StateDict) -> RestCreep:
-        """Inverse of ``state_dict``; older states have no entries: the stage moves."""
+        """Inverse of ``state_dict``; older states have no entries and give a moving stage."""
         if not values:
             return cls()
         try:

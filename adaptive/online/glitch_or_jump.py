@@ -1,11 +1,11 @@
-"""Readings far from the prediction: a glitch, ringing after a shock, a lasting jump, or a fault of the sensor?
+"""Classify readings far from the prediction: glitch, ringing after a shock, lasting jump, or sensor fault.
 
-From the first such reading on, samples are held back and not learnt. Dead reckoning continues from before it
-(``adaptive.online.dead_reckoning``). `judge` decides by the distances of the readings from the reckoned place:
+From the first such reading on, samples are held and not learnt. Dead reckoning continues from the sample before it
+(``adaptive.online.dead_reckoning``). `judge` decides by the distances of the readings from the dead-reckoned position:
 
 - back at the old level for ``CALM_S``: a glitch or a shock that is over;
 - ringing about the old level: motion of the stage; wait until it ends;
-- settled at a new level, by a distance or by a ratio that a jump may have: a jump, if the readings have moved that far
+- settled at a new level, at a distance or ratio that the envelope allows: a jump, if the readings have moved that far
   and still follow the stage;
 - anything else after ``UNDECIDED_S``: the sensor goes on trial (``adaptive.online.sensor_trust``).
 """
@@ -23,43 +23,41 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.features import FeatureMap
 from adaptive.online.dead_reckoning import SLOPES, Reckoning
-from adaptive.online.envelope import EnvelopeConfig
-from adaptive.online.gates import REPEATED, AdmissionConfig
+from adaptive.online.gates import REPEATED, AdmissionConfig, EnvelopeConfig
 from adaptive.online.track import Step
-from adaptive.state_codec import prefixed, under
-from adaptive.types import BoolArray, FloatArray, StateDict
+from adaptive.types import BoolArray, FloatArray, StateDict, prefixed, under
 
-# --- The level of a run of readings. The distances r(k) of the readings from the reckoned place are fitted by:
+# --- The level at which readings settle. The distances r(k) of the readings from the dead-reckoned position are fitted:
 #
-# - a level with ringing on it: r(k) = sum a_i r(k-i) + c + noise. A mode of the stage obeys this exactly with two
-#   coefficients, with a lag or a second mode three and four; without any it is a plain level. The level is
-#   c/(1 - sum a_i), its deviation follows from the covariance of the fit. Ringing of any frequency therefore is no
-#   level: after a shock the level is zero, however large the swing.
-# - the same of the shares r(k)/place(k): a change of the gain.
-# - a straight line: a drift under way.
+# - a constant level with ringing: r(k) = sum a_i r(k-i) + c + noise. One mode of the stage satisfies this exactly with
+#   two coefficients; a lag or a second mode needs three or four; no coefficients give a constant. The level is
+#   c/(1 - sum a_i); its standard deviation follows from the covariance of the fit. Ringing of any frequency does not
+#   shift the level: after a shock the level is zero, however large the amplitude.
+# - the same for the ratios r(k)/position(k): a change of the gain.
+# - a straight line with ringing: a drift in progress.
 #
-# The fit with the best Bayesian information criterion is taken. It decides only where the level is ``SIGMA`` deviations
-# outside the usual distance, or as many inside. Measured error rates: docs/learner.md.
+# The order with the best Bayesian information criterion is used. A level counts as inside or outside of the tolerance
+# only if it is ``SIGMA`` standard deviations away from the limit. Measured error rates: docs/learner.md.
 
 
-#: Most coefficients of ringing.
+#: Most coefficients for ringing.
 ORDERS = 4
-#: Deviations between a level and a limit for a decision.
+#: Standard deviations between a level and a limit that a decision needs.
 SIGMA = 5.0
-#: A recursion whose sum of coefficients is nearer to 1 than this has no level.
+#: If 1 minus the sum of the coefficients is smaller than this, the recursion has no level.
 NO_LEVEL = 0.05
-#: Values that a fit needs beyond two for each coefficient.
+#: Rows that a fit needs in addition to two per coefficient.
 SPARE = 4
 
 
 class Level(NamedTuple):
-    """The level at which readings settle.
+    """The level at which readings settle, in their unit.
 
     Attributes
     ----------
-    at, std : level at the last reading and its standard deviation, in the unit of the readings; infinite deviation
-    where there is none. residual : rms of what the fit leaves. order : coefficients of ringing.
-    rate : change of the level from one reading to the next.
+    at, std : level at the last reading and its standard deviation; infinite if there is no level.
+    residual : rms of the residual of the fit. order : number of ringing coefficients.
+    rate : change of the level per reading.
     """
 
     at: float
@@ -70,12 +68,12 @@ class Level(NamedTuple):
 
 
 def level_of(r: FloatArray, noise: float, drifts: bool = False) -> Level:
-    """The level of (n,) distances whose usual deviation is ``noise`` (above 0), in their unit.
+    """The level of (n,) distances ``r`` whose readings have the standard deviation ``noise`` (above 0, same unit).
 
-    ``drifts`` : a straight line in place of a constant. Fewer than six values have no level.
+    ``drifts`` : fit a straight line instead of a constant. Fewer than six values have no level.
     """
     out = np.array([math.nan, math.inf, math.inf, 0.0, 0.0])
-    # In units of its own size, so that no sum depends on the unit.
+    # Normalised, so that rounding does not depend on the unit.
     size = max(float(np.max(np.abs(r), initial=0.0)), noise)
     _fit(np.ascontiguousarray(r, dtype=np.float64) / size, noise / size, drifts, out)
     return Level(float(out[0]) * size, float(out[1]) * size, float(out[2]) * size, int(out[3]), float(out[4]) * size)
@@ -83,7 +81,7 @@ def level_of(r: FloatArray, noise: float, drifts: bool = False) -> Level:
 
 @compiled
 def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  # pragma: no cover - compiled
-    """Best order by the information criterion; ``out`` is [level, deviation, residual, order, rate]."""
+    """Fit all orders, keep the best by the information criterion; ``out`` is [level, std, residual, order, rate]."""
     n = r.shape[0]
     best = math.inf
     extra = 2 if drifts else 1
@@ -97,7 +95,7 @@ def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  #
                 X[i, j] = r[p + i - 1 - j]
             X[i, p] = 1.0
             if drifts:
-                # Counted backwards from the last reading, so that the constant is the level there.
+                # Zero at the last reading, so that the constant is the level there.
                 X[i, p + 1] = float(i - rows + 1)
         z = r[p:]
         normal = X.T @ X
@@ -108,37 +106,40 @@ def _fit(r: FloatArray, noise: float, drifts: bool, out: FloatArray) -> None:  #
         theta = inverse @ (X.T @ z)
         error = z - X @ theta
         variance = float(error @ error) / (rows - k)
-        gone, squares = 1.0, 1.0
+        remainder, squares = 1.0, 1.0
         lagged = 0.0
         for j in range(p):
-            gone -= theta[j]
+            remainder -= theta[j]
             squares += theta[j] * theta[j]
             lagged += theta[j] * (j + 1)
-        # Noise of the readings passes through the recursion; no fit is better than that.
-        told = rows * math.log(variance + 0.3 * noise * noise * squares) + k * math.log(float(rows))
-        told /= rows
-        if not told < best:
+        # The noise of the readings enters through every coefficient: no fit can have a smaller residual than this.
+        criterion = rows * math.log(variance + 0.3 * noise * noise * squares) + k * math.log(float(rows))
+        criterion /= rows
+        if not criterion < best:
             continue
-        best = told
+        best = criterion
         out[2], out[3] = math.sqrt(variance), float(p)
-        if gone < NO_LEVEL:
+        if remainder < NO_LEVEL:
             out[0], out[1], out[4] = math.nan, math.inf, 0.0
             continue
-        rate = theta[p + 1] / gone if drifts else 0.0
-        # With a line, r = level + rate i: the recursion shifts it by what its lags are of the rate.
-        level = (theta[p] - rate * lagged) / gone
+        rate = theta[p + 1] / remainder if drifts else 0.0
+        # On a line r(i) = level + rate i, a lag of j readings contributes -rate j a_j to the constant.
+        level = (theta[p] - rate * lagged) / remainder
         gradient = np.zeros(k)
         for j in range(p):
-            gradient[j] = level / gone
-        gradient[p] = 1.0 / gone
+            gradient[j] = level / remainder
+        gradient[p] = 1.0 / remainder
         spread = float(gradient @ inverse @ gradient)
         out[0], out[4] = level, rate
         out[1] = math.sqrt(max(variance, noise * noise) * max(spread, 0.0))
 
 
 class Slope(NamedTuple):
-    """A straight line y = constant + slope x: by least squares. std : of the slope. residual : rms. share : of the
-    variance of y that it explains, 0 to 1. swing : standard deviation of x."""
+    """Least-squares line y = constant + slope x.
+
+    std : standard deviation of the slope. residual : rms. share : share of the variance of y that the line explains,
+    0 to 1. swing : standard deviation of x.
+    """
 
     slope: float
     constant: float
@@ -149,7 +150,7 @@ class Slope(NamedTuple):
 
 
 def slope_of(x: FloatArray, y: FloatArray) -> Slope:
-    """Straight line of (n,) values ``y`` over (n,) values ``x``; n at least 3."""
+    """Least-squares line of (n,) values ``y`` over (n,) values ``x``; n at least 3."""
     n = x.size
     dx, dy = x - x.mean(), y - y.mean()
     xx, xy, yy = float(dx @ dx), float(dx @ dy), float(dy @ dy)
@@ -162,34 +163,34 @@ def slope_of(x: FloatArray, y: FloatArray) -> Slope:
     return Slope(slope, float(y.mean() - slope * x.mean()), std, math.sqrt(left / n), share, math.sqrt(xx / n))
 
 
-#: Readings in a row at the expected level that end a hold, at least.
+#: Fewest readings in a row at the expected level that end a hold.
 BACK_AGAIN = 2
-#: Samples without any reading, or with repeated ones, that are bridged at most.
+#: Most samples without a reading, or with a repeated one, that dead reckoning bridges.
 MOST_BRIDGED = 4096
-#: Time for which undecided readings are held, and ringing about the old level, s; samples of the first at least.
+#: Longest hold of undecided readings, and of ringing about the old level, s; fewest samples for the first.
 UNDECIDED_S, RINGING_S, UNDECIDED_SAMPLES = 0.04, 0.6, 40
-#: A jump of place that scales the displacement by less than this, or more than its inverse, is taken for an offset.
+#: A jump is a change of gain if the displacement changes by a ratio between this and its inverse, else an offset.
 JUMP_RATIO = 0.85
-#: Share of the way gone by which the old level may be missed, and the most that this allows, as a share of the range.
+#: Tolerance of the old level: this share of the travelled distance, at most this share of the range.
 WAY_SHARE, WAY_MOST = 0.03, 0.02
-#: Deviation of a level, as a share of it and of what is usual, beyond which it is not yet known.
+#: A level is known if its standard deviation is below this share of the level, or of the tolerance.
 LEVEL_STD, USUAL_STD = 0.03, 0.3
-#: Values that a level is worked out from at most, and the shortest time between two of them, s: noise hides the
-#: curvature of a mode between readings that follow each other faster.
+#: Most values for a level, and the shortest time between two of them, s. With shorter spacing, noise hides the
+#: curvature of a mode.
 VALUES, SPACING_S = 64, 5e-4
 #: Time that readings at a new level must span, s: a glitch of the sensor's electronics lasts some milliseconds.
 SPAN_S = 0.008
-#: Sizes of the windows, in such values, that are tried beside the longest.
+#: Number of values in the shorter windows that are tried after the longest.
 WINDOWS = (28, 16)
-#: Time for which a reading repeats itself under a stage that moves, s, after which it is no lost sample but a fault.
+#: A reading that repeats for this time, s, while the stage moves is a fault and not a lost sample.
 STUCK_S = 0.1
-#: Time for which readings must be where they must be, s.
+#: Time for which readings must be at the expected level, s.
 CALM_S = 0.005
-#: Share of a level that drifts at which its first reading may have been, and how much faster than with the stage, in
-#: proportion to the place, it may drift beyond that.
+#: A drift may begin at no more than this share of its present level. A larger first reading is still allowed if the
+#: drift is at most this many times faster than a change of gain would be from the motion of the stage.
 BEGUN, WITH_STAGE = 0.6, 2.0
-#: Between what slopes readings follow the stage, and the stage's way from which on that is asked, as a share of the
-#: range, for a jump, and to lose the trust without waiting.
+#: Slopes between which readings follow the stage. Travel of the stage from which on the slope is tested, as a share of
+#: the range: for a jump, and for a sensor fault without further waiting.
 FOLLOWING, MOTION_SHARE, SHOWN_SHARE = (0.6, 1.7), 0.004, 0.015
 
 
@@ -204,15 +205,17 @@ class Verdict(Enum):
 
 
 class Circumstances(NamedTuple):
-    """Limits and units by which the readings of a hold are judged.
+    """Limits and scales by which the readings of a hold are judged.
 
     Attributes
     ----------
-    config, envelope : limits. dt_s : sample time. range_um : of the model.
-    noise_um : usual deviation of a reading from the smoother's prediction. usual_um : distance up to which a reading is
-    no surprise. stuck_um : way of the stage under readings that stay equal, from which on they are no chance.
-    rest_um : reading of the stage at rest without voltage. low_um, high_um : readings at the ends of the range in which
-    the model is known. trusted : the sensor has not been wrong lately.
+    config, envelope : limits. dt_s : sample time. range_um : displacement range of the model.
+    noise_um : standard deviation of a reading from the smoother's prediction.
+    usual_um : largest distance of an ordinary reading from the prediction.
+    stuck_um : travel of the stage from which on equal readings cannot be a coincidence.
+    rest_um : reading of the stage at rest without voltage.
+    low_um, high_um : readings at the ends of the identified range.
+    trusted : no sensor fault lately.
     """
 
     config: AdmissionConfig
@@ -230,18 +233,18 @@ class Circumstances(NamedTuple):
 
 @dataclass(slots=True)
 class Hold:
-    """Samples held back, and the quantities that judge them.
+    """Held samples, and the quantities that `judge` uses.
 
-    reckoning : of the place meanwhile. last_um : the last trusted reading.
-    u_V, y_um, old_um : by sample: voltage, reading (NaN for none), and where it must be without any change.
-    slope, shift_um : after the jumps taken so far a reading must be at slope old + shift.
-    jumped : number of samples at the last of them, 0 for none. silent : number of samples at the last one without a
-    reading of its own.
-    level, away_um : of the level that ``judge`` has found: number of its first reading, and its distance.
-    seen_um : largest distance from where readings must be. good : readings in a row where they must be.
-    rang : number of samples when the readings were last found to swing about that, 0 for never.
-    same_um, same, low_um, high_um : last reading, how many in a row are equal to it, and between what places the stage
-    was meanwhile.
+    reckoning : dead reckoning since the last trusted reading ``last_um``.
+    u_V, y_um, old_um : for each sample: voltage, reading (NaN if there is none), and expected reading without a jump.
+    slope, shift_um : the jumps accepted so far; the expected reading is slope old + shift.
+    jumped : number of samples at the last of these jumps, 0 if there is none.
+    silent : number of samples at the last one without a reading, or with a stuck one.
+    level, away_um : the level that `judge` has found: index of its first reading, and its distance.
+    seen_um : largest distance from the expected reading. good : readings in a row at the expected level.
+    rang : number of samples at the last detection of ringing about the expected level, 0 if never.
+    same_um, same : last reading, and how many readings in a row are equal to it.
+    low_um, high_um : lowest and highest dead-reckoned position during those.
     """
 
     reckoning: Reckoning
@@ -264,7 +267,7 @@ class Hold:
     high_um: float = 0.0
 
     def put(self, u_V: float, y_um: float) -> None:
-        """Keep one sample, and advance the reckoned place."""
+        """Append one sample, and advance dead reckoning."""
         old_um = self.reckoning.advance(u_V)
         if y_um == self.same_um:
             self.same += 1
@@ -279,7 +282,7 @@ class Hold:
 
     @property
     def taken(self) -> bool:
-        """Whether a jump has been taken."""
+        """Whether a jump has been accepted."""
         return self.jumped > 0
 
     @property
@@ -288,12 +291,12 @@ class Hold:
         return self.slope * self.old_um[-1] + self.shift_um
 
     def take(self, slope: float, shift_um: float) -> None:
-        """A jump, from where readings have been up to now: to slope y + shift."""
+        """Accept a jump: a reading that was y is from now on slope y + shift."""
         self.slope, self.shift_um = slope * self.slope, slope * self.shift_um + shift_um
         self.jumped, self.good, self.rang = len(self.y_um), 0, 0
 
     def state_dict(self) -> StateDict:
-        """All of it under flat names."""
+        """The whole state under flat names."""
         state: StateDict = prefixed("reckoning.", self.reckoning.state_dict())
         for name in ("u_V", "y_um", "old_um"):
             state[name] = np.array(getattr(self, name), dtype=np.float64)
@@ -319,19 +322,19 @@ def is_stuck(hold: Hold, stuck_um: float) -> bool:
 
 
 def tolerance_um(now: Circumstances, reckoning: Reckoning) -> float:
-    """Largest distance of a good reading from the reckoned place, µm; it grows with the way gone."""
+    """Largest distance of a good reading from the dead-reckoned position, µm; it grows with the travelled distance."""
     way_um = min(WAY_SHARE * reckoning.way_um, WAY_MOST * now.range_um)
     return now.usual_um + way_um + reckoning.std_um
 
 
 def needed(config: AdmissionConfig, away_um: float, range_um: float, trusted: bool) -> int:
-    """Readings at one level beyond which it may be a jump."""
+    """Number of readings at one level that a jump must exceed."""
     usual = config.glitch_share <= abs(away_um) / range_um <= config.jump_share
     return config.glitch_persistence if trusted and usual else config.doubt_persistence
 
 
 def judge(hold: Hold, now: Circumstances) -> Verdict:
-    """Decide by the last sample of a hold. Updates the hold; for JUMP also its ``level`` and ``away_um``."""
+    """Decision after the last sample of a hold. Updates the hold; for JUMP also its ``level`` and ``away_um``."""
     n = len(hold.y_um)
     away_um = hold.y_um[-1] - hold.expected_um
     if math.isnan(away_um):
@@ -339,8 +342,8 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
     stuck = is_stuck(hold, now.stuck_um)
     if not stuck and abs(away_um) <= tolerance_um(now, hold.reckoning):
         hold.good += 1
-        # At once where the voltage explains what surprised the smoother, and after a single wrong reading; a stage that
-        # rings passes by its place again and again.
+        # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,
+        # readings must stay for CALM_S, because a ringing stage passes the expected level again and again.
         enough = max(BACK_AGAIN, round(CALM_S / now.dt_s))
         return Verdict.BACK if hold.good >= enough or n <= 2 else Verdict.WAIT
     hold.good = 0
@@ -351,7 +354,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         return Verdict.LOST if shown or n >= MOST_BRIDGED else Verdict.WAIT
     if hold.reckoning.lost:
         return Verdict.LOST
-    # Readings that clearly do not follow the stage: the sensor is wrong, no need to wait.
+    # Readings that clearly do not follow the stage show a sensor fault; no need to wait.
     if n * now.dt_s >= SPAN_S and n >= 10 and not _follow(hold, min(n, round(2 * SPAN_S / now.dt_s)), now, SHOWN_SHARE):
         return Verdict.LOST
     stride = max(1, round(SPACING_S / now.dt_s))
@@ -359,7 +362,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         found = _level(hold, now, stride)
         if found is not None:
             return found
-    # Without readings, or with repeated ones, nothing could be decided.
+    # Samples without a reading, or with a stuck one, do not count: nothing can be decided from them.
     waited = n - max(hold.jumped, hold.silent)
     if hold.rang and (n - hold.rang) * now.dt_s <= 0.5 * UNDECIDED_S:
         return Verdict.WAIT if waited * now.dt_s < RINGING_S else Verdict.MOTION
@@ -370,10 +373,10 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
 
 
 def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
-    """JUMP or WAIT where the readings have settled on a level or about the old one; None where they have not."""
+    """JUMP if the readings have settled at a new level, WAIT if they ring about the old one, None if undecided."""
     y, old = np.array(hold.y_um), hold.slope * np.array(hold.old_um) + hold.shift_um
-    none = np.flatnonzero(np.isnan(y))
-    first = int(none[-1]) + 1 if none.size else 0
+    missing = np.flatnonzero(np.isnan(y))
+    first = int(missing[-1]) + 1 if missing.size else 0
     first = max(first, y.size - VALUES * stride)
     usual_um = tolerance_um(now, hold.reckoning)
     for count in dict.fromkeys((y.size - first, *(size * stride for size in WINDOWS))):
@@ -381,20 +384,20 @@ def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
         if count < stride * 6 or count > y.size - first:
             continue
         part = slice(y.size - count, None)
-        r, place = _spaced(y[part] - old[part], stride), _spaced(old[part] - now.rest_um, stride)
+        r, position = _spaced(y[part] - old[part], stride), _spaced(old[part] - now.rest_um, stride)
         noise = now.noise_um / math.sqrt(stride)
         levels = [level_of(r, noise)]
-        if np.min(np.abs(place)) > 0.1 * now.range_um:
-            share = level_of(r / place * place[-1], noise)
-            if share.residual <= levels[0].residual:
-                levels.insert(0, share)
+        if np.min(np.abs(position)) > 0.1 * now.range_um:
+            scaled = level_of(r / position * position[-1], noise)
+            if scaled.residual <= levels[0].residual:
+                levels.insert(0, scaled)
         moving = level_of(r, noise, drifts=True)
-        # Where nothing else is known a line is: a frame that is not quite right moves slowly under the ringing.
-        level = next((one for one in (*levels, moving) if _known(one, usual_um)), None)
+        # The line comes last: an inaccurate frame causes slow motion under the ringing, which a line would fit too.
+        level = next((fit for fit in (*levels, moving) if _known(fit, usual_um)), None)
         if level is None:
             continue
         if abs(level.at) + SIGMA * level.std < usual_um:
-            # About the old level. A glitch that alternates looks like that too: it teaches as little.
+            # At the old level: ringing, or a glitch of alternating sign. Neither is learnt.
             hold.rang = y.size
             return Verdict.WAIT
         if level is moving and not _drifts(level, hold, count, now, stride):
@@ -406,51 +409,52 @@ def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
 
 
 def _spaced(x: FloatArray, stride: int) -> FloatArray:
-    """Means of ``stride`` neighbours each: ringing stays ringing, noise becomes less."""
+    """Means of groups of ``stride`` values: they keep the ringing and reduce the noise."""
     return x if stride == 1 else x.reshape(-1, stride).mean(axis=1)
 
 
 def _known(level: Level, usual_um: float) -> bool:
+    """Whether the standard deviation of a level is small enough for a decision."""
     return level.std <= max(LEVEL_STD * abs(level.at), USUAL_STD * usual_um)
 
 
 def _drifts(level: Level, hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
-    """Whether a level that moves may be a drift of the stage: slow enough, and not a sensor that stands still."""
+    """Whether a moving level can be a drift of the stage: slow enough, and not caused by a stuck sensor."""
     rate = abs(level.rate) / (stride * now.dt_s)
-    own = abs(hold.old_um[-1] - hold.old_um[-count]) / (count * now.dt_s)
-    # What drifts begins where it was: readings that are elsewhere at once and then go on from there are no drift. But
-    # the step that a gain makes moves with the stage.
-    place_um = max(abs(hold.old_um[-1] - now.rest_um), 0.1 * now.range_um)
+    stage_rate = abs(hold.old_um[-1] - hold.old_um[-count]) / (count * now.dt_s)
+    # A drift begins at the old level. Readings that start far from it and then move on are not a drift. An exception is
+    # the step of a changed gain: it grows with the displacement of the stage.
+    displacement_um = max(abs(hold.old_um[-1] - now.rest_um), 0.1 * now.range_um)
     begun_um = hold.y_um[hold.jumped] - hold.slope * hold.old_um[hold.jumped] - hold.shift_um
-    if abs(begun_um) > BEGUN * abs(level.at) and rate > WITH_STAGE * own * abs(level.at) / place_um:
+    if abs(begun_um) > BEGUN * abs(level.at) and rate > WITH_STAGE * stage_rate * abs(level.at) / displacement_um:
         return False
     follows = slope_of(np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:]))
     shown = follows.slope - 2.0 * follows.std > 0.5
-    return rate <= now.envelope.drift_per_s * now.range_um and (shown or own < 0.3 * rate)
+    return rate <= now.envelope.drift_per_s * now.range_um and (shown or stage_rate < 0.3 * rate)
 
 
 def _is_jump(level: Level, hold: Hold, count: int, r: FloatArray, usual_um: float, now: Circumstances) -> bool:
-    """Whether a level is one to believe: beyond doubt, long enough, of a size that a stage has, and shown."""
+    """Whether a level is a jump: significant, long enough, allowed by the envelope, and with readings that follow."""
     away = abs(level.at)
-    # Outside the identified range the model itself may be off by as much.
+    # Outside of the identified range the model itself may have an error as large as this.
     if not now.low_um <= hold.expected_um <= now.high_um:
         return False
     if away - usual_um <= SIGMA * level.std or away > now.envelope.jump * now.range_um:
         return False
     if count <= needed(now.config, level.at, now.range_um, now.trusted) or count * now.dt_s < SPAN_S:
         return False
-    # It claims no more than what the readings themselves are away by, nor more than they have moved.
+    # The level must lie within the measured distances, and must not exceed the motion of the readings.
     spread = 3.0 * now.noise_um
     if not float(r.min()) - spread <= level.at <= float(r.max()) + spread:
         return False
     readings = np.array(hold.y_um)
     moved = float(np.nanmax(np.abs(readings - hold.last_um))) + hold.reckoning.way_um + now.usual_um
-    # A sensor that stands still looks settled over a short while: all readings since the surprise are asked.
+    # A stuck sensor looks settled over a short window, so all readings since the last jump must follow as well.
     return away <= moved and _follow(hold, count, now) and _follow(hold, readings.size - hold.jumped, now)
 
 
 def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SHARE) -> bool:
-    """Whether the last ``count`` readings go where the stage goes; if it moves by ``share`` of the range, or more."""
+    """Whether the last ``count`` readings follow the stage. True if it moves by less than ``share`` of the range."""
     x, y = np.array(hold.old_um[-count:]), np.array(hold.y_um[-count:])
     good = ~np.isnan(y)
     x, y = x[good], y[good]
@@ -462,47 +466,47 @@ def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SH
 
 
 def jump_after(frame: FeatureMap, at_um: float, away_um: float) -> tuple[float, float]:
-    """(slope, shift in µm) of a jump by ``away_um`` at ``at_um``: a reading goes to slope y + shift.
+    """(slope, shift in µm) of a jump by ``away_um`` at the reading ``at_um``: a reading y becomes slope y + shift.
 
-    One jump cannot tell a gain from an offset. A gain about the rest position is assumed where there is displacement to
-    scale; the filter corrects it as the stage moves.
+    One jump does not show whether the gain or the offset has changed. A change of gain about the rest position is
+    assumed if the displacement is large enough; the filter corrects it as the stage moves.
     """
     rest_um = frame.offset_um + frame.gain * frame.y_rest_um
-    place = at_um - rest_um
-    ratio = 1.0 + away_um / place if place else math.inf
+    displacement_um = at_um - rest_um
+    ratio = 1.0 + away_um / displacement_um if displacement_um else math.inf
     if JUMP_RATIO < ratio < 1.0 / JUMP_RATIO:
         return ratio, (1.0 - ratio) * rest_um
     return 1.0, away_um
 
 
 def frame_after(frame: FeatureMap, slope: float, shift_um: float) -> FeatureMap:
-    """The frame in which readings that went to slope y + shift are the same displacements."""
+    """The frame after a jump from y to slope y + shift: the new readings give the same displacements as before."""
     return replace(frame, gain=slope * frame.gain, offset_um=slope * frame.offset_um + shift_um)
 
 
 def steps_of_motion(hold: Hold) -> tuple[Step, ...]:
-    """The samples held back, which were the stage's motion after all."""
+    """The held samples as steps of the track, where all readings were motion of the stage."""
     y_um = np.array(hold.y_um)
     return _steps_of(hold, y_um, np.isnan(y_um))
 
 
 def steps_of_hold(hold: Hold, usual_um: float) -> tuple[Step, ...]:
-    """The samples held back when readings are again where they must be: those before are bridged, ending there."""
+    """The held samples as steps of the track, once readings are as expected again; earlier readings are bridged."""
     y_um, n = np.array(hold.y_um), len(hold.y_um)
-    places = hold.slope * np.array(hold.old_um) + hold.shift_um
+    expected_um = hold.slope * np.array(hold.old_um) + hold.shift_um
     good = ~np.isnan(y_um)
     if hold.taken:
-        # Readings at the new level are as good as any; those on the way to it, or ringing, are not.
-        good &= (np.arange(n) >= hold.level) & (np.abs(y_um - places) <= usual_um)
-        return _steps_of(hold, np.where(good, y_um, places), ~good)
-    upto = n - max(hold.good, 1)
-    off = y_um[-1] - places[-1]
-    bridged = places + off * np.minimum(np.arange(1, n + 1) / (upto + 1), 1.0)
-    good[:upto] = False
+        # Use the readings at the new level, but not those on the way to it, nor ringing ones.
+        good &= (np.arange(n) >= hold.level) & (np.abs(y_um - expected_um) <= usual_um)
+        return _steps_of(hold, np.where(good, y_um, expected_um), ~good)
+    bridge = n - max(hold.good, 1)
+    off_um = y_um[-1] - expected_um[-1]
+    bridged = expected_um + off_um * np.minimum(np.arange(1, n + 1) / (bridge + 1), 1.0)
+    good[:bridge] = False
     return _steps_of(hold, np.where(good, y_um, bridged), ~good)
 
 
 def _steps_of(hold: Hold, y_um: FloatArray, bad: BoolArray) -> tuple[Step, ...]:
-    """The samples held back as steps of the track, with (n,) places; a bad one without a place is where it must be."""
-    places = np.where(np.isnan(y_um), hold.slope * np.array(hold.old_um) + hold.shift_um, y_um)
-    return tuple(Step(float(y), u, not no) for y, u, no in zip(places, hold.u_V, bad, strict=True))
+    """The held samples as steps of the track; where (n,) ``y_um`` is NaN, the expected reading is used."""
+    filled_um = np.where(np.isnan(y_um), hold.slope * np.array(hold.old_um) + hold.shift_um, y_um)
+    return tuple(Step(float(y), u, not no) for y, u, no in zip(filled_um, hold.u_V, bad, strict=True))

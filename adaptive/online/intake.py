@@ -31,8 +31,7 @@ from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Ve
 from adaptive.online.sensor_trust import CONFIRMED, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother
-from adaptive.state_codec import joined, prefixed, under
-from adaptive.types import FloatArray, Sample, StateDict
+from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, under
 
 # --- What a intake holds beside its numbers, as flat entries and back.
 

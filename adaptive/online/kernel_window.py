@@ -11,8 +11,7 @@ from adaptive import kernels
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
+from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, prefixed, under
 from adaptive.window import arrays as ws
 from adaptive.window.arrays import Status
 from adaptive.window.config import SolverConfig, WindowConfig

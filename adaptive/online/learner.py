@@ -27,8 +27,18 @@ from adaptive.online.intake import Intake
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.track import Pair
 from adaptive.online.validity import Delay, Judgement
-from adaptive.state_codec import joined, prefixed, under
-from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
+from adaptive.types import (
+    FloatArray,
+    Hyperparameters,
+    InverseModel,
+    OnlineModel,
+    Sample,
+    StateDict,
+    WindowData,
+    joined,
+    prefixed,
+    under,
+)
 
 Mark = tuple[FloatArray, FloatArray]
 

@@ -1,24 +1,25 @@
-"""Trust in the sensor: does it follow the drive, and what is wrong with it where it does not?
+"""Check of the sensor: whether its readings follow the drive, and which fault it has if they do not.
 
-**All the time** `Following` compares readings with the drive. A sensor that sticks with some noise, or whose gain
-creeps away, does not surprise the smoother. So the identified model gives the voltage p for the motion that was read,
-and the steps of p are compared with the steps of the applied voltage u. A step ends when one of the two has moved far
-enough, beyond the noise that readings cause in p. All steps count alike, whatever their size. A fault shows as readings
-that stand still in several steps in a row, as a slope p/u that no stage has, or as steps that do not lie on a line.
+**Always** (`Following`). The smoother does not notice a sensor that sticks with some noise, or whose gain drifts
+slowly. Therefore the identified model computes the voltage p that belongs to each reading, and the steps of p are
+compared with the steps of the applied voltage u. A step ends when u or p has moved far enough, well above the noise of
+p. All steps have the same weight, whatever their size. Three results show a fault: the readings stand still in several
+steps in a row, the slope p/u is one that no stage has, or the steps do not lie on a straight line.
 
-**On trial** (`Trial`) readings teach nothing and move no frame. Dead reckoning carries the hysteresis memory on. The
-readings y are compared with the reckoned places x over a window of ``envelope.follow_s`` of motion:
+**On trial** (`Trial`). Readings of a suspected sensor neither train the model nor move its frame. Dead reckoning
+advances the hysteresis memory. The readings y are compared with the dead-reckoned positions x over a window of
+``envelope.follow_s`` of motion:
 
-    y = slope x + constant, share = share of the variance of y that this explains
+    y = slope x + constant, share = share of the variance of y that this line explains
 
-- share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
-- readings that hardly vary: ``sensor_stuck``; a negative slope: ``sensor_sign``; another slope: ``sensor_gain``; no
-  straight line: ``sensor_foreign``. The fault is named when ``NAMED`` looks in a row have found it.
-- a stage at rest shows only whether a reading is where it was before.
+- Share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
+- Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. Another slope: ``sensor_gain``. No
+  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it.
+- A stage at rest only shows whether the reading is the same as before.
 
-A wrong reckoning must not shut out a good sensor. The identified model is therefore asked for the voltage p of the
-readings here too: where p follows the applied voltage u, no fault is named, and after ``OBEYED`` windows the readings
-are trusted whatever the reckoning says.
+Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
+While p follows the applied voltage u, no fault is reported. After ``OBEYED`` such windows the readings are trusted,
+even if they contradict dead reckoning.
 """
 
 from __future__ import annotations
@@ -33,39 +34,42 @@ import numpy as np
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, slope_of, tolerance_um
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, StateDict, prefixed, under
 
-# --- All the time.
+# --- The check that always runs.
 
-#: Size of a step: this share of the voltage span, and this many times the noise of p.
+#: Smallest step, as a share of the voltage span and as a multiple of the noise of p; the larger of the two applies.
 STEP_SHARE, STEP_SIGMA = 0.004, 8.0
-#: Pairs over which that noise is averaged.
+#: Number of pairs (u, p) over which this noise is averaged.
 NOISE_PAIRS = 250
-#: Shortest time of a step, s: over it, ringing of the stage is small compared with the motion.
+#: Shortest duration of a step, s. Within it the motion becomes large compared with ringing of the stage.
 STEP_S = 0.01
-#: Forgetting factor of a step; fewest steps for a decision; share of the steps in which the voltage must have moved.
+#: Forgetting factor for each step; fewest steps for a decision; share of the steps in which the voltage must move.
 FORGET, ENOUGH, OF_VOLTAGE = 0.9, 3.4, 0.7
-#: A voltage slower than this share of the span a second may only hold a creeping stage in place.
+#: Steps slower than this share of the span per second are not used: such a voltage may just compensate creep.
 CREEP_PER_S = 0.05
 #: Fewest steps for a decision by the slope.
 ENOUGH_SLOPE = 6.0
-#: Slopes that a stage can have, hysteresis and a wrong model included, and the smallest squared correlation.
+#: Slopes p/u that a stage can have, with hysteresis and a wrong model allowed for; smallest squared correlation.
 FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
-#: A reading that moves by less than this share of the voltage's step stands still; number of such steps for a fault.
+#: A reading stands still if p moves by less than this share of the step of u; number of such steps for a fault.
 STEP_STILL, STILL_STEPS = 0.2, 4
-#: Good steps after which the readings so far are confirmed to have followed.
+#: Good steps in a row after which all readings so far count as confirmed.
 CONFIRMED = 10
 
 
 @dataclass(slots=True)
 class Following:
-    """Check of readings that raise no surprise: sums over the last steps, each a vector (u, p) whose larger part is 1.
+    """Check of readings that pass the gates: sums over the last steps.
 
-    u_V, p_V, steps : voltage and answer of the model at the end of the last step, and number of pairs since.
-    count, driven : number of steps, and of those in which the voltage moved, with forgetting as in the sums uu, pp, up.
-    good, still : steps in a row in which the readings followed, and stood still.
-    last_V, noise2 : last p - u, V, and mean square change of it from one pair to the next, V².
+    Each step is a vector (u, p), scaled so that its larger component is 1 or -1.
+
+    u_V, p_V : applied voltage, and voltage of the model for the reading, at the end of the last step.
+    steps : number of pairs since then.
+    count, driven : number of steps, and of steps in which the voltage moved; with forgetting.
+    uu, pp, up : sums of the products over the steps; with forgetting.
+    good, still : number of steps in a row in which the readings followed, and stood still.
+    last_V, noise2 : last p - u, V, and its mean square change between two pairs, V².
     """
 
     u_V: float = math.nan
@@ -82,16 +86,17 @@ class Following:
     noise2: float = 0.0
 
     def forget(self) -> None:
-        """Start again without history."""
+        """Discard all steps so far."""
         self.u_V = self.p_V = math.nan
         self.last_V = math.nan
         self.steps = self.good = self.still = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
 
     def take(self, u_V: float, p_V: float, span_V: float, dt_s: float) -> bool:
-        """Take one pair: the voltage, and the model's voltage for the reading. Returns whether a fault shows.
+        """Process one pair (u, p). Returns True if the last steps show a fault.
 
-        ``span_V`` : range of the drive, V. ``dt_s`` : time between two pairs, s.
+        ``u_V`` : applied voltage. ``p_V`` : the model's voltage for the reading. ``span_V`` : range of the drive, V.
+        ``dt_s`` : time between two pairs, s.
         """
         self.steps += 1
         change_V, self.last_V = p_V - u_V - self.last_V, p_V - u_V
@@ -117,7 +122,7 @@ class Following:
         self.uu = FORGET * self.uu + u * u
         self.pp = FORGET * self.pp + p * p
         self.up = FORGET * self.up + u * p
-        # Readings that move without the voltage are handled as glitch or jump.
+        # If the readings move without the voltage, the glitch-or-jump test decides.
         self.driven = FORGET * self.driven + (abs(u) >= STEP_STILL)
         if self.count < ENOUGH or self.driven < OF_VOLTAGE * self.count:
             return False
@@ -128,7 +133,7 @@ class Following:
     def _fault(self) -> bool:
         slope, straight = self.up / self.uu, self.up * self.up / (self.uu * self.pp) if self.pp > 0.0 else 0.0
         if straight < FOLLOWING_STRAIGHT:
-            # More motion than the drive explains: something else moves the stage, the sensor is not at fault.
+            # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
             return self.pp <= FOLLOWING_SLOPES[1] ** 2 * self.uu
         return self.count >= ENOUGH_SLOPE and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
 
@@ -137,13 +142,13 @@ class Following:
 
     @classmethod
     def from_state(cls, values: StateDict) -> Following:
-        """Inverse of ``state_dict``; older states have no entries: start without history."""
+        """Inverse of ``state_dict``; older states have no entries and give an empty check."""
         if not values:
             return cls()
         return cls(**{name: type(value)(values[name]) for name, value in asdict(cls()).items()})
 
 
-# --- On trial.
+# --- The trial of a suspected sensor.
 
 SENSOR_STUCK = "sensor_stuck"
 SENSOR_SIGN = "sensor_sign"
@@ -153,33 +158,35 @@ OUT_OF_ENVELOPE = "out_of_envelope"
 #: Names of sensor faults.
 SENSOR_FAULTS = frozenset({SENSOR_STUCK, SENSOR_SIGN, SENSOR_GAIN, SENSOR_FOREIGN, OUT_OF_ENVELOPE})
 
-#: Values in the window at most; looks a window.
+#: Most values in the window; evaluations per window.
 VALUES, LOOKS = 128, 8
-#: Standard deviation of the place in the window, as a share of the range and in deviations of a reading, from which on
-#: the stage moves.
+#: The stage moves if the standard deviation of the position in the window is at least this share of the range and this
+#: multiple of the noise of a reading.
 SWING_SHARE, SWING_SIGMA = 0.003, 5.0
-#: Share of the variance from which on readings follow, and from which on they are a straight line at all.
+#: Share of the variance above which the readings follow, and above which they lie on a straight line at all.
 FOLLOWS, STRAIGHT = 0.9, 0.7
-#: Deviations of the reckoned place that the stage must move for the place to tell; where it does not, the share of the
-#: variance below which the voltage of the readings does not follow the applied one.
+#: The dead-reckoned position can be used if the stage moves by this multiple of its standard deviation. Otherwise only
+#: the voltages are compared: below this share of the variance, p does not follow u.
 TELLS, STRAIGHT_ALONE = 2.0, 0.4
 #: Readings that vary by less than this share of the stage's motion stand still.
 STILL = 0.15
-#: Looks in a row that must find a fault before it is named, and before it has another name; windows at rest before
-#: another level is believed.
+#: Evaluations in a row that must find a fault before it is reported, and before a reported fault is replaced by another
+#: one; windows at rest before a new level is accepted.
 NAMED, RENAMED, RESTED = 3, 24, 3
-#: A slope so far from 1 is a change of gain; slopes so near to each other, and places as a share of the range, agree.
+#: A slope that differs from 1 by more than this is a change of gain. Two results agree if slopes, and positions as a
+#: share of the range, differ by less than the second value.
 GAIN_STEP, AGREE = 0.02, 0.02
-#: By how much the slope may be another one where motion bears out a jump that was taken back.
+#: Largest relative difference of slope for which motion confirms a jump that was reverted when the trial began.
 OPEN_SLOPE = 0.15
-#: Between what shares of a change of the zero the identified model must see it too, and share of the variance and
-#: distance of both slopes from 1 for which half a window is enough to believe it.
+#: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
+#: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
+#: both slopes are this close to 1.
 ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
-#: Windows of readings that follow, but not by the same change, after which it is the model that is wrong.
+#: The model is wrong if the readings follow for this many windows without two windows that agree on slope and shift.
 UNCLEAR = 6
-#: Windows in which p must have followed the voltage; share of its variance, and slope, from which on it does; slope up
-#: to which it does whatever the reckoning says; and by what share of the drive it is off where the readings are those
-#: of before.
+#: Number of windows in which p must follow u; smallest share of the variance and largest slope (or its inverse) for
+#: that; the same slope if dead reckoning shows a gain that the envelope does not allow; largest mean of p - u, as a
+#: share of the drive's range, of readings without a change.
 OBEYED, OBEYS, OBEYS_SLOPE, OBEYS_SURE, SAME_SHARE = 2, 0.8, 1.4, 1.2, 0.03
 
 
@@ -187,14 +194,15 @@ class Outcome(Enum):
     """Result of a trial."""
 
     OPEN = 0
-    #: The readings are where they were, but for what the reckoning may be off.
+    #: The readings agree with the frame before the trial, within the uncertainty of dead reckoning.
     SAME = 1
-    #: The readings follow, but y = slope x + shift is where they are now.
+    #: The readings follow in a new frame: y = slope x + shift.
     CHANGED = 2
 
 
 class Decision(NamedTuple):
-    """credit : 1 where reckoning and readings agreed, -1 where only the readings were right, else 0."""
+    """Outcome with the new frame. credit : 1 if dead reckoning and readings agreed, -1 if only the readings were right,
+    else 0."""
 
     outcome: Outcome
     slope: float = 1.0
@@ -207,17 +215,20 @@ OPEN = Decision(Outcome.OPEN)
 
 @dataclass(slots=True)
 class Trial:
-    """reckoning : where the stage is. fault, why : name of what is wrong with the sensor, and the reason in
-    words, "" while open.
+    """State of a trial.
 
-    base, memory : the identified model, and (m,) its memory as if the readings were true.
-    window : (4, VALUES) of voltage, reading, place, and the voltage that the identified model asks for at the reading,
-    in the order of arrival; the next goes to ``count``. since, looked : samples since the trial began and at the last
-    look. suspected, times : the last finding and how often in a row.
-    rested : looks in a row with readings steady at another level. obeyed : looks in a row in which the readings have
-    followed the voltage. followed, agreed : looks at which they followed the place, in a row without a fault, and of
-    those in a row by the same slope and shift_um. open_slope, open_shift_um : of the jumps that were taken back when
-    the trial began, 0 for none.
+    reckoning : dead-reckoned position of the stage.
+    base, memory : the identified model, and its memory (m,) if the readings are assumed to be true.
+    window : (4, VALUES) ring buffer: voltage u, reading y, dead-reckoned position x, and the model's voltage p for the
+    reading. The next column is ``count`` modulo VALUES.
+    fault, why : name of the fault and the reason as text; "" while no fault is reported.
+    since, looked : number of samples since the trial began: now, and at the last evaluation.
+    suspected, times : the fault that the last evaluation found, and how often in a row.
+    rested : evaluations in a row at rest with steady readings at a new level.
+    obeyed : evaluations in a row in which p followed the applied voltage.
+    followed : evaluations in a row in which the readings followed the dead-reckoned position.
+    agreed : evaluations in a row, of those, with the same ``slope`` and ``shift_um``.
+    open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
     """
 
     reckoning: Reckoning
@@ -244,94 +255,95 @@ class Trial:
     def begin(
         cls, reckoning: Reckoning, base: LssvmInverse, memory: FloatArray, slope: float = 0.0, shift_um: float = 0.0
     ) -> Trial:
-        """``memory`` (m,) of the identified model ``base`` where the trial begins.
+        """Start a trial. ``memory`` (m,) : of the identified model ``base`` at the start.
 
-        ``slope``, ``shift_um``: what jumps that are taken back had made of a reading y, slope y + shift; 0 for none.
+        ``slope``, ``shift_um`` : jumps that are reverted now: they mapped a reading y to slope y + shift. 0 for none.
         """
         return cls(reckoning, base, memory, np.zeros((4, VALUES)), open_slope=slope, open_shift_um=shift_um)
 
     def put(self, u_V: float, y_um: float, now: Circumstances) -> Decision:
-        """Take one sample; NaN for one without a reading."""
-        place = self.reckoning.advance(u_V)
+        """Process one sample; ``y_um`` is NaN if it has no reading."""
+        position_um = self.reckoning.advance(u_V)
         self.since += 1
         samples = max(VALUES // 4, now.envelope.follow_s / now.dt_s)
         stride = max(1, math.ceil(samples / VALUES))
         if self.since % stride == 0 and not math.isnan(y_um):
             p_V = self.base.evaluate_point(y_um, 0.0, 0.0, self.memory)[0]
-            self.window[:, self.count % VALUES] = u_V, y_um, place, p_V
+            self.window[:, self.count % VALUES] = u_V, y_um, position_um, p_V
             self.count += 1
         size = min(VALUES, int(samples / stride))
-        # Half a window is enough to see that readings do not follow.
+        # Half a window is enough to detect readings that do not follow.
         if 2 * self.count < size or (self.since - self.looked) * LOOKS < samples:
             return OPEN
-        whole, size = self.count >= size, min(size, self.count)
+        full, size = self.count >= size, min(size, self.count)
         self.looked = self.since
         last = np.arange(self.count - size, self.count) % VALUES
         u, y, x, p = self.window[:, last]
-        return self._look(u, y, x, p, whole, now)
+        return self._evaluate(u, y, x, p, full, now)
 
-    def _look(
-        self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, whole: bool, now: Circumstances
+    def _evaluate(
+        self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, full: bool, now: Circumstances
     ) -> Decision:
         s = slope_of(x, y)
         if s.swing < max(SWING_SHARE * now.range_um, SWING_SIGMA * now.noise_um):
-            return self._at_rest(x, y, now) if whole else OPEN
+            return self._at_rest(x, y, now) if full else OPEN
         self.rested = 0
-        obeys, off_V = slope_of(u, p), float(np.mean(p - u))
+        voltages, off_V = slope_of(u, p), float(np.mean(p - u))
         drive = drive_V(self.base)
         obeyed = (
-            obeys.share >= OBEYS
-            and 1.0 / OBEYS_SLOPE <= obeys.slope <= OBEYS_SLOPE
+            voltages.share >= OBEYS
+            and 1.0 / OBEYS_SLOPE <= voltages.slope <= OBEYS_SLOPE
             and abs(off_V) <= now.envelope.offset * drive
         )
         straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
         follows = straight and allowed
-        if self.open_slope and self._bears_out(s, x, y, now):
+        if self.open_slope and self._confirms_reverted_jumps(s, x, y, now):
             return Decision(Outcome.CHANGED, self.open_slope, self.open_shift_um)
         off_um = float(np.mean(y - x))
         by_model_um = off_V / self.reckoning.mean_slope_V_per_um
-        # Off the place, and the identified model says so too: then the zero has moved, and both are right.
-        there = abs(off_um) <= tolerance_um(now, self.reckoning)
-        moved = follows and not there and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
-        off_line = max(abs(s.slope - 1.0), abs(obeys.slope - 1.0))
-        plain = moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
-        if plain and min(s.share, obeys.share) >= PLAIN and off_line <= PLAIN_SLOPE:
-            # As clear as this, half a window is enough: a change of usual size, and no fault found so far.
+        # Dead reckoning and the identified model show the same shift of the readings: the sensor's zero has moved.
+        in_place = abs(off_um) <= tolerance_um(now, self.reckoning)
+        zero_moved = follows and not in_place and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
+        slope_error = max(abs(s.slope - 1.0), abs(voltages.slope - 1.0))
+        usual = zero_moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
+        if usual and min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE:
+            # A clear shift of usual size, without a fault so far, needs only half a window.
             return Decision(Outcome.CHANGED, 1.0, off_um)
-        wrong = _fault(s, float(np.std(y)))
+        fault = _fault(s, float(np.std(y)))
         if s.swing < TELLS * self.reckoning.std_um:
-            # A place that is not known better than the stage moves tells nothing; the voltage alone must.
-            wrong = _fault(obeys, float(np.std(p)), "V") if obeys.share < STRAIGHT_ALONE else ("", "")
-        if not whole:
+            # The dead-reckoned position is less certain than the motion is large: only the voltages can decide.
+            fault = _fault(voltages, float(np.std(p)), "V") if voltages.share < STRAIGHT_ALONE else ("", "")
+        if not full:
             if not (obeyed or follows):
-                self._suspect(*wrong)
+                self._suspect(*fault)
             return OPEN
-        # Where the readings are the reckoned place but for a gain that no stage has, the answer must be quite right.
-        sure = allowed or not straight or 1.0 / OBEYS_SURE <= obeys.slope <= OBEYS_SURE
+        # If dead reckoning shows a gain that no stage has, the voltages must agree within a tighter limit.
+        sure = allowed or not straight or 1.0 / OBEYS_SURE <= voltages.slope <= OBEYS_SURE
         self.obeyed = self.obeyed + 1 if obeyed and sure else 0
         if self.obeyed >= OBEYED * LOOKS:
-            return Decision(Outcome.CHANGED, 1.0, off_um) if moved else Decision(Outcome.SAME, credit=-1)
+            return Decision(Outcome.CHANGED, 1.0, off_um) if zero_moved else Decision(Outcome.SAME, credit=-1)
         if follows:
             if obeyed and abs(off_V) <= SAME_SHARE * drive:
-                return Decision(Outcome.SAME, credit=1 if there else -1)
-            return self._following(s, off_um, float(x[-1]), there, now)
+                return Decision(Outcome.SAME, credit=1 if in_place else -1)
+            return self._following(s, off_um, float(x[-1]), in_place, now)
         self.followed = self.agreed = 0
         if not obeyed:
-            self._suspect(*wrong)
+            self._suspect(*fault)
         return OPEN
 
-    def _bears_out(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> bool:
-        """Whether motion now bears out the jumps that were taken back: the readings are where they would be by them."""
+    def _confirms_reverted_jumps(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> bool:
+        """Whether the readings follow in the frame of the jumps that were reverted when the trial began."""
         off_um = float(np.mean(y - self.open_slope * x - self.open_shift_um))
         alike = abs(s.slope / self.open_slope - 1.0) <= OPEN_SLOPE
         return s.share >= FOLLOWS and alike and abs(off_um) <= tolerance_um(now, self.reckoning)
 
-    def _following(self, s: Slope, off_um: float, at_um: float, there: bool, now: Circumstances) -> Decision:
-        near = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
-        if near and there:
+    def _following(self, s: Slope, off_um: float, at_um: float, in_place: bool, now: Circumstances) -> Decision:
+        """Decision for readings that follow, with the line ``s`` and the mean distance ``off_um`` at ``at_um``."""
+        same_gain = abs(s.slope - 1.0) <= GAIN_STEP + 4.0 * s.std
+        if same_gain and in_place:
             return Decision(Outcome.SAME, credit=1)
-        slope, shift_um = (1.0, off_um) if near else (s.slope, s.constant)
-        # A change of the stage is the same in the next window; an error of the model differs from place to place.
+        slope, shift_um = (1.0, off_um) if same_gain else (s.slope, s.constant)
+        # A change of the stage is the same in the next window; an error of the model depends on the position.
         self.followed += 1
         moved_um = (self.slope - slope) * at_um + self.shift_um - shift_um
         agrees = abs(self.slope - slope) <= AGREE and abs(moved_um) <= max(AGREE * now.range_um, 2.0 * now.usual_um)
@@ -342,20 +354,21 @@ class Trial:
         return Decision(Outcome.CHANGED, slope, shift_um) if self.agreed >= LOOKS else OPEN
 
     def _at_rest(self, x: FloatArray, y: FloatArray, now: Circumstances) -> Decision:
-        """A stage that does not move: readings that are back where they were, or steady somewhere near."""
+        """Decision for a stage at rest: readings have returned to the old level, or are steady at a new one nearby."""
         off, spread = float(np.mean(y - x)), float(np.std(y - x))
         steady = spread <= max(3.0 * now.noise_um, 0.5 * now.usual_um)
         if steady and not self.fault and abs(off) <= tolerance_um(now, self.reckoning):
             return Decision(Outcome.SAME)
-        near = steady and not self.fault and abs(off) <= now.envelope.jump * now.range_um
-        self.rested = self.rested + 1 if near else 0
+        nearby = steady and not self.fault and abs(off) <= now.envelope.jump * now.range_um
+        self.rested = self.rested + 1 if nearby else 0
         if self.rested >= RESTED * LOOKS:
             return Decision(Outcome.CHANGED, 1.0, off)
         return OPEN
 
     def refuse(self, why: str) -> None:
-        """The envelope refuses the change that the readings show."""
-        # Straight lines outside tell more than the identified model's answer.
+        """The envelope does not allow the change that the readings show; ``why`` is the reason as text."""
+        # A straight line outside of the envelope counts more than agreement with the identified model: start to count
+        # the windows of agreement again, from below zero.
         self.obeyed = -OBEYED * LOOKS
         self._suspect(OUT_OF_ENVELOPE, why)
 
@@ -369,7 +382,7 @@ class Trial:
             self.fault, self.why = fault, why
 
     def state_dict(self) -> StateDict:
-        """All of it under flat names."""
+        """The whole state under flat names."""
         own = {name: getattr(self, name) for name in _NUMBERS}
         return {
             **own,
@@ -387,7 +400,7 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # Older states have no jumps that were taken back.
+        # Older states have no entries for reverted jumps.
         values = {"open_slope": 0.0, "open_shift_um": 0.0} | values
         numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
@@ -402,12 +415,15 @@ _NUMBERS = {
 
 
 def _fault(s: Slope, spread: float, unit: str = "um") -> tuple[str, str]:
-    """(name, why in words) of what readings do that do not follow: ``s`` of the readings over the places, in ``unit``;
-    in V that of the voltages that they ask for over those applied. ``spread`` : rms of the first."""
-    why = f"readings go {s.slope:.3g} times as far as the voltage must have moved the stage, {s.share:.0%} on a line"
+    """(name, reason as text) of the fault of readings that do not follow.
+
+    ``s`` : line of the readings over the positions (``unit`` "um"), or of the voltages p over u ("V"). ``spread`` :
+    standard deviation of the readings, or of p.
+    """
+    why = f"readings move {s.slope:.3g} times as far as the voltage moves the stage, {s.share:.0%} on a straight line"
     if s.share >= STRAIGHT:
         return (SENSOR_SIGN if s.slope < 0.0 else SENSOR_GAIN), why
     if spread <= STILL * s.swing:
-        must = f"where the stage must have by {s.swing:.3g} {unit}"
-        return SENSOR_STUCK, f"readings vary by {spread:.3g} {unit} rms {must}"
+        expected = f"expected {s.swing:.3g} {unit} from the motion of the stage"
+        return SENSOR_STUCK, f"readings vary by {spread:.3g} {unit} rms, {expected}"
     return SENSOR_FOREIGN, why

@@ -11,8 +11,7 @@ from adaptive.errors import InputError
 from adaptive.features import FeatureMap, advance_both
 from adaptive.inverse_model import track_memory
 from adaptive.smoothing import FixedLagSmoother, SmootherState
-from adaptive.state_codec import joined, under
-from adaptive.types import BoolArray, FloatArray, StateDict
+from adaptive.types import BoolArray, FloatArray, StateDict, joined, under
 
 Motion = tuple[float, float, float]
 

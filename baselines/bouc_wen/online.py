@@ -18,8 +18,7 @@ from adaptive.compiled import all_finite, compiled
 from adaptive.errors import InputError
 from adaptive.online import drift as drift_step
 from adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, StateDict, prefixed, under
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
 from baselines.online_baseline import OnlineBaseline, field_of

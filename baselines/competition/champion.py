@@ -20,8 +20,7 @@ import numpy as np
 from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse, evaluate_point
-from adaptive.state_codec import prefixed, under
-from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict
+from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.linear import LinearInverse
 from baselines.prandtl_ishlinskii.inverse import MpiInverse

@@ -1,7 +1,7 @@
 """Several online models learn from the same samples, and the one that predicts best is served.
 
-Every contestant is scored on fresh samples (`baselines.competition.scoring`). The champion is replaced only by a
-contestant that has been clearly better for a while (`baselines.competition.champion_choice`), and callers pass to the
+Every contestant is scored on fresh samples (`baselines.competition.contestants`). The champion is replaced only by a
+contestant that has been clearly better for a while (`baselines.competition.competition`), and callers pass to the
 new champion without a jump (`baselines.competition.champion`).
 
 The first contestant is the favourite. Its verdicts on samples are those of the competition, it is the first champion,
@@ -14,25 +14,87 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
+from adaptive.types import (
+    FloatArray,
+    Hyperparameters,
+    InverseModel,
+    OnlineModel,
+    Sample,
+    StateDict,
+    WindowData,
+    prefixed,
+    under,
+)
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.champion_choice import ChampionChoice
 from baselines.competition.config import CompetitionConfig
 from baselines.competition.contestants import (
+    NOT_SCORED,
     ONLINE_KINDS,
+    Judge,
     Restart,
+    SmoothedMotion,
     fingerprint,
     online_form,
     with_deviation_of_at_least,
 )
-from baselines.competition.scoring import NOT_SCORED, Judge, SmoothedMotion
+
+# --- The rules by which a competition replaces its champion.
+
+BETTER = "it predicts better"
+FAILED = "its answers are not finite, or it failed"
+
+
+@dataclass(slots=True)
+class ChampionChoice:
+    """The present champion, and for how long another contestant has been clearly better.
+
+    Attributes
+    ----------
+    config : margin, floor and patience.
+    span_V : voltage span that the floor refers to, V.
+    champion : index of the contestant that is served.
+    ahead_s : motion during which another contestant has been ahead without a break, s.
+    changes : number of changes of champion.
+    """
+
+    config: CompetitionConfig
+    span_V: float
+    champion: int = 0
+    ahead_s: float = 0.0
+    changes: int = 0
+
+    def choose(self, errors_V: Sequence[float], scored_s: float) -> str:
+        """Choose by the rms errors (k,), V, after ``scored_s`` more seconds of scored motion.
+
+        An infinite error marks a contestant that cannot be served. Returns the reason for a change of champion, or ""
+        where there is none.
+        """
+        c, now, best = self.config, self.champion, int(np.argmin(errors_V))
+        if math.isinf(errors_V[now]) and math.isfinite(errors_V[best]):
+            return self._replace_by(best, FAILED)
+        # The favourite returns as soon as it is no worse; a challenger must win by the margin and the floor.
+        other = 0 if now != 0 and errors_V[0] < errors_V[now] else best
+        margin, floor_V = (1.0, 0.0) if other == 0 else (c.margin, c.floor * self.span_V)
+        ahead = other != now and errors_V[now] > margin * errors_V[other] + floor_V
+        self.ahead_s = self.ahead_s + scored_s if ahead else 0.0
+        if ahead and self.ahead_s >= c.patience_s:
+            return self._replace_by(other, BETTER)
+        return ""
+
+    def _replace_by(self, champion: int, why: str) -> str:
+        self.champion, self.ahead_s = champion, 0.0
+        self.changes += 1
+        return why
+
+
+# --- The competition.
 
 
 class Competition:

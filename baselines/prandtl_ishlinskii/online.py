@@ -8,8 +8,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.online.drift import joseph, walk
-from adaptive.state_codec import prefixed, under
-from adaptive.types import FloatArray, StateDict
+from adaptive.types import FloatArray, StateDict, prefixed, under
 from baselines.online_baseline import field_of
 from baselines.prandtl_ishlinskii.identify import MpiGrid
 from baselines.prandtl_ishlinskii.inverse import MpiInverse

@@ -12,12 +12,11 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from baselines.swarm.evidence_search import EvidenceSearch
-    from baselines.swarm.identification import swarm_bouc_wen, swarm_mpi
-    from baselines.swarm.particle_swarm import MissingTorchError
+    from baselines.swarm.identification import MissingTorchError, swarm_bouc_wen, swarm_mpi
 
 _MODULES = {
     "EvidenceSearch": "evidence_search",
-    "MissingTorchError": "particle_swarm",
+    "MissingTorchError": "identification",
     "swarm_bouc_wen": "identification",
     "swarm_mpi": "identification",
 }

@@ -15,7 +15,7 @@ from adaptive.errors import InputError
 from adaptive.tuning.evidence import EvidenceSamples
 from adaptive.tuning.retuning import pattern
 from adaptive.types import FloatArray
-from baselines.swarm.particle_swarm import torch_module
+from baselines.swarm.identification import torch_module
 
 #: J2 of a point whose kernel matrix cannot be factored.
 _REFUSED = 1e12

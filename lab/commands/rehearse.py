@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Load, identify, run, draw. Returns 0 if no run failed, else 1."""
     from lab.rehearsal import CLASSES, EVENT_KINDS, STANDARD, RehearsalConfig, factory_of, rehearse, standard_events
     from lab.rehearsal.rehearsal import remarks, table
-    from service.storage.output_folder import clear_output
+    from service.storage.output import clear_output
 
     if args.events == "list":
         for name, (kind_name, _) in CLASSES.items():

@@ -43,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the study and write it. Returns 0, also where a target is missed: the summary says so."""
     from threadpoolctl import threadpool_limits
 
+    from lab.reproduce.measured import StudyConfig, run_study
     from lab.reproduce.report import prepare, write_study
-    from lab.reproduce.study import StudyConfig, run_study
     from service.protocol.errors import FieldError
 
     out = prepare(args.out)

@@ -45,8 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
-    from lab.scenarios.judgement import table
-    from lab.scenarios.pictures import draw_overview
+    from lab.scenarios.judgement import draw_overview, table
     from service.config.learner import read_learner_settings
 
     if not 1 <= args.seeds <= 1000:
@@ -115,8 +114,7 @@ def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs:
 
 
 def _one(task: tuple[str, int, float, dict[str, Any], Path | None]) -> Verdict:
-    from lab.scenarios.judgement import judge
-    from lab.scenarios.pictures import draw_course
+    from lab.scenarios.judgement import draw_course, judge
     from lab.scenarios.run import run_scenario
     from sim.scenarios import scenario
 

@@ -24,10 +24,8 @@ from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError, ServiceError
 from service.protocol.keys import Keys
-from service.protocol.query import NEWEST
-from service.protocol.reply import Trajectory
-from service.runtime.delivery import SURELY, wait_followed
-from service.runtime.session import open_client
+from service.protocol.query import NEWEST, Trajectory
+from service.runtime.session import SURELY, open_client, wait_followed
 
 #: How long to wait for the stage's next samples, and for the service to learn far enough, s.
 STALL_S, BEHIND_S = 10.0, 0.1

@@ -10,7 +10,7 @@ import numpy as np
 from adaptive.types import FloatArray
 from lab.demo.plan import MODELS, TEACHER, Plan
 from lab.demo.result import DemoRun, empty
-from service.client.pending import PendingCommands
+from service.client.client import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis

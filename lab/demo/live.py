@@ -15,14 +15,13 @@ import zenoh
 from lab.demo.fast import Progress
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from lab.demo.result import DemoRun
+from lab.testbed.identified_stage import READY_S, Rig
 from lab.testbed.processes import Child
-from lab.testbed.rig import READY_S, Rig
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY, wait_followed
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client, wait_followed
 from service.storage.recorder import Recorder
 
 #: A process may end so much later than planned, s.

@@ -13,20 +13,17 @@ import numpy as np
 from adaptive.errors import InputError
 from lab.demo.fast import run_fast
 from lab.demo.live import record_identification, run_live
-from lab.demo.own_stage import plan_for
-from lab.demo.pictures import draw_loops, draw_tracking
-from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan
-from lab.demo.result import DemoRun
-from lab.testbed.identified_stage import write_service_config
-from lab.testbed.rig import Rig
+from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, Plan, plan_for
+from lab.demo.result import DemoRun, draw_loops, draw_tracking
+from lab.testbed.identified_stage import Rig, write_service_config
 from service.config.settings import read_config
 from service.identification.identifying import NAMES, Stretch, identify_all
 from service.server.axis_loading import load_axis
 from service.storage.model_file import BundleMeta, write_bundle
-from service.storage.output_folder import clear_output
+from service.storage.output import clear_output
 from service.storage.recorder import Recorder, RecorderConfig
-from service.viewer.offline import write_recording
 from service.viewer.records import Event, Record, SceneConfig, Tracking
+from service.viewer.rerun_sink import write_recording
 from sim.recordings import read, repaired
 from sim.stage.stage import Stage
 

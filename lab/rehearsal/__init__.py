@@ -9,11 +9,19 @@ See docs/rehearse.md.
 """
 
 from lab.rehearsal.config import RehearsalConfig
-from lab.rehearsal.events import CLASSES, EVENT_KINDS, INTACT, SENSOR, STANDARD, Event, draw
-from lab.rehearsal.identification import IdentifiedPlant, identify
+from lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, INTACT, SENSOR, STANDARD, Event, draw
 from lab.rehearsal.loop import LoopRecord
 from lab.rehearsal.outcome import ErrorFigures, Outcome, Trouble
-from lab.rehearsal.plant import Change, Changeable, FunctionPlant, Plant, PlantFactory, factory_of
+from lab.rehearsal.plant import (
+    Change,
+    Changeable,
+    FunctionPlant,
+    IdentifiedPlant,
+    Plant,
+    PlantFactory,
+    factory_of,
+    identify,
+)
 from lab.rehearsal.reference import Motion, RandomReference, Reference, ReferenceRequest
 from lab.rehearsal.rehearsal import EventRun, Rehearsal, rehearse, run_event, standard_events
 

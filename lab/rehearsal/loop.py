@@ -22,7 +22,7 @@ from adaptive.types import FloatArray, InverseModel
 from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, Message, MessageLine
 from lab.rehearsal.reference import Motion
 from service.answers.guard import Limits, guard
-from service.client.pending import PendingCommands
+from service.client.client import PendingCommands
 from service.protocol.query import FeedforwardQuery
 from service.server.axis import Axis
 
@@ -44,7 +44,7 @@ class LoopRecord:
     ----------
     t_s : time from the start, s. wanted_um : the reference. true_um : position of the stage. read_um : its reading,
     sent or not. u_V : voltage applied from that instant on. flags : bits of the answer, see
-    ``service.protocol.reply``. verdict : index into ``verdicts`` of the learner's verdict on the sample. trouble :
+    ``service.protocol.query``. verdict : index into ``verdicts`` of the learner's verdict on the sample. trouble :
     index into ``troubles`` of what the axis reported at that time ("" for nothing).
     events : (time s, name, detail) of the axis' events.
     """

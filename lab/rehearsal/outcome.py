@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from lab.rehearsal.events import SENSOR, Event
+from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
 

@@ -14,12 +14,20 @@ from typing import Any
 import numpy as np
 
 from lab.rehearsal.config import RehearsalConfig
-from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, EventScale, MessageLine
-from lab.rehearsal.events import REFERENCE, SENSOR, STANDARD, Event, draw
-from lab.rehearsal.identification import IdentifiedPlant, excitation_range, go_to_lowest, identify
+from lab.rehearsal.disturbance import (
+    REFERENCE,
+    SENSOR,
+    STANDARD,
+    DisturbedPlant,
+    DisturbedSensor,
+    Event,
+    EventScale,
+    MessageLine,
+    draw,
+)
 from lab.rehearsal.loop import LoopRecord, idle_samples, run_adaptive, run_frozen, times
 from lab.rehearsal.outcome import LARGE_PCT, SENSOR_FACTOR, SENSOR_PCT, Outcome, outcome
-from lab.rehearsal.plant import PlantFactory
+from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
 from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
 from service.config.settings import LEARN, AxisConfig
 from service.protocol.errors import FieldError

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from lab.reproduce.measured import WINDOWS, Benchmark, Stack
-from lab.reproduce.study import PresetStudy
+from lab.reproduce.measured import WINDOWS, Benchmark, PresetStudy, Stack
 from service.reports.plot_style import figure, label, legend, line, save
 from service.viewer.colours import BEFORE, REFERENCE, SERIES, model_colour
-from sim.chapter.characterisation import Characterisation, Width
 from sim.chapter.control import FROZEN, GAIN_CHANGE, LEARNING, Control, Loop, moving_mae
-from sim.chapter.experiments import Record
+from sim.chapter.experiments import Characterisation, Record, Width
 from sim.chapter.forward_lssvm import two_inputs
 from sim.chapter.modelling import ForwardRun
 

@@ -19,7 +19,7 @@ from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
 from service.answers.guard import Limits
-from service.client.pending import PendingCommands
+from service.client.client import PendingCommands
 from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch

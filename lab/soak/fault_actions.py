@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from lab.soak.controller import AXIS, STAGE, dwell_key
 from lab.soak.fault_plan import PlannedFault
 from lab.soak.rig import SERVICES, SoakRig
-from lab.soak.task import AXIS, STAGE, dwell_key
-from lab.soak.verdict.monitor import Monitor
+from lab.soak.verdict.observations import Monitor
 from lab.testbed.shifted_clock import write_offset
 from service.protocol.keys import Keys
 from service.stage_node.faults import DELIVERY, READING, fault_key

@@ -13,17 +13,17 @@ from typing import Any, Final
 
 import psutil
 
+from lab.soak.controller import ControlTask
 from lab.soak.fault_actions import FaultActions
 from lab.soak.fault_plan import PlannedFault, Schedule, SoakPlan
 from lab.soak.machine_load import OtherLoad, processor_times_s
 from lab.soak.rig import SERVICES, SoakRig
-from lab.soak.task import ControlTask
 from lab.soak.verdict.interim import InterimJudge
-from lab.soak.verdict.monitor import Monitor
 from lab.soak.verdict.observations import (
     WELL_PCT,
     Counters,
     FaultRecord,
+    Monitor,
     Observations,
     flatten_status,
     query_second,

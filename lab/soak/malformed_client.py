@@ -10,11 +10,10 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from service.operating.request import MAX_BYTES
+from service.operating.verbs import MAX_BYTES
 from service.protocol.query import encode_query
 from service.protocol.samples import encode_reference, encode_samples
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.runtime.stopping import StopSignal
 
 #: Messages per second: many, but other clients must still get through.

@@ -23,13 +23,11 @@ import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError, InputError
-from lab.soak.task import AXIS, STAGE, ControlTask
-from lab.testbed.processes import run_client_process
-from lab.testbed.side_processes import ECHO_KEY
+from lab.soak.controller import AXIS, STAGE, ControlTask
+from lab.testbed.processes import ECHO_KEY, run_client_process
 from service.client.client import Client
 from service.protocol.errors import NoReplyError
-from service.protocol.query import encode_query
-from service.protocol.reply import Answer, Point, encode_reply
+from service.protocol.query import Answer, Point, encode_query, encode_reply
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 

@@ -10,10 +10,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final
 
-from lab.soak.task import AXIS, SERVED, STAGE, ControlTask
-from lab.testbed.identified_stage import identify_stage, write_service_config
+from lab.soak.controller import AXIS, SERVED, STAGE, ControlTask
+from lab.testbed.identified_stage import Rig, identify_stage, write_service_config
 from lab.testbed.processes import Child
-from lab.testbed.rig import Rig
 from lab.testbed.shifted_clock import write_offset
 from sim.stage.config import StageConfig
 from sim.stage.file import load_stage, save_stage

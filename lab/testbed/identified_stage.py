@@ -6,10 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final
 
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import InverseModel
+from lab.testbed.processes import Child, Children, free_port
 from service.identification.identifying import identify_one
 from service.storage.model_file import BundleMeta, write_bundle
 from sim.signals.voltages import training_input
@@ -72,3 +74,90 @@ def _toml(value: Any) -> str:
     if isinstance(value, Path):
         return json.dumps(str(value.resolve()))
     return json.dumps(list(value) if isinstance(value, tuple) else value)
+
+
+# --- The processes of an experiment by name: they meet at one endpoint on loopback and end with the experiment.
+
+#: The command line interface as a module.
+_CLI: Final = ("-m", "lab.cli")
+#: What a process prints when it is ready, and how long that may take, s.
+READY: Final = "ready"
+READY_S: Final = 60.0
+#: Samples in a message of a stage, as the driver of a converter delivers them.
+SAMPLES_PER_MESSAGE: Final = 5
+
+
+class Rig:
+    """Processes on loopback; use as a context manager.
+
+    Attributes
+    ----------
+    endpoint : where the first process (router or service) listens and the others connect.
+    children : by name, the newest process of that name.
+    """
+
+    def __init__(self, logs: Path) -> None:
+        self.logs = logs
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.children: dict[str, Child] = {}
+        self._ready: dict[str, str] = {}
+        self._starts: dict[str, int] = {}
+        self._all = Children(logs)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._all.__exit__(kind, error, trace)
+
+    def start(self, name: str, arguments: list[str], *, ready: str = READY, wait: bool = True) -> Child:
+        """Start ``python ARGUMENTS`` under ``name``; with ``wait`` return when it has printed ``ready``.
+
+        Raises ServiceError if it does not get ready within ``READY_S``.
+        """
+        self._starts[name] = self._starts.get(name, 0) + 1
+        child = self._all.start(f"{name}-{self._starts[name]}", arguments)
+        self.children[name], self._ready[name] = child, ready
+        if wait:
+            self.wait_ready(name)
+        return child
+
+    def wait_ready(self, *names: str) -> None:
+        """Wait until the processes of these names are ready. Raises ServiceError."""
+        for name in names:
+            self.children[name].wait_line(self._ready[name], READY_S)
+
+    def start_router(self, *, wait: bool = True) -> Child:
+        """The router to which all others connect."""
+        return self.start("router", [*_CLI, "router", "--listen", self.endpoint], wait=wait)
+
+    def start_service(
+        self, config: Path, *options: str, name: str = "serve", wall_clock: Path | None = None, wait: bool = True
+    ) -> Child:
+        """A service. ``wall_clock``: the file that shifts its wall clock, see `lab.testbed.shifted_clock`."""
+        program = _CLI if wall_clock is None else ("-m", "lab.testbed.shifted_clock", str(wall_clock))
+        return self.start(name, [*program, "serve", "--config", str(config), "--json", *options], ready="{", wait=wait)
+
+    def start_stage(self, stage: str, axis: str, *options: str, name: str = "stage", wait: bool = True) -> Child:
+        """A simulated stage of that name and axis; ``options`` say how it is reached."""
+        named = ["--name", stage, "--axis", axis, "--batch", str(SAMPLES_PER_MESSAGE)]
+        return self.start(name, [*_CLI, "stage", *named, *options], wait=wait)
+
+    def start_viewer(
+        self, rrd: Path, stage: str, axis: str, range_um: float, *options: str, name: str = "view", wait: bool = True
+    ) -> Child:
+        """The viewer's stream into the file ``rrd``, which each start overwrites."""
+        shown = ["--stage", stage, "--axis", axis, "--range-um", str(range_um), "--rrd", str(rrd), "--json", *options]
+        return self.start(name, [*_CLI, "view", "--endpoint", self.endpoint, *shown], ready="viewing", wait=wait)
+
+    def start_echo(self, endpoint: str = "", *, wait: bool = True) -> Child:
+        """A bare echo: it listens at ``endpoint``, or connects to the rig's own endpoint."""
+        how = ["listen", endpoint] if endpoint else ["connect", self.endpoint]
+        return self.start("echo", ["-m", "lab.testbed.processes", "echo", *how], wait=wait)
+
+    def start_paced_loop(self, step_s: float, ticks: int | None = None, *, wait: bool = True) -> Child:
+        """A bare paced loop, see `lab.testbed.processes`."""
+        length = [] if ticks is None else [str(ticks)]
+        return self.start("bare", ["-m", "lab.testbed.processes", "paced_loop", str(step_s), *length], wait=wait)

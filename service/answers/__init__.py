@@ -12,20 +12,18 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.answers.answering import Served, answer, trust_by_age
+    from service.answers.answering import MemoryTracker, Served, answer, derivatives, trust_by_age
     from service.answers.fallback import Rules, answer_safely
     from service.answers.guard import Limits
-    from service.answers.memory_tracking import MemoryTracker
-    from service.answers.motion import derivatives
 
 _MODULES = {
     "Limits": "guard",
-    "MemoryTracker": "memory_tracking",
+    "MemoryTracker": "answering",
     "Rules": "fallback",
     "Served": "answering",
     "answer": "answering",
     "answer_safely": "fallback",
-    "derivatives": "motion",
+    "derivatives": "answering",
     "trust_by_age": "answering",
 }
 __all__ = [

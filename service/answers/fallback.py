@@ -23,7 +23,7 @@ from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
 from service.protocol.model import StandIn
-from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
+from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
 
 #: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
 FADE_S, FADE_SAMPLES = 0.006, 6.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from adaptive.compiled import compiled
 from adaptive.types import BoolArray, FloatArray
 from service.protocol.errors import FieldError
-from service.protocol.reply import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from service.background.job import BackgroundJob, run_worker
-from service.background.priority import step_back
+from service.background.job import BackgroundJob, run_worker, step_back
 
 __all__ = ["BackgroundJob", "run_worker", "step_back"]

@@ -17,15 +17,15 @@ from adaptive.lazy_names import lazy_names
 if TYPE_CHECKING:
     from service.client.client import Client
     from service.client.follower import Follower
-    from service.protocol.reply import Point, Trajectory
+    from service.protocol.query import Point, Trajectory
 
 __all__ = ["Client", "Follower", "Point", "Trajectory"]
 
 _MODULES = {
     "Client": "client",
     "Follower": "follower",
-    "Point": ".protocol.reply",
-    "Trajectory": ".protocol.reply",
+    "Point": ".protocol.query",
+    "Trajectory": ".protocol.query",
 }
 
 __getattr__ = lazy_names(__name__, _MODULES)

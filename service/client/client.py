@@ -11,9 +11,11 @@ Queries change nothing in the service: any of them can be repeated. The client r
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -22,18 +24,189 @@ import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
+from adaptive.types import FloatArray
+from service.answers.answering import derivatives
 from service.answers.guard import Limits, guard
-from service.answers.motion import derivatives
 from service.client.follower import Follower
-from service.client.pending import continued, with_pending
-from service.client.retry import RETRY_S, RetryingQueries
-from service.protocol.errors import NoReplyError
+from service.protocol.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.protocol.keys import AUTO, Keys
-from service.protocol.query import NEWEST, encode_query
-from service.protocol.reply import Answer, Point, Trajectory
+from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference
-from service.runtime.delivery import SURELY
-from service.runtime.session import DEFAULT_ENDPOINT, open_client
+from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
+
+# --- How a query continues from the answer before it: its memory, its last voltage, and what is under way.
+#
+# Under way are the samples that are commanded and not yet seen by the service.
+
+#: Fewest samples under way that are kept. Only those after the newest snapshot matter, some tens of samples.
+#: While no samples arrive, all since that snapshot are kept, up to MAX_PENDING, because the stage may have turned.
+UNDER_WAY: Final = 512
+
+
+def pending_before(after: Point | Trajectory | None, begin: int) -> Pending | None:
+    """What is under way before sample ``begin``; None for nothing.
+
+    It is what ``after`` left, without the samples from ``begin`` on. Between its end and ``begin`` nothing was
+    commanded: the stage holds the last voltage there.
+    """
+    if after is None or after.pending is None or begin <= after.pending.first:
+        return None
+    first, y_um, u_V = after.pending
+    wanted = begin - first
+    if wanted >= y_um.size + UNDER_WAY:
+        return None
+    held = max(wanted - y_um.size, 0)
+    y_um, u_V = np.pad(y_um, (0, held), "edge")[:wanted], np.pad(u_V, (0, held), "edge")[:wanted]
+    kept = min(wanted, max(UNDER_WAY, min(begin - after.snapshot_seq, MAX_PENDING)))
+    return Pending(begin - kept, y_um[-kept:], u_V[-kept:])
+
+
+def extended(before: Pending | None, begin: int, y_um: FloatArray, u_V: FloatArray) -> Pending:
+    """``before`` and the (n,) samples from ``begin`` on."""
+    if before is None:
+        return Pending(begin, y_um, u_V)
+    return Pending(before.first, np.concatenate([before.y_um, y_um]), np.concatenate([before.u_V, u_V]))
+
+
+def with_pending(answer: Trajectory, before: Pending | None, begin: int, y_um: FloatArray) -> Trajectory:
+    """``answer`` to (n,) ``y_um``, commanded from sample ``begin`` on, behind what is under way ``before`` it."""
+    return answer._replace(pending=extended(before, begin, y_um, answer.u_V))
+
+
+@dataclass(slots=True)
+class PendingCommands:
+    """The commands under way of a loop in one process, which asks as a client that gives ``begin``."""
+
+    answer: Trajectory | None = None
+
+    def before(self, begin: int) -> Pending | None:
+        """What is under way before sample ``begin``."""
+        return pending_before(self.answer, begin)
+
+    def take(self, begin: int, y_um: FloatArray, answer: Trajectory) -> None:
+        """Note that the (n,) voltages of ``answer`` to ``y_um``, µm, are commanded from sample ``begin`` on."""
+        self.answer = with_pending(answer, self.before(begin), begin, y_um)
+
+
+def continued(
+    memory: ArrayLike | None, model: str, u_before_V: float, after: Point | Trajectory | None, begin: int | None = None
+) -> dict[str, Any]:
+    """Arguments ``memory``, ``model``, ``u_before_V`` (and ``pending``) of a query that continues from ``after``.
+
+    Arguments that are given are kept. With ``begin``, the number of the first sample of the query, ``pending`` replaces
+    the memory. Raises InputError if both ``memory`` and ``begin`` are given.
+    """
+    if begin is not None:
+        if memory is not None:
+            raise FieldError("memory", "memory and begin", "one of the two: with begin the service tracks the memory")
+        under = pending_before(after, begin)
+        asked = continued(np.empty(0), model, u_before_V, after)
+        # The answer may replace the end of the one before: then the last voltage under way is the one before it.
+        before_V = float(under.u_V[-1]) if under is not None and math.isnan(u_before_V) else asked["u_before_V"]
+        return asked | {"memory": None, "pending": under, "u_before_V": before_V}
+    if after is not None:
+        memory = after.memory if memory is None else memory
+        model = model or after.model
+        if math.isnan(u_before_V):
+            u_before_V = after.u_V if isinstance(after.u_V, float) else float(after.u_V[-1])
+    return {"memory": memory, "model": model, "u_before_V": u_before_V}
+
+
+# --- Queries of a client: one reply each, an exception that states why there is none, and repetition without an answer.
+
+_BEHIND_PAUSE_S: Final = 0.001
+#: Default time for which an unanswered query is repeated, s. A standby takes over within some hundredths of a second if
+#: the service has died, within about a second if it has only stopped.
+RETRY_S: Final = 2.0
+_RETRY_PAUSE_S: Final = 0.003
+
+
+class RetryingQueries:
+    """The queries of one client.
+
+    Parameters
+    ----------
+    timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
+
+    Attributes
+    ----------
+    retries : count of repetitions.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, timeout_s: float, retry_s: float) -> None:
+        self.timeout_s, self.retry_s = timeout_s, retry_s
+        self.retries = 0
+        self._session, self._keys = session, keys
+        self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True)
+
+    def close(self) -> None:
+        """Undeclare the querier."""
+        self._querier.undeclare()  # type: ignore[no-untyped-call]
+
+    def once(self, selector: str) -> bytes:
+        """The payload of the one reply, without repetition. Raises NoReplyError, ReplyTimeoutError, RefusedError."""
+        return self._one(self._session.get(selector, timeout=self.timeout_s))
+
+    def get(self, selector: str) -> bytes:
+        """As :meth:`once`, but repeated for ``retry_s`` while there is no answer."""
+        return self._repeated(lambda: self.once(selector))
+
+    def status(self, once: bool = False) -> dict[str, Any]:
+        """The present status of the axis; ``once`` : without repetition."""
+        status = json.loads((self.once if once else self.get)(self._keys.status))
+        if not isinstance(status, dict) or "dt_s" not in status:
+            raise FieldError("status", repr(status)[:80], "a status of this wire version")
+        return status
+
+    def feedforward(self, payload: bytes, wait_s: float) -> Trajectory:
+        """The answer to an encoded query, which is repeated for ``retry_s`` while there is none.
+
+        ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
+        BehindError after that.
+        """
+        start = time.monotonic()
+        while True:
+            answer = decode_reply(self._repeated(lambda: self._one(self._querier.get(payload=payload))))
+            if not answer.behind:
+                return answer
+            if time.monotonic() - start >= wait_s:
+                raise BehindError(
+                    f"{self._keys.feedforward}: the service has learnt up to sample {answer.snapshot_seq} only; "
+                    "ask for an earlier as_of, allow more wait_s, or check in the status whether samples arrive"
+                )
+            time.sleep(_BEHIND_PAUSE_S)
+
+    def _repeated(self, ask: Callable[[], bytes]) -> bytes:
+        start = time.monotonic()
+        while True:
+            try:
+                return ask()
+            except (NoReplyError, ReplyTimeoutError):
+                # The service may have died: a standby takes over, or the service restarts.
+                if time.monotonic() - start >= self.retry_s:
+                    raise
+                self.retries += 1
+                time.sleep(_RETRY_PAUSE_S)
+
+    def _one(self, replies: Iterable[zenoh.Reply]) -> bytes:
+        error: bytes | None = None
+        for reply in replies:
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+            if reply.err is not None:
+                error = bytes(reply.err.payload.to_bytes())
+        if error is None:
+            raise NoReplyError(
+                f"{self._keys.base}: no reply within {self.timeout_s:g} s. Check that a service for stage "
+                f"{self._keys.stage!r}, axis {self._keys.axis!r} is running and that your role may query it"
+            )
+        failure = error_from_json(error)
+        if isinstance(failure, ReplyTimeoutError):
+            raise ReplyTimeoutError(f"{self._keys.base}: no answer within {self.timeout_s:g} s; ask again")
+        raise failure
+
+
+# --- The client.
 
 #: Longest time until an open session knows what is declared at its other end, s; until then queries get no reply.
 _SETTLE_S: Final = 0.5

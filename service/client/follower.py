@@ -16,13 +16,12 @@ from adaptive.errors import DehystError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
-from service.answers.answering import trust_by_age
+from service.answers.answering import derivatives, trust_by_age
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, limit_voltage
-from service.answers.motion import derivatives
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
-from service.protocol.reply import (
+from service.protocol.query import (
     BLENDED,
     NOT_FINITE_REPLACED,
     OUTSIDE_DOMAIN,
@@ -42,7 +41,7 @@ class Follower:
     ----------
     memory : (m,) hysteresis memory after the last answered point.
     received, refused : counts of accepted and of unusable snapshots. last_error : why the last one was refused.
-    last_flags : flags of the last voltage (see :func:`service.protocol.reply.flag_names`).
+    last_flags : flags of the last voltage (see :func:`service.protocol.query.flag_names`).
     last_std_V : one standard deviation of the last voltage, V; NaN if the model does not state it or before any answer.
     last_trajectory : the last answer of :meth:`trajectory`, with deviations and stand-in; None before any.
     """

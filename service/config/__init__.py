@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from service.config.settings import AxisConfig, ServeConfig, parse_config, read_config
 
 _MODULES = {
-    "AxisConfig": "config",
+    "AxisConfig": "settings",
     "LearnerSettings": "learner",
-    "ServeConfig": "config",
+    "ServeConfig": "settings",
     "Setting": "schema",
     "build_settings": "schema",
-    "parse_config": "config",
-    "read_config": "config",
+    "parse_config": "settings",
+    "read_config": "settings",
     "read_learner_settings": "learner",
 }
 __all__ = [

@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Final
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.failover.peer_files import PeerFiles, standby_folder
-    from service.failover.reachability import Reachability
-    from service.failover.role_control import RoleControl
+    from service.failover.role_control import Reachability, RoleControl
+    from service.failover.standby_model import PeerFiles, standby_folder
 
 __all__ = ["PeerFiles", "Reachability", "RoleControl", "standby_folder"]
 
 _MODULES: Final = {
-    "PeerFiles": "peer_files",
-    "Reachability": "reachability",
+    "PeerFiles": "standby_model",
+    "Reachability": "role_control",
     "RoleControl": "role_control",
-    "standby_folder": "peer_files",
+    "standby_folder": "standby_model",
 }
 
 __getattr__ = lazy_names(__name__, _MODULES)

@@ -7,18 +7,113 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any, Final
 
 import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
-from service.failover.claims import Claim, Claims
-from service.failover.peer_files import PeerFiles, restore_from_peer
-from service.failover.reachability import Reachability
-from service.failover.standby_model import StandbyModel
+from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
 from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state
-from service.protocol.json_message import fields_of
+from service.protocol.container import fields_of
+from service.protocol.keys import Keys
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
+
+# --- Claims to serve an axis, and the rule that decides which instance serves.
+#
+# A serving instance holds a liveliness token with its *epoch*: one more than any epoch that it knew when it took over.
+# Of two serving instances the one with the lower epoch stands down; with equal epochs, the one with the lower name. An
+# instance that was suspended therefore stands down when it returns, because its successor has the higher epoch. Clocks
+# are not compared.
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Claim:
+    """One claim; the greatest one has precedence."""
+
+    epoch: int
+    instance: str
+
+
+def parse_claim(key: str) -> Claim | None:
+    """The claim in the key of a token; None if the key is not a claim."""
+    parts = key.split("/")
+    return Claim(int(parts[-2]), parts[-1]) if len(parts) > 2 and parts[-2].isdigit() else None
+
+
+class Claims:
+    """The claims of other instances that are alive. Zenoh's thread updates them, the thread of the role reads them.
+
+    Attributes
+    ----------
+    changed : set after every update.
+    """
+
+    def __init__(self, keys: Keys, instance: str) -> None:
+        self.keys = keys
+        self.instance = instance
+        self.changed = threading.Event()
+        self._alive: set[Claim] = set()
+        self._highest_epoch = 0
+        self._lock = threading.Lock()
+
+    def update(self, key: str, alive: bool) -> None:
+        """A token has appeared (``alive``) or disappeared."""
+        claim = parse_claim(key)
+        if claim is None or claim.instance == self.instance:
+            return
+        with self._lock:
+            self._highest_epoch = max(self._highest_epoch, claim.epoch)
+            (self._alive.add if alive else self._alive.discard)(claim)
+        self.changed.set()
+
+    def highest(self) -> Claim | None:
+        """The claim with precedence among the others; None if there is none."""
+        with self._lock:
+            return max(self._alive, default=None)
+
+    def next_epoch(self) -> int:
+        """One more than any known epoch."""
+        with self._lock:
+            return self._highest_epoch + 1
+
+
+# --- Whether an instance behind routers is connected to one of them.
+#
+# An instance that loses its router sees the claims of all others disappear. It must not take over then: nobody could
+# query it, and after the reconnection two instances would serve, of which the one that never failed would stand down.
+
+#: Time from the loss of a claim until the loss of the router is known too, s; 5 ms were measured.
+_ROUTER_LOSS_KNOWN_S: Final = 0.02
+#: Time from a reconnection until the claims behind the router are known, s.
+_CLAIMS_KNOWN_S: Final = 0.5
+
+
+class Reachability:
+    """Reachability of one session.
+
+    Parameters
+    ----------
+    behind_routers : True if others reach this instance through routers only: it listens at no endpoint.
+    """
+
+    def __init__(self, session: zenoh.Session, behind_routers: bool) -> None:
+        self._session = session
+        self._behind_routers = behind_routers
+        self._unconnected_at = -_CLAIMS_KNOWN_S
+
+    def is_cut_off(self) -> bool:
+        """True if missing claims do not show that the others have failed. Takes 20 ms; do not call it in a callback."""
+        if not self._behind_routers:
+            return False
+        time.sleep(_ROUTER_LOSS_KNOWN_S)
+        now = time.monotonic()
+        if not self._session.info.routers_zid():
+            self._unconnected_at = now
+        return now - self._unconnected_at < _CLAIMS_KNOWN_S
+
+
+# --- Role control.
 
 #: Events of the serving instance after which its model no longer follows from the samples alone.
 MODEL_EVENTS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.identification.identifying import Identified, Stretch, identify_all, identify_one
-    from service.identification.pictures import draw_identification
+    from service.identification.identifying import Identified, Stretch, draw_identification, identify_all, identify_one
 
 _MODULES = {
     "Identified": "identifying",
     "Stretch": "identifying",
-    "draw_identification": "pictures",
+    "draw_identification": "identifying",
     "identify_all": "identifying",
     "identify_one": "identifying",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,17 @@ from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
 from service.protocol.errors import FieldError
+from service.reports.plot_style import figure, label, legend, line, save
+from service.viewer.colours import MEASURED, TRAINING, model_colour
 from sim.recordings import Recording, Repaired
+
+# --- Identification and scores.
 
 #: Names of the models, in the order in which they are identified and shown.
 NAMES = ("linear", "bouc_wen", "mpi", "lssvm_frozen", "lssvm_adaptive")
-#: First share of a separate test recording that only settles the models' memory and is not scored.
+#: Share at the beginning of a separate test recording that is not scored: it only settles the models' memory.
 SETTLE_SHARE = 0.05
-#: Least number of samples to identify from, and to score on.
+#: Fewest samples for identification, and for scoring.
 LEAST_TRAIN, LEAST_TEST = 200, 50
 
 
@@ -29,9 +34,9 @@ LEAST_TRAIN, LEAST_TEST = 200, 50
 class Score:
     """Free-run error of an inverse model on held-out data.
 
-    The model turns the measured motion (smoothed with zero phase) into a voltage; the error is that voltage less the
-    applied one. ``_um``: the same times the mean gain of the training data. ``_pct``: in percent of the displacement
-    range of the training data.
+    The model computes a voltage from the measured motion (smoothed with zero phase). The error is this voltage minus
+    the applied one. ``_um`` : the error times the mean gain of the training data. ``_pct`` : that, in percent of the
+    displacement range of the training data.
     """
 
     mae_V: float
@@ -47,9 +52,9 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """One model with its held-out score and the time that its identification took.
+    """One model with its held-out score and the duration of its identification.
 
-    ``error_V`` is (n_test,) V, NaN where a sample is not scored. ``failed`` is the reason if there is no model.
+    error_V : (n_test,) V, NaN where a sample is not scored. failed : the reason if there is no model.
     """
 
     name: str
@@ -92,7 +97,7 @@ def motion_of(recording: Recording) -> FloatArray:
 
 
 def split_at(n: int, holdout: float) -> int:
-    """Index where the held-out last part begins. Raises InputError if either part is too short."""
+    """Index of the first sample of the held-out last part. Raises InputError if one part is too short."""
     if not 0.0 < holdout < 0.9:
         raise FieldError("--holdout", holdout, "a share of the recording above 0 and below 0.9")
     split = round(n * (1.0 - holdout))
@@ -125,10 +130,10 @@ def identify_one(name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: i
 
 
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
-    """(n_test,) voltages, V, that the model gives for the test's measured motion.
+    """(n_test,) voltages, V, of the model for the measured motion of the test.
 
-    ``before`` are the samples just before the test; they only settle the memory. Without them the memory is that of a
-    stage at rest at the first test sample.
+    ``before`` : the samples just before the test; they only settle the memory. Without them, the memory starts as that
+    of a stage at rest at the first test sample.
     """
     first = before if before is not None and len(before) else test
     memory = model.rest_memory(float(first.motion[0, 0]))
@@ -145,7 +150,7 @@ def _columns(stretch: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Score:
-    """The score of (n,) voltage errors, without NaN entries."""
+    """Score of (n,) voltage errors, V; NaN entries are ignored."""
     size = np.abs(error_V[np.isfinite(error_V)])
     in_V = (float(np.mean(size)), float(np.sqrt(np.mean(size**2))), float(np.max(size)))
     in_um = tuple(abs(gain_um_per_V) * value for value in in_V)
@@ -163,11 +168,11 @@ def identify_all(
     n: int = 500,
     progress: Callable[[str], None] = lambda _: None,
 ) -> list[Identified]:
-    """Identify every model on ``train`` and score it on ``test``; with ``whole``, identify it again on all data.
+    """Identify every model from ``train`` and score it on ``test``.
 
-    ``follows``: the test continues the training data in time. Otherwise it is a separate recording, whose first
-    ``SETTLE_SHARE`` only settles the memories. With ``whole`` the returned model is identified from it. A model that
-    cannot be identified is returned with ``failed``; the others are not affected.
+    ``follows`` : the test continues the training data in time. Otherwise it is a separate recording, and its first
+    ``SETTLE_SHARE`` only settles the memory. ``whole`` : if given, the returned models are identified again from this
+    data. If a model cannot be identified, its result has ``failed`` set; the other models are not affected.
     """
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     range_um = float(np.ptp(train.motion[:, 0]))
@@ -192,3 +197,69 @@ def identify_all(
             continue
         results.append(Identified(name, model, score, error_V, seconds))
     return results
+
+
+# --- The picture of an identification: measured loop, remaining loop, held-out residual and errors of all models.
+
+#: Names of the models in the legends.
+LABELS = {
+    "linear": "linear gain",
+    "bouc_wen": "Bouc-Wen",
+    "mpi": "modified Prandtl-Ishlinskii",
+    "lssvm_frozen": "LSSVM, two inputs",
+    "lssvm_adaptive": "LSSVM with memory",
+}
+
+
+def draw_identification(
+    path: Path,
+    title: str,
+    train: Stretch,
+    test: Stretch,
+    dt_s: float,
+    results: list[Identified],
+    gain_um_per_V: float,
+) -> None:
+    """Write one PNG: measured loop, remaining loops on held-out data, held-out residual over time, errors.
+
+    Residuals are voltage errors times the mean gain, µm. Raises OSError if the file cannot be written.
+    """
+    shown = [result for result in results if result.score is not None]
+    drawn, axes = figure(2, 2, (12.0, 8.0), title, width_ratios=[1.0, 1.4])
+    loop, remaining, residual, bars = axes[0, 0], axes[0, 1], axes[1, 1], axes[1, 0]
+
+    line(loop, train.u_V, train.y_um, color=TRAINING, label="identified from")
+    line(loop, test.u_V, test.y_um, color=MEASURED, label="held out")
+    label(loop, "voltage u / V", "displacement y / µm", "measured loop")
+    legend(loop, loc="upper left")
+
+    best = min(shown, key=lambda result: result.score.rmse_V if result.score else np.inf, default=None)
+    for name in dict.fromkeys(["linear", best.name if best else ""]):
+        result = next((r for r in shown if r.name == name), None)
+        if result is not None:
+            motion, error = test.motion[:, 0], result.error_V * 1e3
+            line(remaining, motion, error, color=model_colour(name), lw=0.7, label=LABELS[name])
+    label(remaining, "displacement y / µm", "voltage error / mV", "remaining loop, held out")
+    legend(remaining, loc="best")
+
+    t_s = np.arange(len(test)) * dt_s
+    # Without the linear model: its error is many times larger and is visible in the plot above.
+    compared = [result for result in shown if result.name != "linear"] or shown
+    for result in compared:
+        error = result.error_V * abs(gain_um_per_V)
+        line(residual, t_s, error, color=model_colour(result.name), label=LABELS[result.name])
+    label(residual, "time since the held-out part began / s", "equivalent displacement error / µm")
+    residual.set_title("held-out residual, free run", fontsize=9)
+    residual.axhline(0.0, color="black", lw=0.5)
+    residual.margins(y=0.18)
+    legend(residual, loc="upper right", ncols=2)
+
+    values = [result.score.rmse_um for result in shown if result.score]
+    names = [result.name for result in shown]
+    rows = bars.barh(range(len(names)), values, color=[model_colour(name) for name in names])
+    bars.bar_label(rows, labels=[f"{value:.3g}" for value in values], padding=3, fontsize=8)
+    bars.set_yticks(range(len(names)), [LABELS[name] for name in names])
+    bars.invert_yaxis()
+    label(bars, "held-out RMSE, equivalent displacement / µm", "", "held-out error")
+    bars.margins(x=0.15)
+    save(drawn, path)

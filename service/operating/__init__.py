@@ -11,21 +11,18 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.operating.journal import Journal
-    from service.operating.remote import Standbys, operate, statuses
-    from service.operating.request import Request
-    from service.operating.server import OperationsServer
-    from service.operating.table import screen
-    from service.operating.verbs import Verbs
+    from service.operating.remote import Standbys, operate, screen, statuses
+    from service.operating.server import Journal, OperationsServer
+    from service.operating.verbs import Request, Verbs
 
 _MODULES = {
-    "Journal": "journal",
+    "Journal": "server",
     "OperationsServer": "server",
-    "Request": "request",
+    "Request": "verbs",
     "Standbys": "remote",
     "Verbs": "verbs",
     "operate": "remote",
-    "screen": "table",
+    "screen": "remote",
     "statuses": "remote",
 }
 __all__ = [

@@ -1,10 +1,6 @@
-"""Container of a state: a JSON header and arrays. Checkpoints, model messages and model files use it.
+"""Forms of messages and files: JSON objects, and a container of a JSON header and arrays.
 
-Checkpoints and model messages have the same body behind their own fixed headers (docs/protocol.md): the header as UTF-8
-JSON, padded with blanks to a multiple of eight bytes; then the arrays, little-endian and row-major, each padded with
-zeros to a multiple of eight bytes. The entry ``arrays`` of the header lists ``[name, type, shape]`` of each array in
-order. A model file is a ``.npz`` archive, which stores names, types and shapes itself: it shares the header and the
-division of a state into values and arrays.
+Checkpoints, model messages and model files use the container.
 """
 
 from __future__ import annotations
@@ -20,6 +16,38 @@ from numpy.typing import NDArray
 from adaptive.errors import ModelFileError
 from adaptive.types import StateDict
 from service.protocol.errors import FieldError
+
+# --- JSON on the wire: what other processes send, and what this one answers.
+
+#: Encoding of replies and publications that are JSON.
+JSON: Final = "application/json"
+
+
+def fields_of(payload: bytes) -> dict[str, Any]:
+    """The fields of a JSON object; empty if ``payload`` is not one. Never raises."""
+    try:
+        value = json.loads(payload)
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def to_json(value: Any) -> bytes:
+    """JSON of ``value``, in which numpy's numbers and arrays may be; anything else becomes its text."""
+    return json.dumps(value, default=_plain).encode()
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+# --- Container of a state: a JSON header and arrays. Checkpoints, model messages and model files use it.
+#
+# Checkpoints and model messages have the same body behind their own fixed headers (docs/protocol.md): the header as
+# UTF-8 JSON, padded with blanks to a multiple of eight bytes; then the arrays, little-endian and row-major, each padded
+# with zeros to a multiple of eight bytes. The entry ``arrays`` of the header lists ``[name, type, shape]`` of each
+# array in order. A model file is a ``.npz`` archive, which stores names, types and shapes itself: it shares the header
+# and the division of a state into values and arrays.
 
 UNITS: Final = {"y": "um", "u": "V", "t": "s", "v": "um/s", "a": "um/s2"}
 #: Types of arrays in a body, as numpy names them.

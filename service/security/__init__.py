@@ -12,23 +12,22 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from service.security.access import ROLES, Plan, access_control, add, create, read_plan, remove
     from service.security.check import check_reach, has_access_control
-    from service.security.files import Plan, add, create, read_plan, remove
     from service.security.refusals import Refusals, count_refusals
-    from service.security.rules import ROLES, access_control
 
 _MODULES = {
-    "ROLES": "rules",
-    "Plan": "files",
+    "ROLES": "access",
+    "Plan": "access",
     "Refusals": "refusals",
-    "access_control": "rules",
-    "add": "files",
+    "access_control": "access",
+    "add": "access",
     "check_reach": "check",
     "count_refusals": "refusals",
-    "create": "files",
+    "create": "access",
     "has_access_control": "check",
-    "read_plan": "files",
-    "remove": "files",
+    "read_plan": "access",
+    "remove": "access",
 }
 __all__ = [
     "ROLES",

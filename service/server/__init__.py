@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.server.axis import Axis
+    from service.server.axis import Axis, EventLog
     from service.server.axis_loading import load_axis
     from service.server.axis_loop import AxisLoop
     from service.server.axis_server import AxisServer
-    from service.server.events import EventLog
     from service.server.process import Service
     from service.server.status import axis_status
 
@@ -23,10 +22,10 @@ _MODULES = {
     "Axis": "axis",
     "AxisLoop": "axis_loop",
     "AxisServer": "axis_server",
-    "EventLog": "events",
+    "EventLog": "axis",
     "Service": "process",
     "axis_status": "status",
-    "load_axis": "models",
+    "load_axis": "axis_loading",
 }
 __all__ = [
     "Axis",

@@ -11,19 +11,15 @@ import zenoh
 from service.answers.answering import trust_by_age
 from service.background.retuning.retuner import Retuner
 from service.intake.sample_queue import SampleQueue
-from service.operating.journal import Journal
-from service.operating.server import OperationsServer
+from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
-from service.server.latency import LatencyMeter
-from service.server.publications import Publications
-from service.server.query_answers import QueryAnswers
-from service.server.status import axis_status
-from service.storage.checkpoint import CheckpointFolder
-from service.storage.checkpoint_keeper import CheckpointKeeper
+from service.server.query_answers import LatencyMeter, QueryAnswers
+from service.server.status import Publications, axis_status
+from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
@@ -42,7 +38,7 @@ class AxisServer:
 
     Attributes
     ----------
-    role : "primary" while it serves, else "standby". epoch : number of its take-over, see `service.failover.claims`.
+    role : "primary" while it serves, else "standby". epoch : number of its take-over, see `RoleControl`.
     synced : whether the model is the one to be served: its own, or, of a standby, that of the serving instance.
     loop : the thread of the axis. checkpoints : writes them.
     """

@@ -15,9 +15,8 @@ import zenoh
 from threadpoolctl import threadpool_limits
 
 from service.config.settings import AxisConfig, ServeConfig
-from service.failover.peer_files import PeerFiles, standby_folder
-from service.failover.reachability import Reachability
-from service.failover.role_control import RoleControl
+from service.failover.role_control import Reachability, RoleControl
+from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
@@ -26,7 +25,7 @@ from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
-from service.storage.checkpoint_keeper import learn_again, restore_newest
+from service.storage.checkpoint import learn_again, restore_newest
 
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
 #: 5 ms a query that meets the learner would wait for that long.

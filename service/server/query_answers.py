@@ -7,20 +7,51 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
 from service.failover.state_transfer import send_state
+from service.protocol.container import JSON, to_json
 from service.protocol.errors import FieldError, error_to_json
-from service.protocol.json_message import JSON, to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
-from service.protocol.query import decode_query
-from service.protocol.reply import encode_reply
+from service.protocol.query import decode_query, encode_reply
 from service.server.axis import Axis
-from service.server.latency import LatencyMeter
-from service.storage.checkpoint import encode_checkpoint
-from service.storage.checkpoint_keeper import CheckpointKeeper
+from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
+
+# --- How long the service took over its queries: the last thousand, and counts since the start.
+
+_KEPT: Final = 1024
+
+
+class LatencyMeter:
+    """Keeps the last durations; one thread adds, others may read."""
+
+    def __init__(self) -> None:
+        self._us = np.zeros(_KEPT)
+        self.count = 0
+        self.errors = 0
+
+    def add(self, duration_s: float, failed: bool = False) -> None:
+        """Count one query that took ``duration_s`` in the service, wire not included."""
+        self._us[self.count % _KEPT] = duration_s * 1e6
+        self.count += 1
+        self.errors += failed
+
+    def summary(self) -> dict[str, float | int | None]:
+        """``count``, ``errors``, and of the last thousand ``p50_us`` and ``p99_us``; null before the first."""
+        known = self._us[: min(self.count, _KEPT)].copy()
+        p50, p99 = np.percentile(known, (50, 99)).tolist() if known.size else (None, None)
+        return {
+            "count": self.count,
+            "errors": self.errors,
+            "p50_us": None if p50 is None else round(p50, 1),
+            "p99_us": None if p99 is None else round(p99, 1),
+        }
+
+
+# --- Answers.
 
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02

@@ -13,24 +13,29 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
-    from service.storage.checkpoint_keeper import CheckpointKeeper, learn_again, restore_newest
+    from service.storage.checkpoint import (
+        CheckpointFolder,
+        CheckpointKeeper,
+        CheckpointMeta,
+        learn_again,
+        restore_newest,
+    )
     from service.storage.model_file import Bundle, BundleMeta, read_bundle, write_bundle
-    from service.storage.output_folder import clear_output
+    from service.storage.output import clear_output
     from service.storage.recorder import Recorder, RecorderConfig
 
 _MODULES = {
     "Bundle": "model_file",
     "BundleMeta": "model_file",
     "CheckpointFolder": "checkpoint",
-    "CheckpointKeeper": "checkpoint_keeper",
+    "CheckpointKeeper": "checkpoint",
     "CheckpointMeta": "checkpoint",
     "Recorder": "recorder",
     "RecorderConfig": "recorder",
-    "clear_output": "output_folder",
-    "learn_again": "checkpoint_keeper",
+    "clear_output": "output",
+    "learn_again": "checkpoint",
     "read_bundle": "model_file",
-    "restore_newest": "checkpoint_keeper",
+    "restore_newest": "checkpoint",
     "write_bundle": "model_file",
 }
 __all__ = [

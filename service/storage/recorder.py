@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from service.protocol.errors import FieldError
-from service.storage.journal import Journal, Rows, Syncer
-from service.storage.segments import Closer, claim, journal_of, left_open, make_room, next_number
+from service.storage.segments import Closer, Journal, Rows, Syncer, claim, journal_of, left_open, make_room, next_number
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"

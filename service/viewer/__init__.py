@@ -14,9 +14,9 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from service.viewer.consumer import Consumer, ConsumerConfig
-    from service.viewer.offline import write_recording
     from service.viewer.output import Output, OutputConfig
     from service.viewer.records import Diagnostics, Event, Health, Record, SceneConfig, Status, Tracking
+    from service.viewer.rerun_sink import write_recording
 
 __all__ = [
     "Consumer",
@@ -45,7 +45,7 @@ _MODULES: Final = {
     "ConsumerConfig": "consumer",
     "Output": "output",
     "OutputConfig": "output",
-    "write_recording": "offline",
+    "write_recording": "rerun_sink",
 }
 
 __getattr__ = lazy_names(__name__, _MODULES)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from adaptive.errors import InputError
-from service.background.priority import step_back
+from service.background.job import step_back
 from service.protocol.errors import ServiceError
 from service.viewer.records import Record, SceneConfig
 

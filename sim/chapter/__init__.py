@@ -12,16 +12,15 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from sim.chapter.adaptive_loop import track_learning
-    from sim.chapter.characterisation import characterise
     from sim.chapter.control import run_control
-    from sim.chapter.experiments import Experiments, Record, Score
+    from sim.chapter.experiments import Experiments, Record, Score, characterise
     from sim.chapter.modelling import identify_forward
 
 _MODULES = {
     "Experiments": "experiments",
     "Record": "experiments",
     "Score": "experiments",
-    "characterise": "characterisation",
+    "characterise": "experiments",
     "identify_forward": "modelling",
     "run_control": "control",
     "track_learning": "adaptive_loop",

@@ -1,7 +1,6 @@
 """Signals for simulated stages: ``voltages`` to apply, ``references`` to follow, and ``sample_times``."""
 
 from sim.signals.references import DemoReference, Motion, Reference, demo_reference
-from sim.signals.sample_times import sample_times
 from sim.signals.voltages import (
     CHAPTER_AMPLITUDE_V,
     Excitation,
@@ -10,6 +9,7 @@ from sim.signals.voltages import (
     growing_triangles,
     minor_loops,
     multitone,
+    sample_times,
     sine,
     training_input,
     triangle,

@@ -18,7 +18,7 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.signals.sample_times import sample_times
+from sim.signals.voltages import sample_times
 
 #: Duration of the blend from one part to the next, s.
 BLEND_S = 0.6

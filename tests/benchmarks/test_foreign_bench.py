@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks.foreign import HEAD, LINE, by_class, goals, line, main, read, table, told
-from lab.rehearsal.events import EVENT_KINDS, SENSOR, draw
+from lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
 from tests.foreign.plants import random_plant
 
 

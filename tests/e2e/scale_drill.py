@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.security.files import Plan, create
+from service.security.access import Plan, create
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.e2e.scale_client import AXES, BEFORE_S, RATE_HZ, STAGES
 from tests.e2e.scale_hosts import Host, make_hub

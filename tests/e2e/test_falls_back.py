@@ -19,7 +19,7 @@ import zenoh
 from service.client.client import Client
 from service.identification.identifying import identify_one
 from service.protocol import samples as wire
-from service.protocol.reply import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN, Trajectory
+from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, STALE, STAND_IN, Trajectory
 from service.runtime.session import open_client
 from service.stage_node.faults import fault_key
 from service.stage_node.node import status_key

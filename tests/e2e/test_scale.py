@@ -17,7 +17,7 @@ import pytest
 from service.client.client import Client
 from service.protocol.errors import ServiceError
 from service.protocol.keys import AUTO
-from service.protocol.reply import Point
+from service.protocol.query import Point
 from tests.e2e.scale_client import LEARNT
 from tests.e2e.scale_hosts import ENTER, namespaces_missing
 from tests.service.conftest import unused_port, write_config

@@ -11,7 +11,7 @@ import time
 import pytest
 import zenoh
 
-from lab.soak.task import AXIS, STAGE
+from lab.soak.controller import AXIS, STAGE
 from service.protocol.keys import Keys
 from service.runtime.session import LEASE_S, open_client
 from tests.service.conftest import unused_port

@@ -35,9 +35,9 @@ from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray
 from lab.rehearsal import Change, Event, Motion, RehearsalConfig, identify
 from lab.rehearsal.disturbance import DisturbedSensor, EventScale, Message, MessageLine
-from lab.rehearsal.identification import excitation_range, go_to_lowest
+from lab.rehearsal.plant import excitation_range, go_to_lowest
 from lab.rehearsal.reference import Excursion, Reference, SmoothStep
-from service.client.pending import PendingCommands
+from service.client.client import PendingCommands
 from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import MAX_SEQ, SampleBatch

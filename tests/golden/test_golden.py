@@ -52,8 +52,15 @@ from baselines.fit import fit_linear, fit_mpi
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.protocol.model import decode_model, encode_model
-from service.protocol.query import FeedforwardQuery, Pending, decode_query, encode_query
-from service.protocol.reply import Answer, decode_reply, encode_reply
+from service.protocol.query import (
+    Answer,
+    FeedforwardQuery,
+    Pending,
+    decode_query,
+    decode_reply,
+    encode_query,
+    encode_reply,
+)
 from service.protocol.samples import (
     SampleBatch,
     decode_samples,
@@ -62,12 +69,11 @@ from service.protocol.samples import (
     encode_samples,
     joined,
 )
-from service.replay.replay import covered, replay
+from service.replay import covered, replay
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.stage_node.faults import CHANGE, DELIVERY, READING, Fault, Injector
-from service.storage.checkpoint import CheckpointFolder, CheckpointMeta
-from service.storage.checkpoint_keeper import restore_newest
+from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, restore_newest
 from service.storage.model_file import Bundle, BundleMeta
 from sim.recordings import ColumnMap, Recording, read, repaired
 from sim.signals.voltages import multitone, training_input

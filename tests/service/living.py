@@ -16,7 +16,7 @@ import zenoh
 
 from service.client.client import Client
 from service.protocol import samples as wire
-from service.protocol.reply import Point
+from service.protocol.query import Point
 from service.runtime.session import open_client
 
 DT_S = 1e-3

@@ -11,8 +11,7 @@ from adaptive.errors import InputError
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel
 from baselines.fit import fit_mpi
-from sim.changes.compare import Comparison, compare
-from sim.changes.signatures import Scales, Stretch, frozen_answer
+from sim.changes import Comparison, Scales, Stretch, compare, frozen_answer
 from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig
 from sim.stage.presets import preset

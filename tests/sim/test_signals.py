@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from sim.signals.references import DemoReference, demo_reference
-from sim.signals.sample_times import sample_times
 from sim.signals.voltages import (
     diagnosis_excitation,
     generalisation_input,
     growing_triangles,
     minor_loops,
     multitone,
+    sample_times,
     sine,
     training_input,
     triangle,

@@ -13,7 +13,7 @@ from service.background.job import run_worker
 
 
 def _diagnosed(job: dict[str, Any], arrays: dict[str, FloatArray]) -> dict[str, Any]:
-    from sim.changes.regression import TooFewSamples
+    from sim.changes import TooFewSamples
 
     try:
         return diagnose(job, arrays["reference"], arrays["recent"])
@@ -29,7 +29,7 @@ def diagnose(job: dict[str, Any], reference: FloatArray, recent: FloatArray) -> 
     ``report`` (folder for a full report, or empty). Raises InputError and ModelFileError.
     """
     from service.storage.model_file import read_bundle
-    from sim.changes.compare import compare
+    from sim.changes import compare
 
     bundle = read_bundle(job["model"])
     model = bundle.models[job["name"]]
@@ -47,7 +47,7 @@ def stretch_of(samples: FloatArray, dt_s: float, from_seq: int) -> Any:
     A long gap splits the samples: then the part with most samples from ``from_seq`` on is taken.
     """
     from adaptive.smoothing import SmootherConfig, smooth_recording
-    from sim.changes.signatures import Stretch
+    from sim.changes import Stretch
 
     first = int(np.searchsorted(samples[0], from_seq))
     whole, valid = _repaired(samples, dt_s, first)

@@ -70,7 +70,7 @@ def _search(wanted: bool) -> tuple[Any, str]:
     """(search for starting points, its name): the batch search with torch if it is wanted and installed."""
     if wanted:
         from baselines.swarm.evidence_search import EvidenceSearch
-        from baselines.swarm.particle_swarm import MissingTorchError, torch_module
+        from baselines.swarm.identification import MissingTorchError, torch_module
 
         try:
             torch_module().set_num_threads(1)

@@ -8,8 +8,21 @@ from pathlib import Path
 
 from service.cli.options import add_epilog, add_shared
 from service.protocol.errors import FieldError
-from service.security.files import DEFAULT_HOSTS, Plan, add, create, read_plan, remove
-from service.security.rules import CLIENT, CONTROLLER, OPERATOR, ROLES, ROUTER, SERVICE, STAGE
+from service.security.access import (
+    CLIENT,
+    CONTROLLER,
+    DEFAULT_HOSTS,
+    OPERATOR,
+    ROLES,
+    ROUTER,
+    SERVICE,
+    STAGE,
+    Plan,
+    add,
+    create,
+    read_plan,
+    remove,
+)
 
 EPILOG = """\
 roles:

@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     write_bundle(args.out, models, meta)
     picture: Path | None = None
     if not args.no_pictures:
-        from service.identification.pictures import draw_identification
+        from service.identification.identifying import draw_identification
 
         picture = args.picture or args.out.with_suffix(".png")
         draw_identification(

@@ -16,7 +16,7 @@ from service.cli.options import add_connection, add_shared
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from service.protocol.reply import Trajectory
+    from service.protocol.query import Trajectory
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Ask and print. Returns 0. Raises ServiceError where there is no answer or the service refuses."""
     from service.client.client import Client
-    from service.protocol.query import NEWEST
-    from service.protocol.reply import flag_names
+    from service.protocol.query import NEWEST, flag_names
 
     columns = _columns(args)
     with Client.connect(

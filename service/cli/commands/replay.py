@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptive.inverse_model import LssvmInverse
     from service.background.retuning.adoption import read as read_adoptions
     from service.config.learner import read_learner_settings
-    from service.replay.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
+    from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from service.server.axis_loading import load_axis
     from service.server.competing import standing_of
     from service.storage.model_file import read_bundle, write_bundle
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     write_gates(args.out / "gates.csv", done)
     write_bundle(args.out / "model.npz", dict(axis.newest.models), bundle.meta)
     if not args.no_pictures:
-        from service.replay.pictures import draw_errors, draw_gates
+        from service.replay import draw_errors, draw_gates
 
         draw_errors(args.out / "errors.png", f"{args.data.name}: foretold, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)

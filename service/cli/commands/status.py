@@ -12,10 +12,9 @@ from typing import Any
 import zenoh
 
 from service.cli.options import add_connection, add_shared
-from service.operating.remote import Standbys, in_order, statuses
-from service.operating.table import screen, table
+from service.operating.remote import Standbys, in_order, screen, statuses, table
+from service.protocol.container import fields_of
 from service.protocol.errors import FieldError
-from service.protocol.json_message import fields_of
 from service.protocol.keys import ROOT, check_name
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal

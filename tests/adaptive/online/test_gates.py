@@ -1,17 +1,29 @@
-"""Each gate refuses what it is for, lets the rest through, and never raises on data."""
+"""Gates of the samples, and the envelope of what may be learnt."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
+from adaptive.features import FeatureMap
+from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
-from adaptive.online.gates import AdmissionConfig, AdmissionState
-from adaptive.types import Sample
+from adaptive.online.config import LearnerConfig
+from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig
+from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL, Learner
+from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
+from adaptive.types import FloatArray, Sample, StateDict
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+# --- Each gate refuses what it is for, lets the rest through, and never raises on data.
 
 DT = 1e-3
 CONFIG = AdmissionConfig(u_min_V=0.0, u_max_V=8.0, y_min_um=-1.0, y_max_um=90.0)
@@ -128,3 +140,360 @@ def test_state_round_trip_and_counters() -> None:
 def test_bad_configuration_is_named(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(bad))):
         AdmissionConfig(**{"u_max_V": 8.0, "y_max_um": 90.0, **bad})  # type: ignore[arg-type]
+
+
+# --- What a stage can become, and nothing beyond: bounds of what is believed, and the way back to the identified model.
+
+DT_S = 1e-3
+Recording = tuple[FloatArray, FloatArray]
+#: Limits of the drive, V, and when the voltage reaches the upper one, stays there, and leaves it, s.
+LOW_V, HIGH_V, REACHED_S, LEFT_S = -1.0, 7.0, 3.0, 4.0
+AT = 2500
+
+
+def range_of(model: LssvmInverse) -> float:
+    return model.features.y_max_um - model.features.y_min_um
+
+
+def feed(learner: Learner, recording: Recording, start: int, stop: int) -> list[str]:
+    u, y = recording
+    return [learner.handle(Sample(k, k * DT_S, float(u[k]), float(y[k]))) for k in range(start, stop)]
+
+
+@pytest.fixture(scope="module")
+def railed() -> Recording:
+    """(u_V, y_um) of 6 s: strokes, a second at the upper limit of the drive, and strokes again."""
+    stage = Stage(preset("rich", seed=5))
+    t_s = np.arange(6000) * DT_S
+    stroke = np.minimum(t_s / 0.5, 1.0) * (4.0 - 2.5 * np.cos(2.0 * np.pi * t_s))
+    way = np.interp(t_s, (REACHED_S - 0.2, REACHED_S, LEFT_S, LEFT_S + 0.2), (0.0, 1.0, 1.0, 0.0))
+    u = stroke + way * (HIGH_V - stroke)
+    u[(t_s >= REACHED_S) & (t_s <= LEFT_S)] = HIGH_V
+    return u, stage.run(stage.initial_state(), u)[0]
+
+
+@pytest.fixture(scope="module")
+def warm(model: LssvmInverse, all_strokes: Recording) -> StateDict:
+    learner = Learner.from_model(model)
+    feed(learner, all_strokes, 0, AT)
+    return learner.state_dict()
+
+
+def limited(**changes: float) -> LearnerConfig:
+    """With the limits of the drive."""
+    admission = AdmissionConfig(u_min_V=LOW_V, u_max_V=HIGH_V)
+    return LearnerConfig(admission=admission, envelope=EnvelopeConfig(**changes))
+
+
+# ---- the bounds
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("gain", (1.0, 0.9, 0.0, -2.0, math.nan, math.inf), "a factor above 1"),
+        *((name, (0.0, -1.0, math.nan, math.inf), "a positive finite number")
+          for name in ("offset", "shape", "jump", "drift_per_s", "follow_s")),
+    ],
+)  # fmt: skip
+def test_what_is_no_bound_is_refused_by_name(name: str, values: tuple[float, ...], expected: str) -> None:
+    for value in values:
+        with pytest.raises(InputError, match=rf"envelope\.{name}: got .*, expected {expected}"):
+            EnvelopeConfig(**{name: value})
+    assert EnvelopeConfig(**{name: 1.5})
+
+
+@pytest.mark.parametrize("base_gain", [1.0, 0.4])
+def test_a_frame_is_inside_up_to_its_bounds_and_not_beyond(model: LssvmInverse, base_gain: float) -> None:
+    """Gain about the identified one, and the reading where the identified stage rests, as a share of the range."""
+    envelope, span_um = EnvelopeConfig(gain=1.25, offset=0.2), range_of(model)
+    base = replace(model.features, gain=base_gain, offset_um=3.0, y_rest_um=20.0)
+    rest_um = base.offset_um + base_gain * base.y_rest_um
+
+    def frame(gain: float, shift: float) -> FeatureMap:
+        """That shows the stage's rest at a shift from where it was, as a share of the range."""
+        return replace(
+            base, gain=gain * base_gain, offset_um=rest_um + shift * span_um - gain * base_gain * base.y_rest_um
+        )
+
+    for gain, shift in ((1.0, 0.0), (1.249, 0.0), (0.801, 0.0), (1.0, 0.199), (1.0, -0.199), (1.249, -0.199)):
+        assert envelope.refuses(base, frame(gain, shift)) == ""
+    assert "gain 1.251 of the identified, allowed 0.800 to 1.250" in envelope.refuses(base, frame(1.251, 0.0))
+    assert "gain 0.799" in envelope.refuses(base, frame(0.799, 0.0))
+    for shift in (0.201, -0.201):
+        told = envelope.refuses(base, frame(1.0, shift))
+        assert told == f"zero moved by {shift * span_um:.3g} µm, allowed {0.2 * span_um:.3g} µm"
+
+
+def test_a_gain_of_readings_is_allowed_by_the_same_factor_both_ways() -> None:
+    envelope = EnvelopeConfig(gain=1.25)
+    assert [envelope.gain_allows(gain) for gain in (0.79, 0.81, 1.0, 1.24, 1.26, -1.0, math.nan)] == [
+        False, True, True, True, False, False, False,
+    ]  # fmt: skip
+
+
+# ---- through the learner
+
+
+@pytest.mark.parametrize("shift", [0.4, -0.4])
+def test_a_zero_that_has_moved_further_than_a_stage_can_is_not_believed(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, shift: float
+) -> None:
+    """By 40 % of the range: it has its name within half a second, no frame moves, and what is served stays."""
+    u, y = all_strokes[0], all_strokes[1].copy()
+    y[AT:] += shift * range_of(model)
+    learner = Learner.from_state(warm)
+    frame, beta = learner.features, learner.parts.filter.beta
+    feed(learner, (u, y), AT, AT + 500)
+    assert learner.trouble == OUT_OF_ENVELOPE
+    for k in range(AT + 500, AT + 2500):
+        feed(learner, (u, y), k, k + 1)
+        assert learner.trouble == OUT_OF_ENVELOPE
+    assert learner.features == frame
+    assert np.abs(learner.parts.filter.beta - beta).max() < 0.01 * np.abs(beta).max()
+    assert not learner.snapshot().valid
+    # The sensor is right again: so is the learner.
+    feed(learner, all_strokes, AT + 2500, AT + 3300)
+    assert learner.trouble == ""
+    assert learner.features == frame
+
+
+@pytest.mark.parametrize(("shift", "offset"), [(0.4, 0.5), (-0.25, 0.3)])
+def test_a_zero_that_has_moved_as_far_as_a_stage_can_is_believed_after_motion(
+    model: LssvmInverse, all_strokes: Recording, shift: float, offset: float
+) -> None:
+    """The same, in an envelope that is wide enough."""
+    u, y = all_strokes[0], all_strokes[1].copy()
+    y[AT:] += shift * range_of(model)
+    learner = Learner.from_model(model, LearnerConfig(envelope=EnvelopeConfig(offset=offset)))
+    feed(learner, (u, y), 0, AT + 700)
+    assert learner.trouble == ""
+    assert learner.features.offset_um == pytest.approx(shift * range_of(model), abs=0.02 * range_of(model))
+    feed(learner, (u, y), AT + 700, AT + 1500)
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.5
+
+
+@pytest.mark.parametrize(("gain", "name"), [(1.3, ""), (0.77, ""), (1.6, SENSOR_GAIN), (0.6, SENSOR_GAIN)])
+def test_a_gain_is_believed_as_far_as_a_stage_can_have_it(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, gain: float, name: str
+) -> None:
+    u, y = all_strokes[0], all_strokes[1].copy()
+    y[AT:] *= gain
+    learner = Learner.from_state(warm)
+    feed(learner, (u, y), AT, AT + 600)
+    assert learner.trouble == name
+    inside = learner.config.envelope.refuses(model.features, learner.features) == ""
+    assert inside
+    if name:
+        assert learner.features.gain == pytest.approx(1.0, abs=0.02)
+
+
+def test_whatever_the_readings_claim_no_frame_is_outside(model: LssvmInverse, all_strokes: Recording) -> None:
+    """Jump after jump in the same direction, each small enough to be believed: the sum is not."""
+    u, y = all_strokes[0], all_strokes[1].copy()
+    learner = Learner.from_model(model)
+    for i in range(12):
+        y[1500 + 350 * i :] += 0.06 * range_of(model)
+    for k in range(u.size):
+        feed(learner, (u, y), k, k + 1)
+        assert learner.config.envelope.refuses(model.features, learner.features) == ""
+    assert learner.counters()["jumps"] >= 3
+    assert learner.trouble
+
+
+def test_no_answer_is_further_from_the_identified_model_than_the_bound(
+    model: LssvmInverse, all_strokes: Recording
+) -> None:
+    """Whatever the filter has come to: all over the range, in rest and in motion."""
+    learner = Learner.from_model(model)
+    feed(learner, all_strokes, 0, 1500)
+    memory = learner.memory()
+    y_um = np.linspace(0.0, range_of(model), 60)
+    motion = y_um, 50.0 * np.cos(y_um), 3000.0 * np.sin(y_um)
+    basis = model.features.run(*motion, memory)[0]
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        size = 10.0 ** rng.uniform(-1.0, 3.0)
+        learner.parts.filter.restore((size * rng.standard_normal(model.beta.size), learner.parts.filter.mark()[1]))
+        learner._cache = None
+        u_V = learner.snapshot().feedforward(*motion, memory).u_V
+        away_V = np.abs(u_V - basis @ model.beta)
+        assert away_V.max() <= learner.parts.allowed_V * (1.0 + 1e-9)
+
+
+# ---- the way back to the identified model
+
+
+def shifted(share: float) -> Callable[[Learner], None]:
+    """Spoils what was learnt: its constant is off by a share of the voltage span, now and in all that is kept."""
+
+    def spoil(learner: Learner) -> None:
+        learner.parts.shift_constant(share * learner.base.span_V)
+        learner._cache = None
+
+    return spoil
+
+
+def doubled(learner: Learner) -> None:
+    """Spoils what was learnt: all coefficients twice as large."""
+    beta, covariance = learner.parts.filter.mark()
+    learner.parts.filter.restore((2.0 * beta, covariance))
+    learner._cache = None
+
+
+def is_identified(learner: Learner) -> bool:
+    """Whether what is served asks for the voltages of the identified model, to 1 % of the span."""
+    served, base = learner.snapshot(), learner.base
+    y_um = np.linspace(0.0, 85.0, 40)
+    still, memory = np.zeros(40), base.rest_memory(0.0)
+    off_V = served.feedforward(y_um, still, still, memory).u_V - base.feedforward(y_um, still, still, memory).u_V
+    return bool(np.abs(off_V).max() < 0.01 * base.span_V and served.features == base.features)
+
+
+@pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6), doubled])
+def test_a_voltage_at_a_limit_by_the_models_fault_ends_in_the_identified_one(
+    model: LssvmInverse, railed: Recording, spoil: Callable[[Learner], None]
+) -> None:
+    """Within 0.3 s of it; it has its name until the voltage has left the limit, and then learning goes on."""
+    # No bound of the shape that would find it first.
+    learner = Learner.from_model(model, limited(shape=100.0))
+    at = round(REACHED_S / DT_S) + 100
+    feed(learner, railed, 0, at)
+    assert learner.trouble == ""
+    spoil(learner)
+    feed(learner, railed, at, at + 300)
+    assert learner.trouble == RAIL
+    assert learner.counters()["begun_again"] >= 1
+    assert is_identified(learner)
+    np.testing.assert_array_equal(learner.parts.filter.beta, model.beta)
+    left = round(LEFT_S / DT_S)
+    for k in range(at + 300, left):
+        feed(learner, railed, k, k + 1)
+        assert learner.trouble == RAIL
+    said = feed(learner, railed, left, left + 1000)
+    assert learner.trouble == ""
+    assert said[-200:].count("learnt") > 90
+    assert learner.counters()["begun_again"] == 1
+    assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
+
+
+def test_a_voltage_at_a_limit_by_the_reference_is_no_trouble(model: LssvmInverse, railed: Recording) -> None:
+    """A second of it; it teaches nothing, but the stage goes on being followed."""
+    learner = Learner.from_model(model, limited())
+    said = []
+    for k in range(6000):
+        said += feed(learner, railed, k, k + 1)
+        assert learner.trouble == ""
+    assert learner.counters()["begun_again"] == 0
+    part = slice(round(REACHED_S / DT_S) + 100, round(LEFT_S / DT_S))
+    assert set(said[part]) == {"saturated"}
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
+
+
+def test_a_voltage_at_a_limit_for_less_than_a_tenth_of_a_second_decides_nothing(model: LssvmInverse) -> None:
+    parts = Learner.from_model(model, limited()).parts
+    parts.judgement.short_V2 = model.span_V**2
+    steps = round(0.09 / parts.check_s)
+    for _ in range(20):
+        for _ in range(steps):
+            parts.watch_rail(True)
+        parts.watch_rail(False)
+    assert parts.events["begun_again"] == 0
+    for _ in range(round(0.11 / parts.check_s)):
+        parts.watch_rail(True)
+    assert parts.railed
+    assert parts.events["begun_again"] == 1
+    # Not again and again: what is wrong now is not what was learnt.
+    for _ in range(500):
+        parts.watch_rail(True)
+    assert parts.events["begun_again"] == 1
+
+
+@pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6), doubled])
+def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
+) -> None:
+    """Within 0.3 s, and is told of for a second. The filter may learn meanwhile: from the identified model on."""
+    learner = Learner.from_state(warm)
+    # It would find its way by itself, slowly: held where it is.
+    learner.freeze()
+    spoil(learner)
+    feed(learner, all_strokes, AT, AT + 300)
+    assert learner.trouble == MODEL_LEFT_ENVELOPE
+    assert learner.counters()["begun_again"] == 1
+    assert is_identified(learner)
+    learner.thaw()
+    told = [learner.trouble for k in range(AT + 300, AT + 2000) if feed(learner, all_strokes, k, k + 1)]
+    assert 700 < told.count(MODEL_LEFT_ENVELOPE) < 1300
+    assert set(told[1300:]) == {""}
+    assert learner.counters()["begun_again"] == 1
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
+
+
+@pytest.mark.parametrize(("gain", "shift"), [(0.2, 0.0), (-0.15, 0.0), (0.1, 0.1), (0.0, -0.2)])
+def test_what_is_learnt_of_a_stage_that_changes_much_is_no_trouble(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict, gain: float, shift: float
+) -> None:
+    """A gain that grows by a fifth within two seconds, a zero that moves by a fifth: inside, and learnt."""
+    u, clean = all_strokes
+    grown = np.clip((np.arange(clean.size) - AT) / 2000.0, 0.0, 1.0)
+    y = clean * (1.0 + gain * grown) + shift * range_of(model) * grown
+    learner = Learner.from_state(warm)
+    for k in range(AT, clean.size):
+        feed(learner, (u, y), k, k + 1)
+        assert learner.trouble == ""
+    assert learner.counters()["begun_again"] == 0
+    assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
+
+
+# ---- kept
+
+
+def test_configuration_and_envelope_go_there_and_back() -> None:
+    config = LearnerConfig(
+        window=77, envelope=EnvelopeConfig(gain=1.2, offset=0.1, shape=0.5, jump=0.05, drift_per_s=0.3, follow_s=0.4)
+    )
+    state = config.state_dict()
+    assert LearnerConfig.from_state(state) == config
+    flat = {name.removeprefix("envelope."): state[name] for name in state if name.startswith("envelope.")}
+    assert flat == asdict(config.envelope)
+    # Settings from before there was an envelope have its defaults.
+    old = {name: value for name, value in state.items() if not name.startswith("envelope.")}
+    assert LearnerConfig.from_state(old) == replace(config, envelope=EnvelopeConfig())
+
+
+def test_a_state_from_before_there_was_an_envelope_goes_on(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict
+) -> None:
+    new = ("config.envelope.", "rail", "left", "confirmed", "front.trials", "front.following.", "front.past",
+           "base.anchor", "base.allowed_V")  # fmt: skip
+    old = {name: value for name, value in warm.items() if not name.startswith(new)}
+    assert len(warm) - len(old) > 15
+    learner, twin = Learner.from_state(old), Learner.from_state(warm)
+    assert learner.config.envelope == EnvelopeConfig()
+    said = feed(learner, all_strokes, AT, AT + 1500)
+    feed(twin, all_strokes, AT, AT + 1500)
+    assert learner.trouble == ""
+    assert said.count("learnt") > 700
+    np.testing.assert_array_equal(learner.parts.filter.beta, twin.parts.filter.beta)
+
+
+@pytest.mark.parametrize("trouble", [RAIL, MODEL_LEFT_ENVELOPE])
+def test_state_goes_on_to_the_last_bit_in_trouble(model: LssvmInverse, railed: Recording, trouble: str) -> None:
+    one = Learner.from_model(model, limited(shape=100.0 if trouble == RAIL else 0.25))
+    at = round(REACHED_S / DT_S) + 100 if trouble == RAIL else 2000
+    feed(one, railed, 0, at)
+    if trouble != RAIL:
+        one.freeze()
+    shifted(0.6)(one)
+    # In the middle of the time that it takes, and then of the trouble.
+    feed(one, railed, one.seq + 1, one.seq + 1 + 30)
+    for n in (150, 300, 600):
+        two = Learner.from_state(one.state_dict())
+        for k in range(one.seq + 1, one.seq + 1 + n):
+            assert feed(one, railed, k, k + 1) == feed(two, railed, k, k + 1)
+            assert one.trouble == two.trouble
+        assert one.counters() == two.counters()
+        np.testing.assert_array_equal(one.snapshot().beta, two.snapshot().beta)
+        if n < 600:
+            assert one.trouble == trouble

@@ -1,6 +1,9 @@
-"""The sliding window in both forms, against the direct solver and against itself."""
+"""The sliding window: every step beside the direct solution, leave-one-out errors, residuals, and its handle."""
 
 from __future__ import annotations
+
+import copy
+import pickle
 
 import numpy as np
 import pytest
@@ -9,21 +12,16 @@ from hypothesis import strategies as st
 
 from adaptive import lssvm
 from adaptive.errors import InputError, NumericsError
+from adaptive.types import FloatArray
 from adaptive.window import arrays as ws
-from adaptive.window.arrays import Status
+from adaptive.window import steps
+from adaptive.window.arrays import Status, handle_of
 from adaptive.window.config import Form, WindowConfig
+from adaptive.window.healing import begin
 from adaptive.window.window import Window
-from tests.adaptive.window.windows import (
-    CAPACITY,
-    GAMMA,
-    STEPS,
-    WIDTHS,
-    assert_exact,
-    empty,
-    filled,
-    forms,
-    sample,
-)
+from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
+
+# --- The sliding window in both forms, against the direct solver and against itself.
 
 
 @forms
@@ -253,3 +251,156 @@ def test_a_state_without_what_was_added_since_goes_on(form: Form) -> None:
         assert w.replace(2, *point) is Status.ACCEPTED
     np.testing.assert_array_equal(again.alpha, window.alpha)
     assert_exact(again)
+
+
+# --- What all others foretell for each sample of a window, against fits without it.
+
+
+@forms
+def test_leave_one_out_is_what_it_says_for_every_sample(form: Form) -> None:
+    """Against a fit without the sample, for all of them, at every step of a window at work."""
+    window, rng = filled(form, CAPACITY - 3), np.random.default_rng(11)
+    steps = ["replace", "replace", "append", "reweight", "append", "replace", "reweight"]
+    for name in [*steps, *["replace"] * (CAPACITY + 2)]:
+        STEPS[name](window, rng)
+        X, y, w, n = window.X, window.y, window.weights, len(window)
+        found = window.leave_one_out()
+        for i in range(n):
+            rest = np.arange(n) != i
+            without = lssvm.fit(X[rest], y[rest], WIDTHS, GAMMA, w[rest]).model
+            assert found[i] == pytest.approx(y[i] - without.predict(X[i : i + 1])[0], rel=1e-7, abs=1e-9), (name, i)
+
+
+@forms
+def test_leave_one_out_of_samples_that_determine_a_coefficient_alone_is_no_number(form: Form) -> None:
+    window = empty(form)
+    assert window.append(np.zeros(3), 2.0) is Status.ACCEPTED
+    assert np.isnan(window.leave_one_out()).all()
+
+
+def test_the_diagonal_is_carried_along_while_it_is_asked_for() -> None:
+    """A step with it costs O(N²) and no factor's whole inverse: the elements are those of the step before, moved."""
+    window, rng = filled("cholesky"), np.random.default_rng(12)
+    A = window.arrays
+    assert A.C[ws.CARRIED] == 0
+    window.leave_one_out()
+    assert A.C[ws.CARRIED] == CAPACITY
+    # An element that is off stays off but for its own turn, which comes within a round: nothing is made anew at a call.
+    A.V[ws.DIAGONAL, 3] *= 1.5
+    A.C[ws.CURSOR] = 4
+    window.replace(0, *sample(rng))
+    exact = np.diag(np.linalg.inv(A.R))
+    window.leave_one_out()
+    off = np.abs(A.V[ws.DIAGONAL] / exact - 1.0) > 1e-9
+    np.testing.assert_array_equal(np.flatnonzero(off), [3])
+    for _ in range(CAPACITY):
+        window.replace(0, *sample(rng))
+    np.testing.assert_allclose(A.V[ws.DIAGONAL], np.diag(np.linalg.inv(A.R)), rtol=1e-9)
+    assert A.C[ws.CARRIED] == 0
+    window.replace(5, *sample(rng))
+    assert_exact(window)
+
+
+def test_the_carried_diagonal_does_not_drift_at_cond_1e8() -> None:
+    rng, n = np.random.default_rng(1), 60
+    X = rng.random((4000, 3))
+    y = np.sin(4 * X[:, 0]) + X[:, 1] * X[:, 2] + 1e-3 * rng.standard_normal(4000)
+    window = Window.from_samples(WindowConfig(n, (1.5,) * 3, 2e6, form="cholesky"), X[:n], y[:n])
+    for k in range(n, 4000):
+        assert window.replace(int(rng.integers(n)), X[k], y[k]) is Status.ACCEPTED
+        if k % 20 == 0:
+            window.leave_one_out()
+    assert window.arrays.C[ws.CARRIED] > 0
+    expected = lssvm.fit(window.X, window.y, 1.5, 2e6).leave_one_out()
+    assert np.linalg.norm(window.leave_one_out() - expected) < 1e-7 * np.linalg.norm(expected)
+
+
+# --- What a window finds wrong with its own solution, row by row, and how it puts that right.
+
+
+@forms
+def test_residuals_rotate_and_refinement_heals(form: Form) -> None:
+    window, rng = filled(form), np.random.default_rng(7)
+    exact, A = window.alpha, window.arrays
+    # Damage S and Sy as drift would: all rows but the one being replaced feel it.
+    A.S[:] *= 1 + 1e-4 * rng.standard_normal(A.S.shape)
+    A.V[ws.SY] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
+    assert steps.resum(A)
+    np.testing.assert_allclose(window.alpha, exact, rtol=1e-7)
+    A.V[ws.SY] *= 1 + 1e-4 * rng.standard_normal(CAPACITY)
+    before = window.counters()
+    for _ in range(CAPACITY):
+        assert window.replace(5, *sample(rng)) is Status.ACCEPTED
+    after = window.counters()
+    assert after["residuals_exceeded"] > before["residuals_exceeded"]
+    assert after["refinements"] > before["refinements"]
+    assert after["residual_rounds"] == before["residual_rounds"] + 1
+    assert_exact(window)
+
+
+@forms
+def test_each_row_is_looked_at_once_a_round(form: Form) -> None:
+    """Row after row, each with the residual that it has then; the round's worst is published at its end."""
+    window, rng = filled(form), np.random.default_rng(7)
+    A = window.arrays
+    A.F[ws.TOLERANCE] = np.inf
+    A.V[ws.SY] *= 1 + 1e-3 * rng.standard_normal(CAPACITY)
+    while A.C[ws.CURSOR] != 0:
+        window.replace(5, *sample(rng))
+    worst = 0.0
+    for row in range(CAPACITY):
+        assert window.replace(int(rng.integers(CAPACITY)), *sample(rng)) is Status.ACCEPTED
+        residual = abs(A.V[ws.Y, row] - A.R[row] @ A.V[ws.ALPHA] - A.F[ws.BETA])
+        assert A.F[ws.RESIDUAL] == pytest.approx(residual, rel=1e-6, abs=1e-12)
+        worst = max(worst, A.F[ws.RESIDUAL])
+    assert window.round_residual == worst > 1e-9
+    assert A.C[ws.CURSOR] == 0
+
+
+# --- A window that is handed over by address is the window itself.
+
+
+def samples(count: int, seed: int = 1) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(seed)
+    X = rng.random((count, 3))
+    return X, np.sin(3.0 * X[:, 0]) + X[:, 1] * X[:, 2]
+
+
+def made(form: Form = "inverse") -> tuple[Window, FloatArray, FloatArray]:
+    X, y = samples(80)
+    return Window.from_samples(WindowConfig(60, (0.7, 0.8, 0.9), 50.0, form=form), X[:60], y[:60]), X, y
+
+
+@pytest.mark.parametrize("form", ["inverse", "cholesky"])
+def test_answers_are_those_of_the_arrays_to_the_last_bit(form: Form) -> None:
+    window, X, y = made(form)
+    for k in range(60, 80):
+        window.replace(k % 60, X[k], float(y[k]))
+        point = X[k] + 0.1
+        assert window.predict(point) == steps.predict(window.arrays, point)
+
+
+def test_a_handle_is_of_its_own_arrays_only() -> None:
+    window, X, y = made()
+    twins = [window.copy(), copy.deepcopy(window), pickle.loads(pickle.dumps(window))]
+    before = window.predict(X[70])
+    window.replace(5, X[70], float(y[70]) + 3.0)
+    assert window.predict(X[70]) != before
+    assert [twin.predict(X[70]) for twin in twins] == [before] * 3
+
+
+def test_arrays_of_another_kind_are_refused() -> None:
+    window, _, _ = made()
+    with pytest.raises(TypeError, match="P: a C-ordered"):
+        handle_of(window.arrays._replace(P=np.asfortranarray(window.arrays.P)))
+    with pytest.raises(TypeError, match="F: a C-ordered"):
+        handle_of(window.arrays._replace(F=window.arrays.F.astype(np.float32)))
+
+
+def test_after_a_refresh_the_new_arrays_answer() -> None:
+    window, X, y = made()
+    refresh = begin(window)
+    window.replace(7, X[71], float(y[71]))
+    refresh.factor()
+    assert refresh.finish()
+    assert window.predict(X[72]) == steps.predict(window.arrays, X[72])

@@ -16,8 +16,7 @@ from adaptive.types import FloatArray, InverseModel, Sample
 from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.champion_choice import BETTER, FAILED, ChampionChoice
-from baselines.competition.competition import Competition
+from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition
 from baselines.competition.config import CompetitionConfig
 from baselines.competition.contestants import with_deviation_of_at_least
 from baselines.fit_report import Domain

@@ -9,7 +9,7 @@ import pytest
 
 from adaptive.tuning.evidence import EvidenceSamples, evaluate, evidence_samples
 from baselines.swarm.evidence_search import EvidenceSearch, EvidenceSearchConfig, _Batch
-from baselines.swarm.particle_swarm import MissingTorchError
+from baselines.swarm.identification import MissingTorchError
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 

@@ -12,8 +12,7 @@ import pytest
 
 from lab.cli import main
 from lab.reproduce.measured import data_folder, run_stack
-from lab.reproduce.report import number, table
-from lab.reproduce.tables import json_form
+from lab.reproduce.report import json_form, number, table
 
 FIGURES = {"2.2", "2.3", *(f"2.{n}" for n in range(8, 16)), *(f"2.{n}" for n in range(17, 21))}
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from lab.cli import main
-from lab.scenarios.judgement import FACTOR, FLOORS, judge, table, windows
-from lab.scenarios.pictures import draw_course, draw_overview
+from lab.scenarios.judgement import FACTOR, FLOORS, draw_course, draw_overview, judge, table, windows
 from lab.scenarios.run import ADAPTIVE, FROZEN, ScenarioRecord, noise_floor_um, run_scenario
 from sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
 from sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes

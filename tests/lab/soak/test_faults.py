@@ -17,7 +17,7 @@ from lab.soak.controller import StageClock
 from lab.soak.fault_plan import FAULT_KINDS
 from lab.soak.malformed_client import PAYLOADS, RATE_HZ, TARGETS, bad_query, bad_request, bad_samples
 from lab.soak.verdict.observations import INDICATORS, assess_recovery
-from service.operating.request import decode_request
+from service.operating.verbs import decode_request
 from service.protocol import query as wire_query
 from service.protocol import samples as wire
 from tests.lab.soak.soaked import healthy

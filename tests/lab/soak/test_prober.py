@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError
+from lab.soak.controller import ControlTask
 from lab.soak.prober import OverlappingQueries, Prober
-from lab.soak.task import ControlTask
 from lab.soak.verdict.observations import FaultRecord, Observations
 from lab.soak.verdict.outcome import COLUMNS, write_seconds
 from service.protocol.errors import NoReplyError
-from service.protocol.reply import Answer, Point
+from service.protocol.query import Answer, Point
 from tests.lab.soak.soaked import healthy
 
 AGAIN_S = 0.1

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from lab.commands.soak import seconds
+from lab.soak.controller import PERIOD_S, ControlTask, SoakReference
 from lab.soak.fault_plan import FAULT_KINDS, TAIL_S, WARM_S, make_plan, select_kinds
 from lab.soak.machine_load import OtherLoad, processor_times_s
-from lab.soak.task import PERIOD_S, ControlTask, SoakReference
 from lab.soak.verdict.observations import Intervals
 from service.stage_node.faults import Fault, Injector, decode_fault
 

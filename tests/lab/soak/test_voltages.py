@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.soak.task import AXIS, STAGE, ControlTask
-from lab.soak.verdict.monitor import Monitor
-from lab.soak.verdict.observations import FaultRecord, Observations, SampleTracker
+from lab.soak.controller import AXIS, STAGE, ControlTask
+from lab.soak.verdict.observations import FaultRecord, Monitor, Observations, SampleTracker
 from service.protocol import samples as wire
 from service.runtime.session import open_router
 from tests.lab.soak.soaked import broken, healthy, verdict

@@ -27,8 +27,7 @@ from service.config.settings import AxisConfig
 from service.identification.identifying import identify_one
 from service.protocol import samples as wire
 from service.protocol.samples import SampleBatch
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
+from service.runtime.session import SURELY, open_client
 from service.server.axis import Axis
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle
 from sim.signals.references import demo_reference

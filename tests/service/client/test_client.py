@@ -17,7 +17,7 @@ import zenoh
 
 from adaptive.errors import InputError
 from lab.cli import main
-from service.answers.motion import derivatives
+from service.answers.answering import derivatives
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.errors import (
@@ -30,7 +30,7 @@ from service.protocol.errors import (
     error_to_json,
 )
 from service.protocol.keys import Keys
-from service.protocol.reply import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
+from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
 from service.runtime.session import open_client, open_service
 
 pytestmark = pytest.mark.e2e

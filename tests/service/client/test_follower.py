@@ -18,8 +18,7 @@ from service.answers.guard import Limits
 from service.client.follower import Follower
 from service.config.settings import AxisConfig
 from service.protocol.model import Safety, decode_model, encode_model
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import (
+from service.protocol.query import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -27,6 +26,7 @@ from service.protocol.reply import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
+    FeedforwardQuery,
     Trajectory,
 )
 from service.server.axis import Axis

@@ -13,11 +13,17 @@ from hypothesis import strategies as st
 
 from adaptive.types import FloatArray, InverseModel
 from service.answers.fallback import FADE_S
-from service.client.client import Client
-from service.client.pending import UNDER_WAY, continued, pending_before, with_pending
+from service.client.client import UNDER_WAY, Client, continued, pending_before, with_pending
 from service.protocol.errors import FieldError
-from service.protocol.query import MAX_PENDING, FeedforwardQuery, Pending, decode_query, encode_query
-from service.protocol.reply import Answer, Trajectory
+from service.protocol.query import (
+    MAX_PENDING,
+    Answer,
+    FeedforwardQuery,
+    Pending,
+    Trajectory,
+    decode_query,
+    encode_query,
+)
 from tests.service.server.test_axis import make_axis, parts, recording
 
 FINITE = st.floats(-1e6, 1e6)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from service.client.client import Client
-from service.protocol.reply import STALE
+from service.protocol.query import STALE
 from service.runtime.session import open_service
 from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
 from sim.recordings import read

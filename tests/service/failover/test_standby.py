@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.claims import Claim, Claims, parse_claim
+from service.failover.role_control import Claim, Claims, parse_claim
 from service.protocol.keys import Keys
 from service.runtime.session import open_client
 from sim.recordings import read

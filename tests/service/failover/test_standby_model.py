@@ -13,16 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import ModelFileError
-from service.failover.peer_files import PeerFiles, restore_from_peer, standby_folder
-from service.failover.standby_model import NOT_SYNCED, StandbyModel, newer_than
+from service.failover.standby_model import (
+    NOT_SYNCED,
+    PeerFiles,
+    StandbyModel,
+    newer_than,
+    restore_from_peer,
+    standby_folder,
+)
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop
-from service.storage.checkpoint import encode_checkpoint
-from service.storage.checkpoint_keeper import restore_newest
+from service.storage.checkpoint import encode_checkpoint, restore_newest
 from service.storage.recorder import Recorder, RecorderConfig
 from tests.service.axes import loop_of
-from tests.service.storage.test_checkpoint import folder, make_axis, meta, recording, same
+from tests.service.storage.test_stored_files import folder, make_axis, meta, recording, same
 
 
 class Sink:

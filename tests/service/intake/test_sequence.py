@@ -26,15 +26,15 @@ from service.intake.sequence import (
     MOST_CONFIRMATIONS as MOST,
 )
 from service.protocol.samples import MAX_SEQ, SampleBatch
-from service.replay.replay import sequence
+from service.replay import sequence
 from service.server.axis import Axis
-from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import decode_checkpoint, encode_checkpoint
 from sim.recordings import Recording
 from tests.service.axes import loop_of
 from tests.service.server.test_axis import make_axis, recording
-from tests.service.storage.test_checkpoint import make_axis as make_competing
-from tests.service.storage.test_checkpoint import meta
+from tests.service.storage.test_stored_files import make_axis as make_competing
+from tests.service.storage.test_stored_files import meta
 
 DT_S = 1e-3
 Row = tuple[int, float]

@@ -22,12 +22,9 @@ from numpy import arange, pi, sin
 from adaptive.errors import InputError
 from lab.cli import main
 from service.client.client import Client
-from service.operating.journal import Journal
-from service.operating.remote import operate, statuses
-from service.operating.request import MAX_BYTES, Request, decode_request, encode_request
-from service.operating.server import OperationsServer
-from service.operating.table import screen, table
-from service.operating.verbs import Verbs
+from service.operating.remote import operate, screen, statuses, table
+from service.operating.server import Journal, OperationsServer
+from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from service.protocol.keys import Keys

@@ -1,27 +1,33 @@
-"""Payloads: what is encoded comes back, and nothing malformed gets through."""
+"""What goes over the wire: keys, payloads and containers."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
+from service.protocol import query as wire_flags
 from service.protocol import query as wire_query
-from service.protocol import reply as wire_flags
 from service.protocol import samples as wire
+from service.protocol.container import decode_body, encode_body, split_state
 from service.protocol.errors import FieldError
+from service.protocol.keys import Keys, check_name
 from service.protocol.model import decode_model, encode_model
-from service.protocol.query import decode_query, encode_query
-from service.protocol.reply import Answer, decode_reply, encode_reply
+from service.protocol.query import Answer, decode_query, decode_reply, encode_query, encode_reply
+
+# --- Payloads: what is encoded comes back, and nothing malformed gets through.
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 ANY = st.floats()
@@ -210,3 +216,81 @@ def test_the_bytes_printed_on_the_page_are_what_it_says() -> None:
     asked = decode_query(query)
     assert (asked.y_um[0], asked.v_um_per_s[0], asked.as_of, asked.model) == (40.0, 0.0, -1, "")
     assert math.isnan(asked.u_before_V)
+
+
+# --- The body of checkpoints and model messages: what is written comes back, what is malformed is refused by name.
+
+ARRAYS = {
+    "f": np.linspace(0.0, 1.0, 3), "b": np.array([True, False]), "u": np.arange(5, dtype=np.uint8),
+    "i": np.arange(6).reshape(2, 3).T, "none": np.empty((0, 4)), "one": np.array(np.nan), "s": np.float32([1.5]),
+}  # fmt: skip
+
+
+def test_arrays_come_back_with_type_and_shape() -> None:
+    text, *rest = encode_body({"meta": 1}, ARRAYS)
+    assert len(text) % 8 == 0
+    assert sum(map(len, rest)) % 8 == 0
+    header, arrays = decode_body(b"".join((text, *rest)), len(text), 2**20)
+    assert header == {"meta": 1}
+    assert list(arrays) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        assert arrays[name].dtype == array.dtype  # type: ignore[union-attr]
+        np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_what_is_not_finite_becomes_an_array() -> None:
+    values, arrays = split_state({"a": float("nan"), "b": np.float64(2.0), "c": "word", "d": np.ones(2)})
+    assert values == {"b": 2.0, "c": "word"}
+    assert arrays["a"].shape == ()
+    with pytest.raises(ModelFileError, match="only numbers"):
+        split_state({"a": np.array(["word"])})
+
+
+def test_a_type_that_no_reader_takes_is_not_written() -> None:
+    with pytest.raises(ModelFileError, match="float16"):
+        encode_body({}, {"a": np.float16([1.0])})
+    with pytest.raises(ModelFileError, match="JSON"):
+        encode_body({"a": object()}, {})
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ([], "a JSON object"),
+        ({}, "arrays"),
+        ({"arrays": [1]}, "arrays"),
+        ({"arrays": [["a", "<f8", ["x"]]]}, "arrays"),
+        ({"arrays": [["a", "|O", [1]]]}, "arrays.a"),
+        ({"arrays": [["a", "<f8", [-1]]]}, "arrays.a"),
+        ({"arrays": [["a", "<f8", [1] * 5]]}, "at most 4 dimensions"),
+        ({"arrays": [["a", "<f8", [2]]]}, "no more than"),
+        ({"arrays": [["a", "<f8", [0, 2**40]]]}, "at most 1024 bytes"),
+    ],
+)
+def test_a_malformed_header_is_refused(header: Any, words: str) -> None:
+    text = json.dumps(header).encode()
+    with pytest.raises(InputError, match=words):
+        decode_body(text + bytes(8), len(text), 1024)
+
+
+# --- Names and keys.
+
+
+def test_keys_are_those_of_the_page() -> None:
+    keys = Keys("demo", "x")
+    assert keys.sample == "dehyst/v1/demo/x/sample"
+    assert keys.alive("i1") == "dehyst/v1/demo/x/alive/i1"
+    names = ("sample", "command", "reference", "feedforward", "model", "status", "event", "diagnostics")
+    assert [getattr(keys, name) for name in names] == [f"dehyst/v1/demo/x/{name}" for name in names]
+    assert zenoh.KeyExpr(keys.alive_any).includes(zenoh.KeyExpr(keys.alive("i1")))
+
+
+@pytest.mark.parametrize("name", ["", "X", "a/b", "*", "**", "a$*", "1a", "a b", "ä", "a" * 65, "a\n", None, 3])
+def test_names_that_cannot_be_part_of_a_key_are_refused(name: object) -> None:
+    with pytest.raises(InputError, match="stage"):
+        check_name("stage", name)
+
+
+@pytest.mark.parametrize("name", ["a", "x_linear", "stage-2", "a" * 64])
+def test_good_names_are_chunks_of_zenoh_too(name: str) -> None:
+    assert str(zenoh.KeyExpr(Keys(name, name).feedforward)) == f"dehyst/v1/{name}/{name}/feedforward"

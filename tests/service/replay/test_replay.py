@@ -30,7 +30,7 @@ from service.answers.guard import Limits
 from service.config.learner import read_learner_settings
 from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
-from service.replay.replay import Replayed, covered, replay, sequence, summary, write_gates
+from service.replay import Replayed, covered, replay, sequence, summary, write_gates
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle

@@ -1,8 +1,12 @@
-"""One axis without wire or threads: snapshots, as_of, memory, numbers that go wrong, models that go wrong."""
+"""One axis in the service: learning, answers, status counters and events."""
 
 from __future__ import annotations
 
+import json
+import logging
 import math
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -17,14 +21,19 @@ from adaptive.types import Feedforward, FloatArray, InverseModel, Sample
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sequence import RESTART_AFTER
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import NOT_FINITE_REPLACED, Trajectory
+from service.protocol.keys import Keys
+from service.protocol.query import NOT_FINITE_REPLACED, FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch, decode_samples, encode_samples, joined
-from service.server.axis import Axis
+from service.server.axis import Axis, EventLimiter, EventLog
 from service.server.axis_loading import load_axis, make_learner
+from service.server.axis_loop import AxisLoop
+from service.server.query_answers import LatencyMeter
+from service.server.status import axis_status
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.axes import loop_of
+
+# --- One axis without wire or threads: snapshots, as_of, memory, numbers that go wrong, models that go wrong.
 
 DT_S = 1e-3
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
@@ -349,3 +358,101 @@ def test_samples_through_the_wire_are_those_that_were_sent() -> None:
     batch = recording(5)
     got = decode_samples(encode_samples(batch.seq, batch.t_s, batch.u_V, batch.y_um))
     np.testing.assert_array_equal(got.y_um, batch.y_um)
+
+
+# --- The numerics of the window, counted where they happen, reach whoever asks the service for its status.
+
+#: What is published of the numerics: residuals, refinements, refreshes, and steps refused and undone.
+WINDOW = {
+    "steps", "bad_inputs", "ill_conditioned", "undone", "residuals_exceeded", "residual_rounds", "refinements",
+    "refreshes",
+}  # fmt: skip
+
+
+def give(loop: AxisLoop, first: int, n: int) -> None:
+    """n samples of a stage with 5 % less gain than the models believe, in messages of 20."""
+    for start in range(first, first + n, 20):
+        k = np.arange(start, start + 20)
+        y = 45.0 + 25.0 * np.sin(2 * np.pi * 3.0 * k * DT_S) + 8.0 * np.sin(2 * np.pi * 7.1 * k * DT_S)
+        loop.handle(SampleBatch(k, k * DT_S, (y - 1.0) / (11.0 * 0.95), y))
+
+
+def told(loop: AxisLoop) -> dict[str, Any]:
+    """The learner's counters as a client reads them."""
+    status = axis_status(Keys("demo", "x"), "one", loop, LatencyMeter())
+    counters: dict[str, Any] = json.loads(json.dumps(status, allow_nan=False))["learner"]
+    return counters
+
+
+@pytest.mark.parametrize("compete", [(), ("linear",)], ids=["alone", "competing"])
+def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseModel], compete: tuple[str, ...]) -> None:
+    config = AxisConfig(
+        "x", Path("x.npz"), Limits(0.0, 10.0, 2000.0, 0.0, 90.0), compete=compete,
+        # A small window that learns whatever comes, so that whole rounds of its rows are checked.
+        learner={"window": 30, "learn_every": 2, "valid_enter": 10.0, "valid_leave": 10.0},
+    )  # fmt: skip
+    axis = load_axis("demo", config, bundle=Bundle(models, BundleMeta("demo", "x", DT_S)))
+    loop = loop_of(axis)
+    give(loop, 0, 1000)
+    learner: Any = axis.learner
+    window = (learner.competition.favourite if compete else learner).parts.window
+    first = told(loop)
+    assert first.keys() >= {f"window_{name}" for name in WINDOW}
+    assert {f"window_{name}": count for name, count in window.counters().items()} == {
+        name: count for name, count in first.items() if name.startswith("window_")
+    }
+    assert first["window_steps"] > 100
+    quality = axis_status(Keys("demo", "x"), "one", loop, LatencyMeter())["quality"]
+    assert quality["window_cholesky"] == float(window.form == "cholesky")
+    assert 0.0 <= quality["window_residual_V"] < 1e-6
+    assert first["window_residual_rounds"] >= 1
+    # A step that is refused shows there, like every other.
+    assert window.learn(np.full(models["lssvm_adaptive"].features.kernel_size, np.nan), 0.0) == "numerics"  # type: ignore[attr-defined]
+    give(loop, 1000, 100)
+    second = told(loop)
+    assert (first["window_bad_inputs"], second["window_bad_inputs"]) == (0, 1)
+    assert second["window_steps"] > first["window_steps"]
+
+
+# --- Events of an axis: kept for the publisher, limited, and logged through the standard library.
+
+
+def test_of_a_flood_one_event_is_told() -> None:
+    limiter = EventLimiter(calm=100)
+    told = [k for k in range(1000) if k % 50 == 0 and limiter.allows("a", k)]
+    assert told == [0]
+    assert limiter.allows("b", 1000)
+    assert not limiter.allows("a", 1050)
+    assert limiter.allows("a", 1151)
+
+
+def test_every_event_is_logged_with_the_level_of_its_kind(caplog: pytest.LogCaptureFixture) -> None:
+    events = EventLog("demo", "x")
+    with caplog.at_level(logging.INFO, "dehyst"):
+        events.note(7, "selected", "linear answers instead of auto", by="alice")
+        events.note(8, "trouble", "sensor_frozen: the last good model is served")
+        events.note(9, "learner_failed", "ZeroDivisionError: no")
+    logged = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]
+    assert logged == [
+        ("dehyst.axis.demo.x", "INFO", "selected: linear answers instead of auto (sample 7)"),
+        ("dehyst.axis.demo.x", "WARNING", "trouble: sensor_frozen: the last good model is served (sample 8)"),
+        ("dehyst.axis.demo.x", "ERROR", "learner_failed: ZeroDivisionError: no (sample 9)"),
+    ]
+    taken = events.take()
+    assert [(event["seq"], event["event"], event.get("by")) for event in taken] == [
+        (7, "selected", "alice"), (8, "trouble", None), (9, "learner_failed", None),
+    ]  # fmt: skip
+    assert events.take() == []
+
+
+def test_a_flood_keeps_the_newest() -> None:
+    events = EventLog("", "x")
+    for seq in range(1000):
+        events.note(seq, "numbers_ahead", "")
+    assert [event["seq"] for event in events.take()] == list(range(744, 1000))
+
+
+def test_a_program_without_logging_stays_quiet() -> None:
+    program = "from service.server.axis import EventLog; EventLog('demo', 'x').note(1, 'learner_failed', 'no')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")

@@ -15,12 +15,11 @@ from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import STAND_IN
+from service.protocol.query import STAND_IN, FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import fingerprint
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.conftest import DT_S, make_models

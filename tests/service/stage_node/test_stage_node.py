@@ -20,12 +20,9 @@ from adaptive.errors import InputError
 from service.cli.commands.stage import parse_change
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
-from service.runtime.delivery import SURELY
-from service.runtime.session import open_client
-from service.stage_node.commands import CommandBuffer
+from service.runtime.session import SURELY, open_client
 from service.stage_node.faults import fault_key
-from service.stage_node.node import NodeConfig, status_key
-from service.stage_node.sender import MAX_MESSAGE, RING_SIZE, SampleRing, Sender
+from service.stage_node.node import MAX_MESSAGE, RING_SIZE, CommandBuffer, NodeConfig, SampleRing, Sender, status_key
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

@@ -16,13 +16,12 @@ import pytest
 
 from adaptive.errors import InputError
 from service.storage import segments as recorder_files
-from service.storage.journal import Journal, Rows, read_journal
 from service.storage.recorder import ASIDE, Recorder, RecorderConfig
-from service.storage.segments import segments
+from service.storage.segments import Journal, Rows, read_journal, segments
 from sim.recordings import check, read
 from tests.service.axes import loop_of
-from tests.service.storage.test_checkpoint import make_axis
-from tests.service.storage.test_checkpoint import recording as arriving
+from tests.service.storage.test_stored_files import make_axis
+from tests.service.storage.test_stored_files import recording as arriving
 
 ROOT = Path(__file__).resolve().parents[3]
 

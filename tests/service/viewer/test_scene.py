@@ -18,8 +18,8 @@ from adaptive.types import FloatArray
 from service.viewer import style
 from service.viewer.consumer import ReferenceRing, SampleReferenceJoin
 from service.viewer.layout import HEIGHT, WIDTH, Box, Part, Plane, PlaneView, Plot, TextView, grown, layout, ticks
-from service.viewer.offline import cut, in_order
 from service.viewer.records import Diagnostics, Event, Health, IntArray, SceneConfig, Status, Tracking
+from service.viewer.rerun_sink import cut, in_order
 from service.viewer.scene import Scene
 
 MODELS = ("lssvm_adaptive", "linear")

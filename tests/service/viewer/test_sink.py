@@ -15,9 +15,9 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from service.viewer.offline import write_recording
 from service.viewer.output import Output, OutputConfig
 from service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
+from service.viewer.rerun_sink import write_recording
 
 MODELS = ("lssvm_adaptive", "linear")
 

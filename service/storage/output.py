@@ -1,13 +1,18 @@
-"""Atomic file writing: a reader sees the old file or the new one, never a part."""
+"""Files of the service are written at once: atomic writes, and output folders without results of an earlier run."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import secrets
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
+
+from adaptive.errors import InputError
+
+# --- Atomic file writing: a reader sees the old file or the new one, never a part.
 
 #: Suffix of a file that is not complete. Its name begins with a dot, so that readers of a whole folder skip it.
 PART: Final = ".part"
@@ -48,3 +53,23 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+# --- Prepares the output folder of a command: it exists, is writable, and holds no results of an earlier run.
+
+
+def clear_output(out: Path, names: Iterable[str]) -> None:
+    """Create ``out`` if missing, and remove the files and folders called ``names`` in it; others stay.
+
+    Raises InputError if the folder cannot be written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            path = out / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: got {out}, expected a folder that can be written to: {error}") from error

@@ -1,4 +1,4 @@
-"""What leaves is safe whatever the model says, and outside its domain the answer passes smoothly to the baseline."""
+"""Answers of an axis: the model, its stand-in, and the guard of the voltages."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answers.answering import trust_by_age
 from service.answers.fallback import Rules, answer_safely, domain_weight
-from service.answers.guard import Limits
+from service.answers.guard import Limits, check_domain, guard
 from service.config.settings import AxisConfig
 from service.protocol.model import StandIn, decode_model, encode_model
-from service.protocol.query import FeedforwardQuery
-from service.protocol.reply import (
+from service.protocol.query import (
     BLENDED,
     LIMITED_SLEW,
     LIMITED_VOLTAGE,
@@ -27,10 +28,13 @@ from service.protocol.reply import (
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
+    FeedforwardQuery,
     Trajectory,
 )
 from service.server.axis import Axis
 from tests.service.conftest import DT_S, make_models
+
+# --- What leaves is safe whatever the model says, and outside its domain the answer passes smoothly to the baseline.
 
 LIMITS = Limits(0.0, 10.0, 2000.0, -50.0, 150.0)
 MODELS = make_models()
@@ -279,3 +283,62 @@ def test_a_snapshot_in_another_process_answers_to_the_same_bit_outside_the_domai
 
 def test_inverse_models_are_what_the_tests_take_them_for() -> None:
     assert isinstance(Says((1.0,)), InverseModel)
+
+
+# --- Whatever a model answers, what leaves is finite, within the limits and within the slew.
+
+GUARD_LIMITS = Limits(-1.0, 9.0, 500.0, 0.0, 90.0)
+GUARD_DT_S = 1e-3
+GUARD_STEP_V = GUARD_LIMITS.slew_V_per_s * GUARD_DT_S
+
+
+@settings(deadline=None)
+@given(arrays(np.float64, st.integers(1, 40), elements=st.floats()), st.floats())
+def test_what_leaves_is_safe_whatever_comes(u: np.ndarray, before: float) -> None:
+    original = u.copy()
+    safe, flags = guard(u, np.ones(u.size, dtype=np.bool_), GUARD_DT_S, GUARD_LIMITS, before)
+    np.testing.assert_array_equal(u, original)
+    assert np.isfinite(safe).all()
+    assert (safe >= GUARD_LIMITS.u_min_V).all()
+    assert (safe <= GUARD_LIMITS.u_max_V).all()
+    assert (np.abs(np.diff(safe)) <= GUARD_STEP_V * (1 + 1e-12)).all()
+    if math.isfinite(before):
+        inside = min(max(before, GUARD_LIMITS.u_min_V), GUARD_LIMITS.u_max_V)
+        assert abs(safe[0] - inside) <= GUARD_STEP_V * (1 + 1e-12)
+    # A point that carries no flag is the model's own.
+    np.testing.assert_array_equal(safe[flags == 0], u[flags == 0])
+    np.testing.assert_array_equal((flags & NOT_FINITE_REPLACED) > 0, ~np.isfinite(u))
+
+
+def test_each_flag_says_what_was_done() -> None:
+    u = np.array([12.0, 8.9, 8.8, math.nan, 4.0])
+    inside = np.array([True, False, True, True, True])
+    safe, flags = guard(u, inside, GUARD_DT_S, GUARD_LIMITS)
+    assert flags.tolist() == [LIMITED_VOLTAGE, OUTSIDE_DOMAIN, 0, NOT_FINITE_REPLACED, LIMITED_SLEW]
+    np.testing.assert_allclose(safe, [9.0, 8.9, 8.8, 8.8, 8.8 - GUARD_STEP_V])
+
+
+def test_a_desired_point_beyond_the_stage_is_refused_by_its_index() -> None:
+    check_domain(np.array([0.0, 90.0]), GUARD_LIMITS)
+    with pytest.raises(InputError, match=r"y_um\[2\]: got 90.5 µm, expected 0 to 90 µm"):
+        check_domain(np.array([1.0, 90.0, 90.5, 1.0]), GUARD_LIMITS)
+    with pytest.raises(InputError, match=r"y_um\[0\]"):
+        check_domain(np.array([math.nan]), GUARD_LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [((1.0, 1.0, 1.0), "u_max_V"), ((0.0, math.inf, 1.0), "u_max_V"), ((0.0, 1.0, 0.0), "slew"),
+     ((0.0, 1.0, 1.0, 2.0, 1.0), "y_max_um"), ((math.nan, 1.0, 1.0), "u_max_V")],
+)  # fmt: skip
+def test_limits_that_limit_nothing_are_refused(values: tuple[float, ...], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        Limits(*values)
+
+
+def test_limits_travel_as_json() -> None:
+    open_ended = Limits(0.0, 1.0, math.inf)
+    assert Limits.from_json(open_ended.to_json()) == open_ended
+    assert Limits.from_json(GUARD_LIMITS.to_json()) == GUARD_LIMITS
+    with pytest.raises(InputError, match="limits"):
+        Limits.from_json({"u_min_V": 0.0})

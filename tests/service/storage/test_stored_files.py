@@ -1,9 +1,10 @@
-"""Checkpoints: whole or refused with the reason, enough of them, and a learner that goes on from one."""
+"""Files of the service: checkpoints, model files, and atomic writes."""
 
 from __future__ import annotations
 
 import errno
 import itertools
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +22,24 @@ from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
 from service.server.axis_loop import AxisLoop
-from service.server.learner_state import fingerprint
+from service.server.learner_supervisor import fingerprint
 from service.storage import checkpoint
-from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, decode_checkpoint, encode_checkpoint, is_kept
-from service.storage.checkpoint_keeper import CheckpointKeeper, restore_newest
-from service.storage.model_file import UNITS, Bundle, BundleMeta
+from service.storage import model_file as modelfile
+from service.storage.checkpoint import (
+    CheckpointFolder,
+    CheckpointKeeper,
+    CheckpointMeta,
+    decode_checkpoint,
+    encode_checkpoint,
+    is_kept,
+    restore_newest,
+)
+from service.storage.model_file import UNITS, Bundle, BundleMeta, read_bundle, write_bundle
+from service.storage.output import atomic_write
 from tests.service.conftest import DT_S, make_models
 from tests.service.living import eventually
+
+# --- Checkpoints: whole or refused with the reason, enough of them, and a learner that goes on from one.
 
 LIMITS = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
 CONFIG = AxisConfig("x", Path("x.npz"), LIMITS, served="lssvm_adaptive")
@@ -218,3 +230,139 @@ def test_a_full_disk_costs_checkpoints_and_nothing_else(tmp_path: Path, monkeypa
     again = make_axis()
     restore_newest(again, folder(tmp_path / "kept"))
     assert same(again, axis)
+
+
+# --- The model file: whole or not at all, and nothing foreign is taken for one.
+
+META = BundleMeta("demo", "x", 1e-3, "rec.csv", "ab" * 32, 0.0, 90.0, 0.0, 8.0, {"heldout_rmse_V": 0.01})
+
+
+def test_models_come_back_and_answer_the_same(models: dict[str, InverseModel], tmp_path: Path) -> None:
+    path = tmp_path / "m.npz"
+    write_bundle(path, models, META)
+    bundle = read_bundle(path)
+    assert bundle.meta == META
+    assert list(bundle.models) == list(models)
+    y = np.linspace(5.0, 80.0, 40)
+    for name, model in models.items():
+        memory = model.rest_memory(5.0)
+        mine, theirs = (m.feedforward(y, 10 * y, 0 * y, memory) for m in (bundle.models[name], model))
+        np.testing.assert_array_equal(mine.u_V, theirs.u_V)
+        np.testing.assert_array_equal(mine.std_V, theirs.std_V)
+    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
+
+
+def rewritten(path: Path, **changes: Any) -> Path:
+    """The file with fields of its header changed."""
+    with np.load(path) as file:
+        entries = {name: file[name] for name in file.files}
+    header = {**json.loads(entries["header"].tobytes()), **changes}
+    entries["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    np.savez(path, **entries)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema": 2}, "schema is 2, this program reads 1"),
+        ({"magic": "other"}, "not a model bundle"),
+        ({"units": {"y": "nm"}}, "units"),
+        ({"dt_s": 0}, "dt_s"),
+        ({"dt_s": 2e-3}, "dt_s"),
+        ({"models": {}}, "no models"),
+        ({"models": {"a": {"kind": "sorcery", "values": {}, "arrays": []}}}, "sorcery"),
+        ({"models": {"a": {"kind": "linear", "values": {}, "arrays": []}}}, "model 'a'"),
+        ({"models": {"a": {"kind": "linear", "values": {}, "arrays": ["gone"]}}}, "incomplete"),
+        ({"models": {"a": 5}}, "incomplete"),
+    ],
+)
+def test_another_version_or_a_foreign_file_is_refused(
+    changes: dict[str, Any], words: str, models: dict[str, InverseModel], tmp_path: Path
+) -> None:
+    path = tmp_path / "m.npz"
+    write_bundle(path, models, META)
+    with pytest.raises(ModelFileError, match=words) as refused:
+        read_bundle(rewritten(path, **changes))
+    assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 30, 500, -30])
+def test_a_damaged_file_is_refused(keep: int, models: dict[str, InverseModel], tmp_path: Path) -> None:
+    path = tmp_path / "m.npz"
+    write_bundle(path, models, META)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ModelFileError, match=r"m\.npz"):
+        read_bundle(path)
+
+
+def test_files_of_other_makes_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", y=np.zeros(3))
+    with pytest.raises(ModelFileError, match="header"):
+        read_bundle(tmp_path / "a.npz")
+    np.save(tmp_path / "b.npy", np.zeros(3))
+    with pytest.raises(ModelFileError, match="not a model bundle"):
+        read_bundle(tmp_path / "b.npy")
+    # Pickles are code: never loaded.
+    np.savez(tmp_path / "c.npz", header=np.array([{"magic": modelfile.MAGIC}], dtype=object))
+    with pytest.raises(ModelFileError):
+        read_bundle(tmp_path / "c.npz")
+    with pytest.raises(ModelFileError, match="dehyst identify"):
+        read_bundle(tmp_path / "missing.npz")
+
+
+def test_a_failed_write_leaves_the_old_file_whole(
+    models: dict[str, InverseModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "m.npz"
+    write_bundle(path, models, META)
+    before = path.read_bytes()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(modelfile.np, "savez", full)
+    with pytest.raises(OSError, match="No space"):
+        write_bundle(path, models, META)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
+
+
+def test_models_of_another_sample_time_or_an_unknown_class_are_not_stored(
+    models: dict[str, InverseModel], tmp_path: Path
+) -> None:
+    with pytest.raises(ModelFileError, match="dt_s"):
+        write_bundle(tmp_path / "m.npz", models, BundleMeta("demo", "x", 2e-3))
+
+    class Stranger(type(models["linear"])):  # type: ignore[misc]
+        pass
+
+    line = models["linear"]
+    stranger = Stranger(line.parameters, line.dt_s, line.domain)  # type: ignore[attr-defined]
+    with pytest.raises(ModelFileError, match="register"):
+        write_bundle(tmp_path / "m.npz", {"s": stranger}, META)
+
+
+# --- A file is replaced as a whole or not at all.
+
+
+def test_a_file_is_replaced_when_the_block_ends(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with atomic_write(path, mode=0o600) as file:
+        file.write(b"new")
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+
+
+def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with pytest.raises(TypeError), atomic_write(path) as file:
+        file.write(b"new" + 1)  # type: ignore[operator]
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+    with pytest.raises(OSError, match="No such"), atomic_write(tmp_path / "gone" / "a.bin") as file:
+        file.write(b"new")
