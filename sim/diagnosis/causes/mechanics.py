@@ -238,7 +238,7 @@ def peaks(x: FloatArray, residual_um: FloatArray, dt_s: float, most: int) -> lis
     shares: FloatArray = np.zeros(0)
     for _ in range(most):
         # The power at a mode stands in a few bins that lie together.
-        width = max(3, round(8.0 / spacing))
+        width = min(max(3, round(8.0 / spacing)), f.size // 4)
         power = np.convolve(np.abs(rest) ** 2, np.ones(width), "same")
         around = [float(f[i]) for i in np.argsort(-power)[: 4 * width : width]]
         best: tuple[float, float, float] = (0.0, 0.0, 0.0)

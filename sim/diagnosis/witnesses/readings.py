@@ -119,12 +119,10 @@ class Readings:
             if u[k] < u[low]:
                 low = int(k)
             if way >= 0 and u[high] - u[k] > least:
-                if way > 0 or high > low:
-                    turns += [low, high] if way == 0 else [high]
+                turns.append(high)
                 way, low = -1, int(k)
             elif way <= 0 and u[k] - u[low] > least:
-                if way < 0 or low > high:
-                    turns += [high, low] if way == 0 else [low]
+                turns.append(low)
                 way, high = 1, int(k)
         # The last bottom ends with the record.
         if way < 0:

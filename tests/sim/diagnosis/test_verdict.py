@@ -71,7 +71,7 @@ def linear_record(seed: int, extra: FloatArray | float = 0.0, seconds: float = 2
     n = round(seconds / DT)
     t = np.arange(n) * DT
     phase = np.cumsum(np.where((t % 9.0) < 3.0, 0.3, np.where((t % 9.0) < 6.0, 1.0, 3.0))) * DT
-    u = 4.0 * (1.0 - np.abs(2.0 * (phase % 1.0) - 1.0)) * np.where((t % 7.0) < 3.5, 1.0, 0.6)
+    u = 4.0 * (1.0 - np.abs(2.0 * (phase % 1.0) - 1.0)) * (0.8 + 0.2 * np.cos(2.0 * np.pi * t / 7.0))
     return FitData(DT, u, 10.0 * u + extra + SIGMA_UM * rng.normal(size=n))
 
 
@@ -96,16 +96,16 @@ def test_the_black_box_predicts_a_loop_and_not_noise() -> None:
     before = float(np.sqrt(np.mean(looped.residual_um**2)))
     found = black_box_error(looped, looped, whole, split(looped.model.data))
     assert before > 10.0 * SIGMA_UM
-    assert found < 2.5 * SIGMA_UM
+    assert found < 0.2 * before
     there = fit_on_other_recording(looped, replace(looped.model.data, y_um=looped.model.data.y_um), whole)
-    assert black_box_on_other(looped, there, whole, whole, split(looped.model.data)) < 2.5 * SIGMA_UM
+    assert black_box_on_other(looped, there, whole, whole, split(looped.model.data)) < 0.2 * before
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.3])
 def test_coloured_noise_alone_is_adequate(correlation_s: float) -> None:
     """First-order noise: correlated over far longer than the windows from which white noise would be known."""
     rng = np.random.default_rng(6)
-    levels = np.repeat(rng.permutation([0.0, 3.0, 5.0, 1.0, 8.0, 2.0]), 2500)
+    levels = np.repeat(rng.permutation([0.0, 3.0, 5.0, 1.0, 4.0, 2.0]), 2500)
     u = np.concatenate([levels, linear_record(0).u_V])
     keep = math.exp(-DT / correlation_s)
     coloured, white = np.zeros(u.size), rng.normal(size=u.size) * 0.03 * math.sqrt(1.0 - keep**2)
