@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
+from scipy import stats
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
-from sim.diagnosis.causes.catalogue import NAMES
+from sim.diagnosis.causes.catalogue import NAMES, same_set
 from sim.diagnosis.ceiling import black_box_error, black_box_on_other
 from sim.diagnosis.defects import recording_defects
 from sim.diagnosis.model.calibration import (
@@ -142,7 +143,7 @@ def diagnose(
     extended, held = search.with_refitted_slips(extended, held)
     n = int(mask.sum())
     causes = named(search, nominal, extended, held, found)
-    causes += quantisation(grid, floor, extended, n)
+    causes += quantisation(grid, coarse, floor, extended, n)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     progress("fitting a black box", 0.92)
     held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
@@ -207,6 +208,8 @@ def named(
         if one.name == "resonance" and nominal.model.nominal.name != "linear":
             # The nominal stage has no such mode: it may be the stage's own, or a known one moved by a payload.
             also = (*also, "payload_change")
+        # One voltage and one sensor show the sum of these: the other one of a set is always possible.
+        also = (*also, *sorted(same_set({one.name}) - {one.name, *also}))
         own = 1.0 - held.sse_um2 / one.held_without.sse_um2
         # A single cause's share is measured best by removing it from the final model.
         share = own if len(found) == 1 else one.step.gain
@@ -231,7 +234,9 @@ def named(
 def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """The reported numbers of one cause with 95 % intervals.
 
-    The covariance is estimated from sums over blocks, so correlated errors are allowed for.
+    The covariance is estimated from sums over blocks, so correlated errors are allowed for; and from the spread between
+    fits that leave one fold out in turn, so an error of the model that differs from motion to motion is. The wider of
+    both counts.
     """
     parameters = fit.model.parameters
     free = [i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high]
@@ -240,6 +245,16 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
     bread = np.linalg.pinv(rows @ rows.T, rcond=1e-12)
     scores = search.parts.blocks(rows * fit.residual_um)
     cover = bread @ (scores @ scores.T) @ bread * scale[:, None] * scale[None, :]
+    # Directions that one fold alone determines keep the value from the whole record, as in `held_out`.
+    size = np.sqrt(np.maximum(np.diag(rows @ rows.T), 1e-300))
+    unit = rows / size[:, None]
+    moves = []
+    for k in range(search.parts.n_folds):
+        inside = search.parts.samples(k)
+        kept = unit[:, ~inside] @ unit[:, ~inside].T + 1e-4 * np.eye(len(free))
+        moves.append(np.linalg.solve(kept, unit[:, ~inside] @ fit.residual_um[~inside]) / size * scale)
+    spread = np.array(moves) - np.mean(moves, axis=0)
+    folds = search.parts.n_folds
     where = fit.model.slice_of(index)
     at = {j: row for row, j in enumerate(free)}
     values: dict[str, float] = {}
@@ -252,6 +267,8 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
             if where.start + k in at:
                 g[at[where.start + k]] = slope
         half = 1.96 * float(np.sqrt(max(float(g @ cover @ g), 0.0)))
+        jackknife = float(np.sqrt((folds - 1) / folds * np.sum(np.square(spread @ g))))
+        half = max(half, float(stats.t.ppf(0.975, folds - 1)) * jackknife)
         values[name] = value
         spans[name] = (value - half, value + half)
     return values, spans
@@ -310,13 +327,15 @@ def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: No
     return tuple(name for name in NAMES if not seen.get(name, False))
 
 
-def quantisation(grid: ConverterGrid, floor: NoiseFloor, extended: ModelFit, n: int) -> tuple[NamedCause, ...]:
-    """Quantisation, where the converter grid is coarser than the noise and makes a fifth of what is left."""
+def quantisation(
+    grid: ConverterGrid, coarse: bool, floor: NoiseFloor, extended: ModelFit, n: int
+) -> tuple[NamedCause, ...]:
+    """Quantisation, where the grid is far coarser than the noise, or makes a fifth of what is left above it."""
     if grid.step_um <= 0.0:
         return ()
     own = grid.step_um**2 / 12.0
     share = own / max(extended.sse_um2 / n, own)
-    if grid.step_um <= 1.2 * floor.sigma_um or share <= 0.2:
+    if not coarse and (grid.step_um <= 1.2 * floor.sigma_um or share <= 0.2):
         return ()
     step = grid.step_um
     rounding = 1e-3 * step

@@ -25,15 +25,18 @@ class HysteresisShape(CauseModel):
 
     ``variant`` "restoring", for a nominal stage that is linear: stops of the displacement in the restoring force.
     Thresholds lie twice as dense as the chapter's (2.38) up to half the swing, beyond which only the first rise
-    from rest could tell them apart.
+    from rest could tell them apart. ``variant`` "fine": denser still; "slanted": with weights that go with the
+    voltage as well.
     """
 
     name: str = "hysteresis_shape"
+    #: Voltage (V) that the stage had been driven to and back before the recording; 0 where it was relaxed.
+    before_V: float = 0.0
 
     def radii_V(self, data: FitData) -> FloatArray:
         top = max(abs(data.u_high_V), abs(data.u_low_V), data.swing_V)
         steps = np.concatenate([np.arange(1, 14), np.arange(15, 26, 2)])
-        if self.variant == "fine":
+        if self.variant in ("fine", "slanted"):
             steps = np.concatenate([[0.5], np.arange(1.0, 13.1, 0.5), np.arange(15, 26, 2)])
         return np.asarray(steps / 26.0 * top)
 
@@ -57,25 +60,41 @@ class HysteresisShape(CauseModel):
                 for j in range(self.radii_um(data).size)
             )
         g = data.range_um / max(data.swing_V, 1e-9)
+        names = [f"w{j + 1}_um_per_V" for j in range(self.radii_V(data).size)]
+        names += [f"x{j + 1}_um_per_V" for j in range(self.slanted_V(data).size)]
         return tuple(
-            ModelParameter(f"w{j + 1}_um_per_V", "µm/V", 0.0, -0.5 * g, 0.5 * g, 0.02 * g, ActsOn.STATIC, True)
-            for j in range(self.radii_V(data).size)
+            ModelParameter(name, "µm/V", 0.0, -0.5 * g, 0.5 * g, 0.02 * g, ActsOn.STATIC, True) for name in names
         )
+
+    def slanted_V(self, data: FitData) -> FloatArray:
+        """Radii (V) of the plays whose weight goes with the voltage: a density of relays need not be even (2.3)."""
+        if self.variant != "slanted":
+            return np.zeros(0)
+        return np.asarray(np.array([0.0, 0.02, 0.05, 0.09, 0.15, 0.22, 0.3, 0.4]) * data.swing_V)
 
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
     ) -> FloatArray | None:
         if self.variant == "restoring":
             return None
-        return np.asarray(plays_nested(u_V, self.radii_V(data), np.ascontiguousarray(p)))
+        radii_V = self.radii_V(data)
+        u = u_V if self.before_V == 0.0 else np.concatenate([[self.before_V], u_V])
+        out = plays_nested(u, radii_V, np.ascontiguousarray(p[: radii_V.size]))
+        if np.any(p[radii_V.size :]):
+            x = (u - 0.5 * (data.u_low_V + data.u_high_V)) / max(0.5 * data.swing_V, 1e-12)
+            out = out + x * plays_nested(u, self.slanted_V(data), np.ascontiguousarray(p[radii_V.size :]))
+        return np.asarray(out[-u_V.size :])
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         """Height of the additional loop over the full swing, and the sum of the play weights."""
         if self.variant == "restoring":
             stops = self.radii_um(data) / data.range_um
             return {"force_share": (float(stops @ p), stops), "stiffness_share": (float(p.sum()), np.ones(p.size))}
-        row = 2.0 * np.minimum(self.radii_V(data), 0.5 * data.swing_V)
-        return {"width_um": (float(row @ p), row), "weight_um_per_V": (float(p.sum()), np.ones(p.size))}
+        row, whole = np.zeros(p.size), np.zeros(p.size)
+        radii_V = self.radii_V(data)
+        row[: radii_V.size] = 2.0 * np.minimum(radii_V, 0.5 * data.swing_V)
+        whole[: radii_V.size] = 1.0
+        return {"width_um": (float(row @ p), row), "weight_um_per_V": (float(whole @ p), whole)}
 
 
 @dataclass(frozen=True)

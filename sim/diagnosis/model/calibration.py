@@ -288,7 +288,20 @@ def calibrate_nominal(kind: str | StageConfig, data: FitData, mask: BoolArray) -
             if best is None or fit.sse_um2 < best.sse_um2 * (0.95 if dearer else 1.0 - 1e-3):
                 best = fit
     assert best is not None
-    return calibrate(best.model, best.p, mask, 12, 1e-5)
+    return _with_free_memory(calibrate(best.model, best.p, mask, 12, 1e-5), mask)
+
+
+def _with_free_memory(fit: ModelFit, mask: BoolArray) -> ModelFit:
+    """The fit with a free hysteresis memory at the start, where that explains more: a drive that begins at rest at
+    0 V may have been elsewhere before."""
+    nominal = fit.model.nominal
+    if not isinstance(nominal, BoucWenStage) or nominal.free_memory:
+        return fit
+    model = StageModel(fit.model.data, replace(nominal, free_memory=True))
+    start = np.concatenate([fit.p, [p.neutral for p in model.parameters[fit.p.size :]]])
+    free = calibrate(model, start, mask, 8, 1e-4)
+    # A small gain is another cause, imitated at the start.
+    return free if free.sse_um2 < 0.6 * fit.sse_um2 else fit
 
 
 def with_other_axis(fit: ModelFit, mask: BoolArray, *, refit: bool = True) -> ModelFit:
@@ -344,7 +357,7 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
     )
     nominal = home.nominal
     if isinstance(nominal, BoucWenStage):
-        nominal = replace(nominal, free_memory=not begins_at_rest(data))
+        nominal = replace(nominal, free_memory=nominal.free_memory or not begins_at_rest(data))
     model = StageModel(there, nominal, home.causes)
     known = {parameter.name: fit.p[i] for i, parameter in enumerate(home.parameters[: home.n_nominal])}
     own_parameters = model.parameters[: model.n_nominal]

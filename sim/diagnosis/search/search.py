@@ -14,7 +14,7 @@ import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.causes.catalogue import CAUSE_MODELS, same_set
-from sim.diagnosis.causes.hysteresis import RestoringForceLoop, refined_model
+from sim.diagnosis.causes.hysteresis import HysteresisShape, RestoringForceLoop, refined_model
 from sim.diagnosis.causes.mechanics import Modes
 from sim.diagnosis.causes.slips import Slips, find_slips, fit_slips, refit_slips
 from sim.diagnosis.model.calibration import ModelFit, calibrate, clipped_to_bounds, evaluate, with_new_columns
@@ -50,6 +50,8 @@ class Thresholds:
     most_causes: int = 5
     #: Least share of the nominal's squared error that a cause must remove whose signature is not seen in the readings.
     least_of_nominal: float = 1e-3
+    #: ... unless it removes this share of the present error above the noise floor.
+    least_whole: float = 0.6
     #: The excess that a cause must remove is this many times smaller where its signature is seen.
     seen_eases: float = 4.0
     #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative.
@@ -66,6 +68,9 @@ _VETOED = frozenset(
         *("mains_hum", "asymmetry", "amplifier_lag", "sensor_lag"),
     }
 )
+
+#: Causes so smooth in time that they imitate the rest of many others: not excited, they must explain most.
+_NEEDS_SIGHT = frozenset({"creep", "thermal_drift", "gain_drift", "timing"})
 
 
 def first_fits(
@@ -85,6 +90,13 @@ def first_fits(
     if isinstance(cause, RestoringForceLoop):
         return cause, [_first_fit_of_force_loop(cause, base, guess, mask)]
     fits = [_first_fit(base.model.with_cause(cause), base, guess, mask)]
+    if isinstance(cause, HysteresisShape) and not cause.variant:
+        # Plays remember what happened before the recording: half of the range, or all of it.
+        top = base.model.data.u_high_V
+        used = [replace(cause, before_V=share * top) for share in (0.5, 1.0)]
+        fits += [_first_fit(base.model.with_cause(c), base, guess, mask) for c in used]
+        best = min(fits, key=lambda f: f.sse_um2 * (1.0 if f is fits[0] else 1.03))
+        return best.model.causes[-1], [best]
     if cause.fast:
         fits.append(_first_fit(other.with_cause(cause), base, guess, mask))
     return cause, fits
@@ -236,6 +248,10 @@ class Search:
         """Whether the fitted parameters have a plausible size and sign, and the readings do not speak against it."""
         if self.vetoed(candidate.cause.name):
             return False
+        clock = candidate.cause.name == "timing" and not isinstance(candidate.cause, Slips)
+        if clock and self.sights and self.sights["timing"].seen is not True:
+            # A clock that runs wrong makes the readings later and later, or it is something else.
+            return False
         if isinstance(candidate.cause, Slips) and self.readings is not None:
             slips = next(f.found for f in candidate.fit.model.causes if isinstance(f, Slips))
             if not slips_are_borne_out(self.readings, slips):
@@ -249,8 +265,6 @@ class Search:
         gain = held.sse_um2 - best.held.sse_um2
         seen = self.seen(best.cause.name)
         if gain <= 0.0 or (p > thresholds.level and not seen):
-            return False
-        if not seen and gain < thresholds.least_of_nominal * self.nominal_um2:
             return False
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
@@ -266,6 +280,16 @@ class Search:
         # Blocks whose error is mostly the model error of earlier causes are not evidence for a further one.
         clean = now > 2.0 * left_um2
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
+        sight = self.sights.get(best.cause.name)
+        if (
+            sight is not None
+            and sight.seen is None
+            and best.cause.name in _NEEDS_SIGHT
+            and whole < thresholds.nearly_all
+        ):
+            return False
+        if not seen and gain < thresholds.least_of_nominal * self.nominal_um2 and whole < thresholds.least_whole:
+            return False
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
         need = thresholds.least_excess_first if first else thresholds.least_excess_next
@@ -306,6 +330,12 @@ class Search:
                     break
             if accepted is None:
                 break
+            if not self.seen(accepted.cause.name):
+                slanted = self._with_slanted_shape(current)
+                if slanted is not None and slanted.cost < accepted.cost:
+                    # The loop itself explains it better: no further cause.
+                    current, held = slanted.fit, slanted.held
+                    continue
             accepted = self._other_hold(self._with_refined_model(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
@@ -313,6 +343,21 @@ class Search:
             current, held = accepted.fit, accepted.held
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
+
+    def _with_slanted_shape(self, fit: ModelFit) -> CauseCandidate | None:
+        """The model whose loop shape, if it has one, may change with the voltage; None if it has none or it is so."""
+        for i, cause in enumerate(fit.model.causes):
+            if not isinstance(cause, HysteresisShape) or cause.variant not in ("", "fine"):
+                continue
+            slanted = replace(cause, variant="slanted")
+            model = replace(fit.model, causes=(*fit.model.causes[:i], slanted, *fit.model.causes[i + 1 :]))
+            where = fit.model.slice_of(i)
+            own = np.zeros(len(slanted.parameters(model.data)))
+            start = np.concatenate([fit.p[: where.start], own, fit.p[where.stop :]])
+            better = with_new_columns(calibrate(model, start, self.mask, 10, 1e-4), self.mask)
+            held = self.held(better)
+            return CauseCandidate(slanted, better, held, self.cost(better, held, fit))
+        return None
 
     def _with_witness(self, candidate: CauseCandidate) -> float:
         """The cost, halved where the signature of the cause is seen: flexible forms imitate many causes."""

@@ -73,6 +73,10 @@ def _motions(readings: Readings) -> tuple[FloatArray, FloatArray]:
     if asked.size < 100:
         return np.empty(0), np.empty(0)
     top = float(np.quantile(asked, 0.999))
+    slow = asked < 0.3 * top
+    if int(slow.sum()) < 100 or float(np.corrcoef(asked[slow], got[slow])[0, 1]) < 0.97:
+        # Where slow motions do not follow either, a mode moves the stage.
+        return np.empty(0), np.empty(0)
     if top < 10.0 * data.swing_V:
         # Slower than a tenth of a second for the whole swing: no amplifier limits that.
         return np.empty(0), np.empty(0)

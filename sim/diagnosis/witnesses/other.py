@@ -89,10 +89,20 @@ def timing(readings: Readings) -> list[Sight]:
     cover = np.linalg.pinv(columns @ columns.T) * max(1.0, float(left @ left) / max(1, t.size - 2))
     ppm, sigma = 1e6 * solved[1] * data.dt_s, 1e6 * float(np.sqrt(cover[1, 1])) * data.dt_s
     words = f"the readings' lateness changes by {ppm:.3g} ± {1.96 * sigma:.2g} ppm over {t.size} stretches of motion"
-    if abs(ppm) > 5.0 * sigma and abs(ppm) > 12.0:
+    half = t < 0.5 * (t[0] + t[-1])
+    parts = [_trend(t[p], d[p], e[p]) * 1e6 * data.dt_s for p in (half, ~half) if int(p.sum()) >= 4]
+    steady = len(parts) == 2 and all(abs(part - ppm) < 0.5 * abs(ppm) for part in parts)
+    if abs(ppm) > 5.0 * sigma and abs(ppm) > 12.0 and steady:
         return [Sight("timing", True, words)]
     # Slips have dates of their own and are judged by whole samples; without a trend nothing is decided here.
     return [Sight("timing", None, words)]
+
+
+def _trend(t: FloatArray, d: FloatArray, e: FloatArray) -> float:
+    """Weighted slope of d over t."""
+    w = 1.0 / e**2
+    x = t - float(w @ t) / float(w.sum())
+    return float(w @ (x * d)) / max(float(w @ (x * x)), 1e-300)
 
 
 def slips_are_borne_out(readings: Readings, slips: tuple[tuple[int, int], ...]) -> bool:

@@ -14,7 +14,7 @@ from sim.diagnosis.witnesses.sight import Sight
 #: Time constants (s) of the slow motion that a rest may show after the moves before it.
 _TAUS_S = (0.1, 0.4, 1.6, 6.4, 25.0, 100.0)
 #: Standard errors from which a signature counts as seen.
-_SIGMAS = 4.5
+_SIGMAS = 3.8
 _WHEN = {"": "over the record", "early": "in its first half", "late": "in its second half"}
 
 
@@ -22,7 +22,7 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
     """What the rests show: motion after each step in proportion to it, motion in time alone, and in proportion to u.
 
     Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the voltage; both drifts are
-    polynomials in time. The standard errors come from leaving out one rest in turn.
+    a line and exponentials in time. The standard errors come from leaving out one rest in turn.
     """
     data = readings.data
     names = ("creep", "thermal_drift", "gain_drift")
@@ -44,9 +44,10 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
     creep_um = 0.02 / float(per_decade.sum()) * gain * np.array([np.interp(t, grid_s, row) for row in law])
     span = float(np.ptp(level))
     # One unit of each column is a size that a stage can have, so that one ridge fits all.
-    columns = [*creep_um, 0.01 * data.range_um * x, 0.01 * data.range_um * x**2]
+    drifts = np.array([x, np.exp(-5.0 * x), np.exp(-20.0 * x)])
+    columns = [*creep_um, *(0.01 * data.range_um * drifts)]
     if span > 0.1 * data.swing_V:
-        columns += [0.02 * gain * (level - data.u_low_V) * x**k for k in (1, 2)]
+        columns += [*(0.02 * gain * (level - data.u_low_V) * drifts[:2])]
     rows = np.array(columns)
     for i in np.unique(of):
         inside = of == i
@@ -62,12 +63,14 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
     functionals = {"creep": decade}
     first, last = float(x.min()), float(x.max())
     middle = 0.5 * (first + last)
-    for name, at, unit in (("thermal_drift", 2, 0.01 * data.range_um), ("gain_drift", 4, 0.02)):
+    for name, at, unit, count in (("thermal_drift", 2, 0.01 * data.range_um, 3), ("gain_drift", 5, 0.02, 2)):
         if at >= rows.shape[0]:
             continue
         for part, (begin, end) in {"": (first, last), ".early": (first, middle), ".late": (middle, last)}.items():
             row = np.zeros(rows.shape[0])
-            row[at : at + 2] = unit * (end - begin), unit * (end**2 - begin**2)
+            change = [end - begin, math.exp(-5.0 * end) - math.exp(-5.0 * begin)]
+            change += [math.exp(-20.0 * end) - math.exp(-20.0 * begin)]
+            row[at : at + count] = unit * np.array(change[:count])
             functionals[name + part] = row
     values, errors = _jackknife(grams, slopes, functionals, float(np.var(y)))
     stepped = any(

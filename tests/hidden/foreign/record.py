@@ -79,8 +79,14 @@ class Case:
 
     @property
     def allowed(self) -> frozenset[str]:
-        """Names that may stand beside the truth: the nominal stage is Bouc-Wen."""
-        return frozenset() if self.rig.base == "bouc_wen" else frozenset({"hysteresis_shape"})
+        """Names that may stand beside the truth: the nominal stage is Bouc-Wen.
+
+        Driven to one side only, the loops of three bases are not point-symmetric: asymmetry is a property of theirs.
+        """
+        if self.rig.base == "bouc_wen":
+            return frozenset()
+        bent = self.rig.base in ("preisach", "coleman_hodgdon", "jiles_atherton")
+        return frozenset({"hysteresis_shape", "asymmetry"} if bent else {"hysteresis_shape"})
 
     def without(self, name: str) -> Case:
         """The same case with one effect less."""

@@ -68,7 +68,7 @@ def judge(hidden: Sequence[str], allowed: frozenset[str], verdict: str, named: N
 
     ``allowed`` names may stand beside the truth, each once. An answer "unexplained" names nothing.
     """
-    groups = list(named) if verdict == "effects" else []
+    groups = list(named) if verdict in ("effects", "partly") else []
     of_group = _assigned(groups, list(hidden))
     found = tuple(name for name in hidden if name in of_group.values())
     missed = tuple(name for name in hidden if name not in found)
