@@ -60,7 +60,7 @@ class AmplifierLag(CauseModel):
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         dt = data.dt_s
-        return single_guesses([0.1 * dt, 0.3 * dt, dt, 4.0 * dt])
+        return single_guesses([0.1 * dt, 0.3 * dt, dt, 4.0 * dt, 12.0 * dt])
 
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         ratio = p[0] / data.dt_s

@@ -49,11 +49,11 @@ class NominalStage(Protocol):
 
 
 def common_parameters(data: FitData) -> tuple[ModelParameter, ModelParameter]:
-    """The sensor's offset, and a latch of up to one sample early or late: recorders differ in both."""
+    """The sensor's offset, and a latch from two samples early to one late: recorders differ in both."""
     span = 4.0 * data.range_um + abs(data.middle_um)
     return (
         ModelParameter("offset_um", "µm", 0.0, -span, span, 0.1 * data.range_um, ActsOn.READING),
-        ModelParameter("latch_samples", "1", 0.0, -1.0, 1.0, 0.1, ActsOn.DYNAMICS),
+        ModelParameter("latch_samples", "1", 0.0, -2.0, 1.0, 0.1, ActsOn.DYNAMICS),
     )
 
 

@@ -213,6 +213,8 @@ class Search:
         if not looks:
             return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
+        # Of causes that show only their sum, each is fitted.
+        beside = same_set({self.causes[s.index].name for s in chosen})
         timing = bool(chosen) and self.causes[chosen[0].index].name == "timing"
         for look in looks:
             cause = self.causes[look.index]
@@ -221,7 +223,8 @@ class Search:
             # guess, because several of them look like a clock error at first; and what a direct test sees.
             line = cause.name == "mains_hum" and self.is_line(look, base)
             own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
-            own = own or (self.seen(cause.name) and all(self.causes[c.index].name != cause.name for c in chosen))
+            if self.seen(cause.name) or cause.name in beside:
+                own = own or all(self.causes[c.index].name != cause.name for c in chosen)
             if own and all(look is not c for c in chosen):
                 chosen.append(look)
 
