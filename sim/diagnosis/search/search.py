@@ -60,7 +60,12 @@ class Thresholds:
 
 
 #: Causes whose direct test also answers to others: it supports a name but does not replace the null distribution.
-_WEAK = frozenset({"amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing"})
+_WEAK = frozenset(
+    {
+        *("amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing"),
+        "rate_dependence",
+    }
+)
 #: Causes that are not named where their direct test is excited and sees nothing.
 _VETOED = frozenset(
     {

@@ -127,7 +127,7 @@ def rate_dependence(readings: Readings) -> list[Sight]:
         f"the loop widens by {100 * growth:.2g} ± {196 * sigma:.1g} % per decade of rate ({width.size} kinds of cycles "
         f"over {float(np.log10(np.max(rate) / np.min(rate))):.2g} decades, the parts of height and lag taken off)"
     )
-    if growth > 4.0 * sigma and growth > 0.01:
+    if growth > 6.0 * sigma and growth > 0.01:
         return [Sight("rate_dependence", True, words)]
     return [Sight("rate_dependence", False if sigma < 0.003 and growth < 0.003 else None, words)]
 

@@ -82,7 +82,8 @@ def lags_and_delay(readings: Readings) -> list[Sight]:
         f"misfit of the response to {100 * two.cost / max(one.cost, 1e-300):.0f} %"
     )
     return [
-        Sight("delay", delayed, words),
+        # A little more than the recorder's latch is not decided.
+        Sight("delay", True if delayed else None if late_s > 1.2 * data.dt_s else False, words),
         Sight("amplifier_lag", lagged, lag_words),
         Sight("sensor_lag", lagged, lag_words),
     ]
