@@ -167,7 +167,11 @@ def _errors(d: Diagnosis) -> list[str]:
         f"| extended stage | {length(d.extended_rmse_um)} | {length(d.extended_heldout_um)} |",
         f"| noise floor{bound}, from {d.floor_source} | {length(d.noise_floor_um)} | |",
         f"| black box, beside the nominal stage | | {length(d.ceiling_um)} |",
-        *([] if d.taught_um is None else [f"| black box that knows the recording only | | {length(d.taught_um)} |"]),
+        *(
+            []
+            if d.taught_um is None
+            else [f"| the best that was learnt from this recording | | {length(d.taught_um)} |"]
+        ),
         "",
         *_explainable(d),
     ]
@@ -268,8 +272,9 @@ def _left(d: Diagnosis) -> list[str]:
         lines.append("- a black box does not predict it better: it does not repeat with the drive in a known form")
     if d.taught_um is not None and d.taught_um > 1.2 * d.ceiling_um:
         lines.append(
-            f"- a black box that was fitted to the recording leaves {length(d.taught_um)} on the test recording: what "
-            f"lies between that and {length(d.ceiling_um)} cannot be learnt from this recording; record more motions"
+            f"- the best model that was fitted to the recording, a black box included, leaves {length(d.taught_um)} on "
+            f"the test recording: what lies between that and {length(d.ceiling_um)} cannot be learnt from this recording; "
+            "record more motions"
         )
     if d.partial:
         names = ", ".join(spaced(n) for n in d.partial)

@@ -155,7 +155,8 @@ def diagnose(
         on_test = tuple_of_two(fit_on_other_recording(fit, test.data, shown_mask) for fit in (nominal, extended))
         held_um = tuple_of_two(float(np.sqrt(np.mean(np.square(f.residual_um[shown_mask])))) for f in on_test)
         ceiling_um = black_box_error(*on_test, shown_mask, split(test.data))
-        taught_um = black_box_on_other(nominal, on_test[0], mask, shown_mask, search.parts)
+        # Where named physics does better than the black box, it is what the recording teaches.
+        taught_um = min(black_box_on_other(nominal, on_test[0], mask, shown_mask, search.parts), *held_um)
         shown_floor_um = min(noise_floor(test.data).sigma_um, floor.sigma_um)
     explained = explained_share(*held_um, ceiling_um, shown_floor_um)
     verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)

@@ -66,7 +66,7 @@ class Diagnosis:
     heldout_source: str = FOLDS
     #: Held-out error of a black box, and the share of what is explainable that the named causes explain.
     ceiling_um: float = float("nan")
-    #: Error on the test recording of a black box that was fitted to the recording itself; None without a test.
+    #: Error on the test recording of the better of a black box and the causes, fitted to the recording; None without.
     taught_um: float | None = None
     explained: float = float("nan")
     defects: tuple[Defect, ...] = ()
@@ -114,7 +114,7 @@ class Diagnosis:
         out["explainable"] = {
             "black_box_rmse_um": self.ceiling_um,
             "explained_share": self.explained,
-            "black_box_from_recording_rmse_um": self.taught_um,
+            "learnt_from_recording_rmse_um": self.taught_um,
         }
         out["defects"] = [{"kind": d.kind, "count": d.count, "by_chance": d.by_chance} for d in self.defects]
         out["left"] = list(self.left)
