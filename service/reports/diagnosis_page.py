@@ -273,8 +273,8 @@ def _left(d: Diagnosis) -> list[str]:
     if d.taught_um is not None and d.taught_um > 1.2 * d.ceiling_um:
         lines.append(
             f"- the best model that was fitted to the recording, a black box included, leaves {length(d.taught_um)} on "
-            f"the test recording: what lies between that and {length(d.ceiling_um)} cannot be learnt from this recording; "
-            "record more motions"
+            f"the test recording: what lies between that and {length(d.ceiling_um)} cannot be learnt from this "
+            "recording; record more motions"
         )
     if d.partial:
         names = ", ".join(spaced(n) for n in d.partial)
