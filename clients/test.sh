@@ -35,4 +35,17 @@ echo "test-clients: C, static and shared library"
 LD_LIBRARY_PATH="$built" "$out/test_shared" ../../docs/protocol/vectors
 # shellcheck disable=SC2086
 "$compiler" $flags c/bench.c "$built/libdehyst.a" -o "$out/bench" -lm -lpthread -ldl
+
+if [ -z "${DEHYST_TEST_ZENOH:-}" ]; then
+    echo "test-clients: passed; the zenoh follower was not built: DEHYST_TEST_ZENOH=1 fetches its crates and tests it"
+    exit 0
+fi
+echo "test-clients: the zenoh follower, beside a live service"
+cd zenoh
+cargo build --release --quiet
+DEHYST_ZENOH_LIBRARY="$(cd "${CARGO_TARGET_DIR:-target}/release" && pwd)/libdehyst_zenoh.so"
+export DEHYST_ZENOH_LIBRARY
+cd ../../..
+python="${PYTHON:-.venv/bin/python}"
+"$python" -m pytest -q clients/rust/zenoh/test_live.py
 echo "test-clients: all passed"
