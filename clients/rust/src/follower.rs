@@ -21,6 +21,10 @@ struct Arrived {
     at: Instant,
 }
 
+/// The mailbox hands snapshots from one thread to another, which `AtomicPtr` does not check.
+const fn sendable<T: Send>() {}
+const _: () = sendable::<Arrived>();
+
 /// What the two sides share.
 struct Mailbox {
     /// The newest snapshot, not yet taken; null where there is none.
