@@ -43,7 +43,10 @@ fi
 echo "test-clients: the zenoh follower, beside a live service"
 cd zenoh
 cargo build --release --quiet
-DEHYST_ZENOH_LIBRARY="$(cd "${CARGO_TARGET_DIR:-target}/release" && pwd)/libdehyst_zenoh.so"
+zenoh="${CARGO_TARGET_DIR:-target}/release"
+# shellcheck disable=SC2086
+"$compiler" $flags -I../include c/controller.c -o "$zenoh/controller" -L"$zenoh" -ldehyst_zenoh -lm -Wl,-rpath,'$ORIGIN'
+DEHYST_ZENOH_LIBRARY="$(cd "$zenoh" && pwd)/libdehyst_zenoh.so"
 export DEHYST_ZENOH_LIBRARY
 cd ../../..
 python="${PYTHON:-.venv/bin/python}"

@@ -4,7 +4,8 @@
  * expected), -2 internal error. Units: µm, µm/s, µm/s², V, s. Doubles are IEEE.
  *
  * Threads: one thread at a time uses a handle, except that dehyst_update may be called by another one meanwhile.
- * dehyst_point and dehyst_block neither lock nor allocate, whatever dehyst_update does.
+ * dehyst_point and dehyst_block neither lock nor allocate, whatever dehyst_update does; only the text of a refusal is
+ * allocated.
  */
 #ifndef DEHYST_H
 #define DEHYST_H

@@ -8,8 +8,10 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
+import subprocess
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,6 +95,16 @@ def test_the_native_follower_is_the_python_follower(native: ctypes.CDLL, endpoin
         assert report.refused == 0
         assert report.gain == pytest.approx(0.94, abs=0.01)
     native.dehyst_close(handle)
+
+
+def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
+    program = Path(LIBRARY).parent / "controller"
+    if not program.exists():
+        pytest.skip("c/controller.c is not built: clients/test.sh does")
+    words = [program, endpoint, "demo", "x", "", "1.0", "45", "20"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("1000 points, 0 refused")
 
 
 def test_where_nobody_serves_the_error_says_what_to_check(native: ctypes.CDLL, endpoint: str) -> None:
