@@ -176,3 +176,33 @@ fn no_cut_or_changed_payload_panics() {
         }
     }
 }
+
+#[test]
+fn no_random_damage_of_a_large_payload_panics_or_leaves_the_limits() {
+    let whole = read("auto-in-change.model.payload");
+    let json = u32::from_le_bytes(whole[16..20].try_into().unwrap()) as usize;
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    let mut state = 20_u64;
+    let mut next = |below: usize| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state % below as u64) as usize
+    };
+    let mut accepted = 0;
+    for round in 0..1500 {
+        let mut changed = whole.clone();
+        for _ in 0..=next(3) {
+            // Mostly in the header and its JSON; every third time anywhere.
+            let at = if round % 3 == 0 { next(whole.len()) } else { next(24 + json) };
+            changed[at] = if next(2) == 0 { next(256) as u8 } else { b"0123456789.-e,\"[]{}"[next(19)] };
+        }
+        let Ok(mut follower) = Follower::new(&changed, limits) else { continue };
+        accepted += 1;
+        for y in [40.0, 130.0, -30.0] {
+            let point = follower.point(y, 1e3, 1e5).unwrap();
+            assert!((0.0..=10.0).contains(&point.u_v), "round {round}: {point:?}");
+        }
+    }
+    assert!(accepted > 200, "{accepted}");
+}
