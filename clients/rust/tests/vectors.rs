@@ -206,3 +206,26 @@ fn no_random_damage_of_a_large_payload_panics_or_leaves_the_limits() {
     }
     assert!(accepted > 200, "{accepted}");
 }
+
+#[test]
+fn points_one_by_one_are_the_block() {
+    let mut compared = 0;
+    for case in cases() {
+        let free = case.query.pending.is_none() && case.query.memory.is_none() && case.age_s.is_none();
+        // With the stand-in, and in a change of champion, the page says how they differ.
+        if !free || case.reply.flags.iter().any(|flags| flags & 48 != 0) || case.name.starts_with("auto-in-change") {
+            continue;
+        }
+        let mut follower = Follower::new(&read(&case.model), case.limits).unwrap();
+        follower.start(case.query.u_before_v);
+        let q = &case.query;
+        for i in 0..q.y_um.len() {
+            let got = follower.point(q.y_um[i], q.v_um_per_s[i], q.a_um_per_s2[i]).unwrap();
+            same(&format!("{} u_V of point {i}", case.name), &[got.u_v], &[case.reply.u_v[i]]);
+            assert_eq!(got.flags, case.reply.flags[i], "{} point {i}", case.name);
+        }
+        same(&format!("{} memory", case.name), follower.memory(), &case.reply.memory);
+        compared += 1;
+    }
+    assert!(compared > 15, "{compared}");
+}

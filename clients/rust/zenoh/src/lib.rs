@@ -116,7 +116,9 @@ pub fn open(options: &Options) -> Result<Live> {
 
 fn config(options: &Options) -> Result<Config> {
     let mut config = match &options.zenoh_config {
-        Some(path) => Config::from_file(path).map_err(|error| failed("zenoh_config", error, "a JSON5 file of zenoh"))?,
+        Some(path) => {
+            Config::from_file(path).map_err(|error| failed("zenoh_config", error, "a JSON5 file of zenoh"))?
+        }
         None => Config::default(),
     };
     let endpoints: Vec<String> = options.endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
