@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
 # Tests that only compute, which may share all cores.
-PURE   := tests/test_house.py tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
+PURE   := tests/test_house.py tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
           tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/benchmarks/test_house_bench.py \
           $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_voltages.py) \
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
@@ -25,7 +25,7 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test check bench foreign fuzz blind requirements clean
+.PHONY: help setup setup-test demo test test-clients check bench foreign fuzz blind vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -60,6 +60,9 @@ test: ## lint, types, import contract, and all tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PAIRS)
 	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE) $(PAIRS))
 
+test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
+	@sh clients/test.sh
+
 check: .setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -74,6 +77,9 @@ foreign: setup ## 500 random stages and events in lockstep, with the table of go
 
 fuzz: setup-test ## a million malformed payloads, by coverage, and a live service under fire (minutes)
 	$(BIN)/python -m benchmarks.fuzz --out out/fuzz
+
+vectors: setup ## make the test vectors of the protocol anew
+	$(BIN)/python -m benchmarks.vectors
 
 blind: setup-test ## score the diagnosis on 218 recordings with hidden effects (about half an hour)
 	$(BIN)/python -m tests.hidden.blind

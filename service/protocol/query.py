@@ -159,7 +159,7 @@ def _pending(data: bytes, begin: int, options: int) -> Pending:
         raise FieldError("payload", f"{len(data)} bytes", f"at least {begin + _PENDING.size}, for what is under way")
     first, k = _PENDING.unpack_from(data, begin)
     if not 1 <= k <= MAX_PENDING:
-        raise FieldError("pending", f"{k} samples", f"1 to {MAX_PENDING}")
+        raise FieldError("pending.k", k, f"1 to {MAX_PENDING} samples")
     check_length(data, begin + _PENDING.size + 16 * k)
     values = doubles(data, begin + _PENDING.size, 2 * k)
     pending = Pending(check_seq("pending.first", first), values[:k], values[k:])

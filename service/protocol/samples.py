@@ -127,7 +127,7 @@ def check_sizes(m: int, name_bytes: int) -> None:
     if m > MAX_MEMORY:
         raise FieldError("m", m, f"at most {MAX_MEMORY} doubles of memory")
     if name_bytes > MAX_NAME_BYTES:
-        raise FieldError("name_bytes", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
+        raise FieldError("b", name_bytes, f"a name of at most {MAX_NAME_BYTES} bytes")
 
 
 def decode_name(raw: bytes) -> str:

@@ -1,4 +1,4 @@
-"""A client written from docs/protocol.md alone: zenoh, struct and json, and nothing of this project.
+"""A client written from docs/protocol.md alone (`page_client`), over zenoh, beside a real service.
 
 Only the harness that starts the service is ours. One model file is changed as the page tells its form, with numpy.
 """
@@ -20,6 +20,10 @@ import pytest
 import zenoh
 
 from tests.service.conftest import ServeProcess, unused_port, write_config
+from tests.service.protocol.page_client import Model, decode_query
+from tests.service.protocol.page_client import answer as answer_by_the_page
+from tests.service.protocol.page_client import decode_model as model
+from tests.service.protocol.page_client import decode_reply as reply
 
 pytestmark = pytest.mark.e2e
 BASE = "dehyst/v1/demo/x"
@@ -105,20 +109,6 @@ def query(
     return body + struct.pack(f"<qI{2 * len(y_um)}d", first, len(y_um), *y_um, *u_V)
 
 
-def reply(data: bytes) -> dict[str, Any]:
-    version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
-    assert (version, kind) == (1, 5)
-    snapshot_seq, m, b = struct.unpack_from("<qII", data, 8)
-    assert len(data) == 24 + 16 * n + 8 * m + n + b
-    doubles = struct.unpack_from(f"<{2 * n + m}d", data, 24)
-    flags = list(data[24 + 16 * n + 8 * m :][:n])
-    name = data[len(data) - b :].decode()
-    return {
-        "options": options, "snapshot_seq": snapshot_seq, "u_V": doubles[:n], "std_V": doubles[n : 2 * n],
-        "memory": list(doubles[2 * n :]), "flags": flags, "model": name,
-    }  # fmt: skip
-
-
 def samples(first: int, n: int) -> bytes:
     k = list(range(first, first + n))
     y = [45.0 + 30.0 * math.sin(2 * math.pi * 3e-3 * i) for i in k]
@@ -182,25 +172,6 @@ def test_a_stranger_asks_continues_teaches_and_is_corrected(session: zenoh.Sessi
     assert list(session.get("dehyst/v1/demo/nobody/feedforward", payload=b"", timeout=5.0)) == []
 
 
-def model(data: bytes) -> dict[str, Any]:
-    version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
-    assert (version, kind, options) == (1, 6, 0)
-    snapshot_seq, j, b = struct.unpack_from("<qII", data, 8)
-    assert len(data) == 24 + j + b
-    assert j % 8 == 0
-    text = json.loads(data[24 : 24 + j])
-    assert len(text["arrays"]) == n
-    formats = {"<f8": "d", "<f4": "f", "<i8": "q", "<i4": "i", "|u1": "B", "|b1": "?"}
-    arrays, at = {}, 24 + j
-    for name, dtype, shape in text["arrays"]:
-        assert at % 8 == 0
-        layout = f"<{math.prod(shape)}{formats[dtype]}"
-        arrays[name] = list(struct.unpack_from(layout, data, at))
-        at += -(-struct.calcsize(layout) // 8) * 8
-    assert at == len(data)
-    return {**text, "data": arrays, "snapshot_seq": snapshot_seq}
-
-
 def test_a_stranger_follows_the_model_as_it_is_published(session: zenoh.Session) -> None:
     arrived: list[dict[str, Any]] = []
     second = threading.Event()
@@ -222,41 +193,10 @@ def test_a_stranger_follows_the_model_as_it_is_published(session: zenoh.Session)
     assert len(arrived[0]["data"]["/memory"]) > 0
 
 
-def lssvm(
-    values: dict[str, Any], data: dict[str, list[float]], memory: list[float], y: float, v: float, a: float
-) -> float:
-    """Steps 1 to 5 of the page for one point; ``memory`` advances in place."""
-    f = {name.removeprefix("features."): value for name, value in {**values, **data}.items()}
-    y, v, a = (y - f["offset_um"]) / f["gain"], v / f["gain"], a / f["gain"]
-    plays, arcs, slow = f["thresholds_um"], f["arc_lengths_um"], f["time_constants_s"]
-    k, n_arcs = len(plays), len(arcs)
-    for i, r in enumerate(plays):
-        memory[i] = max(y - r, min(y + r, memory[i]))
-    z = max(y - f["dead_um"], min(y + f["dead_um"], memory[-1])) if arcs else 0.0
-    for i, rho in enumerate(arcs):
-        memory[k + i] = y + (memory[k + i] - y) * math.exp(-abs(z - memory[-1]) / rho)
-    for i, tau in enumerate(slow):
-        memory[k + n_arcs + i] = y + (memory[k + n_arcs + i] - y) * math.exp(-f["dt_s"] / tau)
-    if arcs:
-        memory[-1] = z
-    h = (f["y_max_um"] - f["y_min_um"]) / 2
-    yn, vn, an = (y - f["y_min_um"] - h) / h, v / f["v_scale_um_per_s"], a / f["a_scale_um_per_s2"]
-    p = [(y - memory[i]) / r for i, r in enumerate(plays)]
-    basis = [1.0]
-    if f["linear"]:
-        basis += [yn, vn, an, yn**2, yn**3, *p, *([yn * value for value in p] if f["asymmetric"] else [])]
-        basis += [(y - memory[k + i]) / rho for i, rho in enumerate(arcs)]
-        basis += [(y - memory[k + n_arcs + i]) / h for i in range(len(slow))]
-    x = [yn, vn, *(p[i] for i in f["kernel_plays"])]
-    u = sum(b * c for b, c in zip(f["beta"], basis, strict=True))
-    for row, alpha in enumerate(f["alpha"]):
-        point = f["support"][row * len(x) : (row + 1) * len(x)]
-        distance = sum(((q - s) / w) ** 2 for q, s, w in zip(x, point, f["widths"], strict=True))
-        u += alpha * math.exp(-distance)
-    if f["anchor"]:
-        known = sum(b * c for b, c in zip(f["anchor"], basis, strict=True))
-        u = min(max(u, known - f["allowed_V"]), known + f["allowed_V"])
-    return float(u)
+def lssvm(values: dict[str, Any], data: dict[str, Any], memory: list[float], y: float, v: float, a: float) -> float:
+    """The voltage of one point; ``memory`` advances in place."""
+    (u_V,), _, _, memory[:] = Model("lssvm", values | data, values["features.dt_s"]).evaluate([y], [v], [a], memory)
+    return u_V
 
 
 def test_a_stranger_evaluates_the_lssvm_by_the_formula_of_the_page(session: zenoh.Session) -> None:
@@ -332,3 +272,42 @@ def test_a_stranger_goes_on_from_what_is_under_way_as_the_service_does(bounded: 
         assert m == pytest.approx(u, rel=1e-9) or flag & 2
     assert asked["flags"].count(2) == 0
     assert memory == pytest.approx(asked["memory"], rel=1e-12)
+
+
+def stage_samples(first: int, n: int, gain: float) -> bytes:
+    """Samples of a stage of ``gain`` times 11 µm/V, moved by one and the same sequence of voltages."""
+    k = np.arange(first, first + n)
+    u = 4.0 + 2.5 * np.sin(2 * np.pi * 4e-3 * k) + 0.8 * np.sin(2 * np.pi * 11e-3 * k)
+    y = gain * (11.0 * u + 1.0)
+    return struct.pack("<BBHI", 1, 1, 0, n) + struct.pack(f"<{n}q{3 * n}d", *k, *(k * 1e-3), *u, *y)
+
+
+def taught(session: zenoh.Session, first: int, last: int, gain: float) -> None:
+    """Send the samples from ``first`` to ``last`` and wait until they are handled."""
+    for k in range(first, last + 1, 50):
+        session.put(f"{BASE}/sample", stage_samples(k, 50, gain), congestion_control=zenoh.CongestionControl.BLOCK)
+    until = time.monotonic() + 30.0
+    while json.loads(get(session, f"{BASE}/status"))["seq"] < last and time.monotonic() < until:
+        time.sleep(0.02)
+
+
+def test_a_stranger_stays_exact_through_a_jump_of_the_gain(serve: Any) -> None:
+    y, v, a = [30.0, 33.0, 37.0, 36.0, 35.5], [3e3, 4e3, 0.0, -1e3, -5e2], [0.0, 1e4, -5e4, 0.0, 2e3]
+    with connected(serve().endpoint) as session:
+        taught(session, 0, 1999, 1.0)
+        before = model(get(session, f"{BASE}/model?name=lssvm_adaptive"))
+        taught(session, 2000, 3999, 0.94)
+        after = {name: model(get(session, f"{BASE}/model?name={name}")) for name in ("lssvm_adaptive", "auto")}
+        frames = [m["values"]["features.gain"] for m in (before, after["lssvm_adaptive"])]
+        assert frames[0] == pytest.approx(1.0, abs=0.01)
+        assert frames[1] == pytest.approx(0.94, abs=0.01)
+        way = 3995, [32.0, 31.0, 30.5, 30.0, 29.5, 29.0, 29.5], [2.9, 2.8, 2.75, 2.7, 2.65, 2.6, 2.65]
+        for name, message in after.items():
+            for pending in (None, way):
+                payload = query(y, v, a, None, name.encode(), message["snapshot_seq"], pending)
+                asked = reply(get(session, f"{BASE}/feedforward", payload))
+                mine = answer_by_the_page(message, decode_query(payload), (0.0, 10.0, 2000.0))
+                assert asked["snapshot_seq"] == message["snapshot_seq"]
+                assert asked["flags"] == mine["flags"]
+                for field in ("u_V", "std_V", "memory"):
+                    np.testing.assert_allclose(mine[field], asked[field], rtol=1e-12, atol=1e-12, err_msg=field)

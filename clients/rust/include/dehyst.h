@@ -1,0 +1,99 @@
+/* dehyst: evaluates the model of a dehyst service in the controller's process.
+ *
+ * Every function returns 0, or a negative number: -1 refused (dehyst_error says which field, what was got, what was
+ * expected), -2 internal error. Units: µm, µm/s, µm/s², V, s. Doubles are IEEE.
+ *
+ * Threads: one thread at a time uses a handle, except that dehyst_update may be called by another one meanwhile.
+ * dehyst_point and dehyst_block neither lock nor allocate, whatever dehyst_update does; only the text of a refusal is
+ * allocated.
+ */
+#ifndef DEHYST_H
+#define DEHYST_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef struct dehyst dehyst;
+
+/* Limits of the axis, as the status of the service has them. No limit: -INFINITY or INFINITY (not for u_min, u_max). */
+typedef struct {
+    double u_min_V, u_max_V, slew_V_per_s, y_min_um, y_max_um;
+} dehyst_limits;
+
+/* Bits of flags; docs/protocol.md, "Feedforward reply". */
+enum {
+    DEHYST_LIMITED_VOLTAGE = 1,
+    DEHYST_LIMITED_SLEW = 2,
+    DEHYST_OUTSIDE_DOMAIN = 4,
+    DEHYST_NOT_FINITE_REPLACED = 8,
+    DEHYST_BLENDED = 16,
+    DEHYST_STAND_IN = 32,
+    DEHYST_STALE = 64
+};
+
+typedef struct {
+    double u_V;     /* finite, within the limits, within the slew limit from the point before */
+    double std_V;   /* one standard deviation; NaN where the model has none */
+    uint32_t flags;
+} dehyst_answer;
+
+typedef struct {
+    int64_t snapshot_seq;        /* last sample that the model in use has seen; -1 before any */
+    uint64_t received, refused;  /* payloads, the first one included */
+    uint64_t answered;           /* points */
+    double age_s;                /* since the model in use arrived */
+    double trust;                /* weight of the model inside its domain, 0 to 1 */
+    double dt_s;                 /* distance of points */
+    double gain, offset_um;      /* frame of the learning model; 1 and 0 for a model without one */
+    dehyst_answer last;
+    uint32_t memory_size, stale;
+    char source[132];            /* model of the last voltage: "A+B" where B was blended in; empty where held */
+} dehyst_report_t;
+
+/* 1, the version of the wire and of this interface. */
+uint32_t dehyst_version(void);
+
+/* Text of the last error of this thread; valid until its next call. */
+const char *dehyst_error(void);
+
+/* A handle from the payload of `.../model` (kind 6) and the limits. */
+int dehyst_open_payload(const uint8_t *payload, size_t bytes, const dehyst_limits *limits, dehyst **handle);
+
+/* A newer payload of the same model, from any thread. Refused payloads are counted and change nothing. */
+int dehyst_update(dehyst *handle, const uint8_t *payload, size_t bytes);
+
+/* Begin from the memory of the newest payload: that after sample snapshot_seq of the report. u_before_V: voltage from
+ * which the slew limit counts; NAN: none. Then dehyst_advance along what was commanded for the samples since. */
+int dehyst_start(dehyst *handle, double u_before_V);
+
+/* Memory after n points that were commanded with these voltages, without an answer. */
+int dehyst_advance(dehyst *handle, size_t n, const double *y_um, const double *u_V);
+
+/* The voltage for the next point of the wanted motion. */
+int dehyst_point(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2, dehyst_answer *answer);
+
+/* The voltages for the next n points, dt_s apart. v and a may be NULL for 0. Outputs have n elements. */
+int dehyst_block(dehyst *handle, size_t n, const double *y_um, const double *v_um_per_s, const double *a_um_per_s2,
+                 double *u_V, double *std_V, uint8_t *flags);
+
+/* The reply (kind 5) to a query (kind 4) as the service gives it; age_s: of the newest sample, NAN: none. Changes
+ * nothing in the handle. Allocates: to compare, not for a loop. On a reply longer than room only length is set. */
+int dehyst_query(dehyst *handle, const uint8_t *query, size_t bytes, double age_s, uint8_t *reply, size_t room,
+                 size_t *length);
+
+/* Copy the hysteresis memory, memory_size doubles of the report. */
+int dehyst_memory(dehyst *handle, double *memory, size_t room);
+
+int dehyst_report(dehyst *handle, dehyst_report_t *report);
+
+/* NULL is allowed. */
+void dehyst_close(dehyst *handle);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,149 @@
+//! What the follower promises to a real-time loop: no allocation in a point, and whole models only.
+
+use dehyst::{Follower, Limits, Out};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+thread_local! {
+    /// Calls of the allocator in this thread.
+    static CALLS: Cell<u64> = const { Cell::new(0) };
+}
+
+struct Counting;
+
+fn count() {
+    let _ = CALLS.try_with(|calls| calls.set(calls.get() + 1));
+}
+
+// SAFETY: everything is left to the system's allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        System.alloc(layout)
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        count();
+        System.dealloc(pointer, layout);
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        System.realloc(pointer, layout, size)
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const LIMITS: Limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 1e9, y_min_um: -40.0, y_max_um: 140.0 };
+
+fn read(name: &str) -> Vec<u8> {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/protocol/vectors/");
+    std::fs::read(format!("{folder}{name}.model.payload")).unwrap()
+}
+
+#[test]
+fn points_and_blocks_allocate_and_free_nothing() {
+    let (first, jumped, changed) = (read("auto"), read("auto-jumped"), read("auto-champion-changed"));
+    let mut follower = Follower::new(&first, LIMITS).unwrap();
+    let publisher = follower.publisher();
+    let (mut u, mut std, mut flags) = ([0.0; 8], [0.0; 8], [0u8; 8]);
+    let mut total = 0;
+    for round in 0..60 {
+        // Another model before the points: the follower takes it, and gives the old one back unfreed.
+        publisher.publish([&first, &jumped, &changed][round % 3]).unwrap();
+        let before = CALLS.with(Cell::get);
+        // Inside the domain, and outside it with the stand-in.
+        for y in [40.0, 41.0, 45.0, 120.0, -20.0] {
+            follower.point(y + 0.01 * round as f64, 100.0, 0.0).unwrap();
+        }
+        let mut out = Out { u_v: &mut u, std_v: &mut std, flags: &mut flags };
+        follower.block(&[30.0, 31.0, 32.0, 33.0, 34.0, 110.0, 34.0, 33.0], &[], &[], &mut out).unwrap();
+        follower.start(f64::NAN);
+        follower.advance(&[30.0, 32.0], &[2.0, 2.1]).unwrap();
+        total += CALLS.with(Cell::get) - before;
+    }
+    assert_eq!(total, 0);
+    assert_eq!(follower.report().received, 61);
+}
+
+#[test]
+fn a_model_of_another_size_brings_its_own_memory_without_allocation() {
+    let (small, other) = (read("bouc_wen"), read("bouc_wen-zero-order"));
+    let mut follower = Follower::new(&small, LIMITS).unwrap();
+    follower.publisher().publish(&other).unwrap();
+    follower.point(30.0, 0.0, 0.0).unwrap();
+    // The plays of `mpi` and `pi` differ in number, and both are called mpi.
+    let (mpi, pi) = (read("mpi"), read("pi"));
+    let mut follower = Follower::new(&mpi, LIMITS).unwrap();
+    assert_eq!(follower.memory().len(), 4);
+    follower.publisher().publish(&pi).unwrap();
+    let before = CALLS.with(Cell::get);
+    let got = follower.point(30.0, 0.0, 0.0).unwrap();
+    assert_eq!(CALLS.with(Cell::get), before);
+    assert_eq!(follower.memory().len(), 3);
+    assert_eq!(got.u_v, Follower::new(&pi, LIMITS).unwrap().point(30.0, 0.0, 0.0).unwrap().u_v);
+    assert!(follower.publisher().publish(&small).is_err());
+    assert_eq!(follower.report().refused, 1);
+    assert!(follower.publisher().last_error().contains("bouc_wen"));
+}
+
+#[test]
+fn every_answer_is_of_one_whole_model_while_others_publish() {
+    let payloads = [read("lssvm"), read("lssvm-jumped"), read("lssvm-distrusted")];
+    // From the memory of the payload, each model has one answer.
+    let expected: Vec<f64> = payloads
+        .iter()
+        .map(|payload| Follower::new(payload, LIMITS).unwrap().point(44.0, 500.0, 0.0).unwrap().u_v)
+        .collect();
+    assert!(expected[0] != expected[1] && expected[1] != expected[2]);
+    let mut follower = Follower::new(&payloads[0], LIMITS).unwrap();
+    let publisher = follower.publisher();
+    let (stop, mut seen) = (AtomicBool::new(false), [0u64; 3]);
+    std::thread::scope(|scope| {
+        for start in 0..2 {
+            let (publisher, payloads, stop) = (publisher.clone(), &payloads, &stop);
+            scope.spawn(move || {
+                let mut i = start;
+                while !stop.load(Ordering::Relaxed) {
+                    publisher.publish(&payloads[i % 3]).unwrap();
+                    i += 1;
+                }
+            });
+        }
+        while seen.iter().any(|count| *count < 200) {
+            follower.start(f64::NAN);
+            let got = follower.point(44.0, 500.0, 0.0).unwrap();
+            // A newer model may come between `start` and the point: then its memory is that of the older one.
+            if let Some(i) = expected.iter().position(|u| *u == got.u_v) {
+                seen[i] += 1;
+            }
+            assert!(got.u_v.is_finite() && (0.0..=10.0).contains(&got.u_v));
+        }
+        stop.store(true, Ordering::Relaxed);
+    });
+    // The last one that was published is in use after the next point: nothing stays in the mailbox.
+    publisher.publish(&payloads[1]).unwrap();
+    follower.point(44.0, 0.0, 0.0).unwrap();
+    assert_eq!(follower.report().snapshot_seq, 4500);
+    assert_eq!(follower.report().gain, 0.94);
+}
+
+#[test]
+fn the_follower_tells_when_models_no_longer_come() {
+    let payload = read("lssvm-jumped");
+    let mut follower = Follower::new(&payload, LIMITS).unwrap();
+    assert!(!follower.report().stale);
+    let (mut u, mut std, mut flags) = ([0.0], [0.0], [0u8]);
+    for (age_s, expected) in [(None, 0), (Some(1.0), 0), (Some(3.0), 64), (Some(60.5), 64 | 16), (Some(70.0), 64 | 32)]
+    {
+        let mut out = Out { u_v: &mut u, std_v: &mut std, flags: &mut flags };
+        follower.block_at(&[44.0], &[0.0], &[0.0], age_s, &mut out).unwrap();
+        assert_eq!(flags[0], expected, "{age_s:?}");
+    }
+    let source = follower.report().source;
+    assert_eq!(source, "bouc_wen");
+    assert_eq!(follower.hold(), u[0]);
+}

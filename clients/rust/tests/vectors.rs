@@ -1,0 +1,231 @@
+//! The test vectors of docs/protocol/vectors, by queries and by a follower that goes along.
+
+use dehyst::wire::{Query, Reply};
+use dehyst::{Follower, Limits, Out, Snapshot};
+use std::fs;
+use std::path::PathBuf;
+
+fn folder() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../docs/protocol/vectors")
+}
+
+fn read(name: &str) -> Vec<u8> {
+    fs::read(folder().join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+}
+
+struct Case {
+    name: String,
+    model: String,
+    query: Query,
+    query_bytes: Vec<u8>,
+    reply: Reply,
+    continues: Option<String>,
+    limits: Limits,
+    age_s: Option<f64>,
+}
+
+fn rows(name: &str) -> Vec<Vec<String>> {
+    let text = String::from_utf8(read(name)).unwrap();
+    let lines = text.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
+    lines.map(|line| line.split_whitespace().map(String::from).collect()).collect()
+}
+
+fn cases() -> Vec<Case> {
+    let number = |text: &str| text.parse::<f64>().unwrap();
+    rows("cases.txt")
+        .into_iter()
+        .map(|row| Case {
+            name: row[0].clone(),
+            model: row[1].clone(),
+            query: Query::decode(&read(&row[2])).unwrap(),
+            query_bytes: read(&row[2]),
+            reply: Reply::decode(&read(&row[3])).unwrap(),
+            continues: (row[4] != "-").then(|| row[4].clone()),
+            limits: Limits {
+                u_min_v: number(&row[5]),
+                u_max_v: number(&row[6]),
+                slew_v_per_s: number(&row[7]),
+                y_min_um: number(&row[8]),
+                y_max_um: number(&row[9]),
+            },
+            age_s: Some(number(&row[10])).filter(|age| !age.is_nan()),
+        })
+        .collect()
+}
+
+fn same(what: &str, got: &[f64], expected: &[f64]) {
+    assert_eq!(got.len(), expected.len(), "{what}");
+    for (i, (g, e)) in got.iter().zip(expected).enumerate() {
+        let close = (g - e).abs() <= 1e-12 * e.abs().max(1.0);
+        assert!(close || (g.is_nan() && e.is_nan()), "{what}[{i}]: got {g}, expected {e}, off by {:e}", g - e);
+    }
+}
+
+#[test]
+fn every_query_has_the_reply_of_the_service() {
+    let cases = cases();
+    assert!(cases.len() > 50);
+    for case in cases {
+        let mut follower = Follower::new(&read(&case.model), case.limits).unwrap();
+        let got = follower.reply(&case.query_bytes, case.age_s).unwrap();
+        same(&format!("{} u_V", case.name), &got.u_v, &case.reply.u_v);
+        same(&format!("{} std_V", case.name), &got.std_v, &case.reply.std_v);
+        same(&format!("{} memory", case.name), &got.memory, &case.reply.memory);
+        let rest = |r: &Reply| (r.flags.clone(), r.model.clone(), r.stand_in.clone(), r.fallback, r.tracked_memory);
+        assert_eq!(rest(&got), rest(&case.reply), "{}", case.name);
+        assert_eq!(got.snapshot_seq, case.reply.snapshot_seq);
+        assert_eq!(Reply::decode(&got.encode()).unwrap().flags, got.flags);
+    }
+}
+
+#[test]
+fn a_follower_goes_along_with_its_own_memory() {
+    let mut followers: Vec<(String, String, Follower)> = Vec::new();
+    let mut continued = 0;
+    for case in cases() {
+        let free = case.query.pending.is_none() && case.query.u_before_v.is_nan() && case.query.memory.is_none();
+        let (model, mut follower) = match &case.continues {
+            None if free => (case.model.clone(), Follower::new(&read(&case.model), case.limits).unwrap()),
+            None => continue,
+            Some(name) => {
+                continued += 1;
+                let at = followers.iter().position(|(known, _, _)| known == name).unwrap();
+                let (_, model, follower) = followers.swap_remove(at);
+                (model, follower)
+            }
+        };
+        if model != case.model {
+            follower.publisher().publish(&read(&case.model)).unwrap();
+        }
+        let (n, query) = (case.query.y_um.len(), &case.query);
+        let (mut u_v, mut std_v, mut flags) = (vec![0.0; n], vec![0.0; n], vec![0; n]);
+        let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
+        let (y, v, a) = (&query.y_um, &query.v_um_per_s, &query.a_um_per_s2);
+        if n == 1 {
+            let got = follower.point(y[0], v[0], a[0]).unwrap();
+            (u_v[0], std_v[0], flags[0]) = (got.u_v, got.std_v, got.flags);
+        } else if case.age_s.is_some() {
+            follower.block_at(y, v, a, case.age_s, &mut out).unwrap();
+        } else {
+            follower.block(y, v, a, &mut out).unwrap();
+        }
+        same(&format!("{} u_V", case.name), &u_v, &case.reply.u_v);
+        same(&format!("{} std_V", case.name), &std_v, &case.reply.std_v);
+        same(&format!("{} memory", case.name), follower.memory(), &case.reply.memory);
+        assert_eq!(flags, case.reply.flags, "{}", case.name);
+        followers.push((case.name, case.model, follower));
+    }
+    assert!(continued >= 8);
+}
+
+#[test]
+fn start_and_advance_are_what_is_under_way() {
+    let case = cases().into_iter().find(|case| case.name == "auto-in-change-under-way").unwrap();
+    let pending = case.query.pending.as_ref().unwrap();
+    let k = pending.y_um.len();
+    let mut follower = Follower::new(&read(&case.model), case.limits).unwrap();
+    // The service evaluates the last one under way; before it, both only advance.
+    follower.start(f64::NAN);
+    follower.advance(&pending.y_um[..k - 1], &pending.u_v[..k - 1]).unwrap();
+    let (v, a, dt) = (&case.query.v_um_per_s, &case.query.a_um_per_s2, follower.report().dt_s);
+    let y: Vec<f64> = [&pending.y_um[k - 1..], &case.query.y_um].concat();
+    let v: Vec<f64> = [&[v[0] - a[0] * dt], &v[..]].concat();
+    let a: Vec<f64> = [&a[..1], a].concat();
+    let (mut u_v, mut std_v, mut flags) = (vec![0.0; y.len()], vec![0.0; y.len()], vec![0; y.len()]);
+    let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
+    follower.block(&y, &v, &a, &mut out).unwrap();
+    same("memory", follower.memory(), &case.reply.memory);
+}
+
+#[test]
+fn malformed_payloads_are_refused_with_the_field_of_the_service() {
+    let mut checked = 0;
+    for row in rows("refused.txt") {
+        let (payload, field) = (read(&row[0]), &row[2]);
+        let error = match row[1].as_str() {
+            "4" => Query::decode(&payload).map(drop).unwrap_err(),
+            "6" => Snapshot::decode(&payload).map(drop).unwrap_err(),
+            _ => continue, // this client sends samples and commands, and reads none
+        };
+        assert_eq!(&error.field, field, "{}", row[0]);
+        checked += 1;
+    }
+    assert!(checked >= 15);
+}
+
+#[test]
+fn no_cut_or_changed_payload_panics() {
+    // Deterministic damage: every cut of a small payload, and bytes changed in turn.
+    for name in ["linear.model.payload", "mpi.model.payload", "lssvm-bare.model.payload", "bouc_wen.model.payload"] {
+        let whole = read(name);
+        for end in 0..whole.len() {
+            assert!(Snapshot::decode(&whole[..end]).is_err(), "{name} cut to {end}");
+        }
+        for at in 0..whole.len() {
+            for value in [0, 0xff, whole[at] ^ 1, b'9'] {
+                let mut changed = whole.clone();
+                changed[at] = value;
+                let limits =
+                    Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+                if let Ok(mut follower) = Follower::new(&changed, limits) {
+                    if let Ok(point) = follower.point(40.0, 100.0, 0.0) {
+                        assert!((0.0..=10.0).contains(&point.u_v), "{name} byte {at}");
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn no_random_damage_of_a_large_payload_panics_or_leaves_the_limits() {
+    let whole = read("auto-in-change.model.payload");
+    let json = u32::from_le_bytes(whole[16..20].try_into().unwrap()) as usize;
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    let mut state = 20_u64;
+    let mut next = |below: usize| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state % below as u64) as usize
+    };
+    let mut accepted = 0;
+    for round in 0..1500 {
+        let mut changed = whole.clone();
+        for _ in 0..=next(3) {
+            // Mostly in the header and its JSON; every third time anywhere.
+            let at = if round % 3 == 0 { next(whole.len()) } else { next(24 + json) };
+            changed[at] = if next(2) == 0 { next(256) as u8 } else { b"0123456789.-e,\"[]{}"[next(19)] };
+        }
+        let Ok(mut follower) = Follower::new(&changed, limits) else { continue };
+        accepted += 1;
+        for y in [40.0, 130.0, -30.0] {
+            let point = follower.point(y, 1e3, 1e5).unwrap();
+            assert!((0.0..=10.0).contains(&point.u_v), "round {round}: {point:?}");
+        }
+    }
+    assert!(accepted > 200, "{accepted}");
+}
+
+#[test]
+fn points_one_by_one_are_the_block() {
+    let mut compared = 0;
+    for case in cases() {
+        let free = case.query.pending.is_none() && case.query.memory.is_none() && case.age_s.is_none();
+        // With the stand-in, and in a change of champion, the page says how they differ.
+        if !free || case.reply.flags.iter().any(|flags| flags & 48 != 0) || case.name.starts_with("auto-in-change") {
+            continue;
+        }
+        let mut follower = Follower::new(&read(&case.model), case.limits).unwrap();
+        follower.start(case.query.u_before_v);
+        let q = &case.query;
+        for i in 0..q.y_um.len() {
+            let got = follower.point(q.y_um[i], q.v_um_per_s[i], q.a_um_per_s2[i]).unwrap();
+            same(&format!("{} u_V of point {i}", case.name), &[got.u_v], &[case.reply.u_v[i]]);
+            assert_eq!(got.flags, case.reply.flags[i], "{} point {i}", case.name);
+        }
+        same(&format!("{} memory", case.name), follower.memory(), &case.reply.memory);
+        compared += 1;
+    }
+    assert!(compared > 15, "{compared}");
+}

@@ -1,0 +1,196 @@
+//! A [`dehyst::Follower`] that is fed by a service over zenoh: docs/protocol.md, "Following a model".
+//!
+//! ```no_run
+//! # fn main() -> Result<(), dehyst::Error> {
+//! let mut live = dehyst_zenoh::open(&dehyst_zenoh::Options::default())?;
+//! let point = live.follower.point(40.0, 1000.0, 0.0)?;
+//! println!("{} V from {}", point.u_v, live.follower.report().source);
+//! # Ok(()) }
+//! ```
+
+pub mod ffi;
+
+use dehyst::json::{self, Value};
+use dehyst::{Error, Follower, Limits, Result};
+use std::time::{Duration, Instant};
+use zenoh::pubsub::Subscriber;
+use zenoh::{Config, Session, Wait};
+
+/// Which service, and which of its models.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Of the service, and of its standby if there is one.
+    pub endpoints: Vec<String>,
+    pub stage: String,
+    pub axis: String,
+    /// Empty: the default of the service.
+    pub model: String,
+    /// Longest time until the first model is there.
+    pub timeout: Duration,
+    /// zenoh's own JSON5 file with certificates and passwords; the endpoints here come over it.
+    pub zenoh_config: Option<std::path::PathBuf>,
+}
+
+impl Default for Options {
+    fn default() -> Options {
+        Options {
+            endpoints: vec!["tcp/127.0.0.1:7447".into()],
+            stage: "demo".into(),
+            axis: "x".into(),
+            model: String::new(),
+            timeout: Duration::from_secs(2),
+            zenoh_config: None,
+        }
+    }
+}
+
+/// Keeps the models coming: session and subscription end when it is dropped.
+pub struct Feed {
+    _subscriber: Option<Subscriber<()>>,
+    session: Session,
+    base: String,
+    timeout: Duration,
+}
+
+/// A follower and what feeds it.
+pub struct Live {
+    pub follower: Follower,
+    pub feed: Feed,
+}
+
+fn failed(field: &str, error: impl std::fmt::Display, expected: &str) -> Error {
+    Error::new(field, error, expected)
+}
+
+/// Connect, fetch the model, and follow it. Waits up to the time-out for the service.
+pub fn open(options: &Options) -> Result<Live> {
+    for (field, name) in [("stage", &options.stage), ("axis", &options.axis)] {
+        let good = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
+        let first = name.chars().next().is_some_and(|c| c.is_ascii_lowercase());
+        if !first || name.len() > 64 || !name.chars().all(good) {
+            return Err(Error::new(field, name, "1 to 64 of a-z, 0-9, _ and -, beginning with a letter"));
+        }
+    }
+    let session = zenoh::open(config(options)?)
+        .wait()
+        .map_err(|error| failed("endpoints", error, "the endpoint of a running service"))?;
+    let base = format!("dehyst/v1/{}/{}", options.stage, options.axis);
+    let mut feed = Feed { _subscriber: None, session, base, timeout: options.timeout };
+    let status = feed.status()?;
+    let text = |name: &str| status.get(name).and_then(Value::text).unwrap_or("").to_string();
+    let name = if options.model.is_empty() { text("served") } else { options.model.clone() };
+    let limits = limits_of(&status)?;
+    // Subscribe before the fetch, so that no model is missed between the two; a follower is made by the fetch.
+    let (early, waiting) = std::sync::mpsc::sync_channel::<Vec<u8>>(64);
+    let publisher = std::sync::Arc::new(std::sync::OnceLock::<dehyst::Publisher>::new());
+    let key = match name.as_str() {
+        "auto" => Some("champion"),
+        other if other == text("learning") => Some("model"),
+        _ => None, // what does not learn is not published
+    };
+    if let Some(key) = key {
+        let publisher = publisher.clone();
+        let subscriber = feed
+            .session
+            .declare_subscriber(format!("{}/{key}", feed.base))
+            .callback(move |sample| {
+                let payload = sample.payload().to_bytes();
+                match publisher.get() {
+                    // A refused payload is counted there; the next one is complete again.
+                    Some(publisher) => drop(publisher.publish(&payload)),
+                    None => drop(early.try_send(payload.into_owned())),
+                }
+            })
+            .wait()
+            .map_err(|error| failed("model", error, "a subscription"))?;
+        feed._subscriber = Some(subscriber);
+    }
+    let follower = Follower::new(&feed.get(&format!("{}/model?name={name}", feed.base))?, limits)?;
+    let own = follower.publisher();
+    while let Ok(payload) = waiting.try_recv() {
+        drop(own.publish(&payload));
+    }
+    drop(publisher.set(own));
+    Ok(Live { follower, feed })
+}
+
+fn config(options: &Options) -> Result<Config> {
+    let mut config = match &options.zenoh_config {
+        Some(path) => {
+            Config::from_file(path).map_err(|error| failed("zenoh_config", error, "a JSON5 file of zenoh"))?
+        }
+        None => Config::default(),
+    };
+    let endpoints: Vec<String> = options.endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
+    for (key, value) in [
+        ("mode", "\"client\"".to_string()),
+        ("connect/endpoints", format!("[{}]", endpoints.join(","))),
+        ("connect/timeout_ms", options.timeout.as_millis().to_string()),
+        ("scouting/multicast/enabled", "false".to_string()),
+        ("scouting/gossip/enabled", "false".to_string()),
+    ] {
+        config.insert_json5(key, &value).map_err(|error| failed(key, error, "a setting of zenoh"))?;
+    }
+    Ok(config)
+}
+
+fn limits_of(status: &Value) -> Result<Limits> {
+    let limits = status.get("limits").ok_or_else(|| Error::new("status", "no limits", "the five limits of an axis"))?;
+    let of = |name: &str, missing: f64| limits.get(name).and_then(Value::number).unwrap_or(missing);
+    let limits = Limits {
+        u_min_v: of("u_min_V", f64::NAN),
+        u_max_v: of("u_max_V", f64::NAN),
+        slew_v_per_s: of("slew_V_per_s", f64::INFINITY),
+        y_min_um: of("y_min_um", f64::NEG_INFINITY),
+        y_max_um: of("y_max_um", f64::INFINITY),
+    };
+    limits.check()?;
+    Ok(limits)
+}
+
+impl Feed {
+    /// The status of the axis, as docs/protocol.md has it.
+    pub fn status(&self) -> Result<Value> {
+        json::parse(&self.get(&format!("{}/status", self.base))?)
+    }
+
+    /// The one reply to a query, which is repeated until the time-out while nobody answers.
+    pub fn get(&self, selector: &str) -> Result<Vec<u8>> {
+        let until = Instant::now() + self.timeout;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let replies = self
+                .session
+                .get(selector)
+                .timeout(left.max(Duration::from_millis(100)))
+                .wait()
+                .map_err(|error| failed("query", error, "an open session"))?;
+            while let Ok(reply) = replies.recv() {
+                match reply.result() {
+                    Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
+                    Err(error) => {
+                        let payload = error.payload().to_bytes();
+                        if !String::from_utf8_lossy(&payload).to_lowercase().contains("timeout") {
+                            return Err(refusal(&payload));
+                        }
+                    }
+                }
+            }
+            if Instant::now() >= until {
+                let expected = "a running service for this stage and axis, which this role may query";
+                return Err(Error::new(selector, "no reply", expected));
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+/// The error in an error reply.
+fn refusal(payload: &[u8]) -> Error {
+    let data = json::parse(payload).unwrap_or(Value::Null);
+    let text = |name: &str| data.get(name).and_then(Value::text).unwrap_or("").to_string();
+    if text("field").is_empty() {
+        return Error::new("service", String::from_utf8_lossy(payload), "an answer");
+    }
+    Error::new(text("field"), text("got"), text("expected"))
+}

@@ -1,0 +1,120 @@
+"""The native follower beside the Python follower of a live service, through the shared library's C interface.
+
+``DEHYST_ZENOH_LIBRARY=.../libdehyst_zenoh.so python -m pytest clients/rust/zenoh/test_live.py`` from a checkout.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import struct
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from service.client.client import Client
+from tests.service.conftest import ServeProcess, unused_port, write_config
+
+LIBRARY = os.environ.get("DEHYST_ZENOH_LIBRARY", "")
+pytestmark = pytest.mark.skipif(not LIBRARY, reason="DEHYST_ZENOH_LIBRARY names no library: build clients/rust/zenoh")
+
+
+class Answer(ctypes.Structure):
+    _fields_ = (("u_V", ctypes.c_double), ("std_V", ctypes.c_double), ("flags", ctypes.c_uint32))
+
+
+class Report(ctypes.Structure):
+    _fields_ = (
+        ("snapshot_seq", ctypes.c_int64), ("received", ctypes.c_uint64), ("refused", ctypes.c_uint64),
+        ("answered", ctypes.c_uint64), ("age_s", ctypes.c_double), ("trust", ctypes.c_double),
+        ("dt_s", ctypes.c_double), ("gain", ctypes.c_double), ("offset_um", ctypes.c_double), ("last", Answer),
+        ("memory_size", ctypes.c_uint32), ("stale", ctypes.c_uint32), ("source", ctypes.c_char * 132),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def native() -> ctypes.CDLL:
+    library = ctypes.CDLL(LIBRARY)
+    library.dehyst_error.restype = ctypes.c_char_p
+    library.dehyst_open.argtypes = [ctypes.c_char_p] * 4 + [ctypes.c_double, ctypes.POINTER(ctypes.c_void_p)]
+    library.dehyst_point.argtypes = [ctypes.c_void_p] + [ctypes.c_double] * 3 + [ctypes.POINTER(Answer)]
+    library.dehyst_report.argtypes = [ctypes.c_void_p, ctypes.POINTER(Report)]
+    library.dehyst_close.argtypes = [ctypes.c_void_p]
+    library.dehyst_close.restype = None
+    return library
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    port = unused_port()
+    process = ServeProcess(write_config(tmp_path_factory.mktemp("live"), port), port)
+    yield process.endpoint
+    process.kill()
+
+
+def stage_samples(first: int, n: int, gain: float) -> bytes:
+    k = np.arange(first, first + n)
+    u = 4.0 + 2.5 * np.sin(2 * np.pi * 4e-3 * k) + 0.8 * np.sin(2 * np.pi * 11e-3 * k)
+    y = gain * (11.0 * u + 1.0)
+    return struct.pack("<BBHI", 1, 1, 0, n) + struct.pack(f"<{n}q{3 * n}d", *k, *(k * 1e-3), *u, *y)
+
+
+@pytest.mark.parametrize("model", [b"", b"lssvm_adaptive"])
+def test_the_native_follower_is_the_python_follower(native: ctypes.CDLL, endpoint: str, model: bytes) -> None:
+    handle, answer, report = ctypes.c_void_p(), Answer(), Report()
+    begin = 0 if not model else 4000
+    with Client.connect(endpoint) as client:
+        opened = native.dehyst_open(endpoint.encode(), b"demo", b"x", model, 5.0, ctypes.byref(handle))
+        assert opened == 0, native.dehyst_error()
+        mine = client.follow(model.decode())
+        session: zenoh.Session = client._session
+        for k in range(begin, begin + 4000, 50):  # a gain of 0.94 from the middle on
+            payload = stage_samples(k, 50, 1.0 if k % 4000 < 2000 else 0.94)
+            session.put(f"{client.keys.base}/sample", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+            time.sleep(0.01)
+        until = time.monotonic() + 20.0
+        while client.status()["seq"] < begin + 3999 and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(0.3)  # the last model comes
+        # Whatever came meanwhile, both go along the same motion from their memories of the start.
+        for i in range(40):
+            y, v = 40.0 + 10.0 * np.sin(0.1 * i), 1000.0 * np.cos(0.1 * i)
+            assert native.dehyst_point(handle, y, v, 0.0, ctypes.byref(answer)) == 0, native.dehyst_error()
+            assert answer.u_V == pytest.approx(mine.point(y, v), rel=1e-12, abs=1e-12)
+            assert answer.std_V == pytest.approx(mine.last_std_V, rel=1e-12, abs=1e-12)
+            assert answer.flags == mine.last_flags
+        assert native.dehyst_report(handle, ctypes.byref(report)) == 0
+        assert report.source.decode() == mine.source
+        assert report.snapshot_seq == mine.snapshot_seq > begin + 3000
+        assert report.received > 10
+        assert report.refused == 0
+        assert report.gain == pytest.approx(0.94, abs=0.01)
+    native.dehyst_close(handle)
+
+
+def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
+    program = Path(LIBRARY).parent / "controller"
+    if not program.exists():
+        pytest.skip("c/controller.c is not built: clients/test.sh does")
+    words = [program, endpoint, "demo", "x", "", "1.0", "45", "20"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("1000 points, 0 refused")
+
+
+def test_where_nobody_serves_the_error_says_what_to_check(native: ctypes.CDLL, endpoint: str) -> None:
+    handle = ctypes.c_void_p()
+    for where, axis, words in (
+        (f"tcp/127.0.0.1:{unused_port()}", b"x", b"endpoint"),
+        (endpoint, b"nobody", b"no reply"),
+        (endpoint, b"X", b"axis"),
+    ):
+        assert native.dehyst_open(where.encode(), b"demo", axis, b"", 0.5, ctypes.byref(handle)) == -1
+        assert words in native.dehyst_error()
+    assert native.dehyst_open(endpoint.encode(), b"demo", b"x", b"sorcery", 2.0, ctypes.byref(handle)) == -1
+    assert b"one of" in native.dehyst_error()
