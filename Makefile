@@ -25,7 +25,7 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test test-clients check bench foreign fuzz blind vectors requirements clean
+.PHONY: help setup setup-test demo test test-clients check bench foreign fuzz blind blind-foreign vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -83,6 +83,9 @@ vectors: setup ## make the test vectors of the protocol anew
 
 blind: setup-test ## score the diagnosis on 218 recordings with hidden effects (about half an hour)
 	$(BIN)/python -m tests.hidden.blind
+
+blind-foreign: setup-test ## the same on 92 recordings of six other hysteresis models, rigs and drives (half an hour)
+	$(BIN)/python -m tests.hidden.foreign
 
 requirements: ## pin both requirement files anew (needs uv)
 	$(COMPILE) pyproject.toml -o requirements.txt
