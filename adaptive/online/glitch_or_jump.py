@@ -266,6 +266,11 @@ class Hold:
     low_um: float = 0.0
     high_um: float = 0.0
 
+    @classmethod
+    def after_equal(cls, reckoning: Reckoning, last_um: float, same_um: float, same: int) -> Hold:
+        """A hold after ``same`` readings in a row, before the last one, that are equal to ``same_um``."""
+        return cls(reckoning, last_um, same_um=same_um, same=same, low_um=same_um, high_um=same_um)
+
     def put(self, u_V: float, y_um: float) -> None:
         """Append one sample, and advance dead reckoning."""
         old_um = self.reckoning.advance(u_V)
@@ -294,6 +299,10 @@ class Hold:
         """Accept a jump: a reading that was y is from now on slope y + shift."""
         self.slope, self.shift_um = slope * self.slope, slope * self.shift_um + shift_um
         self.jumped, self.good, self.rang = len(self.y_um), 0, 0
+
+    def shift(self, by_um: float) -> None:
+        """Move the expected readings by ``by_um``."""
+        self.shift_um += by_um
 
     def state_dict(self) -> StateDict:
         """The whole state under flat names."""

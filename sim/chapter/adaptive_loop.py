@@ -73,7 +73,7 @@ def track_learning(
                 feedback[k] = pid.step(fed, float(reference.y_um[k]) - y[k])
                 wanted = float(forward[k]) + feedback[k]
                 u[k] = min(max(wanted, low), high)
-                fed.u_V += u[k] - wanted
+                fed.limit(wanted, float(u[k]))
                 stage.step(state, float(u[k]))
         for k in range(part.start, part.stop):
             online.handle(Sample(first + k, (first + k) * dt_s, float(u[k]), float(y[k])))
