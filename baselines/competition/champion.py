@@ -21,9 +21,9 @@ from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse, evaluate_point
 from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
-from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import BoucWenInverse
 from baselines.linear import LinearInverse
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiInverse
 
 #: Class of a contestant's inverse model by the name that stored states use.
 INVERSE_KINDS: Final[dict[str, Any]] = {

@@ -11,8 +11,7 @@ from adaptive.online.drift import joseph, walk
 from adaptive.types import FloatArray, StateDict, prefixed, under
 from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
 from baselines.prandtl_ishlinskii.identify import MpiGrid
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import inverse_thresholds, inverse_weights
+from baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
 from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
 
 #: Random walk of gain and offset per square root of a second of teaching: relative, and as a share of the stroke.

@@ -13,7 +13,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel, OnlineModel
-from baselines.competition.contestants import online_form
+from baselines.competition.competition import online_form
 from baselines.fit import fit_bouc_wen, fit_mpi
 from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Record, Score

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.fit import fit_bouc_wen
 from baselines.fit_report import Domain
 from sim.chapter import published
