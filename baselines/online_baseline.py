@@ -248,7 +248,7 @@ class LeastSquaresConfig:
 
 
 @compiled
-def forget_and_add(normal: FloatArray, row: FloatArray, keep: float) -> None:
+def _forget_and_add(normal: FloatArray, row: FloatArray, keep: float) -> None:
     """normal <- keep normal + row row', (p, p) in place; the result is exactly symmetric."""
     for i in range(row.size):
         for j in range(i, row.size):
@@ -299,7 +299,7 @@ class LeastSquaresOnline(OnlineBaseline):
         speed = (self._recent[-1][1] - self._recent[0][1]) / (2.0 * _HALF * self._dt)
         self._taught_u = u
         row = self._row(self._pending, y, speed)
-        forget_and_add(self._normal, row, self._keep)
+        _forget_and_add(self._normal, row, self._keep)
         residual = self._residual(row)
         self._square += (residual * residual - self._square) / self.config.remember
         if (self._counters[LEARNT] + 1) % self.config.solve_every == 0 and not self._solve():

@@ -325,7 +325,7 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-def is_stuck(hold: Hold, stuck_um: float) -> bool:
+def _is_stuck(hold: Hold, stuck_um: float) -> bool:
     """Whether the last readings are equal although the stage has moved: the sensor is stuck."""
     return hold.same >= REPEATED and hold.high_um - hold.low_um > SLOPES[0] * stuck_um
 
@@ -348,7 +348,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
     away_um = hold.y_um[-1] - hold.expected_um
     if math.isnan(away_um):
         return Verdict.WAIT if n < MOST_BRIDGED else Verdict.LOST
-    stuck = is_stuck(hold, now.stuck_um)
+    stuck = _is_stuck(hold, now.stuck_um)
     if not stuck and abs(away_um) <= tolerance_um(now, hold.reckoning):
         hold.good += 1
         # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,

@@ -36,7 +36,7 @@ from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, unde
 # --- What a intake holds beside its numbers, as flat entries and back.
 
 
-def parts_to_state(
+def _parts_to_state(
     gates: AdmissionState,
     track: Track | None,
     hold: Hold | None,
@@ -52,10 +52,10 @@ def parts_to_state(
     return joined(parts)
 
 
-def parts_of(
+def _parts_of(
     smoother: FixedLagSmoother, model: LssvmInverse, state: StateDict
 ) -> tuple[AdmissionState, Track | None, Hold | None, Trial | None, FeatureMap | None, Following]:
-    """Inverse of ``parts_to_state``; ``model`` is the identified one.
+    """Inverse of ``_parts_to_state``; ``model`` is the identified one.
 
     Raises KeyError, TypeError, ValueError or InputError where it does not fit.
     """
@@ -78,7 +78,7 @@ def parts_of(
 MOST_LOGGED = MOST_BRIDGED
 
 
-class VoltageLog:
+class _VoltageLog:
     """Pairs (seq, voltage in V) of the samples without a good reading since the last one taken."""
 
     def __init__(self) -> None:
@@ -162,7 +162,7 @@ class Intake:
         self._hold: Hold | None = None
         self._trial: Trial | None = None
         self._lost = True  # The smoother has to start again.
-        self._voltages = VoltageLog()
+        self._voltages = _VoltageLog()
         self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
@@ -634,7 +634,7 @@ class Intake:
 
     def state_dict(self) -> StateDict:
         """The whole state under flat names."""
-        state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
+        state = _parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
         for i, past in enumerate(self._pasts):
             state |= prefixed(f"past{i}.", past.state_dict())
         if self._proven is not None:
@@ -657,7 +657,7 @@ class Intake:
 
     def restore(self, state: StateDict) -> None:
         """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        parts = parts_of(self.smoother, self.base, state)
+        parts = _parts_of(self.smoother, self.base, state)
         self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
         pasts = (under(f"past{i}.", state) for i in range(2))
         self._pasts = [Past.from_state(values) for values in pasts if values]

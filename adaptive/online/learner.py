@@ -201,6 +201,17 @@ MOST_MOVED = 2.0
 RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
 
 
+def _ages(values: object) -> tuple[int, int]:
+    """Two counts; older states have none."""
+    first, second = (0, 0) if values is None else np.asarray(values).tolist()
+    return int(first), int(second)
+
+
+def _mark(values: StateDict) -> Mark:
+    """A mark of the drift filter from its entries."""
+    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)
+
+
 class Parts:
     """The changing state of a learner, and the operations on several of its parts.
 
@@ -410,61 +421,116 @@ class Parts:
             beta[0] += by_V
         self.delay.shift(by_V)
 
+    def model(self) -> LssvmInverse:
+        """The learnt model, immutable; the identified one while that predicts better."""
+        base = self.intake.base
+        j, window, seq = self.judgement, self.window, self.intake.gates.seq
+        valid = j.valid and not self.intake.fault
+        if j.fallback or self.alone:
+            return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
+        support, alpha, bias = window.arrays()
+        beta = self.filter.beta
+        beta[0] += bias
+        return replace(
+            base,
+            features=self.intake.served,
+            beta=beta,
+            support=support,
+            alpha=alpha,
+            widths=np.array(window.hyper.widths),
+            gamma=window.hyper.gamma,
+            domain=self.domain,
+            noise_variance=j.variance_V2,
+            kernel_variance=window.kernel_variance,
+            beta_covariance=np.empty((0, 0)),
+            seq=seq,
+            valid=valid,
+            anchor=base.beta if self.allowed_V else np.empty(0),
+            allowed_V=self.allowed_V,
+        )
 
-def _model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
-    """The learnt model, immutable; the identified one while that predicts better."""
-    j, window, seq = parts.judgement, parts.window, parts.intake.gates.seq
-    valid = j.valid and not parts.intake.fault
-    if j.fallback or parts.alone:
-        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
-    support, alpha, bias = window.arrays()
-    beta = parts.filter.beta
-    beta[0] += bias
-    return replace(
-        base,
-        features=parts.intake.served,
-        beta=beta,
-        support=support,
-        alpha=alpha,
-        widths=np.array(window.hyper.widths),
-        gamma=window.hyper.gamma,
-        domain=parts.domain,
-        noise_variance=j.variance_V2,
-        kernel_variance=window.kernel_variance,
-        beta_covariance=np.empty((0, 0)),
-        seq=seq,
-        valid=valid,
-        anchor=base.beta if parts.allowed_V else np.empty(0),
-        allowed_V=parts.allowed_V,
-    )
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Let the window continue with other hyper-parameters. Returns "", or why they are refused.
 
+        The window is factored anew over its own samples: O(N³), once. The constant of the linear part takes up the
+        difference at the last point that was learnt, so that the output there does not jump. Refused without a change
+        where the kernel matrix cannot be factored, where the leave-one-out errors of the newest samples (rms) are not
+        smaller, or where the output would move too far.
+        """
+        window = self.window
+        try:
+            challenger = window.with_hyperparameters(hyper)
+            now_V, then_V = challenger.newest_error_V(NEWEST), window.newest_error_V(NEWEST)
+        except DehystError as error:
+            return f"numerics: {error}"
+        if not now_V <= then_V:
+            return f"worse: {now_V:.3g} V rms on the newest samples, {then_V:.3g} V as it is"
+        point = self.point
+        shift_V = window.mean(point) - challenger.mean(point) if np.all(np.isfinite(point)) else 0.0
+        moves_V = np.array([challenger.mean(x) + shift_V - window.mean(x) for x in window.newest(NEWEST)])
+        moved_V = max(abs(shift_V), sqrt(float(np.mean(moves_V**2))) if moves_V.size else 0.0)
+        limit_V = MOST_MOVED * sqrt(self.judgement.variance_V2)
+        if not moved_V <= limit_V:
+            return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
+        self.window = challenger
+        self.shift_constant(shift_V)
+        return ""
 
-def _adopt(parts: Parts, hyper: Hyperparameters) -> str:
-    """Let the window of ``parts`` continue with other hyper-parameters. Returns "", or why they are refused.
+    # ---- keeping
 
-    The window is factored anew over its own samples: O(N³), once. The constant of the linear part takes up the
-    difference at the last point that was learnt, so that the output there does not jump. Refused without a change where
-    the kernel matrix cannot be factored, where the leave-one-out errors of the newest samples (rms) are not smaller, or
-    where the output would move too far.
-    """
-    window = parts.window
-    try:
-        challenger = window.with_hyperparameters(hyper)
-        now_V, then_V = challenger.newest_error_V(NEWEST), window.newest_error_V(NEWEST)
-    except DehystError as error:
-        return f"numerics: {error}"
-    if not now_V <= then_V:
-        return f"worse: {now_V:.3g} V rms on the newest samples, {then_V:.3g} V as it is"
-    point = parts.point
-    shift_V = window.mean(point) - challenger.mean(point) if np.all(np.isfinite(point)) else 0.0
-    moves_V = np.array([challenger.mean(x) + shift_V - window.mean(x) for x in window.newest(NEWEST)])
-    moved_V = max(abs(shift_V), sqrt(float(np.mean(moves_V**2))) if moves_V.size else 0.0)
-    limit_V = MOST_MOVED * sqrt(parts.judgement.variance_V2)
-    if not moved_V <= limit_V:
-        return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
-    parts.window = challenger
-    parts.shift_constant(shift_V)
-    return ""
+    def state_dict(self) -> StateDict:
+        """The whole changing state under flat names."""
+        groups = {
+            "front": self.intake.state_dict(),
+            "filter": self.filter.state_dict(),
+            "window": self.window.state_dict(),
+            "rest": self.rest.state_dict(),
+            "judgement": self.judgement.state_dict(),
+            "counters": dict(self.counters),
+            "events": dict(self.events),
+            "mark": {"beta": self.mark[0].copy(), "covariance": self.mark[1].copy()},
+            "next_mark": {"beta": self.next_mark[0].copy(), "covariance": self.next_mark[1].copy()},
+            "jump_mark": {"beta": self.jump_mark[0].copy(), "covariance": self.jump_mark[1].copy()},
+            "proven_mark": {"beta": self.proven_mark[0].copy(), "covariance": self.proven_mark[1].copy()},
+            "confirmed0": {"beta": self.confirmed[0][0].copy(), "covariance": self.confirmed[0][1].copy()},
+            "confirmed1": {"beta": self.confirmed[1][0].copy(), "covariance": self.confirmed[1][1].copy()},
+        }
+        return joined(groups) | {
+            "domain": self.domain.copy(),
+            "point": self.point.copy(),
+            "delay": self.delay.array(),
+            "rail_s": self.rail_s,
+            "railed": self.railed,
+            "left_s": self.left_s,
+            "left": self.left,
+            "alone": self.alone,
+            "mark_ages": np.array(self.mark_ages),
+            "confirmed_ages": np.array(self.confirmed_ages),
+        }
+
+    def restore(self, state: StateDict) -> None:
+        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
+        self.intake.restore(under("front.", state))
+        kept_filter = under("filter.", state)
+        self.filter = DriftFilter.from_state(self.config.drift, self.filter.step_s, self.filter.span_V, kept_filter)
+        self.window.restore(under("window.", state))
+        self.rest = RestCreep.from_state(under("rest.", state))
+        self.judgement = Judgement.from_state(under("judgement.", state))
+        self.counters |= {key: int(value) for key, value in under("counters.", state).items()}
+        self.events |= {key: int(value) for key, value in under("events.", state).items()}
+        self.domain = np.array(state["domain"], dtype=np.float64)
+        self.point = np.array(state["point"], dtype=np.float64)
+        self.rail_s, self.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
+        self.left_s, self.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
+        self.alone = bool(state.get("alone", False))
+        self.mark_ages, self.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
+        self.delay.restore(np.asarray(state["delay"], dtype=np.float64))
+        names = ("mark", "next_mark", "jump_mark")
+        self.mark, self.next_mark, self.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
+        proven = under("proven_mark.", state)
+        self.proven_mark = _mark(proven) if proven else self.jump_mark
+        kept = [under(f"confirmed{i}.", state) for i in range(2)]
+        self.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (self.mark, self.next_mark)
 
 
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
@@ -497,12 +563,12 @@ class Learner:
     """
 
     def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None) -> None:
-        self._begin(model, config or LearnerConfig(), None)
+        self._begin(model, config or LearnerConfig())
 
-    def _begin(self, model: LssvmInverse, config: LearnerConfig, parts: Parts | None) -> None:
+    def _begin(self, model: LssvmInverse, config: LearnerConfig) -> None:
         self.config = config
         self.base = model
-        self.parts = parts or Parts(model, config)
+        self.parts = Parts(model, config)
         features = model.features
         self._basis = np.empty(features.basis_size)
         self._frozen_basis, self._frozen_kernel = self._basis.copy(), np.empty(features.kernel_size)
@@ -671,7 +737,7 @@ class Learner:
     def snapshot(self) -> LssvmInverse:
         """The model as it stands, immutable. The same object while nothing new was learnt."""
         if self._cache is None:
-            self._cache = _model_of(self.base, self.parts)
+            self._cache = self.parts.model()
         return self._cache
 
     def memory(self) -> FloatArray:
@@ -732,7 +798,7 @@ class Learner:
 
         Atomic, and without a jump of the output; refused unless it predicts the newest samples better.
         """
-        reason = _adopt(self.parts, hyper)
+        reason = self.parts.adopt(hyper)
         self.parts.events["adoptions_refused" if reason else "adoptions"] += 1
         if not reason:
             self._cache = None
@@ -808,7 +874,8 @@ class Learner:
 
     def state_dict(self) -> StateDict:
         """The whole state; ``from_state`` continues from it with the same result to the last bit."""
-        return _state_of(self.base, self.config, self.parts, self._frozen)
+        made_from = joined({"base": self.base.state_dict(), "config": self.config.state_dict()})
+        return {**made_from, **self.parts.state_dict(), "frozen": self._frozen}
 
     def restored(self, state: StateDict) -> Learner:
         """A learner with ``state``. Raises ModelFileError where entries are missing or do not fit together."""
@@ -818,89 +885,13 @@ class Learner:
     def from_state(cls, state: StateDict) -> Learner:
         """Inverse of ``state_dict``. Raises ModelFileError where entries are missing or do not fit together."""
         made = cls.__new__(cls)
-        base, config, parts, frozen = _restored(state)
-        made._begin(base, config, parts)
-        made._frozen = frozen
+        try:
+            base = LssvmInverse.from_state(under("base.", state))
+            made._begin(base, LearnerConfig.from_state(under("config.", state)))
+            made.parts.restore(state)
+            made._frozen = bool(state["frozen"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(
+                f"learner state: entry missing or damaged: {error}; start from the model instead"
+            ) from error
         return made
-
-
-# --- The state of a learner.
-
-
-def _state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:
-    """The whole state; `_restored` continues from it with the same result to the last bit."""
-    groups = {
-        "base": base.state_dict(),
-        "config": config.state_dict(),
-        "front": parts.intake.state_dict(),
-        "filter": parts.filter.state_dict(),
-        "window": parts.window.state_dict(),
-        "rest": parts.rest.state_dict(),
-        "judgement": parts.judgement.state_dict(),
-        "counters": dict(parts.counters),
-        "events": dict(parts.events),
-        "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
-        "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
-        "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
-        "proven_mark": {"beta": parts.proven_mark[0].copy(), "covariance": parts.proven_mark[1].copy()},
-        "confirmed0": {"beta": parts.confirmed[0][0].copy(), "covariance": parts.confirmed[0][1].copy()},
-        "confirmed1": {"beta": parts.confirmed[1][0].copy(), "covariance": parts.confirmed[1][1].copy()},
-    }
-    state = joined(groups)
-    return state | {
-        "domain": parts.domain.copy(),
-        "point": parts.point.copy(),
-        "delay": parts.delay.array(),
-        "frozen": frozen,
-        "rail_s": parts.rail_s,
-        "railed": parts.railed,
-        "left_s": parts.left_s,
-        "left": parts.left,
-        "alone": parts.alone,
-        "mark_ages": np.array(parts.mark_ages),
-        "confirmed_ages": np.array(parts.confirmed_ages),
-    }
-
-
-def _restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool]:
-    """Inverse of ``state_of``. Raises ModelFileError where entries are missing or do not fit together."""
-    try:
-        base = LssvmInverse.from_state(under("base.", state))
-        config = LearnerConfig.from_state(under("config.", state))
-        parts = Parts(base, config)
-        parts.intake.restore(under("front.", state))
-        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, under("filter.", state))
-        parts.window.restore(under("window.", state))
-        parts.rest = RestCreep.from_state(under("rest.", state))
-        parts.judgement = Judgement.from_state(under("judgement.", state))
-        parts.counters |= {key: int(value) for key, value in under("counters.", state).items()}
-        parts.events |= {key: int(value) for key, value in under("events.", state).items()}
-        parts.domain = np.array(state["domain"], dtype=np.float64)
-        parts.point = np.array(state["point"], dtype=np.float64)
-        parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
-        parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
-        parts.alone = bool(state.get("alone", False))
-        parts.mark_ages, parts.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
-        parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
-        names = ("mark", "next_mark", "jump_mark")
-        parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
-        proven = under("proven_mark.", state)
-        parts.proven_mark = _mark(proven) if proven else parts.jump_mark
-        kept = [under(f"confirmed{i}.", state) for i in range(2)]
-        parts.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (parts.mark, parts.next_mark)
-        return base, config, parts, bool(state["frozen"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(
-            f"learner state: entry missing or damaged: {error}; start from the model instead"
-        ) from error
-
-
-def _ages(values: object) -> tuple[int, int]:
-    """Two counts; older states have none."""
-    first, second = (0, 0) if values is None else np.asarray(values).tolist()
-    return int(first), int(second)
-
-
-def _mark(values: StateDict) -> Mark:
-    """A mark of the drift filter from its entries."""
-    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)

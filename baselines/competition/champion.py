@@ -55,7 +55,7 @@ class StatesValidity(Protocol):
         ...
 
 
-def memory_advance_of(model: InverseModel) -> AdvanceMemory:
+def _memory_advance_of(model: InverseModel) -> AdvanceMemory:
     """The function that advances the memory of ``model`` over answers of another model."""
     if isinstance(model, AdvancesMemory):
         return model.carry
@@ -72,13 +72,13 @@ def _advances_but(
 ) -> tuple[tuple[AdvanceMemory, slice], ...]:
     """The advance functions of all models with a memory except the champion, with their parts of the whole memory."""
     return tuple(
-        (memory_advance_of(model), part)
+        (_memory_advance_of(model), part)
         for i, (model, part) in enumerate(zip(models, parts, strict=True))
         if i != champion and part.stop > part.start
     )
 
 
-def inverse_kind_of(model: InverseModel) -> str:
+def _inverse_kind_of(model: InverseModel) -> str:
     """Name of the model's class in stored states. Raises InputError for a class that has none."""
     for kind, known in INVERSE_KINDS.items():
         if type(model) is known:
@@ -194,7 +194,7 @@ class ChampionInverse:
         for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
             end = answers[i].memory if i in answers else part.copy()
             if i not in answers and part.size:
-                memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+                _memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
             ends.append(end if np.isfinite(end).all() else part)
         return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 
@@ -297,7 +297,7 @@ class ChampionInverse:
 
     def state_dict(self) -> StateDict:
         """Flat entries; contestants under ``NAME.``. Raises InputError for a class that cannot be stored."""
-        kinds = [inverse_kind_of(model) for model in self.models]
+        kinds = [_inverse_kind_of(model) for model in self.models]
         state: StateDict = {
             "name": self.name,
             "names": ",".join(self.names),

@@ -51,7 +51,7 @@ from baselines.prandtl_ishlinskii.online import MpiOnline
 #: Makes a new online model from the last snapshot of one that has failed.
 Restart = Callable[[InverseModel], OnlineModel]
 #: Class of a contestant by the name that stored states use.
-ONLINE_KINDS: Final[dict[str, type[Learner] | type[OnlineBaseline]]] = {
+_ONLINE_KINDS: Final[dict[str, type[Learner] | type[OnlineBaseline]]] = {
     "learner": Learner,
     "linear": LinearOnline,
     "mpi": MpiOnline,
@@ -101,7 +101,7 @@ def fingerprint(model: InverseModel) -> str:
 # motion is scored, because every model predicts a stage at rest.
 
 #: Verdicts on a sample that exclude it from scoring.
-NOT_SCORED: Final = frozenset(
+_NOT_SCORED: Final = frozenset(
     {gates.GLITCH, gates.RINGING, gates.UNTRUSTED, gates.SATURATED, gates.OUT_OF_RANGE, gates.SETTLING, gates.GAP}
 )
 #: Sample time up to which ``glitch_share`` is used as given, s; it grows in proportion to longer ones.
@@ -112,7 +112,7 @@ _MAX_GAP = 5
 _MAX_GLITCHES = 3
 
 
-class SmoothedMotion:
+class _SmoothedMotion:
     """Collects the smoothed motion with the voltage of the same instant, and marks the samples that are scored."""
 
     def __init__(self, config: CompetitionConfig, dt_s: float, range_um: float) -> None:
@@ -204,7 +204,7 @@ class SmoothedMotion:
 
 
 @dataclass(slots=True)
-class RunningError:
+class _RunningError:
     """Exponentially weighted mean square error of one contestant, V², and the memory that its answers carry.
 
     ``weight`` rises from 0 to 1 as scored motion fills the horizon.
@@ -254,7 +254,7 @@ class Judge:
     def __init__(self, config: CompetitionConfig, start: Snapshots, lag: int, span_V: float) -> None:
         self._config, self._dt_s, self._lag, self._span_V = config, start[0].dt_s, lag, span_V
         self._start = start
-        self.scores = [RunningError(np.empty(0)) for _ in start]
+        self.scores = [_RunningError(np.empty(0)) for _ in start]
         # (sequence number, snapshots) at the last blocks, back to the age of an answer.
         depth = math.ceil((config.serving_age_s / self._dt_s + lag) / config.block) + 2
         self._past: deque[tuple[int, Snapshots]] = deque(maxlen=depth)
@@ -293,7 +293,7 @@ class Judge:
 
     def begin_anew(self, i: int) -> None:
         """Reset the score of contestant ``i`` to the worst value, which new samples soon replace."""
-        self.scores[i] = RunningError(np.empty(0), self._span_V**2, 1.0)
+        self.scores[i] = _RunningError(np.empty(0), self._span_V**2, 1.0)
 
     def _served_then(self, seq: int, count: int) -> Snapshots:
         """The snapshots that were ``serving_age_s`` old at the first instant of a block of ``count`` samples."""
@@ -412,7 +412,7 @@ class Competition:
         self._models = list(contestants.values())
         first = tuple(model.snapshot() for model in self._models)
         self._dt_s, self._range_um, self._span_V = first[0].dt_s, range_um, span_V
-        self._motion = SmoothedMotion(self.config, self._dt_s, range_um)
+        self._motion = _SmoothedMotion(self.config, self._dt_s, range_um)
         self.judge = Judge(self.config, first, self._motion.lag, span_V)
         self._choice = ChampionChoice(self.config, span_V)
         self._newest = first
@@ -506,7 +506,7 @@ class Competition:
         before, self._seq = self._seq, seq
         if seq == before:
             return verdict
-        self._motion.take(sample, max(0, seq - before - 1) if before >= 0 else 0, verdict not in NOT_SCORED)
+        self._motion.take(sample, max(0, seq - before - 1) if before >= 0 else 0, verdict not in _NOT_SCORED)
         if seq // self.config.block > before // self.config.block:
             self._judge_block()
         return verdict
@@ -675,9 +675,9 @@ class Competition:
 
         Raises InputError where a contestant is of a class that cannot be stored.
         """
-        kinds: dict[type, str] = {known: kind for kind, known in ONLINE_KINDS.items()}
+        kinds: dict[type, str] = {known: kind for kind, known in _ONLINE_KINDS.items()}
         if any(type(model) not in kinds for model in self._models):
-            raise InputError(f"contestants: expected models of the kinds {', '.join(ONLINE_KINDS)} to be stored")
+            raise InputError(f"contestants: expected models of the kinds {', '.join(_ONLINE_KINDS)} to be stored")
         state: StateDict = {
             "names": ",".join(self.names),
             "kinds": ",".join(kinds[type(model)] for model in self._models),
@@ -714,7 +714,7 @@ class Competition:
         try:
             names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
             contestants = {
-                name: ONLINE_KINDS[kind].from_state(under(f"model.{name}.", state))
+                name: _ONLINE_KINDS[kind].from_state(under(f"model.{name}.", state))
                 for name, kind in zip(names, kinds, strict=True)
             }
             config = CompetitionConfig(**under("config.", state))

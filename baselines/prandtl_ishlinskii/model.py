@@ -72,7 +72,7 @@ def states_from_inverse(sum_h: FloatArray, inverse_um: FloatArray, out_V: FloatA
 
 
 @compiled
-def run_forward(
+def _run_forward(
     u_V: FloatArray,
     r_V: FloatArray,
     w_h: FloatArray,
@@ -154,7 +154,7 @@ class MpiParameters:
             return np.empty(0)
         state = self.start(float(u[0])) if state_V is None else state_V.copy()
         y = np.empty(u.size)
-        run_forward(u, self.r_, self.w_h_, self.d_, self.w_s_, self.c_um, self.y_ref_um, state, y)
+        _run_forward(u, self.r_, self.w_h_, self.d_, self.w_s_, self.c_um, self.y_ref_um, state, y)
         return _lag(y, self.lag_s / dt_s) if self.lag_s > 0.0 else y
 
     def state_dict(self) -> StateDict:
