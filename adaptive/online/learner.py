@@ -638,7 +638,7 @@ class Learner:
         c, parts, intake = self.config, self.parts, self.parts.intake
         gates, track = intake.gates, intake.track
         assert track is not None
-        if min(gates.since_start, gates.since_step) <= c.admission.settle:
+        if admission.settling(c.admission, gates):
             return admission.SETTLING
         if not pair.good:
             return admission.GLITCH
