@@ -139,7 +139,6 @@ class Intake:
     Attributes
     ----------
     track : of the stage, None before the first reading. gates : state of the gates.
-    doubt_V : standard deviation of the model's predictions, V, as of the last sample.
     following : check that the readings follow the drive; confirmed : whether it has just confirmed that they do.
     """
 
@@ -150,7 +149,7 @@ class Intake:
         self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
         self.gates = admission.AdmissionState()
         self.track: Track | None = None
-        self.doubt_V = 0.0
+        self._doubt_V = 0.0  # Standard deviation of the model's predictions as of the last sample, V.
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.confirmed = False
@@ -231,7 +230,7 @@ class Intake:
 
         ``doubt_V`` : standard deviation of the model's predictions, V. Never raises on data.
         """
-        self.doubt_V = doubt_V
+        self._doubt_V = doubt_V
         c, gates, track = self._admission, self.gates, self.track
         refused = admission.check_sample(c, gates, sample, self.dt_s)
         if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
@@ -382,7 +381,7 @@ class Intake:
         """What readings are judged by; ``limit`` : distance, in ranges, up to which one is no surprise."""
         c, gates, served = self._admission, self.gates, self.served
         usual = max(limit, c.surprise_share)
-        usual += min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
+        usual += min(2.0 * self._doubt_V / self.base.span_V, c.glitch_share)
         return Circumstances(
             config=c,
             envelope=self._envelope,

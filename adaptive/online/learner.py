@@ -171,6 +171,9 @@ class Delay:
         self._past.extend(np.array(v, dtype=np.float64) for v in vectors)
 
 
+# --- The learner.
+
+#: Estimate and covariance of the drift filter.
 Mark = tuple[FloatArray, FloatArray]
 
 #: Names of the events that are counted beside the samples.
