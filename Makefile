@@ -5,8 +5,9 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
 # Tests that only compute, which may share all cores.
-PURE   := tests/test_house.py tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden tests/hidden \
-          tests/lab/reproduce tests/lab/scenarios tests/lab/rehearsal tests/benchmarks/test_house_bench.py \
+PURE   := tests/test_house.py tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
+          tests/hidden tests/lab/reproduce tests/lab/test_scenarios.py tests/lab/rehearsal \
+          tests/benchmarks/test_house_bench.py \
           $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_voltages.py) \
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \

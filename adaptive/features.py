@@ -129,7 +129,7 @@ def fill(
 
 
 @compiled
-def run_features(
+def _run_features(
     y: FloatArray,
     v: FloatArray,
     a: FloatArray,
@@ -285,7 +285,7 @@ class FeatureMap:
         after = memory.copy()
         basis = np.empty((n, self.basis_size))
         kernel = np.empty((n, self.kernel_size))
-        run_features(y_um, v_um_per_s, a_um_per_s2, after, self._arrays, basis, kernel)
+        _run_features(y_um, v_um_per_s, a_um_per_s2, after, self._arrays, basis, kernel)
         return basis, kernel, after
 
     def state_dict(self) -> StateDict:

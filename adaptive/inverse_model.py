@@ -122,7 +122,7 @@ def unpacked(
 
 
 @compiled
-def evaluate_packed(
+def _evaluate_packed(
     y: FloatArray,
     v: FloatArray,
     a: FloatArray,
@@ -167,17 +167,17 @@ def voltage_of(
     advance(y, scratch, m)
     basis, kernel = np.empty(beta.shape[0]), np.empty(inverse_widths.shape[0])
     fill(y, v, a, scratch, m, basis, kernel)
-    return mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
+    return _mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
 
 
 @compiled
 def evaluate_point(
     y: float, v: float, a: float, memory: FloatArray, constants: FloatArray, counts: IntArray
 ) -> tuple[float, float, bool]:  # pragma: no cover - compiled
-    """`evaluate_packed` of one point with plain numbers: an array costs as much to hand over as five of them."""
+    """`_evaluate_packed` of one point with plain numbers: an array costs as much to hand over as five of them."""
     five, inside = np.empty(5), np.empty(1, dtype=np.bool_)
     five[0], five[1], five[2] = y, v, a
-    evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
+    _evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
     return five[3], five[4], inside[0]
 
 
@@ -189,7 +189,7 @@ def track_memory(y: FloatArray, memory: FloatArray, m: FeatureArrays) -> None:  
 
 
 @compiled
-def mean_of(
+def _mean_of(
     basis: FloatArray,
     kernel: FloatArray,
     beta: FloatArray,
@@ -251,7 +251,7 @@ class LssvmInverse:
     allowed_V: float = 0.0
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
     _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
-    #: All that `evaluate_packed` needs.
+    #: All that `_evaluate_packed` needs.
     _constants: FloatArray = field(init=False, repr=False, compare=False)
     _counts: IntArray = field(init=False, repr=False, compare=False)
 
@@ -317,7 +317,7 @@ class LssvmInverse:
         after = self._memory(memory)
         n = y.size
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
+        _evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
         return Feedforward(u, std, inside, after)
 
     @property
@@ -337,7 +337,7 @@ class LssvmInverse:
 
     def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
-        return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
+        return float(_mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
 
     def at_bound(self, y_um: FloatArray, u_V: FloatArray) -> BoolArray:
         """(n,) whether the voltages, (n,) V, that it gave for (n,) places at rest are held by ``allowed_V``."""

@@ -67,6 +67,11 @@ class SmootherState:
         """An independent copy."""
         return SmootherState(self.x.copy(), self.ring.copy(), self.count)
 
+    def move(self, slope: float, shift_um: float) -> None:
+        """Go on at another place, y <- slope y + shift. Smoothed instants from before stay where they are."""
+        self.x *= slope
+        self.x[0] += shift_um
+
 
 @compiled
 def _step(

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.bouc_wen.inverse import BoucWenInverse as BoucWenInverse
+    from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
     from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
     from baselines.competition.champion import ChampionInverse as ChampionInverse
     from baselines.competition.competition import Competition as Competition
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from baselines.fit_report import FitReport as FitReport
     from baselines.linear import LinearInverse as LinearInverse
     from baselines.linear import LinearOnline as LinearOnline
-    from baselines.prandtl_ishlinskii.inverse import MpiInverse as MpiInverse
+    from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
     from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
 _MODULES = {
-    "BoucWenInverse": "bouc_wen.inverse",
+    "BoucWenInverse": "bouc_wen.model",
     "BoucWenOnline": "bouc_wen.online",
     "ChampionInverse": "competition.champion",
     "Competition": "competition.competition",
@@ -43,7 +43,7 @@ _MODULES = {
     "FitReport": "fit_report",
     "LinearInverse": "linear",
     "LinearOnline": "linear",
-    "MpiInverse": "prandtl_ishlinskii.inverse",
+    "MpiInverse": "prandtl_ishlinskii.model",
     "MpiOnline": "prandtl_ishlinskii.online",
     "fit_bouc_wen": "fit",
     "fit_linear": "fit",

@@ -12,8 +12,7 @@ from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, StateDict, prefixed, under
 from baselines.bounded_least_squares import SLOPE_FLOOR
 from baselines.fit_report import Domain, FitReport
-from baselines.online_baseline import field_of
-from baselines.recursive_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
 from baselines.validation import (
     checked_memory,
     checked_motion,

@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.types import Sample
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 from baselines.bounded_least_squares import bounded_minimum
 from baselines.fit_report import Domain
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.online_baseline import LeastSquaresConfig
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from baselines.prandtl_ishlinskii.operators import play_run
-from baselines.recursive_least_squares import LeastSquaresConfig
 from baselines.swarm.identification import TABLE_2_1_UPPER, bouc_wen_costs
 
 

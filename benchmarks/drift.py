@@ -12,8 +12,7 @@ from adaptive.compiled import compiled
 from adaptive.types import FloatArray
 from adaptive.window import steps as window_core
 from adaptive.window.arrays import WindowArrays
-from adaptive.window.config import Form, WindowConfig
-from adaptive.window.window import Window
+from adaptive.window.window import Form, Window, WindowConfig
 
 #: gamma and width for condition numbers from about 1e3 to 1e8 with windows of 100 samples in three dimensions.
 HARDNESS: tuple[tuple[float, float], ...] = ((1e2, 0.5), (1.5e3, 1.0), (1e4, 1.0), (1e5, 1.0), (1.2e6, 1.5))

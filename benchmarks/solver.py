@@ -10,8 +10,7 @@ from adaptive import kernels
 from adaptive.compiled import compiled_reassociating
 from adaptive.types import FloatArray
 from adaptive.window.arrays import BETA
-from adaptive.window.config import Form, WindowConfig
-from adaptive.window.window import Window
+from adaptive.window.window import Form, Window, WindowConfig
 from benchmarks.measuring import DIMENSION, GAMMA, WIDTH, Times, interleaved, stream, times
 
 

@@ -20,12 +20,12 @@ import numpy as np
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import BoucWenInverse
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.competition.champion import ChampionInverse
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiInverse
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits

@@ -10,7 +10,7 @@ from adaptive.online.gates import AdmissionConfig, EnvelopeConfig
 from adaptive.online.kernel_window import Eviction, WeightConfig
 from adaptive.smoothing import SmootherConfig
 from adaptive.types import StateDict, joined, under
-from adaptive.window.config import SolverConfig
+from adaptive.window.window import SolverConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from adaptive.types import FloatArray, StateDict
 
 
 @compiled
-def open_gain(x: FloatArray, P: FloatArray, variance: float) -> None:  # pragma: no cover - compiled
+def _open_gain(x: FloatArray, P: FloatArray, variance: float) -> None:  # pragma: no cover - compiled
     """P <- P + variance x x': variance along x, the direction of a change of the gain. ``x`` (p,), ``P`` (p, p)."""
     for i in range(x.shape[0]):
         scaled = variance * x[i]
@@ -43,7 +43,7 @@ def walk(x: FloatArray, P: FloatArray, walks: FloatArray, gain_variance: float) 
     """Prediction step: add ``walks`` (p,) to the diagonal of P, and ``gain_variance`` along x."""
     for i in range(x.shape[0]):
         P[i, i] += walks[i]
-    open_gain(x, P, gain_variance)
+    _open_gain(x, P, gain_variance)
 
 
 @compiled
@@ -64,7 +64,7 @@ def innovation_of(
 
 
 @compiled
-def walk_and_innovation(
+def _walk_and_innovation(
     x: FloatArray, P: FloatArray, walks: FloatArray, gain_variance: float, h: FloatArray, z: float, towards: FloatArray
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """:func:`walk`, then :func:`innovation_of`, in one call."""
@@ -255,7 +255,7 @@ class DriftFilter:
         c, s, x, P = self.config, self.state, self._x, self._P
         if moving:
             gain_V2 = c.gain_walk**2 * self.step_s
-            innovation, variance = walk_and_innovation(x, P, self._walk, gain_V2, basis, target_V, self._row)
+            innovation, variance = _walk_and_innovation(x, P, self._walk, gain_V2, basis, target_V, self._row)
         else:
             P[0, 0] += self._walk[0]
             innovation, variance = innovation_of(x, P, basis, target_V, self._row)

@@ -148,6 +148,28 @@ class AdmissionState:
     low_V: float = 0.0
     high_V: float = 0.0
 
+    def take(self, sample: Sample, steps: int) -> None:
+        """Note a sample that has passed `check_sample`, ``steps`` sample times after the last one."""
+        self.seq, self.t_s = sample.seq, sample.t_s
+        self.since_glitch += steps
+
+    def restart(self) -> None:
+        """The smoother starts again."""
+        self.since_start = self.since_jump = self.moved = 0
+
+    def step(self) -> None:
+        """The smoother makes a step."""
+        self.since_start += 1
+        self.since_jump += 1
+
+    def note_glitch(self) -> None:
+        """The sensor was found to have been wrong until now."""
+        self.since_glitch = 0
+
+    def note_jump(self) -> None:
+        """The smoother is moved to another place."""
+        self.since_jump = 0
+
     def state_dict(self) -> StateDict:
         return asdict(self)
 

@@ -266,6 +266,11 @@ class Hold:
     low_um: float = 0.0
     high_um: float = 0.0
 
+    @classmethod
+    def after_equal(cls, reckoning: Reckoning, last_um: float, same_um: float, same: int) -> Hold:
+        """A hold after ``same`` readings in a row, before the last one, that are equal to ``same_um``."""
+        return cls(reckoning, last_um, same_um=same_um, same=same, low_um=same_um, high_um=same_um)
+
     def put(self, u_V: float, y_um: float) -> None:
         """Append one sample, and advance dead reckoning."""
         old_um = self.reckoning.advance(u_V)
@@ -295,6 +300,10 @@ class Hold:
         self.slope, self.shift_um = slope * self.slope, slope * self.shift_um + shift_um
         self.jumped, self.good, self.rang = len(self.y_um), 0, 0
 
+    def shift(self, by_um: float) -> None:
+        """Move the expected readings by ``by_um``."""
+        self.shift_um += by_um
+
     def state_dict(self) -> StateDict:
         """The whole state under flat names."""
         state: StateDict = prefixed("reckoning.", self.reckoning.state_dict())
@@ -316,7 +325,7 @@ _NUMBERS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-def is_stuck(hold: Hold, stuck_um: float) -> bool:
+def _is_stuck(hold: Hold, stuck_um: float) -> bool:
     """Whether the last readings are equal although the stage has moved: the sensor is stuck."""
     return hold.same >= REPEATED and hold.high_um - hold.low_um > SLOPES[0] * stuck_um
 
@@ -339,7 +348,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
     away_um = hold.y_um[-1] - hold.expected_um
     if math.isnan(away_um):
         return Verdict.WAIT if n < MOST_BRIDGED else Verdict.LOST
-    stuck = is_stuck(hold, now.stuck_um)
+    stuck = _is_stuck(hold, now.stuck_um)
     if not stuck and abs(away_um) <= tolerance_um(now, hold.reckoning):
         hold.good += 1
         # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,

@@ -36,7 +36,7 @@ from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, unde
 # --- What a intake holds beside its numbers, as flat entries and back.
 
 
-def parts_to_state(
+def _parts_to_state(
     gates: AdmissionState,
     track: Track | None,
     hold: Hold | None,
@@ -52,10 +52,10 @@ def parts_to_state(
     return joined(parts)
 
 
-def parts_of(
+def _parts_of(
     smoother: FixedLagSmoother, model: LssvmInverse, state: StateDict
 ) -> tuple[AdmissionState, Track | None, Hold | None, Trial | None, FeatureMap | None, Following]:
-    """Inverse of ``parts_to_state``; ``model`` is the identified one.
+    """Inverse of ``_parts_to_state``; ``model`` is the identified one.
 
     Raises KeyError, TypeError, ValueError or InputError where it does not fit.
     """
@@ -78,7 +78,7 @@ def parts_of(
 MOST_LOGGED = MOST_BRIDGED
 
 
-class VoltageLog:
+class _VoltageLog:
     """Pairs (seq, voltage in V) of the samples without a good reading since the last one taken."""
 
     def __init__(self) -> None:
@@ -139,7 +139,6 @@ class Intake:
     Attributes
     ----------
     track : of the stage, None before the first reading. gates : state of the gates.
-    doubt_V : standard deviation of the model's predictions, V; set by the learner.
     following : check that the readings follow the drive; confirmed : whether it has just confirmed that they do.
     """
 
@@ -150,7 +149,7 @@ class Intake:
         self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
         self.gates = admission.AdmissionState()
         self.track: Track | None = None
-        self.doubt_V = 0.0
+        self._doubt_V = 0.0  # Standard deviation of the model's predictions as of the last sample, V.
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.confirmed = False
@@ -162,7 +161,7 @@ class Intake:
         self._hold: Hold | None = None
         self._trial: Trial | None = None
         self._lost = True  # The smoother has to start again.
-        self._voltages = VoltageLog()
+        self._voltages = _VoltageLog()
         self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
@@ -226,11 +225,12 @@ class Intake:
 
     # ---- what a sample is
 
-    def take(self, sample: Sample, model: Model) -> Taken:
+    def take(self, sample: Sample, model: Model, doubt_V: float) -> Taken:
         """Judge one sample; ``model`` returns the served model, for dead reckoning if needed.
 
-        Never raises on data.
+        ``doubt_V`` : standard deviation of the model's predictions, V. Never raises on data.
         """
+        self._doubt_V = doubt_V
         c, gates, track = self._admission, self.gates, self.track
         refused = admission.check_sample(c, gates, sample, self.dt_s)
         if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
@@ -244,8 +244,7 @@ class Intake:
         self._voltages.clear()
         for u in (*between, sample.u_V):
             admission.watch_voltage(c, gates, u, self.base.span_V)
-        gates.seq, gates.t_s = sample.seq, sample.t_s
-        gates.since_glitch += 1 + missing
+        gates.take(sample, 1 + missing)
         if self._trial is not None:
             # Missing samples count as no motion; the readings correct the reckoning later.
             for u in between:
@@ -276,8 +275,8 @@ class Intake:
         """Begin smoothing anew at a sample."""
         self._hold, self._trial, self._lost = None, None, False
         self._proven_past = None
-        self.gates.since_start = self.gates.since_jump = 0
-        self.gates.moved = self._look_from = 0
+        self.gates.restart()
+        self._look_from = 0
         self._forget()
         if self.track is None:
             self.track = Track.begin(self.smoother, self.base.features, self.base.features, sample.y_um)
@@ -360,11 +359,10 @@ class Intake:
         track.doubt(repeated)
         past_um = past_um[: max(past_um.size - repeated, 0)]
         reckoning = Reckoning.begin(self._of_track(track, model), motion, u_before_V, past_V, past_um, track.memory)
-        hold = Hold(reckoning, float(past_um[-1]) if past_um.size else motion[0])
+        last_um = float(past_um[-1]) if past_um.size else motion[0]
         if gates.same > 1:
-            hold.same_um, hold.same = gates.y_um, gates.same - 1
-            hold.low_um = hold.high_um = gates.y_um
-        return hold
+            return Hold.after_equal(reckoning, last_um, gates.y_um, gates.same - 1)
+        return Hold(reckoning, last_um)
 
     def _from_past(self, track: Track, model: LssvmInverse) -> Reckoning:
         """From the last place that readings have confirmed, over the voltages since."""
@@ -383,7 +381,7 @@ class Intake:
         """What readings are judged by; ``limit`` : distance, in ranges, up to which one is no surprise."""
         c, gates, served = self._admission, self.gates, self.served
         usual = max(limit, c.surprise_share)
-        usual += min(2.0 * self.doubt_V / self.base.span_V, c.glitch_share)
+        usual += min(2.0 * self._doubt_V / self.base.span_V, c.glitch_share)
         return Circumstances(
             config=c,
             envelope=self._envelope,
@@ -415,7 +413,7 @@ class Intake:
         if verdict is Verdict.MOTION:
             return Taken("", hypotheses.steps_of_motion(hold))
         if hold.seen_um > self._admission.glitch_share * self.range_um and not (hold.taken or hold.rang):
-            self.gates.since_glitch = 0
+            self.gates.note_glitch()
         self._calm = -len(hold.y_um) if len(hold.y_um) > 1 else self._calm
         return Taken("", hypotheses.steps_of_hold(hold, now.usual_um))
 
@@ -447,7 +445,8 @@ class Intake:
         if first:
             self._proven_past = self._clean_past() if self._pasts else Past.of(track)
         if undone:
-            self._before, self.gates.since_glitch = None, 0
+            self._before = None
+            self.gates.note_glitch()
             self.undone += 1
             if self._proven == frame:
                 self._proven = self._proven_past = None
@@ -455,13 +454,13 @@ class Intake:
             self._before, self._jump_um = f, away_um
             self._proven = self._proven or f
             self.jumps += 1
-        self.gates.since_jump = 0
+        self.gates.note_jump()
         track.move(frame, slope, shift_um)
         hold.take(slope, shift_um)
         self._forget()
         if undone:
             # The reckoning since then used the wrong frame.
-            hold.shift_um += level_um - hold.expected_um
+            hold.shift(level_um - hold.expected_um)
         if abs(hold.y_um[-1] - hold.expected_um) > now.usual_um:
             # It rings about the new level: the frame is right, wait for settled readings.
             return Taken(admission.RINGING, (), away_um, undone, first=first)
@@ -495,8 +494,8 @@ class Intake:
             jump = slope, track.served.offset_um - slope * proven.offset_um
             reckoning = reckoning.in_frame(proven)
             if self._proven_past is not None:
-                self._proven_past.u_V += () if self._hold is None else self._hold.u_V
-            track.features = track.served = proven
+                self._proven_past.u_V.extend(() if self._hold is None else self._hold.u_V)
+            track.enter(proven)
             self.undone += 1
         self._hold, self._before, self._proven = None, None, None
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump)
@@ -522,8 +521,8 @@ class Intake:
                 return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
             away_um = sample.y_um - trial.reckoning.y_um
             self.jumps += 1
-        track.served = track.features = frame
-        self.gates.since_glitch = 0
+        track.enter(frame)
+        self.gates.note_glitch()
         taken = self._restart(sample, admission.SETTLING)
         track.remember(trial.reckoning.memory)
         return taken._replace(jump_um=away_um, renamed=True)
@@ -538,7 +537,7 @@ class Intake:
             return
         model = self._of_track(self.track, model)
         reckoning = self._trial.reckoning
-        self._trial.reckoning = reckoning.by_model(model) if past is None else _from_past(past, model)
+        self._trial.go_on_from(reckoning.by_model(model) if past is None else _from_past(past, model))
 
     # ---- where the stage is
 
@@ -565,8 +564,7 @@ class Intake:
     def advance(self, step: Step) -> tuple[Pair | None, bool]:
         """One step of the track; see there."""
         assert self.track is not None
-        self.gates.since_start += 1
-        self.gates.since_jump += 1
+        self.gates.step()
         self._calm += 1
         for past in self._pasts:
             past.u_V.append(step.u_V)
@@ -595,8 +593,7 @@ class Intake:
         track = self.track
         if track is None or self.jumps == self.undone or track.served == self.base.features:
             return
-        track.features = track.served = self.base.features
-        track.memory, track.switch = track.frozen_memory.copy(), 0
+        track.to_base()
         self._before, self._hold, self._proven, self._proven_past = None, None, None, None
         self.undone += 1
 
@@ -623,7 +620,7 @@ class Intake:
         if self.confirmed:
             if self.following.good >= CONFIRMED:
                 self._proven = self._proven_past = None
-            self.following.good = 0
+            self.following.count_again()
             self._pasts = [*self._pasts[-1:], Past.of(track)]
         return fault
 
@@ -636,7 +633,7 @@ class Intake:
 
     def state_dict(self) -> StateDict:
         """The whole state under flat names."""
-        state = parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
+        state = _parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
         for i, past in enumerate(self._pasts):
             state |= prefixed(f"past{i}.", past.state_dict())
         if self._proven is not None:
@@ -659,7 +656,7 @@ class Intake:
 
     def restore(self, state: StateDict) -> None:
         """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        parts = parts_of(self.smoother, self.base, state)
+        parts = _parts_of(self.smoother, self.base, state)
         self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
         pasts = (under(f"past{i}.", state) for i in range(2))
         self._pasts = [Past.from_state(values) for values in pasts if values]

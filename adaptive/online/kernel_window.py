@@ -14,9 +14,8 @@ from adaptive.online import gates as admission
 from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, prefixed, under
 from adaptive.window import arrays as ws
 from adaptive.window.arrays import Status
-from adaptive.window.config import SolverConfig, WindowConfig
 from adaptive.window.healing import Healing
-from adaptive.window.window import Window
+from adaptive.window.window import SolverConfig, Window, WindowConfig
 
 # --- Sample weights: a weight w means 1/w times the noise variance, in window and filter. An ordinary sample has 1.
 

@@ -8,7 +8,8 @@ so that a change is learnt once and the old samples of the window stay valid.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import deque
+from dataclasses import asdict, dataclass, replace
 from math import isfinite, sqrt
 from typing import Any
 
@@ -26,7 +27,6 @@ from adaptive.online.glitch_or_jump import level_of
 from adaptive.online.intake import Intake
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.track import Pair
-from adaptive.online.validity import Delay, Judgement
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -40,6 +40,140 @@ from adaptive.types import (
     under,
 )
 
+# --- Errors of the served model: whether it is valid, and whether the identified one predicts better.
+#
+# The error is the measured voltage minus the voltage that the model gives for the measured motion, before the sample is
+# learnt, with the model as old as an answer is when it takes effect. The identified (frozen) model is judged likewise.
+
+
+#: Time constants of the mean square errors, s: long for reports and stated uncertainty, short to detect trouble.
+LONG_S, SHORT_S = 2.0, 0.1
+
+#: The frozen model is served where the learner's short-term rms exceeds its own by this factor plus a floor.
+FALLBACK_RATIO = 1.3
+
+
+@dataclass(slots=True)
+class Judgement:
+    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model.
+
+    error_V : the learner's last error. judged : number of errors. valid : whether the learnt model is valid.
+    inside : number of errors within one stated standard deviation.
+    fallback : whether the frozen model is served because it predicts better; fallen_s : for how long, s.
+    doubt_V2 : extra variance after a jump whose cause is open; it decays as errors are seen.
+    """
+
+    long_V2: float
+    short_V2: float
+    frozen_V2: float
+    frozen_short_V2: float
+    error_V: float = 0.0
+    judged: int = 0
+    inside: int = 0
+    valid: bool = True
+    fallback: bool = False
+    fallen_s: float = 0.0
+    doubt_V2: float = 0.0
+
+    def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
+        """Take one error of the learnt and of the frozen model, V."""
+        squared = error_V * error_V
+        slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
+        if self.judged > 0 and squared <= self.variance_V2:
+            self.inside += 1
+        self.error_V = error_V
+        self.judged += 1
+        self.long_V2 += (squared - self.long_V2) * slow
+        self.short_V2 += (squared - self.short_V2) * fast
+        self.doubt_V2 *= 1.0 - fast
+        frozen = frozen_error_V * frozen_error_V
+        self.frozen_V2 += (frozen - self.frozen_V2) * slow
+        self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
+
+    def decide(self, enter_V: float, leave_V: float) -> bool:
+        """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
+        rms = sqrt(self.short_V2)
+        if self.valid and rms > leave_V:
+            self.valid = False
+        elif not self.valid and rms < enter_V:
+            self.valid = True
+        return self.valid
+
+    def choose(self, floor_V: float, step_s: float) -> bool:
+        """Whether to serve the frozen model: taken when clearly better, left when worse."""
+        learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
+        if not self.fallback and learnt > FALLBACK_RATIO * frozen + floor_V:
+            self.fallback = True
+        elif self.fallback and learnt < frozen:
+            self.fallback = False
+        self.fallen_s = self.fallen_s + step_s if self.fallback else 0.0
+        return self.fallback
+
+    def rolled_back(self) -> None:
+        """The learner has returned to an earlier estimate: count the time of the frozen model from zero."""
+        self.fallen_s = 0.0
+
+    def add_doubt(self, variance_V2: float) -> None:
+        """Add to the stated variance for a jump whose cause is open, V²."""
+        self.doubt_V2 += variance_V2
+
+    @property
+    def std_V(self) -> float:
+        """Standard deviation of the learner's predictions, V: the larger of long and short term."""
+        return sqrt(max(self.long_V2, self.short_V2))
+
+    @property
+    def variance_V2(self) -> float:
+        """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
+        return max(self.long_V2, self.short_V2) + self.doubt_V2
+
+    def state_dict(self) -> StateDict:
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, values: StateDict) -> Judgement:
+        return cls(
+            long_V2=float(values["long_V2"]),
+            short_V2=float(values["short_V2"]),
+            frozen_V2=float(values["frozen_V2"]),
+            frozen_short_V2=float(values["frozen_short_V2"]),
+            error_V=float(values["error_V"]),
+            judged=int(values["judged"]),
+            inside=int(values["inside"]),
+            valid=bool(values["valid"]),
+            fallback=bool(values["fallback"]),
+            fallen_s=float(values["fallen_s"]),
+            doubt_V2=float(values["doubt_V2"]),
+        )
+
+
+class Delay:
+    """The last ``steps`` + 1 coefficient vectors: errors are those of the model as it was ``steps`` ago."""
+
+    def __init__(self, steps: int) -> None:
+        self._past: deque[FloatArray] = deque(maxlen=steps + 1)
+
+    def push(self, vector: FloatArray) -> FloatArray:
+        """Take the newest, return the oldest kept."""
+        self._past.append(vector)
+        return self._past[0]
+
+    def shift(self, by: float) -> None:
+        """Add to the first entry of all kept."""
+        for vector in self._past:
+            vector[0] += by
+
+    def array(self) -> FloatArray:
+        """All vectors, oldest first, for a state file."""
+        return np.array(self._past, dtype=np.float64)
+
+    def restore(self, vectors: FloatArray) -> None:
+        self._past.extend(np.array(v, dtype=np.float64) for v in vectors)
+
+
+# --- The learner.
+
+#: Estimate and covariance of the drift filter.
 Mark = tuple[FloatArray, FloatArray]
 
 #: Names of the events that are counted beside the samples.
@@ -68,6 +202,17 @@ NEWEST = 100
 MOST_MOVED = 2.0
 #: Troubles of the model. The identified one is served then.
 RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
+
+
+def _ages(values: object) -> tuple[int, int]:
+    """Two counts; older states have none."""
+    first, second = (0, 0) if values is None else np.asarray(values).tolist()
+    return int(first), int(second)
+
+
+def _mark(values: StateDict) -> Mark:
+    """A mark of the drift filter from its entries."""
+    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)
 
 
 class Parts:
@@ -167,7 +312,7 @@ class Parts:
         if j.fallen_s > ROLLBACK_S:
             # The frozen model was better for half a second: take back what was learnt since the last good estimate,
             # and jumps that the frozen model does not have.
-            j.fallen_s = 0.0
+            j.rolled_back()
             self.intake.to_base_frame()
             self.filter.go_back(self.mark)
             self.events["rollbacks"] += 1
@@ -250,7 +395,7 @@ class Parts:
     def take_jump(self, jump_um: float, fresh: bool, first: bool) -> None:
         """The frame has moved by ``jump_um``, µm. ``fresh``: not by undoing a jump; ``first``: see ``Taken``."""
         intake = self.intake
-        self.judgement.doubt_V2 += (JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2
+        self.judgement.add_doubt((JUMP_DOUBT * jump_um / intake.range_um * intake.base.span_V) ** 2)
         if fresh:
             self.jump_mark = self.filter.mark()
         if first:
@@ -279,61 +424,116 @@ class Parts:
             beta[0] += by_V
         self.delay.shift(by_V)
 
+    def model(self) -> LssvmInverse:
+        """The learnt model, immutable; the identified one while that predicts better."""
+        base = self.intake.base
+        j, window, seq = self.judgement, self.window, self.intake.gates.seq
+        valid = j.valid and not self.intake.fault
+        if j.fallback or self.alone:
+            return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
+        support, alpha, bias = window.arrays()
+        beta = self.filter.beta
+        beta[0] += bias
+        return replace(
+            base,
+            features=self.intake.served,
+            beta=beta,
+            support=support,
+            alpha=alpha,
+            widths=np.array(window.hyper.widths),
+            gamma=window.hyper.gamma,
+            domain=self.domain,
+            noise_variance=j.variance_V2,
+            kernel_variance=window.kernel_variance,
+            beta_covariance=np.empty((0, 0)),
+            seq=seq,
+            valid=valid,
+            anchor=base.beta if self.allowed_V else np.empty(0),
+            allowed_V=self.allowed_V,
+        )
 
-def _model_of(base: LssvmInverse, parts: Parts) -> LssvmInverse:
-    """The learnt model, immutable; the identified one while that predicts better."""
-    j, window, seq = parts.judgement, parts.window, parts.intake.gates.seq
-    valid = j.valid and not parts.intake.fault
-    if j.fallback or parts.alone:
-        return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
-    support, alpha, bias = window.arrays()
-    beta = parts.filter.beta
-    beta[0] += bias
-    return replace(
-        base,
-        features=parts.intake.served,
-        beta=beta,
-        support=support,
-        alpha=alpha,
-        widths=np.array(window.hyper.widths),
-        gamma=window.hyper.gamma,
-        domain=parts.domain,
-        noise_variance=j.variance_V2,
-        kernel_variance=window.kernel_variance,
-        beta_covariance=np.empty((0, 0)),
-        seq=seq,
-        valid=valid,
-        anchor=base.beta if parts.allowed_V else np.empty(0),
-        allowed_V=parts.allowed_V,
-    )
+    def adopt(self, hyper: Hyperparameters) -> str:
+        """Let the window continue with other hyper-parameters. Returns "", or why they are refused.
 
+        The window is factored anew over its own samples: O(N³), once. The constant of the linear part takes up the
+        difference at the last point that was learnt, so that the output there does not jump. Refused without a change
+        where the kernel matrix cannot be factored, where the leave-one-out errors of the newest samples (rms) are not
+        smaller, or where the output would move too far.
+        """
+        window = self.window
+        try:
+            challenger = window.with_hyperparameters(hyper)
+            now_V, then_V = challenger.newest_error_V(NEWEST), window.newest_error_V(NEWEST)
+        except DehystError as error:
+            return f"numerics: {error}"
+        if not now_V <= then_V:
+            return f"worse: {now_V:.3g} V rms on the newest samples, {then_V:.3g} V as it is"
+        point = self.point
+        shift_V = window.mean(point) - challenger.mean(point) if np.all(np.isfinite(point)) else 0.0
+        moves_V = np.array([challenger.mean(x) + shift_V - window.mean(x) for x in window.newest(NEWEST)])
+        moved_V = max(abs(shift_V), sqrt(float(np.mean(moves_V**2))) if moves_V.size else 0.0)
+        limit_V = MOST_MOVED * sqrt(self.judgement.variance_V2)
+        if not moved_V <= limit_V:
+            return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
+        self.window = challenger
+        self.shift_constant(shift_V)
+        return ""
 
-def _adopt(parts: Parts, hyper: Hyperparameters) -> str:
-    """Let the window of ``parts`` continue with other hyper-parameters. Returns "", or why they are refused.
+    # ---- keeping
 
-    The window is factored anew over its own samples: O(N³), once. The constant of the linear part takes up the
-    difference at the last point that was learnt, so that the output there does not jump. Refused without a change where
-    the kernel matrix cannot be factored, where the leave-one-out errors of the newest samples (rms) are not smaller, or
-    where the output would move too far.
-    """
-    window = parts.window
-    try:
-        challenger = window.with_hyperparameters(hyper)
-        now_V, then_V = challenger.newest_error_V(NEWEST), window.newest_error_V(NEWEST)
-    except DehystError as error:
-        return f"numerics: {error}"
-    if not now_V <= then_V:
-        return f"worse: {now_V:.3g} V rms on the newest samples, {then_V:.3g} V as it is"
-    point = parts.point
-    shift_V = window.mean(point) - challenger.mean(point) if np.all(np.isfinite(point)) else 0.0
-    moves_V = np.array([challenger.mean(x) + shift_V - window.mean(x) for x in window.newest(NEWEST)])
-    moved_V = max(abs(shift_V), sqrt(float(np.mean(moves_V**2))) if moves_V.size else 0.0)
-    limit_V = MOST_MOVED * sqrt(parts.judgement.variance_V2)
-    if not moved_V <= limit_V:
-        return f"jump: the output would move by {moved_V:.3g} V, {limit_V:.3g} V is the most"
-    parts.window = challenger
-    parts.shift_constant(shift_V)
-    return ""
+    def state_dict(self) -> StateDict:
+        """The whole changing state under flat names."""
+        groups = {
+            "front": self.intake.state_dict(),
+            "filter": self.filter.state_dict(),
+            "window": self.window.state_dict(),
+            "rest": self.rest.state_dict(),
+            "judgement": self.judgement.state_dict(),
+            "counters": dict(self.counters),
+            "events": dict(self.events),
+            "mark": {"beta": self.mark[0].copy(), "covariance": self.mark[1].copy()},
+            "next_mark": {"beta": self.next_mark[0].copy(), "covariance": self.next_mark[1].copy()},
+            "jump_mark": {"beta": self.jump_mark[0].copy(), "covariance": self.jump_mark[1].copy()},
+            "proven_mark": {"beta": self.proven_mark[0].copy(), "covariance": self.proven_mark[1].copy()},
+            "confirmed0": {"beta": self.confirmed[0][0].copy(), "covariance": self.confirmed[0][1].copy()},
+            "confirmed1": {"beta": self.confirmed[1][0].copy(), "covariance": self.confirmed[1][1].copy()},
+        }
+        return joined(groups) | {
+            "domain": self.domain.copy(),
+            "point": self.point.copy(),
+            "delay": self.delay.array(),
+            "rail_s": self.rail_s,
+            "railed": self.railed,
+            "left_s": self.left_s,
+            "left": self.left,
+            "alone": self.alone,
+            "mark_ages": np.array(self.mark_ages),
+            "confirmed_ages": np.array(self.confirmed_ages),
+        }
+
+    def restore(self, state: StateDict) -> None:
+        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
+        self.intake.restore(under("front.", state))
+        kept_filter = under("filter.", state)
+        self.filter = DriftFilter.from_state(self.config.drift, self.filter.step_s, self.filter.span_V, kept_filter)
+        self.window.restore(under("window.", state))
+        self.rest = RestCreep.from_state(under("rest.", state))
+        self.judgement = Judgement.from_state(under("judgement.", state))
+        self.counters |= {key: int(value) for key, value in under("counters.", state).items()}
+        self.events |= {key: int(value) for key, value in under("events.", state).items()}
+        self.domain = np.array(state["domain"], dtype=np.float64)
+        self.point = np.array(state["point"], dtype=np.float64)
+        self.rail_s, self.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
+        self.left_s, self.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
+        self.alone = bool(state.get("alone", False))
+        self.mark_ages, self.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
+        self.delay.restore(np.asarray(state["delay"], dtype=np.float64))
+        names = ("mark", "next_mark", "jump_mark")
+        self.mark, self.next_mark, self.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
+        proven = under("proven_mark.", state)
+        self.proven_mark = _mark(proven) if proven else self.jump_mark
+        kept = [under(f"confirmed{i}.", state) for i in range(2)]
+        self.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (self.mark, self.next_mark)
 
 
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
@@ -366,12 +566,12 @@ class Learner:
     """
 
     def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None) -> None:
-        self._begin(model, config or LearnerConfig(), None)
+        self._begin(model, config or LearnerConfig())
 
-    def _begin(self, model: LssvmInverse, config: LearnerConfig, parts: Parts | None) -> None:
+    def _begin(self, model: LssvmInverse, config: LearnerConfig) -> None:
         self.config = config
         self.base = model
-        self.parts = parts or Parts(model, config)
+        self.parts = Parts(model, config)
         features = model.features
         self._basis = np.empty(features.basis_size)
         self._frozen_basis, self._frozen_kernel = self._basis.copy(), np.empty(features.kernel_size)
@@ -416,8 +616,7 @@ class Learner:
 
     def _handle(self, sample: Sample) -> str:
         parts, intake = self.parts, self.parts.intake
-        intake.doubt_V = sqrt(max(parts.judgement.long_V2, parts.judgement.short_V2))
-        taken = intake.take(sample, self.snapshot)
+        taken = intake.take(sample, self.snapshot, parts.judgement.std_V)
         if taken.distrusted:
             self._go_on_without_readings(taken.undone)
         elif taken.undone:
@@ -442,7 +641,7 @@ class Learner:
         c, parts, intake = self.config, self.parts, self.parts.intake
         gates, track = intake.gates, intake.track
         assert track is not None
-        if min(gates.since_start, gates.since_step) <= c.admission.settle:
+        if admission.settling(c.admission, gates):
             return admission.SETTLING
         if not pair.good:
             return admission.GLITCH
@@ -541,7 +740,7 @@ class Learner:
     def snapshot(self) -> LssvmInverse:
         """The model as it stands, immutable. The same object while nothing new was learnt."""
         if self._cache is None:
-            self._cache = _model_of(self.base, self.parts)
+            self._cache = self.parts.model()
         return self._cache
 
     def memory(self) -> FloatArray:
@@ -602,7 +801,7 @@ class Learner:
 
         Atomic, and without a jump of the output; refused unless it predicts the newest samples better.
         """
-        reason = _adopt(self.parts, hyper)
+        reason = self.parts.adopt(hyper)
         self.parts.events["adoptions_refused" if reason else "adoptions"] += 1
         if not reason:
             self._cache = None
@@ -678,7 +877,8 @@ class Learner:
 
     def state_dict(self) -> StateDict:
         """The whole state; ``from_state`` continues from it with the same result to the last bit."""
-        return _state_of(self.base, self.config, self.parts, self._frozen)
+        made_from = joined({"base": self.base.state_dict(), "config": self.config.state_dict()})
+        return {**made_from, **self.parts.state_dict(), "frozen": self._frozen}
 
     def restored(self, state: StateDict) -> Learner:
         """A learner with ``state``. Raises ModelFileError where entries are missing or do not fit together."""
@@ -688,89 +888,13 @@ class Learner:
     def from_state(cls, state: StateDict) -> Learner:
         """Inverse of ``state_dict``. Raises ModelFileError where entries are missing or do not fit together."""
         made = cls.__new__(cls)
-        base, config, parts, frozen = _restored(state)
-        made._begin(base, config, parts)
-        made._frozen = frozen
+        try:
+            base = LssvmInverse.from_state(under("base.", state))
+            made._begin(base, LearnerConfig.from_state(under("config.", state)))
+            made.parts.restore(state)
+            made._frozen = bool(state["frozen"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(
+                f"learner state: entry missing or damaged: {error}; start from the model instead"
+            ) from error
         return made
-
-
-# --- The state of a learner.
-
-
-def _state_of(base: LssvmInverse, config: LearnerConfig, parts: Parts, frozen: bool) -> StateDict:
-    """The whole state; `_restored` continues from it with the same result to the last bit."""
-    groups = {
-        "base": base.state_dict(),
-        "config": config.state_dict(),
-        "front": parts.intake.state_dict(),
-        "filter": parts.filter.state_dict(),
-        "window": parts.window.state_dict(),
-        "rest": parts.rest.state_dict(),
-        "judgement": parts.judgement.state_dict(),
-        "counters": dict(parts.counters),
-        "events": dict(parts.events),
-        "mark": {"beta": parts.mark[0].copy(), "covariance": parts.mark[1].copy()},
-        "next_mark": {"beta": parts.next_mark[0].copy(), "covariance": parts.next_mark[1].copy()},
-        "jump_mark": {"beta": parts.jump_mark[0].copy(), "covariance": parts.jump_mark[1].copy()},
-        "proven_mark": {"beta": parts.proven_mark[0].copy(), "covariance": parts.proven_mark[1].copy()},
-        "confirmed0": {"beta": parts.confirmed[0][0].copy(), "covariance": parts.confirmed[0][1].copy()},
-        "confirmed1": {"beta": parts.confirmed[1][0].copy(), "covariance": parts.confirmed[1][1].copy()},
-    }
-    state = joined(groups)
-    return state | {
-        "domain": parts.domain.copy(),
-        "point": parts.point.copy(),
-        "delay": parts.delay.array(),
-        "frozen": frozen,
-        "rail_s": parts.rail_s,
-        "railed": parts.railed,
-        "left_s": parts.left_s,
-        "left": parts.left,
-        "alone": parts.alone,
-        "mark_ages": np.array(parts.mark_ages),
-        "confirmed_ages": np.array(parts.confirmed_ages),
-    }
-
-
-def _restored(state: StateDict) -> tuple[LssvmInverse, LearnerConfig, Parts, bool]:
-    """Inverse of ``state_of``. Raises ModelFileError where entries are missing or do not fit together."""
-    try:
-        base = LssvmInverse.from_state(under("base.", state))
-        config = LearnerConfig.from_state(under("config.", state))
-        parts = Parts(base, config)
-        parts.intake.restore(under("front.", state))
-        parts.filter = DriftFilter.from_state(config.drift, parts.filter.step_s, base.span_V, under("filter.", state))
-        parts.window.restore(under("window.", state))
-        parts.rest = RestCreep.from_state(under("rest.", state))
-        parts.judgement = Judgement.from_state(under("judgement.", state))
-        parts.counters |= {key: int(value) for key, value in under("counters.", state).items()}
-        parts.events |= {key: int(value) for key, value in under("events.", state).items()}
-        parts.domain = np.array(state["domain"], dtype=np.float64)
-        parts.point = np.array(state["point"], dtype=np.float64)
-        parts.rail_s, parts.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
-        parts.left_s, parts.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
-        parts.alone = bool(state.get("alone", False))
-        parts.mark_ages, parts.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
-        parts.delay.restore(np.asarray(state["delay"], dtype=np.float64))
-        names = ("mark", "next_mark", "jump_mark")
-        parts.mark, parts.next_mark, parts.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
-        proven = under("proven_mark.", state)
-        parts.proven_mark = _mark(proven) if proven else parts.jump_mark
-        kept = [under(f"confirmed{i}.", state) for i in range(2)]
-        parts.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (parts.mark, parts.next_mark)
-        return base, config, parts, bool(state["frozen"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(
-            f"learner state: entry missing or damaged: {error}; start from the model instead"
-        ) from error
-
-
-def _ages(values: object) -> tuple[int, int]:
-    """Two counts; older states have none."""
-    first, second = (0, 0) if values is None else np.asarray(values).tolist()
-    return int(first), int(second)
-
-
-def _mark(values: StateDict) -> Mark:
-    """A mark of the drift filter from its entries."""
-    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)

@@ -92,6 +92,10 @@ class Following:
         self.steps = self.good = self.still = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
 
+    def count_again(self) -> None:
+        """Count the steps in which the readings followed from zero again."""
+        self.good = 0
+
     def take(self, u_V: float, p_V: float, span_V: float, dt_s: float) -> bool:
         """Process one pair (u, p). Returns True if the last steps show a fault.
 
@@ -260,6 +264,10 @@ class Trial:
         ``slope``, ``shift_um`` : jumps that are reverted now: they mapped a reading y to slope y + shift. 0 for none.
         """
         return cls(reckoning, base, memory, np.zeros((4, VALUES)), open_slope=slope, open_shift_um=shift_um)
+
+    def go_on_from(self, reckoning: Reckoning) -> None:
+        """Continue with a better dead-reckoned position of the same instant."""
+        self.reckoning = reckoning
 
     def put(self, u_V: float, y_um: float, now: Circumstances) -> Decision:
         """Process one sample; ``y_um`` is NaN if it has no reading."""

@@ -155,14 +155,22 @@ class Track:
 
     def move(self, served: FeatureMap, slope: float, shift_um: float) -> None:
         """A jump: the smoother goes on at another place, y <- slope y + shift, in a new frame."""
-        self.state.x *= slope
-        self.state.x[0] += shift_um
+        self.state.move(slope, shift_um)
         self.served, self.switch = served, self.state.count + self.lag
+
+    def enter(self, frame: FeatureMap) -> None:
+        """Learn and serve in another frame from now on, where no jump is under way."""
+        self.features = self.served = frame
+
+    def to_base(self) -> None:
+        """Return to the frame of ``base`` and the memory tracked in it."""
+        self.enter(self.base)
+        self.memory, self.switch = self.frozen_memory.copy(), 0
 
     def creep(self, by_um: float) -> None:
         """The frame's offset moves, µm, under a motion that stays. Nothing where the frame is about to jump."""
         if self.features is self.served:
-            self.features = self.served = replace(self.served, offset_um=self.served.offset_um + by_um)
+            self.enter(replace(self.served, offset_um=self.served.offset_um + by_um))
 
     def advance(self, step: Step) -> tuple[Pair | None, bool]:
         """One step: the pair of ``lag`` samples ago, None before there is one; whether it is the first after a jump."""

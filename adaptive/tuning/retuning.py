@@ -21,8 +21,7 @@ from adaptive.tuning.evidence import EvidenceSamples, evidence_samples
 from adaptive.tuning.search import REFUSED, CountedEvidence, descend
 from adaptive.types import BoolArray, FloatArray, Hyperparameters, WindowData
 from adaptive.window.arrays import Status
-from adaptive.window.config import WindowConfig
-from adaptive.window.window import Window
+from adaptive.window.window import Window, WindowConfig
 
 #: ``search(data, start, low, high)``: (s, 1 + d) starts worth a descent, best first, in logarithms of gamma and widths.
 Search = Callable[[EvidenceSamples, FloatArray, FloatArray, FloatArray], FloatArray]

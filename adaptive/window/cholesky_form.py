@@ -36,7 +36,7 @@ from adaptive.window.arrays import (
 
 
 @compiled_reassociating
-def forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
+def _forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
     """b <- L^-1 b in place, L' in the upper triangle of P[:n, :n]; two columns at a time."""
     k = 0
     while k + 1 < n:
@@ -54,7 +54,7 @@ def forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
 
 
 @compiled_reassociating
-def backward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
+def _backward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
     """b <- L'^-1 b in place, L' in the upper triangle of P[:n, :n]; two rows at a time."""
     k = n - 1
     while k >= 1:
@@ -75,7 +75,7 @@ def backward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
 
 
 @compiled_reassociating
-def shift_columns(P: FloatArray, n: int, position: int, b: FloatArray) -> None:
+def _shift_columns(P: FloatArray, n: int, position: int, b: FloatArray) -> None:
     """The columns of L before ``position`` lose that row, and take their part in b <- L^-1 b."""
     for k in range(position):
         row = P[k]
@@ -92,7 +92,7 @@ def shift_columns(P: FloatArray, n: int, position: int, b: FloatArray) -> None:
 
 
 @compiled_reassociating
-def rotate_column(
+def _rotate_column(
     old: FloatArray, new: FloatArray, x: FloatArray, b: FloatArray, cosine: float, sine: float, t: float
 ) -> None:
     """One rotation of the rank-1 update over the rest of a column, and that column's part in b <- L^-1 b."""
@@ -126,13 +126,13 @@ def gather(A: WindowArrays, by_slot: FloatArray, by_position: FloatArray) -> Non
 @compiled_reassociating
 def forward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L^-1 b in place, by position."""
-    forward_columns(A.P, A.C[COUNT], b)
+    _forward_columns(A.P, A.C[COUNT], b)
 
 
 @compiled_reassociating
 def backward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L'^-1 b in place, by position."""
-    backward_columns(A.P, A.C[COUNT], b)
+    _backward_columns(A.P, A.C[COUNT], b)
 
 
 @compiled_reassociating
@@ -145,7 +145,7 @@ def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
     row = A.P[position]
     for i in range(position + 1, n):
         x[i] = row[i]
-    shift_columns(A.P, n, position, b)
+    _shift_columns(A.P, n, position, b)
     tau, tau_y = A.S[position], A.V[SY, position]
     for k in range(position + 1, n):
         old, new = A.P[k], A.P[k - 1]
@@ -154,7 +154,7 @@ def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
         new[k - 1] = r
         t = b[k - 1] / r
         b[k - 1] = t
-        rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
+        _rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
         value = A.S[k]
         A.S[k - 1] = cosine * value + sine * tau
         tau = cosine * tau - sine * value
@@ -237,7 +237,7 @@ def _column(A: WindowArrays, place: int, out: FloatArray) -> None:
     """out <- R^-1 e, by slot, of the sample at ``place``."""
     t = A.V[MINUS]
     _half_column(A, place, t)
-    backward_columns(A.P, A.C[COUNT], t)
+    _backward_columns(A.P, A.C[COUNT], t)
     for i in range(A.C[COUNT]):
         out[A.order[i]] = t[i]
 

@@ -77,7 +77,7 @@ class Refresh:
         if not steps.resum(copy.arrays):
             return False
         copy.arrays.C[ws.UNDO] = ws.UNDO_NOTHING
-        self._source.arrays = copy.arrays
+        self._source.take_arrays(copy.arrays)
         return True
 
     def state_dict(self) -> StateDict:

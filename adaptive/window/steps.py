@@ -88,7 +88,7 @@ from adaptive.window.arrays import (
 
 
 @compiled_reassociating
-def kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
+def _kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
     """K, (2.31), of the samples in use with the point ``x`` (d,) into ``out`` (N,)."""
     for i in range(A.X.shape[0]):
         A.point[i] = x[i] * A.inverse_widths[i]
@@ -99,7 +99,7 @@ def kernel_column(A: WindowArrays, x: FloatArray, out: FloatArray) -> None:
 def predict(A: WindowArrays, x: FloatArray) -> float:
     """Mean at one point, (2.32). O(N d). Its scratch is the window's: one thread at a time."""
     k = A.V[K]
-    kernel_column(A, x, k)
+    _kernel_column(A, x, k)
     mean: float = dot(k, A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
     return mean
 
@@ -114,7 +114,7 @@ def predict_by_handle(handle: IntArray, x: FloatArray) -> float:  # pragma: no c
 def nearest(A: WindowArrays, x: FloatArray) -> tuple[int, float]:
     """Slot of the sample with the largest kernel value to ``x`` (d,), and that value; (-1, 0) while it is empty."""
     n, k = A.C[COUNT], A.V[K]
-    kernel_column(A, x, k)
+    _kernel_column(A, x, k)
     slot, most = -1, -1.0
     for j in range(n):
         if k[j] > most:
@@ -137,7 +137,7 @@ def scale(A: WindowArrays) -> float:
 
 
 @compiled_reassociating
-def acceptable_weight(A: WindowArrays, w: float) -> bool:
+def _acceptable_weight(A: WindowArrays, w: float) -> bool:
     """True where double precision can tell the sample's noise variance 1/(gamma w) from the kernel."""
     precision: float = A.F[GAMMA] * w
     return precision >= LEAST_PRECISION and precision <= MOST_PRECISION
@@ -146,14 +146,14 @@ def acceptable_weight(A: WindowArrays, w: float) -> bool:
 @compiled_reassociating
 def acceptable(A: WindowArrays, x: FloatArray, y: float, w: float) -> bool:
     """Features and target finite and at most MOST, a weight as above."""
-    good = abs(y) <= MOST and acceptable_weight(A, w)
+    good = abs(y) <= MOST and _acceptable_weight(A, w)
     for j in range(x.shape[0]):
         good = good and abs(x[j]) <= MOST
     return good
 
 
 @compiled_reassociating
-def write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
+def _write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> None:
     """Put a sample into a slot, and its kernel column (in COLUMN, but for the slot's own element) into R."""
     column, row, n = A.V[COLUMN], A.R[slot], A.C[COUNT]
     for j in range(n):
@@ -168,7 +168,7 @@ def write_sample(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) 
 
 
 @compiled_reassociating
-def keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
+def _keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
     """Copy into U what a step on ``slot`` overwrites, all but P."""
     for j in range(A.C[COUNT]):
         A.U[UNDO_S, j] = A.S[j]
@@ -185,20 +185,20 @@ def keep_for_undo(A: WindowArrays, slot: int, kind: int) -> None:
 
 
 @compiled_reassociating
-def restore_solution(A: WindowArrays) -> None:
-    """S, Sy, bias and alpha as `keep_for_undo` found them. Nothing is left to undo then."""
+def _restore_solution(A: WindowArrays) -> None:
+    """S, Sy, bias and alpha as `_keep_for_undo` found them. Nothing is left to undo then."""
     for j in range(A.C[COUNT]):
         A.S[j] = A.U[UNDO_S, j]
         A.V[SY, j] = A.U[UNDO_SY, j]
         A.V[ALPHA, j] = A.U[UNDO_ALPHA, j]
     A.F[BETA] = A.U[UNDO_POINT, 0]
-    factor_gram(A)
+    _factor_gram(A)
     A.C[UNDO] = UNDO_NOTHING
 
 
 @compiled_reassociating
-def restore_sample(A: WindowArrays) -> None:
-    """The sample of the slot, and its row of R, as `keep_for_undo` found them."""
+def _restore_sample(A: WindowArrays) -> None:
+    """The sample of the slot, and its row of R, as `_keep_for_undo` found them."""
     slot = A.C[UNDO_SLOT]
     for j in range(A.C[COUNT]):
         A.R[slot, j] = A.U[UNDO_R, j]
@@ -223,7 +223,7 @@ def finite(a: FloatArray, n: int) -> bool:
 
 
 @compiled_reassociating
-def add_up(a: FloatArray, n: int) -> float:
+def _add_up(a: FloatArray, n: int) -> float:
     """Sum of the first n elements."""
     total = 0.0
     for j in range(n):
@@ -232,16 +232,16 @@ def add_up(a: FloatArray, n: int) -> float:
 
 
 @compiled_reassociating
-def factor_gram(A: WindowArrays) -> bool:
+def _factor_gram(A: WindowArrays) -> bool:
     """GRAM <- sqrt(1'P 1), 0 where that is not positive. False where it is not finite."""
     n = A.C[COUNT]
-    gram = add_up(A.S, n) if A.C[FORM] == INVERSE_FORM else dot(A.S, A.S, n)
+    gram = _add_up(A.S, n) if A.C[FORM] == INVERSE_FORM else dot(A.S, A.S, n)
     A.F[GRAM] = np.sqrt(gram) if gram > 0.0 else 0.0
     return bool(np.isfinite(gram))
 
 
 @compiled_reassociating
-def solve_bias(A: WindowArrays, moment: float) -> float:
+def _solve_bias(A: WindowArrays, moment: float) -> float:
     """moment/(1'P 1): the bias for the moment 1'P y; 0 where no sample determines it."""
     root = A.F[GRAM]
     return moment / root / root if root > 0.0 else 0.0
@@ -251,11 +251,11 @@ def solve_bias(A: WindowArrays, moment: float) -> float:
 def finish(A: WindowArrays) -> bool:
     """Bias and alpha from S and Sy, (2.29). False, with both spoilt, where they are not finite."""
     n, sy, inverse_form = A.C[COUNT], A.V[SY], A.C[FORM] == INVERSE_FORM
-    good = factor_gram(A)
-    moment = add_up(sy, n) if inverse_form else dot(A.S, sy, n)
+    good = _factor_gram(A)
+    moment = _add_up(sy, n) if inverse_form else dot(A.S, sy, n)
     # Before it is solved for: a vanishing 1'P 1 would hide it.
     good = good and bool(np.isfinite(moment))
-    A.F[BETA] = solve_bias(A, moment)
+    A.F[BETA] = _solve_bias(A, moment)
     rest = A.V[ALPHA] if inverse_form else A.V[Z]
     for j in range(n):
         rest[j] = sy[j]
@@ -292,7 +292,7 @@ def _take_out_inverse(A: WindowArrays, slot: int, p: FloatArray) -> None:
 def _take_in_inverse(A: WindowArrays, q: FloatArray, s: float) -> None:
     """S and Sy gain the term q q'/s; q_slot = -1 and the slot's sample are in place."""
     n = A.C[COUNT]
-    inverse.add_scaled(A.S, add_up(q, n) / s, q, n)
+    inverse.add_scaled(A.S, _add_up(q, n) / s, q, n)
     inverse.add_scaled(A.V[SY], dot(q, A.V[Y], n) / s, q, n)
 
 
@@ -302,7 +302,7 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
     b, z, p, q = A.V[COLUMN], A.V[Z], A.V[PK], A.V[TRIAL]
     b[slot] = 0.0
     inverse.multiply(A, b, z)
-    keep_for_undo(A, slot, UNDO_REPLACE)
+    _keep_for_undo(A, slot, UNDO_REPLACE)
     inverse.lift_column(A, slot, p)
     pkk = p[slot]
     factor = dot(p, b, n) / pkk if pkk > 0.0 else 0.0
@@ -316,13 +316,13 @@ def _replace_inverse(A: WindowArrays, slot: int, x: FloatArray, y: float, w: flo
     if good:
         q[slot] = -1.0
         _take_out_inverse(A, slot, p)
-        write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y, w)
         _take_in_inverse(A, q, s)
         good = finish(A)
     if not good:
-        # write_sample may not have run: restoring writes the same values again.
-        restore_solution(A)
-        restore_sample(A)
+        # _write_sample may not have run: restoring writes the same values again.
+        _restore_solution(A)
+        _restore_sample(A)
         inverse.lower_column(A, slot, p)
         return ILL_CONDITIONED
     _scale_into(A.V[MINUS], p, 1.0 / np.sqrt(pkk), n)
@@ -339,7 +339,7 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     inverse.multiply(A, b, q)
     noise = 1.0 / (A.F[GAMMA] * w)
     s = 1.0 + noise - dot(b, q, n)
-    keep_for_undo(A, n, UNDO_APPEND)
+    _keep_for_undo(A, n, UNDO_APPEND)
     good = s > SCHUR_SHARE * noise and np.isfinite(dot(q, q, n) / s)
     if good:
         q[n] = -1.0
@@ -347,13 +347,13 @@ def _append_inverse(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         A.V[SY, n] = 0.0
         for j in range(n + 1):
             A.P[n, j] = 0.0
-        write_sample(A, n, x, y, w)
+        _write_sample(A, n, x, y, w)
         A.C[COUNT] = n + 1
         _take_in_inverse(A, q, s)
         good = finish(A)
         A.C[COUNT] = n
     if not good:
-        restore_solution(A)
+        _restore_solution(A)
         return ILL_CONDITIONED
     A.C[COUNT] = n + 1
     for j in range(n + 1):
@@ -371,7 +371,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
     n = A.C[COUNT]
     column, half = A.V[COLUMN], A.V[TRIAL]
     place = cholesky.position_of(A, slot)
-    keep_for_undo(A, slot, UNDO_REPLACE)
+    _keep_for_undo(A, slot, UNDO_REPLACE)
     A.C[UNDO_PLACE] = place
     cholesky.keep_factor(A)
     cholesky.before_leaving(A, place)
@@ -385,7 +385,7 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
     good = s > SCHUR_SHARE * noise
     if good:
         A.C[COUNT] = n
-        write_sample(A, slot, x, y, w)
+        _write_sample(A, slot, x, y, w)
         A.C[COUNT] = n - 1
         cholesky.add(A, slot, half, np.sqrt(s))
         good = finish(A)
@@ -402,8 +402,8 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
 def _restore_replaced_cholesky(A: WindowArrays) -> None:
     """The window as it was before the sample of UNDO_SLOT was replaced, to the last bit. COUNT is what it was."""
     cholesky.restore_factor(A)
-    restore_solution(A)
-    restore_sample(A)
+    _restore_solution(A)
+    _restore_sample(A)
 
 
 @compiled_reassociating
@@ -416,8 +416,8 @@ def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
     s = 1.0 + noise - dot(half, half, n)
     if not s > SCHUR_SHARE * noise:
         return ILL_CONDITIONED
-    keep_for_undo(A, n, UNDO_APPEND)
-    write_sample(A, n, x, y, w)
+    _keep_for_undo(A, n, UNDO_APPEND)
+    _write_sample(A, n, x, y, w)
     cholesky.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)
@@ -430,7 +430,7 @@ def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
 
 
 @compiled_reassociating
-def row_residual(A: WindowArrays, i: int) -> float:
+def _row_residual(A: WindowArrays, i: int) -> float:
     """y_i - b - R_i alpha: zero but for the error of the recursion. In units of the target."""
     fitted = dot(A.R[i], A.V[ALPHA], A.C[COUNT]) + A.F[BETA]
     residual: float = A.V[Y, i] - fitted
@@ -438,7 +438,7 @@ def row_residual(A: WindowArrays, i: int) -> float:
 
 
 @compiled_reassociating
-def rotate_residual(A: WindowArrays) -> bool:
+def _rotate_residual(A: WindowArrays) -> bool:
     """Check the next row of the round. False where its residual exceeds the tolerance or is not a number.
 
     The row of the newest sample does not see the error of P, every other row does; a round of N steps has checked all
@@ -450,7 +450,7 @@ def rotate_residual(A: WindowArrays) -> bool:
     i = A.C[CURSOR]
     if i >= n:
         i = 0
-    residual = abs(row_residual(A, i))
+    residual = abs(_row_residual(A, i))
     A.F[RESIDUAL] = residual
     if not residual <= A.F[ROUND_WORST]:
         A.F[ROUND_WORST] = residual
@@ -506,9 +506,9 @@ def _refine_cholesky(A: WindowArrays) -> bool:
     """S and Sy anew, and one step of iterative refinement of bias and alpha."""
     n, good, t = A.C[COUNT], resum(A), A.V[MINUS]
     for i in range(n):
-        t[i] = row_residual(A, A.order[i])
+        t[i] = _row_residual(A, A.order[i])
     cholesky.forward(A, t)
-    correction = solve_bias(A, dot(A.S, t, n))
+    correction = _solve_bias(A, dot(A.S, t, n))
     inverse.add_scaled(t, -correction, A.S, n)
     A.F[BETA] += correction
     cholesky.backward(A, t)
@@ -540,7 +540,7 @@ def _refined(A: WindowArrays) -> bool:
     good = refine(A)
     n = A.C[COUNT]
     size = abs(A.V[Y, row]) + abs(A.F[BETA]) + np.sqrt(dot(A.V[ALPHA], A.V[ALPHA], n))
-    return good and abs(row_residual(A, row)) <= max(CONTRACTION * before, NEGLIGIBLE * size)
+    return good and abs(_row_residual(A, row)) <= max(CONTRACTION * before, NEGLIGIBLE * size)
 
 
 @compiled_reassociating
@@ -549,10 +549,10 @@ def take_back(A: WindowArrays) -> None:
     kind, slot = A.C[UNDO], A.C[UNDO_SLOT]
     if kind == UNDO_APPEND:
         A.C[COUNT] -= 1
-        restore_solution(A)
+        _restore_solution(A)
     elif A.C[FORM] == INVERSE_FORM:
-        restore_solution(A)
-        restore_sample(A)
+        _restore_solution(A)
+        _restore_sample(A)
         inverse.lower_column(A, slot, A.V[PK])
     else:
         _restore_replaced_cholesky(A)
@@ -574,7 +574,7 @@ def _checked(A: WindowArrays, status: int) -> int:
     if status == ACCEPTED:
         residual, worst, last = A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST]
         cursor, rounds = A.C[CURSOR], A.C[ROUNDS]
-        if not rotate_residual(A) and not _refined(A):
+        if not _rotate_residual(A) and not _refined(A):
             take_back(A)
             A.F[RESIDUAL], A.F[ROUND_WORST], A.F[LAST_WORST] = residual, worst, last
             A.C[CURSOR], A.C[ROUNDS] = cursor, rounds
@@ -598,7 +598,7 @@ def replace(A: WindowArrays, slot: int, x: FloatArray, y: float, w: float) -> in
         return BAD_INPUT
     if slot < 0 or slot >= A.C[COUNT]:
         return NO_SLOT
-    kernel_column(A, x, A.V[COLUMN])
+    _kernel_column(A, x, A.V[COLUMN])
     if A.C[FORM] == INVERSE_FORM:
         status = _checked(A, _replace_inverse(A, slot, x, y, w))
     else:
@@ -615,7 +615,7 @@ def append(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         return BAD_INPUT
     if A.C[COUNT] >= A.P.shape[0]:
         return NO_SLOT
-    kernel_column(A, x, A.V[COLUMN])
+    _kernel_column(A, x, A.V[COLUMN])
     if A.C[FORM] == INVERSE_FORM:
         status = _checked(A, _append_inverse(A, x, y, w))
     else:
@@ -629,7 +629,7 @@ def reweight(A: WindowArrays, slot: int, w: float) -> int:
     """Give the sample in ``slot`` the noise weight w: out and in again, which is exact for any change. O(N²)."""
     if slot < 0 or slot >= A.C[COUNT]:
         return NO_SLOT
-    if not acceptable_weight(A, w):
+    if not _acceptable_weight(A, w):
         A.C[BAD_INPUTS] += 1
         return BAD_INPUT
     x = A.point

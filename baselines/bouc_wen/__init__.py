@@ -13,12 +13,11 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from baselines.bouc_wen.identify import identify_bouc_wen
-    from baselines.bouc_wen.inverse import BoucWenInverse
-    from baselines.bouc_wen.model import BoucWenParameters
+    from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
     from baselines.bouc_wen.online import BoucWenOnline
 
 _MODULES = {
-    "BoucWenInverse": "inverse",
+    "BoucWenInverse": "model",
     "BoucWenOnline": "online",
     "BoucWenParameters": "model",
     "identify_bouc_wen": "identify",

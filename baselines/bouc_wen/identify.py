@@ -107,8 +107,7 @@ class _Fit:
             ftol=1e-10,
         )
         theta[free] = found.x
-        found.x = theta.copy()
-        return found
+        return OptimizeResult(found, x=theta.copy())
 
 
 def _independent_samples(residual: FloatArray) -> float:

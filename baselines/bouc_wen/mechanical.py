@@ -78,7 +78,7 @@ class PeriodicRecord:
         return PeriodicRecord(us[0].copy(), ys.mean(axis=0), positive("dt_s", dt_s, "s"), kept, noise)
 
 
-def best_linear_approximation(records: Sequence[PeriodicRecord]) -> tuple[float, float, float]:
+def _best_linear_approximation(records: Sequence[PeriodicRecord]) -> tuple[float, float, float]:
     """m kg, c N s/m, k N/m by least squares of the force spectrum on the spectra of y'', y' and y."""
     rows, targets = [], []
     for record in records:
@@ -235,7 +235,7 @@ def identify_mechanical(
     if not records:
         raise InputError("records: got none, expected at least one periodic record")
     s = float(np.sqrt(np.mean(np.concatenate([r.y_m for r in records]) ** 2)))
-    m, c, k = best_linear_approximation(records)
+    m, c, k = _best_linear_approximation(records)
     if not (m > 0.0 and k > 0.0):
         raise InputError(
             f"records: their linear part has mass {m:.3g} kg, stiffness {k:.3g} N/m, expected both above 0"

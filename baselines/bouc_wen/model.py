@@ -1,4 +1,4 @@
-"""The Bouc-Wen stage (2.1), (2.2) with n = 1, simulated without step-size error.
+"""The Bouc-Wen stage (2.1), (2.2) with n = 1, simulated without step-size error, and its inverse.
 
 Divided by k, (2.1) is a second-order system of unit gain, driven by ``w = u - g`` in volts::
 
@@ -21,9 +21,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from adaptive.compiled import compiled
 from adaptive.errors import InputError
-from adaptive.types import FloatArray, StateDict
-from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
+from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
+from baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
+from baselines.fit_report import Domain
+from baselines.validation import (
+    checked_memory,
+    checked_motion,
+    common_fields,
+    common_state,
+    of_length,
+    positive,
+    std_or_nan,
+)
 
 
 @dataclass(frozen=True)
@@ -125,3 +136,183 @@ class BoucWenParameters:
 
 #: The chapter's identified stage, Table 2.1 (d: 1.1351e-5 m/V).
 TABLE_2_1 = BoucWenParameters(0.2789, 8.9055e5, 3.5244e8, 11.351, 0.4754, 0.8718, 0.9925)
+
+
+# --- The inverse Bouc-Wen model (Fig. 2.5): motion in, voltage out, (u, g) as memory.
+#
+# At each point (2.1) gives the drive that the motion needs, ``w = (y - y0 + (b/k) v + (m/k) a)/d``. The voltage is the
+# root of ``u - g(u) = w`` on the branch that leaves the remembered (u, g). With s = |u - u_prev| this reads
+# ``s - (q(s) - q0) = |w - w_prev|``, a line plus an exponential on each side of q = 0. Newton's method, started from
+# the side where it cannot overshoot, converges to round-off in a few steps.
+
+
+_FLAT = 1e-7
+_NEWTON_LIMIT = 60
+
+
+@compiled
+def _solve(q: float, target: float, alpha: float, rate: float) -> float:
+    """Root s >= 0 of s - (q(s) - q) = target with q' = alpha - rate q.
+
+    The left side rises; it is convex for rate > 0 and concave for rate < 0 (q' > 0 here). The root of the first
+    tangent lies right of the solution, or left of it, and all further ones stay on that side.
+    """
+    if abs(rate) < _FLAT:
+        return target / (1.0 - alpha)
+    span = q - alpha / rate
+    s = target / (1.0 - alpha + rate * q)
+    for _ in range(_NEWTON_LIMIT):
+        shrink = math.expm1(-rate * s)
+        step = (s - span * shrink - target) / (1.0 + span * rate * (shrink + 1.0))
+        s -= step
+        if abs(step) <= 1e-15 * (1.0 + s):
+            break
+    return max(s, 0.0)
+
+
+@compiled
+def voltage(w_V: float, u0_V: float, g0_V: float, alpha: float, beta: float, gamma: float) -> float:
+    """The voltage u with the drive u - g = ``w_V``, on the branch that leaves (u0, g0)."""
+    target = w_V - (u0_V - g0_V)
+    sign = 1.0 if target > 0.0 else -1.0
+    target = abs(target)
+    q = sign * g0_V
+    s = 0.0
+    if q < 0.0:
+        s0 = crossing(q, alpha, beta - gamma)
+        if target < s0 + q:
+            return u0_V + sign * _solve(q, target, alpha, beta - gamma)
+        s, target, q = s0, target - (s0 + q), 0.0
+    return u0_V + sign * (s + _solve(q, target, alpha, beta + gamma))
+
+
+@compiled
+def run_inverse(
+    y_um: FloatArray,
+    v_um_per_s: FloatArray,
+    a_um_per_s2: FloatArray,
+    constants: FloatArray,
+    memory_V: FloatArray,
+    u_V: FloatArray,
+    inside: BoolArray,
+) -> None:
+    """Voltages ``u_V`` (n,) for points (n,); ``memory_V`` = (u, g) is advanced in place.
+
+    ``constants``: 1/d, y0, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max. A point that is not finite gets NaN
+    and does not change the memory.
+    """
+    per_um, offset, lag, inertia, alpha, beta, gamma, y_min, y_max, v_max = constants
+    bound = alpha / (beta + gamma)
+    u, g = memory_V[0], min(max(memory_V[1], -bound), bound)  # so that a memory of other parameters is reachable
+    for k in range(y_um.size):
+        y, v = y_um[k], v_um_per_s[k]
+        w = (y - offset + lag * v + inertia * a_um_per_s2[k]) * per_um
+        if not math.isfinite(w):
+            u_V[k] = np.nan
+            inside[k] = False
+            continue
+        new = voltage(w, u, g, alpha, beta, gamma)
+        g = hysteresis_step(g, new - u, alpha, beta, gamma)
+        u = new
+        u_V[k] = u
+        inside[k] = y_min <= y <= y_max and abs(v) <= v_max
+    memory_V[0], memory_V[1] = u, g
+
+
+@compiled
+def _track(u_V: FloatArray, shape: FloatArray, memory_V: FloatArray) -> None:
+    for k in range(u_V.size):
+        if math.isfinite(u_V[k]):
+            memory_V[1] = hysteresis_step(memory_V[1], u_V[k] - memory_V[0], shape[0], shape[1], shape[2])
+            memory_V[0] = u_V[k]
+
+
+@dataclass(frozen=True)
+class BoucWenInverse:
+    """Inverse of a Bouc-Wen stage; implements ``adaptive.types.InverseModel`` under the name ``bouc_wen``.
+
+    Under the zero-order hold the voltage acts half a sample after its instant on average. The inverse then looks half
+    a sample ahead by the Taylor series of the motion, ``w(t + T/2)``. Under the linear hold the identification has put
+    that delay into b/k, and nothing is added.
+
+    The memory is (u, g) in V, driven by the voltage alone. ``track`` uses the applied voltages and not the measured
+    motion, because (2.2) responds to every reversal and sensor noise would wear the hysteresis off.
+    """
+
+    parameters: BoucWenParameters
+    dt_s: float
+    domain: Domain
+    voltage_std_V: float = math.nan
+    name: str = "bouc_wen"
+    _constants: FloatArray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        positive("dt_s", self.dt_s, "s")
+        std_or_nan("voltage_std_V", self.voltage_std_V, "V")
+        p, domain = self.parameters, self.domain
+        ahead = 0.5 * self.dt_s if p.hold == "zero_order" else 0.0
+        constants = [
+            1.0 / p.d_um_per_V,
+            p.offset_um,
+            p.lag_s + ahead,
+            p.inertia_s2 + p.lag_s * ahead + 0.5 * ahead * ahead,
+            p.alpha,
+            p.beta_per_V,
+            p.gamma_per_V,
+            domain.y_min_um,
+            domain.y_max_um,
+            domain.v_max_um_per_s,
+        ]
+        object.__setattr__(self, "_constants", np.array(constants, dtype=np.float64))
+
+    @property
+    def memory_size(self) -> int:
+        """2: last voltage and hysteresis, V."""
+        return 2
+
+    def rest_memory(self, y_um: float) -> FloatArray:
+        """(u, g) V after a monotone motion from rest at 0 V to ``y_um`` µm."""
+        y, rest = np.array([float(y_um)]), np.zeros(1)
+        return self.feedforward(y, rest, rest, np.zeros(2)).memory
+
+    def feedforward(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
+    ) -> Feedforward:
+        """Voltages (n,) V for points (n,). Raises InputError on bad shapes."""
+        y, v, a = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, 2)
+        u, inside = np.empty(y.size), np.empty(y.size, dtype=np.bool_)
+        run_inverse(y, v, a, self._constants, after, u, inside)
+        std = np.empty(y.size)
+        std.fill(self.voltage_std_V)
+        return Feedforward(u, std, inside, after)
+
+    def track(
+        self,
+        y_um: FloatArray,
+        v_um_per_s: FloatArray,
+        a_um_per_s2: FloatArray,
+        u_V: FloatArray,
+        memory: FloatArray,
+    ) -> FloatArray:
+        """(u, g) after the voltages ``u_V`` (n,) were applied; values that are not finite are skipped."""
+        y, _, _ = checked_motion(y_um, v_um_per_s, a_um_per_s2)
+        after = checked_memory(memory, 2)
+        _track(of_length("u_V", u_V, y.size), self.parameters.shape, after)
+        return after
+
+    def carry(self, y_um: FloatArray, u_V: FloatArray, memory: FloatArray) -> None:
+        """``track`` in place and without checks; ``u_V`` (n,) V is contiguous."""
+        _track(u_V, self.parameters.shape, memory)
+
+    def state_dict(self) -> StateDict:
+        """Flat numbers by name."""
+        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
+        return {**state, "name": self.name, **self.parameters.state_dict()}
+
+    @staticmethod
+    def from_state(state: StateDict) -> BoucWenInverse:
+        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
+        dt_s, std_V, domain = common_fields("bouc_wen", state)
+        parameters = BoucWenParameters.from_state(state)
+        return BoucWenInverse(parameters, dt_s, domain, std_V, str(state.get("name", "bouc_wen")))

@@ -19,7 +19,7 @@ from adaptive.errors import InputError
 from adaptive.online import drift as drift_step
 from adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
 from adaptive.types import FloatArray, StateDict, prefixed, under
-from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import BoucWenInverse
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
 from baselines.online_baseline import OnlineBaseline, field_of
 

@@ -1,8 +1,7 @@
 """Several online models on the same samples; the best is served.
 
-`Competition` runs them, ``scoring`` measures their errors, ``champion_choice`` decides, `ChampionInverse` is the
-inverse model that is served, and ``contestants`` lists what can compete. The names are loaded on first use, because
-`CompetitionConfig` needs no numerics.
+`Competition` runs and scores them and chooses the champion, `ChampionInverse` is the inverse model that is served. The
+names are loaded on first use, because `CompetitionConfig` needs no numerics.
 """
 
 from __future__ import annotations

@@ -21,9 +21,9 @@ from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
 from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse, evaluate_point
 from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
-from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import BoucWenInverse
 from baselines.linear import LinearInverse
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiInverse
 
 #: Class of a contestant's inverse model by the name that stored states use.
 INVERSE_KINDS: Final[dict[str, Any]] = {
@@ -55,7 +55,7 @@ class StatesValidity(Protocol):
         ...
 
 
-def memory_advance_of(model: InverseModel) -> AdvanceMemory:
+def _memory_advance_of(model: InverseModel) -> AdvanceMemory:
     """The function that advances the memory of ``model`` over answers of another model."""
     if isinstance(model, AdvancesMemory):
         return model.carry
@@ -72,13 +72,13 @@ def _advances_but(
 ) -> tuple[tuple[AdvanceMemory, slice], ...]:
     """The advance functions of all models with a memory except the champion, with their parts of the whole memory."""
     return tuple(
-        (memory_advance_of(model), part)
+        (_memory_advance_of(model), part)
         for i, (model, part) in enumerate(zip(models, parts, strict=True))
         if i != champion and part.stop > part.start
     )
 
 
-def inverse_kind_of(model: InverseModel) -> str:
+def _inverse_kind_of(model: InverseModel) -> str:
     """Name of the model's class in stored states. Raises InputError for a class that has none."""
     for kind, known in INVERSE_KINDS.items():
         if type(model) is known:
@@ -194,7 +194,7 @@ class ChampionInverse:
         for i, (model, part) in enumerate(zip(self.models, parts, strict=True)):
             end = answers[i].memory if i in answers else part.copy()
             if i not in answers and part.size:
-                memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
+                _memory_advance_of(model)(np.ascontiguousarray(y_um, dtype=np.float64), u, end)
             ends.append(end if np.isfinite(end).all() else part)
         return Feedforward(u, std, inside, np.concatenate([weights[-1] if n else shares, *ends]))
 
@@ -297,7 +297,7 @@ class ChampionInverse:
 
     def state_dict(self) -> StateDict:
         """Flat entries; contestants under ``NAME.``. Raises InputError for a class that cannot be stored."""
-        kinds = [inverse_kind_of(model) for model in self.models]
+        kinds = [_inverse_kind_of(model) for model in self.models]
         state: StateDict = {
             "name": self.name,
             "names": ",".join(self.names),

@@ -12,13 +12,12 @@ from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
-    from baselines.prandtl_ishlinskii.inverse import MpiInverse
-    from baselines.prandtl_ishlinskii.model import MpiParameters
+    from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
     from baselines.prandtl_ishlinskii.online import MpiOnline
 
 _MODULES = {
     "MpiGrid": "identify",
-    "MpiInverse": "inverse",
+    "MpiInverse": "model",
     "MpiOnline": "online",
     "MpiParameters": "model",
     "identify_mpi": "identify",

@@ -9,12 +9,10 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.online.drift import joseph, walk
 from adaptive.types import FloatArray, StateDict, prefixed, under
-from baselines.online_baseline import field_of
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
 from baselines.prandtl_ishlinskii.identify import MpiGrid
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import inverse_thresholds, inverse_weights
+from baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
 from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
-from baselines.recursive_least_squares import LeastSquaresConfig, LeastSquaresOnline, config_from
 
 #: Random walk of gain and offset per square root of a second of teaching: relative, and as a share of the stroke.
 GAIN_WALK, OFFSET_WALK = 0.02, 0.01

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         (args.out / "rehearsal.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         (args.out / "rehearsal.md").write_text(table(done, markdown=True) + "\n", encoding="utf-8")
         if not args.no_pictures:
-            from lab.rehearsal.pictures import draw_rehearsal
+            from lab.rehearsal.rehearsal import draw_rehearsal
 
             draw_rehearsal(args.out / "rehearsal.png", done)
     except OSError as error:

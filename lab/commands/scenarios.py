@@ -15,7 +15,7 @@ from service.cli.options import add_epilog, add_shared, make_folder, progress_pr
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from lab.scenarios.judgement import Verdict
+    from lab.scenarios import Verdict
 
 EPILOG = """\
 Two twin stages have the same noise and the same reference. The learning model steers one, the same model as identified
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
-    from lab.scenarios.judgement import draw_overview, table
+    from lab.scenarios import draw_overview, table
     from service.config.learner import read_learner_settings
 
     if not 1 <= args.seeds <= 1000:
@@ -114,8 +114,7 @@ def _all(tasks: list[tuple[str, int, float, dict[str, Any], Path | None]], jobs:
 
 
 def _one(task: tuple[str, int, float, dict[str, Any], Path | None]) -> Verdict:
-    from lab.scenarios.judgement import draw_course, judge
-    from lab.scenarios.run import run_scenario
+    from lab.scenarios import draw_course, judge, run_scenario
     from sim.scenarios import scenario
 
     kind, seed, rest_s, settings, out = task

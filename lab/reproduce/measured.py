@@ -19,11 +19,9 @@ from adaptive.online.learner import Learner
 from adaptive.types import FloatArray
 from baselines.bouc_wen.mechanical import MechanicalBoucWen, MechanicalReport, PeriodicRecord, identify_mechanical
 from service.identification.identifying import SETTLE_SHARE, Identified, Stretch, identify_all, score_of
-from sim.chapter.adaptive_loop import BlockConfig, replay
-from sim.chapter.control import Control, learner_of, run_control
+from sim.chapter.control import BlockConfig, Control, ReplayRun, learner_of, replay, replay_records, run_control
 from sim.chapter.experiments import Characterisation, Experiments, characterise, experiments
 from sim.chapter.modelling import ForwardRun, identify_forward
-from sim.chapter.replayed import ReplayRun, replay_records
 from sim.recordings import ColumnMap, read, repaired
 
 # --- The models on data from others: a measured stack actuator, and the Bouc-Wen benchmark.

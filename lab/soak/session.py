@@ -59,7 +59,7 @@ def run_fast(
     limits = Limits(control.u_min_V, control.u_max_V, control.slew_V_per_s)
     config = AxisConfig(AXIS, out / "model.npz", limits, served=SERVED, snapshot_every=control.block)
     turn = _Turns(Stage(stage), load_axis(STAGE, config), control)
-    observed.seconds = turn.track.seconds
+    observed.follow(turn.track.seconds)
     waiting = list(plan.faults)
     under_way: list[tuple[float, FaultRecord]] = []
     begin, reported_s = time.monotonic(), 0.0
@@ -72,13 +72,13 @@ def run_fast(
             under_way.append((fault.end_s, record))
         for end_s, record in list(under_way):
             if end_s <= turn.now_s:
-                record.end_s = turn.now_s
+                record.end(turn.now_s)
                 under_way.remove((end_s, record))
         turn.step()
         if turn.second_is_over():
             observed.counters.append((turn.now_s, "service", Counters(flatten_status(turn.status()))))
             # In a service the axis loop publishes them.
-            observed.events += [{"t_s": turn.now_s, **event} for event in turn.axis.take_events()]
+            observed.events.extend({"t_s": turn.now_s, **event} for event in turn.axis.take_events())
             interim.due(turn.now_s, lambda: _samples(turn))
         if time.monotonic() - reported_s >= _PROGRESS_S:
             reported_s = time.monotonic()
@@ -90,8 +90,7 @@ def run_fast(
                 f"  [{'#' * round(20 * min(1.0, done)):<20}] {turn.now_s:6.0f} of {plan.duration_s:g} s  {error}"
                 f"{len(observed.faults)} of {len(plan.faults)} faults, {speed:.1f} times as fast as real time"
             )
-    observed.duration_s = turn.now_s
-    observed.seconds = turn.track.seconds[:-1] or turn.track.seconds
+    observed.end(turn.now_s, turn.track.seconds)
     observed.notes.append("In one process: latency, memory, recordings and take-overs are not part of this run.")
     return _samples(turn)
 
@@ -225,8 +224,8 @@ def run(
     say(f"[2/3] {plan.duration_s:g} s with {len(plan.faults)} faults, {where}")
     if plan.left_out:
         say(f"      no time for: {', '.join(plan.left_out)}")
-    observed = Observations(0.0, control.range_um, control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME)
-    observed.planned = len(plan.faults)
+    step_V, mode = control.slew_V_per_s * control.dt_s, FAST if fast else REAL_TIME
+    observed = Observations(0.0, control.range_um, step_V, mode, planned=len(plan.faults))
     # For a stage from a file the limit is known only when the first fault begins; it is judged at the end.
     interim = InterimJudge(observed, out / "soak.json", say, TRACKING_PCT if stage_file is None else None)
     missing: int | None = None
@@ -241,7 +240,7 @@ def run(
     assess_recovery(observed)
     invariants = judge(observed, missing, **_tracking_limit(observed, stage_file))
     found = soak_summary(observed, invariants, samples)
-    observed.notes += _machine(observed)
+    observed.notes.extend(_machine(observed))
     interrupted = observed.duration_s < plan.duration_s - 1.0
     write_summary(out / "soak.json", found)
     write_seconds(out / SECONDS, observed)

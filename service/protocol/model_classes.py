@@ -14,8 +14,8 @@ from adaptive.types import InverseModel, StateDict
 MODEL_CLASSES: Final = {
     "lssvm": "adaptive.inverse_model:LssvmInverse",
     "linear": "baselines.linear:LinearInverse",
-    "bouc_wen": "baselines.bouc_wen.inverse:BoucWenInverse",
-    "mpi": "baselines.prandtl_ishlinskii.inverse:MpiInverse",
+    "bouc_wen": "baselines.bouc_wen.model:BoucWenInverse",
+    "mpi": "baselines.prandtl_ishlinskii.model:MpiInverse",
     "champion": "baselines.competition.champion:ChampionInverse",
 }
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from sim.chapter.adaptive_loop import track_learning
-    from sim.chapter.control import run_control
+    from sim.chapter.control import run_control, track_learning
     from sim.chapter.experiments import Experiments, Record, Score, characterise
     from sim.chapter.modelling import identify_forward
 
@@ -23,7 +22,7 @@ _MODULES = {
     "characterise": "experiments",
     "identify_forward": "modelling",
     "run_control": "control",
-    "track_learning": "adaptive_loop",
+    "track_learning": "control",
 }
 __all__ = [
     "Experiments",

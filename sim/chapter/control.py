@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,17 +13,119 @@ from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
-from adaptive.types import FloatArray, InverseModel, OnlineModel
-from baselines.competition.contestants import online_form
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from baselines.competition.competition import online_form
 from baselines.fit import fit_bouc_wen, fit_mpi
-from sim.chapter.adaptive_loop import track_learning
 from sim.chapter.experiments import DT_S, Experiments, Record, Score
 from sim.effects import effect
 from sim.signals.references import Reference, blend_step, demo_reference
 from sim.signals.voltages import sample_times
 from sim.stage.closed_loop import CHAPTER_GAINS, PID, Run, UltimateGain, track, ultimate_gain
 from sim.stage.config import StageConfig
-from sim.stage.stage import Stage
+from sim.stage.stage import Stage, StageState
+
+# --- Control and replay with a model that learns while it serves, in one process and without a clock.
+#
+# Block by block, a snapshot that has seen no sample of the last ``delay_blocks`` blocks gives the voltages of the next
+# one. The stage runs on them, with feedback added sample by sample, and its samples then teach the model. That is what
+# the service does.
+
+
+@dataclass(frozen=True, slots=True)
+class BlockConfig:
+    """block : samples answered at once, >= 1. delay_blocks : age of the answering snapshot, blocks, >= 1.
+
+    Raises InputError on smaller values.
+    """
+
+    block: int = 20
+    delay_blocks: int = 3
+
+    def __post_init__(self) -> None:
+        if self.block < 1 or self.delay_blocks < 1:
+            raise InputError(f"block, delay_blocks: got {self.block}, {self.delay_blocks}, expected at least 1 each")
+
+
+def track_learning(
+    stage: Stage,
+    reference: Reference,
+    online: OnlineModel,
+    *,
+    pid: PID | None = None,
+    state: StageState | None = None,
+    config: BlockConfig | None = None,
+) -> Run:
+    """Follow ``reference`` with the feedforward of a model that learns; ``online`` and ``state`` are advanced.
+
+    Without ``state`` the stage starts at rest. The memory starts at rest at 0 µm and is passed from block to block.
+    Limits and the integral of the feedback are handled as in ``sim.stage.closed_loop.track``.
+    """
+    config = config or BlockConfig()
+    state = state or stage.initial_state()
+    n, dt_s = reference.y_um.size, stage.config.dt_s
+    first = state.k
+    low, high = stage.config.u_min_V, stage.config.u_max_V
+    y, u, forward, feedback = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
+    memory = snapshots[0].rest_memory(0.0)
+    fed = pid.initial_state() if pid is not None else None
+    for start in range(0, n, config.block):
+        part = slice(start, min(n, start + config.block))
+        answer = snapshots[0].feedforward(
+            reference.y_um[part], reference.v_um_per_s[part], reference.a_um_per_s2[part], memory
+        )
+        memory = answer.memory
+        forward[part] = answer.u_V
+        if pid is None or fed is None:
+            u[part] = np.clip(answer.u_V, low, high)
+            y[part], _ = stage.run(state, u[part])
+        else:
+            for k in range(part.start, part.stop):
+                y[k] = stage.read(state)[0]
+                feedback[k] = pid.step(fed, float(reference.y_um[k]) - y[k])
+                wanted = float(forward[k]) + feedback[k]
+                u[k] = min(max(wanted, low), high)
+                fed.limit(wanted, float(u[k]))
+                stage.step(state, float(u[k]))
+        for k in range(part.start, part.stop):
+            online.handle(Sample(first + k, (first + k) * dt_s, float(u[k]), float(y[k])))
+        snapshots.append(online.snapshot())
+    t_s = np.arange(first, first + n, dtype=np.float64) * dt_s
+    return Run(t_s, reference.y_um, y, u, forward, feedback)
+
+
+def replay(
+    online: OnlineModel,
+    motion: FloatArray,
+    u_V: FloatArray,
+    y_um: FloatArray,
+    dt_s: float,
+    config: BlockConfig | None = None,
+) -> FloatArray:
+    """Voltages (n,) V that a learning model would have given for a recorded motion, learning from it block by block.
+
+    ``motion`` (n, 3) is smoothed displacement, velocity and acceleration; ``u_V``, ``y_um`` (n,) are the applied
+    voltages and the readings. A block is answered by a snapshot that has seen neither it nor the ``delay_blocks - 1``
+    blocks before. ``online`` is advanced. Raises InputError on bad shapes.
+    """
+    config = config or BlockConfig()
+    n = u_V.size
+    if motion.shape != (n, 3) or y_um.shape != (n,):
+        raise InputError(f"motion, y_um: got {motion.shape}, {y_um.shape}, expected ({n}, 3) and ({n},)")
+    y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
+    snapshots: deque[InverseModel] = deque([online.snapshot()], maxlen=config.delay_blocks)
+    memory = snapshots[0].rest_memory(float(y[0]))
+    out = np.empty(n)
+    for start in range(0, n, config.block):
+        part = slice(start, min(n, start + config.block))
+        model = snapshots[0]
+        out[part] = model.feedforward(y[part], v[part], a[part], memory).u_V
+        memory = model.track(y[part], v[part], a[part], u_V[part], memory)
+        for k in range(part.start, part.stop):
+            online.handle(Sample(k, k * dt_s, float(u_V[k]), float(y_um[k])))
+        snapshots.append(online.snapshot())
+    return out
+
 
 # --- References for the controllers: the response to (2.45), the chapter's shapes, and a family that it lacks.
 
@@ -273,3 +376,54 @@ def moving_mae(error_um: FloatArray, range_um: float, span_s: float = 0.5) -> Fl
     at = np.arange(1, error_um.size + 1)
     since = np.maximum(at - n, 0)
     return np.asarray((total[at] - total[since]) / (at - since) * (100.0 / range_um), dtype=np.float64)
+
+
+# --- Table 2.4 for inverse models: voltages for the motion of every record, from frozen and from learning models.
+#
+# The error is a voltage. Times the mean gain of the training record it is a displacement, comparable with the errors of
+# the forward models. A learning model answers each block from a snapshot of its past.
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRun:
+    """Scores of one inverse model by record: (2.45), then the records of the third family."""
+
+    model: str
+    scores: dict[str, Score]
+
+    @property
+    def third_mae_pct(self) -> float:
+        """Mean MAE over the third family."""
+        return float(np.mean([score.mae_pct for name, score in self.scores.items() if name != "generalisation"]))
+
+
+def replay_records(
+    data: Experiments,
+    inverses: dict[str, Inverse],
+    *,
+    quick: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[ReplayRun, ...]:
+    """Scores of every frozen and learning model on all records except the training one; ``quick``: on two records."""
+    gain = float(np.polyfit(data.training.u_V, data.training.y_um, 1)[0])
+    records = (data.generalisation, *(data.third[:1] if quick else data.third))
+    progress("replaying the records through the inverse models")
+    runs = []
+    for key in FROZEN:
+        runs.append(ReplayRun(key, dict(_scores(records, inverses[key].model, False, gain, data.range_um))))
+    for key, (_, base) in LEARNING.items():
+        runs.append(ReplayRun(key, dict(_scores(records, inverses[base].model, True, gain, data.range_um))))
+    return tuple(runs)
+
+
+def _scores(
+    records: tuple[Record, ...], model: InverseModel, learns: bool, gain: float, range_um: float
+) -> Iterator[tuple[str, Score]]:
+    for record in records:
+        motion = smooth_recording(record.y_um, SmootherConfig.for_rate(DT_S))
+        if learns:
+            u = replay(learner_of(model), motion, record.u_V, record.y_um, DT_S)
+        else:
+            y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
+            u = model.feedforward(y, v, a, model.rest_memory(float(y[0]))).u_V
+        yield record.name, Score.of((u - record.u_V) * gain, range_um)

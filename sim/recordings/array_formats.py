@@ -6,7 +6,10 @@ h5py, npTDMS and openpyxl are imported when a file of theirs is read.
 from __future__ import annotations
 
 import io
+import json
 import logging
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,11 @@ from sim.recordings.text_formats import different, from_arrow, has_names, units_
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: MATLAB puts a text header of this length before the HDF5 data of version 7.3.
 _MATLAB_HEADER = 512
+_MATLAB_4_HEADER = 20
+#: Time to read a MATLAB file of version 4 to 7: to start the process on a busy machine, s, and bytes per second.
+MATLAB_TIME_S, _MATLAB_BYTES_PER_S = 60.0, 5e6
+#: Most memory of the process that reads it: the file, its arrays, and the interpreter with scipy.
+MATLAB_MEMORY_BYTES = 3 * MAX_BYTES
 #: Deepest nesting of groups in an HDF5 file, and most of its members: more is a loop of links.
 _DEEPEST, _MOST_MEMBERS = 16, 10_000
 
@@ -42,37 +50,39 @@ def read_parquet(path: Path, content: bytes) -> Table:
 
 
 def read_mat(path: Path, content: bytes) -> Table:
-    """MATLAB files of all versions; fields of structures get dotted names (``rec.u``)."""
-    from scipy.io import loadmat
+    """MATLAB files of all versions; fields of structures get dotted names (``rec.u``).
 
+    Versions 4 to 7 are read in a process of their own, which a damaged file may end (`matlab_process`).
+    """
     if content[_MATLAB_HEADER : _MATLAB_HEADER + len(HDF5_SIGNATURE)] == HDF5_SIGNATURE:
         return read_hdf5(path, content)
+    # Version 4 begins with a number of four bytes, versions 5 to 7 with a text and the order of bytes behind it.
+    if len(content) < _MATLAB_4_HEADER or not (0 in content[:4] or content[126:128] in (b"IM", b"MI")):
+        raise InputError(f"{path}: is not a .mat file (no header of MATLAB's), expected a recording")
+    command = [sys.executable, "-P", str(Path(__file__).with_name("matlab_process.py")), str(MATLAB_MEMORY_BYTES)]
+    limit_s = MATLAB_TIME_S + len(content) / _MATLAB_BYTES_PER_S
     try:
-        variables = loadmat(io.BytesIO(content), squeeze_me=True)
-    except NotImplementedError as error:
+        done = subprocess.run(command, input=content, capture_output=True, timeout=limit_s, check=False)
+    except subprocess.TimeoutExpired as error:
         raise InputError(
-            f"{path}: announces MATLAB 7.3 (HDF5) and holds no HDF5 data, expected a whole file: save it again"
+            f"{path}: is not a whole .mat file (not read within {limit_s:.0f} s), expected a recording: save it again"
         ) from error
-    except Exception as error:  # scipy raises many kinds of errors on a damaged file
-        raise InputError(f"{path}: is not a whole .mat file ({error})") from error
-    arrays: dict[str, NDArray[Any]] = {}
-    left_out: list[str] = []
-    for name, value in variables.items():
-        if not name.startswith("__"):
-            _flatten(name, np.asarray(value), arrays, left_out)
-    return Table(str(path), arrays, left_out=tuple(left_out))
-
-
-def _flatten(name: str, value: NDArray[Any], into: dict[str, NDArray[Any]], left_out: list[str]) -> None:
-    """Add a numeric array, or each field of a structure; texts, cells, tables and objects are left out."""
-    if value.dtype.names is not None and value.ndim == 0:
-        for field in value.dtype.names:
-            _flatten(f"{name}.{field}", np.asarray(value[field].item()), into, left_out)
-    elif value.dtype.kind in "fiubc":
-        into[name] = value
-    else:
-        kind = "text" if value.dtype.kind in "SU" else "no array of numbers"
-        left_out.append(f"{name} ({kind})")
+    try:
+        if done.returncode:
+            said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+            raise ValueError(f"its reader ended with {done.returncode}{f': {said[-1][:200]}' if said else ''}")
+        answer = io.BytesIO(done.stdout)
+        line = json.loads(answer.readline())
+        if "error" in line:
+            if line["kind"] == "NotImplementedError":
+                raise InputError(
+                    f"{path}: announces MATLAB 7.3 (HDF5) and holds no HDF5 data, expected a whole file: save it again"
+                )
+            raise ValueError(line["error"] or line["kind"])
+        arrays = {name: np.lib.format.read_array(answer, allow_pickle=False) for name in line["names"]}
+    except ValueError as error:
+        raise InputError(f"{path}: is not a whole .mat file ({error}), expected one: save it again") from error
+    return Table(str(path), arrays, left_out=tuple(line["left_out"]))
 
 
 def read_hdf5(path: Path, content: bytes) -> Table:

@@ -69,6 +69,10 @@ class PIDState:
     e1_um: float = 0.0
     e2_um: float = 0.0
 
+    def limit(self, wanted_V: float, applied_V: float) -> None:
+        """Take the part of the output that the voltage limits cut off out of the integral."""
+        self.u_V += applied_V - wanted_V
+
 
 @dataclass(frozen=True, slots=True)
 class Run:
@@ -142,7 +146,7 @@ def track(
             back = pid.step(memory_pid, float(reference.y_um[k]) - reading)
             wanted = float(forward[k]) + back
             applied = min(max(wanted, low), high)
-            memory_pid.u_V += applied - wanted
+            memory_pid.limit(wanted, applied)
             stage.step(state, applied, 0.0 if u2_V is None else float(u2_V[k]))
             y[k], u[k], feedback[k] = reading, applied, back
     t_s = np.arange(first, first + n, dtype=np.float64) * dt_s

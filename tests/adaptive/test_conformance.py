@@ -15,14 +15,12 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import Learner
 from adaptive.types import InverseModel, OnlineModel, Sample
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
 from baselines.competition.competition import Competition
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearOnline, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
 
 DT, N = 1e-3, 1500

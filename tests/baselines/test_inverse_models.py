@@ -11,12 +11,10 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import InverseModel
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 
 SEEN = Domain(0.0, 88.0, 2000.0)
 MPI = MpiParameters((0.0, 0.5, 1.5), (8.0, 1.5, 1.0), (0.0, 30.0), (1.0, -0.1), c_um=0.4, y_ref_um=-3.0, lag_s=1e-3)

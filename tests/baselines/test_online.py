@@ -9,16 +9,14 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, Sample
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearOnline, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.online_baseline import LeastSquaresConfig
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from baselines.prandtl_ishlinskii.operators import play_run
-from baselines.recursive_least_squares import LeastSquaresConfig
 
 DT = 1e-3
 SEEN = Domain(0.0, 80.0, 2000.0)

@@ -143,11 +143,11 @@ class InterimJudge:
             last += 1
         if first == last:
             return
-        part = _part(self._ledger, faults[first].begin_s - _BEFORE_S, now_s, now_s)
+        seen = _part(self._ledger, faults[first].begin_s - _BEFORE_S, now_s, now_s)
         # With the next fault: from its beginning on, a silence belongs to it.
-        part.faults = [replace(fault) for fault in faults[first : last + 1]]
-        assess_recovery(part, last - first)
-        part.faults = part.faults[: last - first]
+        copies = [replace(fault) for fault in faults[first : last + 1]]
+        assess_recovery(replace(seen, faults=copies), last - first)
+        part = replace(seen, faults=copies[: last - first])
         self._settled += part.faults
         self._add({"recovers_by_itself": recovers(part), "faults_told": faults_told(part)})
         if part.mode != FAST:

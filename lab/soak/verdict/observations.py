@@ -289,6 +289,10 @@ class FaultRecord:
     look_until_s: float = 0.0
     value: float = 0.0
 
+    def end(self, now_s: float) -> None:
+        """It ends now."""
+        self.end_s = now_s
+
     @property
     def ended(self) -> bool:
         """Whether it has ended."""
@@ -359,6 +363,19 @@ class Observations:
     planned: int = 0
     loop_delays: list[tuple[float, float]] = field(default_factory=list)
     other_load: list[tuple[float, float]] = field(default_factory=list)
+
+    def follow(self, seconds: list[SampleSecond], events: list[dict[str, Any]] | None = None) -> None:
+        """Take the seconds, and the events if given, from these lists, which another object continues to fill."""
+        self.seconds = seconds
+        self.events = self.events if events is None else events
+
+    def end(self, duration_s: float, seconds: list[SampleSecond]) -> None:
+        """The run is over. Its last second is not whole and is left out unless it is the only one."""
+        self.duration_s, self.seconds = duration_s, seconds[:-1] or seconds
+
+    def note_unsafe_blocks(self, count: int) -> None:
+        """Take the controller's count so far; a controller that was started again counts from zero."""
+        self.unsafe_blocks = max(self.unsafe_blocks, count)
 
     def quiet(self, t_s: float) -> bool:
         """Whether no fault and no recovery is under way at ``t_s``.

@@ -15,8 +15,7 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
-from adaptive.online.learner import Learner
-from adaptive.online.validity import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement
+from adaptive.online.learner import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement, Learner
 
 ENTER_V, LEAVE_V = 0.25, 1.0
 BETWEEN_V = 0.5

@@ -19,9 +19,8 @@ from adaptive.online.kernel_window import ResidualWindow
 from adaptive.types import FloatArray
 from adaptive.window import healing as window_refresh
 from adaptive.window.arrays import CHOLESKY_FORM, FORM, TOLERANCE, Status
-from adaptive.window.config import Form, SolverConfig, WindowConfig
 from adaptive.window.healing import STEPS, Refresh
-from adaptive.window.window import Window
+from adaptive.window.window import Form, SolverConfig, Window, WindowConfig
 
 # --- A worn-out window is healed beside its work, at the same sample whatever the thread does.
 

@@ -15,8 +15,7 @@ from adaptive.window import arrays as ws
 from adaptive.window import healing as window_refresh
 from adaptive.window import steps
 from adaptive.window.arrays import Status
-from adaptive.window.config import Form, WindowConfig
-from adaptive.window.window import Window
+from adaptive.window.window import Form, Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, GAMMA, WIDTHS, filled, forms, sample
 
 HELD = 12

@@ -16,9 +16,8 @@ from adaptive.types import FloatArray
 from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import Status, handle_of
-from adaptive.window.config import Form, WindowConfig
 from adaptive.window.healing import begin
-from adaptive.window.window import Window
+from adaptive.window.window import Form, Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
 
 # --- The sliding window in both forms, against the direct solver and against itself.

@@ -9,8 +9,7 @@ import pytest
 
 from adaptive import lssvm
 from adaptive.window.arrays import BETA, Status
-from adaptive.window.config import Form, WindowConfig
-from adaptive.window.window import Window
+from adaptive.window.window import Form, Window, WindowConfig
 
 FORMS: list[Form] = ["inverse", "cholesky"]
 forms = pytest.mark.parametrize("form", FORMS)

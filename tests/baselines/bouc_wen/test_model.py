@@ -14,9 +14,8 @@ from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen.inverse import BoucWenInverse
 from baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenParameters
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
 from baselines.fit_report import Domain
 

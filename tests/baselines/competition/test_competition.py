@@ -13,16 +13,13 @@ from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, Sample
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import BoucWenParameters
+from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition
+from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition, with_deviation_of_at_least
 from baselines.competition.config import CompetitionConfig
-from baselines.competition.contestants import with_deviation_of_at_least
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from tests.online_models import PlainModel
 

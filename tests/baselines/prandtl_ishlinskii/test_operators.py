@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from adaptive.errors import InputError
 from baselines.fit_report import Domain
 from baselines.prandtl_ishlinskii import operators
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
 from baselines.prandtl_ishlinskii.model import (
+    MpiInverse,
     MpiParameters,
     from_inverse_saturation,
     inverse_thresholds,

@@ -19,12 +19,10 @@ from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.inverse import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from lab.cli import main
 from service.answers.guard import Limits
 from service.config.learner import read_learner_settings

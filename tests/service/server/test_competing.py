@@ -392,7 +392,7 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
         "sys.meta_path.insert(0, Blocked())\n"
         "import service.server.axis_server, service.server.axis_loading, service.background.retuning.retuner\n"
         "from service.background.retuning.worker import _search\n"
-        "assert 'baselines.swarm.evidence' not in sys.modules\n"
+        "assert 'baselines.swarm.evidence_search' not in sys.modules\n"
         "print(_search(True)[1])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)

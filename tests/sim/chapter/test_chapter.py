@@ -12,20 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from baselines.bouc_wen.inverse import BoucWenInverse
-from baselines.bouc_wen.model import TABLE_2_1
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.fit import fit_bouc_wen
 from baselines.fit_report import Domain
 from sim.chapter import published
-from sim.chapter.adaptive_loop import BlockConfig, replay, track_learning
 from sim.chapter.control import (
+    BlockConfig,
     changing,
     chapter_reference,
     control_references,
     learner_of,
     moving_mae,
+    replay,
     run_control,
     sine_reference,
+    track_learning,
     training_reference,
 )
 from sim.chapter.experiments import DT_S, EVERY, Experiments, Score, characterise, experiments, loop_width

@@ -10,8 +10,20 @@ import numpy as np
 import pytest
 
 from lab.cli import main
-from lab.scenarios.judgement import FACTOR, FLOORS, draw_course, draw_overview, judge, table, windows
-from lab.scenarios.run import ADAPTIVE, FROZEN, ScenarioRecord, noise_floor_um, run_scenario
+from lab.scenarios import (
+    ADAPTIVE,
+    FACTOR,
+    FLOORS,
+    FROZEN,
+    ScenarioRecord,
+    draw_course,
+    draw_overview,
+    judge,
+    noise_floor_um,
+    run_scenario,
+    table,
+    windows,
+)
 from sim.scenarios import LOW_UM, SCENARIO_KINDS, Scenario, dwell, scenario
 from sim.signals.references import DemoReference, Sequenced, Shifted, Tones, strokes
 from sim.stage.presets import preset
@@ -167,7 +179,7 @@ def test_the_command_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytes
 def test_the_command_writes_numbers_and_says_by_its_status_whether_all_held(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lab.scenarios import run as scenarios_run
+    from lab import scenarios as scenarios_run
 
     settings_seen = []
 
