@@ -20,13 +20,11 @@ import numpy as np
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
-from baselines.bouc_wen.model import BoucWenInverse
-from baselines.bouc_wen.model import BoucWenParameters
+from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
 from baselines.competition.champion import ChampionInverse
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
-from baselines.prandtl_ishlinskii.model import MpiInverse
-from baselines.prandtl_ishlinskii.model import MpiParameters
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
