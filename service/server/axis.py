@@ -33,8 +33,9 @@ from service.protocol.model import Safety
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.competing import champion_of
-from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, fingerprint
+from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, check_same_learner, fingerprint
 from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
+from service.server.state_schema import StateSchema
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
 
@@ -119,8 +120,11 @@ class Archive(Protocol):
         """The checkpoints, newest first."""
         ...
 
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint. Raises FieldError if there is none with this number, or it does not fit."""
+    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
+        """The learner of a checkpoint, whose state passes ``check``.
+
+        Raises FieldError if there is none with this number, or it does not fit.
+        """
         ...
 
 
@@ -143,6 +147,8 @@ class Axis:
     limits : those of ``config``, with a displacement range filled in.
     revive : starts another learner from a model, some time after a learner has failed; None: it stays failed.
     stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
+    template : state of a learner like ``learner`` that has learnt some samples: what a state to restore must look like.
+        By default that of ``learner`` itself.
 
     Raises InputError if ``config`` names a model that is missing, or if the sample times differ.
     """
@@ -157,6 +163,7 @@ class Axis:
         *,
         stage: str = "",
         archive: Archive | None = None,
+        template: StateDict | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
             config = replace(config, served=config.learn or LEARN)  # without a competition
@@ -186,6 +193,10 @@ class Axis:
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
         self.counts = SampleCounts(-1, self.sequence.counters(), {})
         self._age_s = 0.0
+        if template is None:
+            template = {} if learner is None else learner.state_dict()
+        sizes = {name: memory.size for name, memory in self.newest.memories.items()}
+        self._schema = StateSchema(template, sizes)
 
     # ---- what other threads read
 
@@ -424,7 +435,7 @@ class Axis:
         """
         if self._archive is None or self.learner is None:
             raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
-        learner = self._archive.learner_of(checkpoint, self.learner)
+        learner = self._archive.learner_of(checkpoint, self.learner, self._check_state)
         self.supervisor.replace(learner)
         newest = self.newest
         changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}
@@ -465,6 +476,7 @@ class Axis:
 
     def restore(self, state: StateDict) -> None:
         """Continue from ``state``. Raises ModelFileError if it does not fit; the axis is then unchanged."""
+        self._check_state(state)
         try:
             sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)
             sequence.restore(under("sequence.", state))
@@ -474,13 +486,27 @@ class Axis:
             served = self._restored_snapshot(state, supervisor)
             gates = {name: int(count) for name, count in under("gates.", state).items()}
             seq = int(state["seq"])
-        except (KeyError, TypeError, ValueError, InputError) as error:
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+            RecursionError,
+            InputError,
+        ) as error:
             raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
         self.sequence, self.clock, self.tracker, self.supervisor = sequence, clock, tracker, supervisor
         self._gates = gates
         self._snapshots = (served,)
         self.handled_seq = seq
         self._update_counts()
+
+    def _check_state(self, state: StateDict) -> None:
+        """Raise ModelFileError if ``state`` is of another learner, or an entry is not as it must be."""
+        if self.learner is not None:
+            check_same_learner(under("learner.", state), self.learner)
+        self._schema.check(state)
 
     def _restored_snapshot(self, state: StateDict, supervisor: LearnerSupervisor) -> Served:
         now = self.newest

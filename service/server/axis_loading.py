@@ -67,7 +67,7 @@ def load_axis(
             config.learn, model, lambda start: factory(start, config.learner, limits), others, config.competition
         )
 
-    learner = None
+    learner = template = None
     if config.learn:
         if config.learn not in models:
             raise FieldError(
@@ -75,12 +75,14 @@ def load_axis(
             )
         learner = begin(models[config.learn])
         # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
-        _warm_learner(begin(models[config.learn]), limits)
+        warmed = begin(models[config.learn])
+        _warm_learner(warmed, limits)
+        template = warmed.state_dict()
         models |= champion_of(learner)
     archive = None
     if config.checkpoints is not None:
         archive = CheckpointFolder(config.checkpoints, stage, config.name, bundle.meta.dt_s, config.checkpoints_kept)
-    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive)
+    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive, template=template)
     _warm_models(axis)
     return axis
 

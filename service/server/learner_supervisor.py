@@ -37,6 +37,12 @@ _ADDED: Final = re.compile(r"(^|\.)config\.envelope\.")
 
 def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
     """A learner of the kind of ``like`` with ``state``. Raises ModelFileError with the reason if it does not fit."""
+    check_same_learner(state, like)
+    return like.restored(state)
+
+
+def check_same_learner(state: StateDict, like: OnlineModel) -> None:
+    """Raise ModelFileError if ``state`` is of a learner with other settings or another identified model."""
     if not state:
         raise ModelFileError("it holds no learner, but this axis learns")
     for name, value in like.state_dict().items():
@@ -47,7 +53,6 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
             raise ModelFileError(
                 f"it belongs to another {what}: {name} is {_short(state.get(name))}, now {_short(value)}"
             )
-    return like.restored(state)
 
 
 def fingerprint(model: InverseModel) -> str:
@@ -65,6 +70,8 @@ def fingerprint(model: InverseModel) -> str:
 def _equal(a: Any, b: Any) -> bool:
     # A file stores a number that is not finite as an array, and a tuple as a list.
     if isinstance(a, np.ndarray | float) or isinstance(b, np.ndarray | float):
+        if np.asarray(a).dtype.kind not in "fiub" or np.asarray(b).dtype.kind not in "fiub":
+            return False
         return np.shape(a) == np.shape(b) and bool(np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True))
     return bool(a == b or (isinstance(a, tuple) and list(a) == b))
 

@@ -25,6 +25,7 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
+from service.server.state_schema import MOST_FLOAT, MOST_INT
 from service.storage.output import atomic_write
 from service.storage.segments import rows_behind
 
@@ -33,6 +34,12 @@ from service.storage.segments import rows_behind
 MAGIC: Final = b"DHCKPT01"
 _HEAD: Final = struct.Struct("<8sQ16s")
 SUFFIX: Final = ".ckpt"
+
+
+_META_TYPES: Final[dict[str, tuple[type, ...]]] = {
+    "stage": (str,), "axis": (str,), "dt_s": (float, int), "seq": (int,), "samples": (int,),
+    "time_unix_s": (float, int), "instance": (str,), "schema": (int,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +62,15 @@ class CheckpointMeta:
     instance: str = ""
     schema: int = STATE_SCHEMA
     units: dict[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        for name, kinds in _META_TYPES.items():
+            value = getattr(self, name)
+            if not isinstance(value, kinds) or isinstance(value, bool):
+                raise ModelFileError(f"{name}: got {str(value)[:40]!r}, expected {kinds[0].__name__}")
+        if max(abs(self.seq), abs(self.samples)) > MOST_INT or not (0.0 < self.dt_s < MOST_FLOAT):
+            got = f"{str(self.seq)[:40]}, {str(self.samples)[:40]}, {self.dt_s}"
+            raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers of 62 bits and a time in s")
 
     def refuse_unless(self, stage: str, axis: str, dt_s: float) -> None:
         """Raise ModelFileError with the reason if the checkpoint is of another axis or of another version."""
@@ -149,13 +165,18 @@ class CheckpointFolder:
         """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
 
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint. Raises InputError if it does not exist or does not match ``like``."""
+    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
+        """The learner of a checkpoint, whose state passes ``check``.
+
+        Raises InputError if it does not exist or does not match ``like``.
+        """
         if number not in self.numbers():
             known = ", ".join(map(str, self.numbers()[:8])) or "none"
             raise FieldError("checkpoint", number, f"one of those there are ({known} ...)", "see 'checkpoints'")
         try:
-            return restored_learner(under("learner.", self.read(number)[1]), like)
+            state = self.read(number)[1]
+            check(state)
+            return restored_learner(under("learner.", state), like)
         except ModelFileError as error:
             raise FieldError("checkpoint", number, "one that is whole and matches", str(error)) from error
 
