@@ -30,6 +30,7 @@ from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, Sequen
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
+from service.protocol.model_classes import build_model, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.competing import champion_of
@@ -266,9 +267,9 @@ class Axis:
             blends(name, served.default, config),
             config.blend_share,
             served.trust if learns(name, config) else 1.0,
-            config.stale_s if learns(name, config) else 0.0,
+            config.stale_s if learns(name, config) and not served.frozen else 0.0,
             config.last_good_s,
-            served.standing_in_for(name),
+            served.standing_in_for(name, served.frozen),
         )
 
     def differs(self, seq: int, theirs: str) -> bool:
@@ -397,25 +398,29 @@ class Axis:
         last, supervisor = self.newest, self.supervisor
         models = last.models
         if supervisor.learner is not None:
-            models = models | supervisor.models(last, self.sequence.received)
-        memories = supervisor.memories(models, self.tracker.advance(models, last.memories))
+            learnt = supervisor.models(last, self.sequence.received)
+            # While frozen the samples are still judged, but what they change is not served.
+            models = models if last.frozen else models | learnt
+        memories = supervisor.memories(models, self.tracker.advance(models, last.memories), last.frozen)
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
-            trust=supervisor.watch.trust, trouble=supervisor.watch.trouble,
+            trust=last.trust if last.frozen else supervisor.watch.trust, trouble=supervisor.watch.trouble,
         )  # fmt: skip
         self._snapshots = (*self._snapshots, served)[-self.config.snapshots_kept :]
 
     # ---- operator's commands; each returns the number of the sample after which it holds
 
     def freeze(self, by: str = "") -> int:
-        """Stop learning: samples are still tracked, judged and recorded."""
+        """Stop learning and keep what is served to the last bit; samples are still tracked, judged and recorded."""
         self.supervisor.freeze(by or "operator")
+        self._snapshots = (*self._snapshots[:-1], self.newest.freeze())
         self.note("frozen", "learning is stopped", by=by)
         return self.handled_seq
 
     def thaw(self, by: str = "") -> int:
-        """Resume learning."""
+        """Resume learning; the next snapshot serves what has been learnt."""
         self.supervisor.thaw()
+        self._snapshots = (*self._snapshots[:-1], self.newest.thaw())
         self.note("thawed", "learning goes on", by=by)
         return self.handled_seq
 
@@ -471,6 +476,14 @@ class Axis:
         state |= prefixed("tracker.", self.tracker.state_dict())
         state |= prefixed("gates.", self._gates)
         state |= prefixed("memory.", served.memories)
+        if served.frozen:
+            for name in (self.config.learn, AUTO):
+                if name in served.models and learns(name, self.config):
+                    model = served.models[name]
+                    role = f"frozen.{'auto' if name == AUTO else 'learn'}."
+                    state |= {f"{role}kind": stored_kind(model), **prefixed(role, model.state_dict())}
+            if served.held is not None:
+                state["frozen.held"] = served.held.copy()
         state |= self.supervisor.state_dict(served.trouble in POISON)
         return state
 
@@ -515,6 +528,9 @@ class Axis:
             good = supervisor.watch.good
             models[self.config.learn] = supervisor.learner.snapshot() if good is None else good
             models |= champion_of(supervisor.learner)
+        for role, name in (("frozen.learn.", self.config.learn), ("frozen.auto.", AUTO)):
+            if supervisor.frozen and f"{role}kind" in state and name in models:
+                models[name] = build_model(str(state[f"{role}kind"]), under(role, state), f"the frozen model {name!r}")
         memories: dict[str, FloatArray] = {}
         for name, model in models.items():
             memory = np.array(state.get(f"memory.{name}", model.rest_memory(0.0)), dtype=np.float64)
@@ -522,8 +538,16 @@ class Axis:
                 raise FieldError(f"memory.{name}", memory.shape, f"({model.memory_size},) finite numbers")
             memories[name] = memory
         default = str(state["served.default"])
-        return replace(
+        served = replace(
             now, seq=int(state["served.seq"]), t_s=float(state["served.t_s"]), u_V=float(state["served.u_V"]),
             models=models, memories=memories, default=default if default in models else now.default,
-            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]),
+            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]), frozen=False, held=None,
         )  # fmt: skip
+        if not supervisor.frozen:
+            return served
+        served, held = served.freeze(), state.get("frozen.held")
+        if held is None or served.held is None:  # a state of before there was one
+            return served
+        if np.shape(held) != served.held.shape:
+            raise FieldError("frozen.held", np.shape(held), f"{served.held.shape}")
+        return replace(served, held=np.array(held, dtype=np.float64))

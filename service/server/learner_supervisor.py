@@ -15,6 +15,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from adaptive.errors import DehystError, ModelFileError
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import Served
@@ -79,6 +80,15 @@ def _equal(a: Any, b: Any) -> bool:
 def _short(value: Any) -> str:
     text = f"an array {value.shape}" if isinstance(value, np.ndarray) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _same_frame(model: InverseModel, learner: OnlineModel) -> bool:
+    """Whether ``model`` reads displacements as the present model of ``learner`` does."""
+    try:
+        now = learner.snapshot()
+    except (DehystError, ValueError, ArithmeticError):
+        return False
+    return isinstance(now, LssvmInverse) and isinstance(model, LssvmInverse) and now.features == model.features
 
 
 # --- Supervision.
@@ -187,9 +197,15 @@ class LearnerSupervisor:
             return {}
         return {self.name: good, **self._champion(last, good, now in POISON)}
 
-    def memories(self, models: dict[str, InverseModel], tracked: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """``tracked`` memories by model, with the learner's own for its model, alone and as a contestant."""
-        if self.learner is None or self._failed:
+    def memories(
+        self, models: dict[str, InverseModel], tracked: dict[str, FloatArray], frozen: bool = False
+    ) -> dict[str, FloatArray]:
+        """``tracked`` memories by model, with the learner's own for its model, alone and as a contestant.
+
+        ``frozen`` : the models are those of an earlier moment. The learner's memory does not fit them once it has found
+        that the readings have jumped.
+        """
+        if self.learner is None or self._failed or (frozen and not _same_frame(models[self.name], self.learner)):
             return tracked
         own = self.learner.memory_for(models[self.name])
         if own is None or own.shape != tracked[self.name].shape or not np.isfinite(own).all():

@@ -64,6 +64,7 @@ RULES: Final = (
     Rule(r"served\.trust", "", low=0.0, high=1.0),
     Rule(r"^gates\.\w+", "", "i", low=0),
     Rule(r"^memory\.\w+", "*"),
+    Rule(r"^frozen\.held", "*"),
     Rule(r"watch\.(y|u_low|u_high)", "", finite=False),
     Rule(r"watch\.trust", "", low=0.0, high=1.0),
     Rule(r"^(frozen_by|adoptions|watch\.trouble|served\.(default|trouble))", "", "s"),
@@ -73,7 +74,7 @@ RULES: Final = (
     Rule(r"(features|before|proven)\.time_constants_s", "slow"),
     Rule(r"(features|before|proven)\.kernel_plays", "kernel_plays", "i", low=0, high="plays"),
     Rule(r"(features|before|proven)\.(linear|asymmetric)", "", "b"),
-    Rule(r"(lssvm_adaptive|model|good|mark|next_mark|base)\.beta", "p"),
+    Rule(r"(lssvm_adaptive|model|good|mark|next_mark|base|learn)\.beta", "p"),
     Rule(r"support", "*,d"),
     Rule(r"alpha", "*"),
     Rule(r"anchor", "p|0"),
@@ -134,7 +135,7 @@ RULES: Final = (
 #: Entries whose text must be that of the template: they say which contestants and kinds of models there are.
 _SAME_TEXT: Final = re.compile(r"(^|\.)(names|kinds)$")
 #: Snapshots of a competition at earlier times have the entries of the newest one; a kept state those of the learner.
-_SNAPSHOTS: Final = re.compile(r"^learner\.(past\d+|start)\.")
+_SNAPSHOTS: Final = re.compile(r"^(learner\.(past\d+|start)|frozen\.auto)\.")
 _KEPT: Final = re.compile(r"^mark\.")
 #: Settings and what is identified: compared with those of the present learner where it is restored.
 _COMPARED: Final = re.compile(r"(^|\.)config[._]")
