@@ -1,4 +1,7 @@
-"""The bounded queue between the wire and the thread of an axis: samples, and jobs that run between two batches."""
+"""The bounded queue between the wire and the thread of an axis: samples, and jobs that run between two batches.
+
+Urgent jobs, which are the commands of operators, have a lane of their own in front of the samples that wait.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,10 @@ T = TypeVar("T")
 #: Time to wait after the first message for others to handle with it, s. Waking the thread costs as much as learning
 #: from two samples, and fewer wake-ups disturb fewer queries.
 GATHER_S: Final = 0.005
+#: Samples that are handled together at most unless one message holds more: a command waits for no more than these.
+MOST_TOGETHER: Final = 500
+#: Time, s, that a job which runs already may take. What it does takes far less.
+_LONGEST_JOB_S: Final = 60.0
 
 
 class Arrived(NamedTuple):
@@ -68,6 +75,7 @@ class SampleQueue:
         self._name = name
         self._capacity = capacity
         self._items: deque[Arrived | Job] = deque()
+        self._urgent: deque[Job] = deque()
         self._changed = threading.Condition()
         self._taker: threading.Thread | None = None
         self._closing = False
@@ -93,26 +101,28 @@ class SampleQueue:
         self.malformed += 1
         return self.malformed
 
-    def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
-        """Run ``work`` in the thread of the axis, after the samples that have come; what it returns or raises.
+    def call(self, work: Callable[[], T], timeout_s: float = 2.0, urgent: bool = False) -> T:
+        """Run ``work`` in the thread of the axis; what it returns or raises.
 
-        Not from that thread itself. Raises ServiceError if the thread does not run, or did not reach the work within
-        ``timeout_s``.
+        ``urgent`` : before the samples that wait; else after those that have come. Not from that thread itself.
+        Raises ServiceError if the thread does not run, or did not begin the work within ``timeout_s``; the work is then
+        not done later either.
         """
         done: Future[T] = Future()
         with self._changed:
             if self._closing or self._taker is None or not self._taker.is_alive():
                 raise ServiceError(f"axis {self._name}: no samples are handled; the service begins or ends")
-            self._items.append(Job(work, done))
+            (self._urgent if urgent else self._items).append(Job(work, done))
             self._changed.notify()
         try:
             return done.result(timeout_s)
         except FutureTimeout:
             if done.done():  # the work itself raised it
                 raise
-            done.cancel()
+            if not done.cancel():  # it has begun: say how it ends
+                return done.result(_LONGEST_JOB_S)
             raise ServiceError(
-                f"axis {self._name}: timed out after {timeout_s:g} s; the command may still be applied"
+                f"axis {self._name}: the learner did not get to it within {timeout_s:g} s; it was not applied"
             ) from None
         finally:
             # An exception in it refers to this frame: without this, both would wait for the garbage collector.
@@ -136,22 +146,34 @@ class SampleQueue:
         self._taker = taker
 
     def take(self) -> Arrived | Job | None:
-        """Wait for the next job, or for samples: all up to the next job, as one batch. None: closed and empty."""
+        """Wait for the next job, urgent ones first, or for samples as one batch. None: closed and empty.
+
+        A batch ends before the next job, and holds `MOST_TOGETHER` samples at most unless one message holds more.
+        """
         with self._changed:
-            while not self._items and not self._closing:
+            while not self._items and not self._urgent and not self._closing:
                 self._changed.wait()
+            if self._urgent:
+                return self._urgent.popleft()
             if not self._items:
                 return None
             first = self._items[0]
             if isinstance(first, Job):
                 self._items.popleft()
                 return first
-        if not self._closing:
+            behind = self._closing or self.waiting >= MOST_TOGETHER
+        if not behind:
             time.sleep(GATHER_S)
-        batches, at_s = [], 0.0
+        batches: list[SampleBatch] = []
+        at_s, count = 0.0, 0
         with self._changed:
+            if self._urgent:
+                return self._urgent.popleft()
             while self._items and isinstance(self._items[0], Arrived):
                 arrived = self._items[0]
+                count += len(arrived.batch)
+                if batches and count > MOST_TOGETHER:
+                    break
                 self._items.popleft()
                 batches.append(arrived.batch)
                 at_s = arrived.at_s

@@ -23,6 +23,8 @@ from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
+#: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
+_WRITTEN_S: Final = 1.0
 
 
 class AxisServer:
@@ -59,6 +61,8 @@ class AxisServer:
         self.role = STANDBY
         self.synced = True
         self.epoch = 0
+        #: Count of all samples when the last command was applied.
+        self._operated_at = 0
         config = axis.config
         queue = SampleQueue(config.name, config.queue_samples)
         folder = None
@@ -150,13 +154,23 @@ class AxisServer:
     # ---- operator's commands
 
     def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
-        """Run an operator's command between two batches of samples and keep a checkpoint of the outcome.
+        """Run an operator's command before the samples that wait, and copy the outcome for a checkpoint.
 
         Returns what ``work`` returns. Not from a callback of the wire, because it waits for the learner.
         """
-        seq = self.loop.queue.call(lambda: work(self.axis), timeout_s)
-        self.checkpoints.write_now(timeout_s)
-        return seq
+
+        def apply() -> int:
+            seq = work(self.axis)
+            self._operated_at = self.axis.sequence.received
+            self.checkpoints.copy_now()
+            return seq
+
+        return self.loop.queue.call(apply, timeout_s, urgent=True)
+
+    def journal(self) -> Journal:
+        """The operators' journal of the axis."""
+        config = self.axis.config
+        return Journal(config.recorder or config.checkpoints)
 
     def _operations_server(self) -> OperationsServer:
         def diagnose() -> Background | None:
@@ -165,10 +179,17 @@ class AxisServer:
         def retune() -> Background | None:
             return None if self.loop.tuner is None else self.loop.tuner.request
 
-        config = self.axis.config
         verbs = Verbs(self.axis, self.operate, {"diagnose": diagnose, "retune": retune})
-        journal = Journal(config.recorder or config.checkpoints)
-        return OperationsServer(self.keys, self.instance, verbs, journal, self.axis.note, lambda: self.role)
+        return OperationsServer(
+            self.keys,
+            self.instance,
+            verbs,
+            self.journal(),
+            self.axis.note,
+            lambda: self.role,
+            samples=lambda: self._operated_at,
+            settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
+        )
 
     # ---- the publishing thread
 

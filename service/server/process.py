@@ -78,10 +78,19 @@ def as_standby(config: ServeConfig) -> ServeConfig:
 
 
 def _restore(server: AxisServer) -> None:
-    """Restore the newest checkpoint, then learn the samples after it from the recording."""
+    """Restore the newest checkpoint, then learn the samples after it from the recording.
+
+    A *freeze* or *thaw* that is in the operators' journal but not in the checkpoint is applied at its sample.
+    """
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
-    if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
-        learn_again(axis, axis.config.recorder)
+    number = None if folder is None else restore_newest(axis, folder)
+    switch = server.journal().last_switch()
+    if switch is not None and folder is not None and number is not None:
+        switch = switch if switch.time_unix_s >= folder.written_at(number) else None
+    if number is not None and axis.config.recorder is not None:
+        learn_again(axis, axis.config.recorder, switch)
+    elif switch is not None:
+        switch.apply(axis)
     if sink is not None:
         sink.rebase(axis.sequence.received)
 

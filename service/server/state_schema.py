@@ -22,9 +22,10 @@ from adaptive.online.sensor_trust import VALUES
 from adaptive.types import StateDict
 from adaptive.window import arrays as window_arrays
 
-#: Largest magnitude of a float: its cube is still finite. Largest magnitude of an integer: sums of two fit 64 bits.
+#: Largest magnitude of a float: its cube is still finite. Largest magnitude of an integer: sample numbers of up to 2^62 are legal,
+#: and what is counted on from one must fit 64 bits.
 MOST_FLOAT: Final = 1e100
-MOST_INT: Final = 2**62
+MOST_INT: Final = 3 * 2**61
 #: Longest variable dimension, longest text, and most entries.
 MOST_ROWS: Final = 2_000_000
 MOST_TEXT: Final = 100_000
@@ -350,7 +351,7 @@ def _check_scalar(name: str, value: Any, kind: str | None, finite: bool = True) 
     if isinstance(value, str) and len(value) > MOST_TEXT:
         raise _refused(name, f"{len(value)} characters", f"at most {MOST_TEXT}")
     if isinstance(value, int) and abs(value) > MOST_INT:
-        raise _refused(name, str(value)[:40], "an integer from -2^62 to 2^62")
+        raise _refused(name, str(value)[:40], "an integer from -3 x 2^61 to 3 x 2^61")
     if isinstance(value, float) and finite and not abs(value) <= MOST_FLOAT:
         raise _refused(name, repr(value), f"a finite number of at most {MOST_FLOAT:g}")
 

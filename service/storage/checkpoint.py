@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.types import OnlineModel, StateDict, under
@@ -70,7 +70,7 @@ class CheckpointMeta:
                 raise ModelFileError(f"{name}: got {str(value)[:40]!r}, expected {kinds[0].__name__}")
         if max(abs(self.seq), abs(self.samples)) > MOST_INT or not (0.0 < self.dt_s < MOST_FLOAT):
             got = f"{str(self.seq)[:40]}, {str(self.samples)[:40]}, {self.dt_s}"
-            raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers of 62 bits and a time in s")
+            raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers within 3 x 2^61 and a time in s")
 
     def refuse_unless(self, stage: str, axis: str, dt_s: float) -> None:
         """Raise ModelFileError with the reason if the checkpoint is of another axis or of another version."""
@@ -161,6 +161,12 @@ class CheckpointFolder:
         meta.refuse_unless(*self._belongs)
         return meta, state
 
+    def written_at(self, number: int) -> float:
+        """Time at which the state of a checkpoint was copied, s since 1970; 0 if it cannot be read."""
+        with contextlib.suppress(OSError, ModelFileError):
+            return _read_meta(self.directory / f"checkpoint-{number:09d}{SUFFIX}").time_unix_s
+        return 0.0
+
     def numbers(self) -> list[int]:
         """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
@@ -224,6 +230,20 @@ def _read_meta(path: Path) -> CheckpointMeta:
 #
 # The thread that handles samples only copies the state; a thread of its own encodes and writes it.
 
+
+class Switch(Protocol):
+    """An operator's command that the operators' journal holds: freeze or thaw."""
+
+    @property
+    def samples(self) -> int:
+        """Count of all samples handled before it held."""
+        ...
+
+    def apply(self, axis: Axis) -> None:
+        """Apply it."""
+        ...
+
+
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
 _PORTION = 100
@@ -247,6 +267,8 @@ class CheckpointKeeper:
         self._clock = clock
         self._names = (stage, axis.config.name, instance)
         self._copied: tuple[CheckpointMeta, StateDict] | None = None
+        #: Copies made; of which the newest that is on the disk, and the newest that was tried.
+        self._copies = self._on_disk = self._tried = 0
         self._ready = threading.Condition()
         self._closing = False
         self._due_at_s = 0.0
@@ -263,15 +285,19 @@ class CheckpointKeeper:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
             self._copy()
 
-    def write_now(self, timeout_s: float = 2.0) -> None:
-        """Write a checkpoint of the present state. Raises ServiceError if the learner does not respond in time."""
-        if self.folder is not None:
-            self._queue.call(self._copy, timeout_s)
-
     def copy_now(self) -> None:
-        """As `write_now`, in the thread that handles samples."""
+        """Copy the present state, to be written. Call it in the thread that handles samples."""
         if self.folder is not None:
             self._copy()
+
+    def wait_written(self, timeout_s: float) -> bool:
+        """Wait until the last copy, or a later one, is on the disk; False if it is not, or no checkpoints are kept."""
+        if self.folder is None:
+            return False
+        with self._ready:
+            wanted = self._copies
+            self._ready.wait_for(lambda: self._tried >= wanted, timeout_s)
+            return self._on_disk >= wanted
 
     def state(self, timeout_s: float = 2.0) -> tuple[CheckpointMeta, StateDict]:
         """(meta, copy of the state), for a standby. Raises ServiceError if the learner does not respond in time."""
@@ -291,7 +317,7 @@ class CheckpointKeeper:
         self._copy()
         with self._ready:
             self._closing = True
-            self._ready.notify()
+            self._ready.notify_all()
         self._thread.join(10.0)
 
     def _meta(self) -> CheckpointMeta:
@@ -306,7 +332,8 @@ class CheckpointKeeper:
         with self._ready:
             # Replaces a copy that has not been written yet.
             self._copied = copied
-            self._ready.notify()
+            self._copies += 1
+            self._ready.notify_all()
 
     def _run(self) -> None:
         assert self.folder is not None
@@ -317,15 +344,22 @@ class CheckpointKeeper:
                 if self._copied is None:
                     return
                 (meta, state), self._copied = self._copied, None
+                copy = self._copies
+            written = False
             try:
                 self.folder.write(meta, state)
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
                 self._written_at_s = time.monotonic()
+                written = True
             except (OSError, DehystError, ValueError) as error:
                 words = (isinstance(error, OSError) and error.strerror) or str(error)
                 if not self._counts["degraded"]:
                     self._axis.note("checkpoint_failed", f"{words}; tried again")
                 self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
+            with self._ready:
+                self._tried = copy
+                self._on_disk = copy if written else self._on_disk
+                self._ready.notify_all()
 
 
 def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
@@ -345,17 +379,29 @@ def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
     return None
 
 
-def learn_again(axis: Axis, recordings: Path) -> int:
+def learn_again(axis: Axis, recordings: Path, switch: Switch | None = None) -> int:
     """Learn the samples after the restored state again, from the journals in the folder ``recordings``.
 
-    Returns the number of samples. They are not recorded a second time.
+    ``switch`` : an operator's command that the restored state does not include; it is applied after the sample after
+    which it held, or at the end if the journals do not reach that far. Returns the number of samples. They are not
+    recorded a second time.
     """
-    rows = rows_behind(recordings, axis.sequence.received)
+    begun = axis.sequence.received
+    rows = rows_behind(recordings, begun)
+    count = 0 if rows is None else len(rows)
+    first = max(0, count - _MOST_AGAIN)
+    at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)
+    start = first
+    while rows is not None and start < count:
+        if start == at and switch is not None:
+            switch.apply(axis)
+        stop = min(start + _PORTION, count, at if start < at else count)
+        part = rows.part(start, stop)
+        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
+        start = stop
+    if switch is not None and at >= count:
+        switch.apply(axis)
     if rows is None:
         return 0
-    first = max(0, len(rows) - _MOST_AGAIN)
-    for start in range(first, len(rows), _PORTION):
-        part = rows.part(start, start + _PORTION)
-        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
     axis.note("learnt_again", f"{len(rows) - first} samples from the journal")
     return len(rows) - first

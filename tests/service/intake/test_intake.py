@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
+import pytest
+
 from adaptive.types import InverseModel
+from service.intake.sample_queue import MOST_TOGETHER
+from service.protocol.errors import ServiceError
 from service.protocol.samples import SampleBatch
 from service.server.axis_loop import AxisLoop
 from tests.service.axes import loop_of
@@ -105,3 +110,76 @@ def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, 
     loop.close()
     assert loop.queue.handled_at_s == came_s
     assert [event["event"] for event in axis.take_events()] == ["internal_error"]
+
+
+# --- Commands of operators: in front of what waits, and what is said of them is true.
+
+
+def slowed(axis: Any, per_sample_s: float) -> list[int]:
+    """Let every sample take ``per_sample_s``; returns the sizes of the batches that are handled."""
+    sizes: list[int] = []
+    handle = axis.handle
+
+    def slowly(batch: SampleBatch, *more: Any) -> list[str]:
+        sizes.append(len(batch))
+        time.sleep(per_sample_s * len(batch))
+        verdicts: list[str] = handle(batch, *more)
+        return verdicts
+
+    axis.handle = slowly
+    return sizes
+
+
+def test_a_command_does_not_wait_for_the_samples_that_wait(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models, queue_samples=20_000)
+    sizes = slowed(axis, 4e-4)
+    loop = loop_of(axis)
+    for part in parts(recording(8000), 100):
+        assert loop.offer(part)
+    loop.start()
+    try:
+        time.sleep(0.05)
+        begin_s = time.monotonic()
+        seq = loop.queue.call(lambda: axis.freeze("alice"), 2.0, urgent=True)
+        took_s = time.monotonic() - begin_s
+        assert axis.frozen
+        assert seq < 2000
+        assert took_s < 1.0, "8000 samples take 3.2 s"
+    finally:
+        loop.close()
+    assert axis.handled_seq == 7999
+    assert max(sizes) <= MOST_TOGETHER
+
+
+def test_work_that_has_begun_is_told_as_it_ends(models: dict[str, InverseModel]) -> None:
+    loop = loop_of(make_axis(models))
+    loop.start()
+    done: list[str] = []
+
+    def slow() -> str:
+        time.sleep(0.3)
+        done.append("slow")
+        return "done"
+
+    try:
+        assert loop.queue.call(slow, 0.05, urgent=True) == "done"
+    finally:
+        loop.close()
+    assert done == ["slow"]
+
+
+def test_work_that_was_given_up_is_never_done(models: dict[str, InverseModel]) -> None:
+    loop = loop_of(make_axis(models))
+    loop.start()
+    done: list[str] = []
+    blocker = threading.Thread(target=lambda: loop.queue.call(lambda: time.sleep(0.4), 2.0))
+    blocker.start()
+    time.sleep(0.05)
+    try:
+        with pytest.raises(ServiceError, match=r"did not get to it within 0.1 s; it was not applied"):
+            loop.queue.call(lambda: done.append("late"), 0.1, urgent=True)
+        blocker.join()
+        loop.queue.call(lambda: None)
+    finally:
+        loop.close()
+    assert done == []
