@@ -57,6 +57,7 @@ LEVELS: Final = {
     "operation_refused": logging.WARNING,
     "standby_refused": logging.WARNING,
     "standby_differed": logging.WARNING,
+    "claim_ignored": logging.WARNING,
 }
 #: Events that wait for the publisher; of a flood only the newest are kept.
 _KEPT: Final = 256

@@ -10,11 +10,13 @@ import zenoh
 
 from service.answers.answering import trust_by_age
 from service.background.retuning.retuner import Retuner
+from service.failover.state_transfer import NO_SECRET
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
+from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.query_answers import LatencyMeter, QueryAnswers
@@ -37,6 +39,7 @@ class AxisServer:
     ----------
     instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
     sink : records samples, or None. watcher : the background diagnosis, or None.
+    secret : by which the instances of this service prove themselves to each other.
 
     Attributes
     ----------
@@ -54,8 +57,10 @@ class AxisServer:
         wake: Callable[[], None],
         sink: SampleSink | None = None,
         watcher: SampleWatcher | None = None,
+        secret: PeerSecret = NO_SECRET,
     ) -> None:
         self.keys = keys
+        self.secret = secret
         self.axis = axis
         self.instance = instance
         self.role = STANDBY
@@ -73,7 +78,7 @@ class AxisServer:
         retuner = Retuner(config.retuning, config.recorder) if tuned else None
         self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
         self._latency = LatencyMeter()
-        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status)
+        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status, instance, secret)
         self._operations = self._operations_server()
         self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
         self._session = session

@@ -21,6 +21,7 @@ from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import open_service
+from service.security.peers import read_secret
 from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
@@ -149,6 +150,7 @@ class Service:
         """
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
+        secret = read_secret(config.peer_secret)
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
@@ -166,6 +168,7 @@ class Service:
                     self._wake.set,
                     self._sinks(axis.config),
                     make_watcher(axis),
+                    secret,
                 )
                 self.axes.append(server)
                 _restore(server)

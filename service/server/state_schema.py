@@ -22,8 +22,8 @@ from adaptive.online.sensor_trust import VALUES
 from adaptive.types import StateDict
 from adaptive.window import arrays as window_arrays
 
-#: Largest magnitude of a float: its cube is still finite. Largest magnitude of an integer: sample numbers of up to 2^62 are legal,
-#: and what is counted on from one must fit 64 bits.
+#: Largest magnitude of a float: its cube is still finite. Largest magnitude of an integer: sample numbers of up to 2^62
+#: are legal, and what is counted on from one must fit 64 bits.
 MOST_FLOAT: Final = 1e100
 MOST_INT: Final = 3 * 2**61
 #: Longest variable dimension, longest text, and most entries.
