@@ -5,6 +5,7 @@ Urgent jobs, which are the commands of operators, have a lane of their own in fr
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -61,6 +62,7 @@ class SampleQueue:
 
     Attributes
     ----------
+    capacity : samples that may wait.
     waiting : samples that wait or are being handled. dropped, malformed : samples refused for lack of space, messages
     that could not be decoded.
     handled_at_s : time of arrival, by ``time.monotonic``, of the last sample that was handled; of the first one until
@@ -73,12 +75,13 @@ class SampleQueue:
         self.malformed = 0
         self.handled_at_s: float | None = None
         self._name = name
-        self._capacity = capacity
+        self.capacity = capacity
         self._items: deque[Arrived | Job] = deque()
         self._urgent: deque[Job] = deque()
         self._changed = threading.Condition()
         self._taker: threading.Thread | None = None
         self._closing = False
+        self._until_s = math.inf
 
     # ---- putting, from any thread
 
@@ -88,7 +91,7 @@ class SampleQueue:
         with self._changed:
             if self.handled_at_s is None:
                 self.handled_at_s = at_s
-            if self._closing or self.waiting + len(batch) > self._capacity:
+            if self._closing or self.waiting + len(batch) > self.capacity:
                 self.dropped += len(batch)
                 return False
             self._items.append(Arrived(batch, at_s))
@@ -133,11 +136,26 @@ class SampleQueue:
         at_s = self.handled_at_s
         return None if at_s is None else max(0.0, now_s - at_s)
 
-    def close(self) -> None:
-        """Take no more; what is queued is still handed out."""
+    def close(self, drain_s: float = math.inf) -> None:
+        """Take no more; what is queued is still handed out for ``drain_s``."""
         with self._changed:
             self._closing = True
+            self._until_s = time.monotonic() + drain_s
             self._changed.notify()
+
+    def leave(self) -> list[SampleBatch]:
+        """The samples that were not handed out, which count as dropped; the jobs among them are refused."""
+        with self._changed:
+            items = [*self._urgent, *self._items]
+            self._urgent.clear()
+            self._items.clear()
+        for item in items:
+            if isinstance(item, Job):
+                item.done.cancel()
+        left = [item.batch for item in items if isinstance(item, Arrived)]
+        self.dropped += sum(map(len, left))
+        self.waiting -= sum(map(len, left))
+        return left
 
     # ---- taking, from the thread of the axis
 
@@ -155,7 +173,7 @@ class SampleQueue:
                 self._changed.wait()
             if self._urgent:
                 return self._urgent.popleft()
-            if not self._items:
+            if not self._items or time.monotonic() > self._until_s:
                 return None
             first = self._items[0]
             if isinstance(first, Job):

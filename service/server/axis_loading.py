@@ -14,7 +14,7 @@ from adaptive.types import InverseModel, OnlineModel, Sample
 from service.answers import guard
 from service.answers.guard import Limits
 from service.config.schema import build_settings
-from service.config.settings import AxisConfig
+from service.config.settings import COMPETE, AxisConfig
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
 from service.server.competing import champion_of, compete
@@ -60,6 +60,10 @@ def load_axis(
             )
     models = dict(bundle.models)
     limits = _with_domain(config.limits, bundle.meta)
+    for name in config.compete:
+        if name not in models and name not in COMPETE:
+            expected = f"one of the models in {config.model}: {', '.join(models)}, or of {', '.join(COMPETE)}"
+            raise FieldError("compete", repr(name), expected)
     others = {name: models[name] for name in config.compete if name in models and name != config.learn}
 
     def begin(model: InverseModel) -> OnlineModel:

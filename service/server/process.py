@@ -40,6 +40,8 @@ PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
+#: How long a start waits for a process that still holds the folder of the checkpoints, s.
+_HOLD_S: Final = 5.0
 #: Longest pause of the publishing thread, s.
 _TICK_S: Final = 0.02
 
@@ -84,6 +86,7 @@ def _restore(server: AxisServer) -> None:
     A *freeze* or *thaw* that is in the operators' journal but not in the checkpoint is applied at its sample.
     """
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
+    server.checkpoints.hold(_HOLD_S)
     number = None if folder is None else restore_newest(axis, folder)
     switch = server.journal().last_switch()
     if switch is not None and folder is not None and number is not None:

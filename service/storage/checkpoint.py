@@ -8,6 +8,7 @@ refused.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import struct
 import threading
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import IO, Any, Final, Protocol
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.types import OnlineModel, StateDict, under
@@ -27,13 +28,16 @@ from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
 from service.server.state_schema import MOST_FLOAT, MOST_INT
 from service.storage.output import atomic_write
-from service.storage.segments import rows_behind
+from service.storage.segments import claim, is_still_at, rows_behind
 
 # --- Files.
 
 MAGIC: Final = b"DHCKPT01"
 _HEAD: Final = struct.Struct("<8sQ16s")
 SUFFIX: Final = ".ckpt"
+_LOCK: Final = ".lock-checkpoints"
+#: Checkpoints that are never removed to make room on a full disk.
+_LEAST_KEPT: Final = 2
 
 
 _META_TYPES: Final[dict[str, tuple[type, ...]]] = {
@@ -128,9 +132,19 @@ class CheckpointFolder:
         self.directory.mkdir(parents=True, exist_ok=True)
         number = max((number_of(path) for path in self._paths()), default=0) + 1
         path = self.directory / f"checkpoint-{number:09d}{SUFFIX}"
-        with atomic_write(path) as file:
-            for buffer in encode_checkpoint(meta, state):
-                file.write(buffer)
+        buffers = encode_checkpoint(meta, state)
+        while True:
+            try:
+                with atomic_write(path) as file:
+                    for buffer in buffers:
+                        file.write(buffer)
+                break
+            except OSError as error:
+                # A full disk: the oldest checkpoint is worth less than the newest.
+                oldest = self._paths()[:-_LEAST_KEPT]
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not oldest:
+                    raise
+                oldest[0].unlink(missing_ok=True)
         self._remove_surplus(number)
         return path
 
@@ -273,10 +287,50 @@ class CheckpointKeeper:
         self._closing = False
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
+        self._lock: IO[bytes] | None = None
+        self._bytes = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
             self._thread.start()
+
+    def hold(self, timeout_s: float) -> None:
+        """Lock the folder for this process: two services would remove and restore each other's files.
+
+        Waits ``timeout_s`` for a process that ends. Raises FieldError if another process goes on holding it. Where the
+        disk does not allow a lock, writing fails later, and is counted.
+        """
+        if self.folder is None:
+            return
+        until = time.monotonic() + timeout_s
+        while True:
+            try:
+                self._claim()
+            except BlockingIOError as error:
+                if time.monotonic() >= until:
+                    raise FieldError(
+                        "checkpoints",
+                        str(self.folder.directory),
+                        "a folder that no other process keeps its checkpoints in",
+                        "end the other service, or give each its own folder",
+                    ) from error
+                time.sleep(0.05)
+            except OSError:
+                return
+            else:
+                return
+
+    def _claim(self) -> None:
+        """Hold the lock; take it anew where the folder was removed. Raises OSError."""
+        assert self.folder is not None
+        directory = self.folder.directory
+        if self._lock is not None and is_still_at(self._lock.fileno(), directory / _LOCK):
+            return
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+        directory.mkdir(parents=True, exist_ok=True)
+        self._lock = claim(directory, _LOCK, "keeps its checkpoints in")
 
     def on_snapshot(self) -> None:
         """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
@@ -304,11 +358,16 @@ class CheckpointKeeper:
         return self._queue.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
 
     def counters(self) -> dict[str, Any] | None:
-        """Checkpoints written, age of the newest in s, failures of the disk; None if no checkpoints are written."""
+        """Checkpoints written, age of the newest in s, its size, what a day of them writes, failures of the disk.
+
+        None if no checkpoints are written.
+        """
         if self.folder is None:
             return None
         at = self._written_at_s
-        return {**self._counts, "age_s": None if at is None else time.monotonic() - at}
+        a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
+        age_s = None if at is None else time.monotonic() - at
+        return {**self._counts, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
 
     def close(self) -> None:
         """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
@@ -319,6 +378,9 @@ class CheckpointKeeper:
             self._closing = True
             self._ready.notify_all()
         self._thread.join(10.0)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _meta(self) -> CheckpointMeta:
         stage, name, instance = self._names
@@ -347,7 +409,8 @@ class CheckpointKeeper:
                 copy = self._copies
             written = False
             try:
-                self.folder.write(meta, state)
+                self._claim()
+                self._bytes = self.folder.write(meta, state).stat().st_size
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
                 self._written_at_s = time.monotonic()
                 written = True
