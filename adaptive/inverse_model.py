@@ -277,8 +277,9 @@ class LssvmInverse:
         anchor.flags.writeable = False
         object.__setattr__(self, "anchor", anchor)
         covariance = np.array(self.beta_covariance, dtype=np.float64)
-        if covariance.shape not in ((0, 0), (p, p)):
-            raise InputError(f"beta_covariance: got shape {covariance.shape}, expected ({p}, {p}) or (0, 0)")
+        if covariance.shape not in ((0, 0), (p, p)) or not np.all(np.isfinite(covariance)):
+            expected = f"({p}, {p}) finite numbers, or (0, 0)"
+            raise InputError(f"beta_covariance: got shape {covariance.shape}, expected {expected}")
         covariance.flags.writeable = False
         object.__setattr__(self, "beta_covariance", covariance)
         scaled = np.ascontiguousarray((self.support / self.widths).T)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
@@ -131,6 +131,8 @@ class Served:
     stand_in : name of the baseline that stands in for it; empty for none.
     trust : weight of the learning model inside its domain, 0 to 1.
     trouble : name of what is wrong with the samples or the learner, empty while nothing is.
+    frozen : whether an operator has stopped learning: models and trust stay those of that moment.
+    held : while frozen, memory of the stand-in at that moment, for queries that bring a memory of their own.
     """
 
     seq: int
@@ -142,12 +144,29 @@ class Served:
     stand_in: str = ""
     trust: float = 1.0
     trouble: str = ""
+    frozen: bool = False
+    held: FloatArray | None = None
 
-    def standing_in_for(self, name: str) -> StandIn | None:
-        """The model that stands in for the one called ``name``; None where there is no other."""
+    def standing_in_for(self, name: str, own_memory: bool = False) -> StandIn | None:
+        """The model that stands in for the one called ``name``; None where there is no other.
+
+        ``own_memory`` : the query brings its own memory, so that its answer depends on samples by the stand-in alone.
+        """
         if self.stand_in in ("", name) or self.stand_in not in self.models:
             return None
-        return StandIn(self.stand_in, self.models[self.stand_in], self.memories[self.stand_in])
+        memory = self.memories[self.stand_in]
+        if own_memory and self.frozen and self.held is not None:
+            memory = self.held
+        return StandIn(self.stand_in, self.models[self.stand_in], memory)
+
+    def freeze(self) -> Served:
+        """The same, frozen."""
+        held = self.memories.get(self.stand_in)
+        return self if self.frozen else replace(self, frozen=True, held=None if held is None else held.copy())
+
+    def thaw(self) -> Served:
+        """The same, not frozen."""
+        return replace(self, frozen=False, held=None)
 
 
 def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[float, bool]:
@@ -172,6 +191,8 @@ def answer(
     served, behind, trust, stale = ring[-1], False, 1.0, False
     if query.as_of == NEWEST:
         trust, stale = trust_by_age(age_s, config.stale_s, config.last_good_s)
+        if served.frozen:
+            trust = 1.0  # it follows no samples: without them it is as good as with them
     else:
         served, behind = _as_of(ring, query.as_of, handled, config.snapshot_every)
     default = served.default or config.served
@@ -204,7 +225,7 @@ def answer(
         query.u_before_V,
         # What does not learn is as good as ever, whatever the samples are.
         Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
-        served.standing_in_for(name),
+        served.standing_in_for(name, query.memory is not None),
         blends(name, default, config),
         resumes_V,
     )

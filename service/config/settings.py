@@ -13,8 +13,9 @@ from service.background.retuning.settings import RetuningConfig
 from service.config.schema import Setting, build_settings, parse_toml, read_text
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO, check_name
-from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
+from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, is_loopback
 from service.security.check import check_reach
+from service.security.peers import OWN_SECRET
 
 #: The model that learns.
 LEARN = "lssvm_adaptive"
@@ -88,7 +89,7 @@ class AxisConfig:
     ] = None
     checkpoint_s: Annotated[
         float, Setting(help="time of samples between two checkpoints", unit="s", low=0.05, high=86400)
-    ] = 1.0
+    ] = 10.0
     checkpoints_kept: Annotated[
         int, Setting(help="checkpoints kept: the newest, and older ones ever further apart", low=2, high=10_000)
     ] = 32
@@ -150,6 +151,14 @@ class ServeConfig:
         tuple[str, ...],
         Setting(help="where 'dehyst serve --standby' listens; clients look for it there", check=check_endpoint),
     ] = ()
+    peer_secret: Annotated[
+        Path | None,
+        Setting(
+            help="file with the secret by which the instances of this service prove themselves to each other; default: "
+            "one made beside this file where all endpoints are of this machine",
+            example=OWN_SECRET,
+        ),
+    ] = None
     lease_s: Annotated[
         float, Setting(help="silence after which a service counts as dead", unit="s", low=0.1, high=60)
     ] = 1.0
@@ -180,6 +189,9 @@ def parse_config(text: str, where: str, folder: Path, insecure_beyond_loopback: 
     names = [axis.name for axis in config.axes]
     if len(set(names)) < len(names):
         raise FieldError(f"{where}: axis", ", ".join(names), "a different name for each axis")
+    endpoints = (*config.listen, *config.standby_listen, *config.connect)
+    if config.peer_secret is None and all(map(is_loopback, endpoints)):
+        config = replace(config, peer_secret=folder / OWN_SECRET)
     return replace(config, axes=tuple(_with_reports_in(folder, axis) for axis in config.axes))
 
 

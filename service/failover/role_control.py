@@ -5,18 +5,21 @@ A thread of its own decides when claims change: callbacks of zenoh only store wh
 
 from __future__ import annotations
 
+import re
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
 from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state
+from service.failover.state_transfer import MAX_PAUSE_S, NO_SECRET, PAUSE_S, fetch_state, gives_sign_of_life
 from service.protocol.container import fields_of
+from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
+from service.security.peers import PeerSecret
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 # --- Claims to serve an axis, and the rule that decides which instance serves.
@@ -33,12 +36,20 @@ class Claim:
 
     epoch: int
     instance: str
+    signature: str = field(default="", compare=False)
+
+
+#: Greatest epoch that is taken for one: a take-over every second for thirty years.
+MAX_EPOCH: Final = 10**9
+_CLAIM: Final = re.compile(r"/claim/([0-9]{1,10})/([a-z][a-z0-9_-]{0,63})(?:/([0-9a-f]{1,64}))?$")
 
 
 def parse_claim(key: str) -> Claim | None:
-    """The claim in the key of a token; None if the key is not a claim."""
-    parts = key.split("/")
-    return Claim(int(parts[-2]), parts[-1]) if len(parts) > 2 and parts[-2].isdigit() else None
+    """The claim in the key of a token; None if the key is not a claim, or its epoch is out of range."""
+    found = _CLAIM.search(key)
+    if found is None or int(found[1]) > MAX_EPOCH:
+        return None
+    return Claim(int(found[1]), found[2], found[3] or "")
 
 
 class Claims:
@@ -46,10 +57,13 @@ class Claims:
 
     Attributes
     ----------
-    changed : set after every update.
+    changed : set after every update. unproven : count of claims that were ignored because they prove nothing.
     """
 
-    def __init__(self, keys: Keys, instance: str) -> None:
+    def __init__(self, keys: Keys, instance: str, secret: PeerSecret = NO_SECRET) -> None:
+        self.unproven = 0
+        self._secret = secret
+        self._ignored: set[Claim] = set()
         self.keys = keys
         self.instance = instance
         self.changed = threading.Event()
@@ -62,7 +76,12 @@ class Claims:
         claim = parse_claim(key)
         if claim is None or claim.instance == self.instance:
             return
+        if not self._secret.proves(claim.signature, *claim_parts(self.keys, claim.epoch, claim.instance)):
+            self.unproven += alive
+            self.changed.set()
+            return
         with self._lock:
+            self._ignored.discard(claim)
             self._highest_epoch = max(self._highest_epoch, claim.epoch)
             (self._alive.add if alive else self._alive.discard)(claim)
         self.changed.set()
@@ -70,12 +89,22 @@ class Claims:
     def highest(self) -> Claim | None:
         """The claim with precedence among the others; None if there is none."""
         with self._lock:
-            return max(self._alive, default=None)
+            return max(self._alive - self._ignored, default=None)
+
+    def ignore(self, claim: Claim) -> None:
+        """Ignore a claim whose instance does not answer, until its token appears anew."""
+        with self._lock:
+            self._ignored.add(claim)
 
     def next_epoch(self) -> int:
         """One more than any known epoch."""
         with self._lock:
             return self._highest_epoch + 1
+
+
+def claim_parts(keys: Keys, epoch: int, instance: str) -> tuple[object, ...]:
+    """What the signature of a claim is made of."""
+    return "claim", keys.base, epoch, instance
 
 
 # --- Whether an instance behind routers is connected to one of them.
@@ -123,6 +152,10 @@ _TRANSFER_PAUSE_S: Final = 0.3
 #: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
 _CLAIM_LOST_S: Final = 2.0
 _POLL_S: Final = 1.0
+#: Longest wait for a sign of life of an instance that claims to have taken over, s, and longest time without a status
+#: of the serving instance, s, before a standby asks for one.
+_LIFE_S: Final = 2.0
+_SILENT_S: Final = 5.0
 _LEAST_WAIT_S: Final = 0.01
 #: Longest time for a change of role, and for restoring a received state, in the thread that handles samples, s.
 _CHANGE_S: Final = 60.0
@@ -152,7 +185,10 @@ class RoleControl:
         peer_files: PeerFiles,
     ) -> None:
         self.server = server
-        self.claims = Claims(server.keys, server.instance)
+        self.claims = Claims(server.keys, server.instance, server.secret)
+        self._unproven = 0
+        #: When the instance that serves was last heard, by ``time.monotonic``, s, and its name.
+        self._heard: tuple[str, float] = ("", 0.0)
         self.model = StandbyModel(
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
@@ -209,6 +245,8 @@ class RoleControl:
         """Compare the digest of the served model, published once a second, with the own one of the same sample."""
         status = fields_of(sample.payload.to_bytes())
         server = self.server
+        if isinstance(status.get("instance"), str):
+            self._heard = (str(status["instance"]), time.monotonic())
         if server.role == PRIMARY or not server.synced or status.get("instance") == server.instance:
             return
         if self._outdated or self._fetching:
@@ -238,10 +276,13 @@ class RoleControl:
             self.claims.changed.wait(wait_s)
 
     def _decide(self, until: float) -> None:
+        self._note_unproven()
         highest = self.claims.highest()
         if self.server.role == PRIMARY:
             if highest is not None and highest > Claim(self._epoch, self.server.instance):
-                self._stand_down(highest.instance)
+                # Who does not answer queries is no successor.
+                if self._answers(highest):
+                    self._stand_down(highest.instance)
             else:
                 self._check_rival(highest)
             return
@@ -255,6 +296,35 @@ class RoleControl:
         self.settled.set()
         if self._outdated:
             self._take_state()
+        self._check_silent(highest)
+
+    def _answers(self, rival: Claim) -> bool:
+        """Whether ``rival`` answers; if not, its claim is ignored from now on."""
+        server = self.server
+        if gives_sign_of_life(self._session, server.keys.state, rival.instance, _LIFE_S, server.secret):
+            return True
+        if self._stopping or self._reachability.is_cut_off():
+            return False
+        self.claims.ignore(rival)
+        detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer: its claim is ignored"
+        server.axis.note("claim_ignored", detail)
+        return False
+
+    def _check_silent(self, highest: Claim) -> None:
+        """Ask the instance that serves for a sign of life when nothing has been heard of it for long."""
+        now = time.monotonic()
+        if self._heard[0] != highest.instance:
+            self._heard = (highest.instance, now)
+        elif now - self._heard[1] > _SILENT_S and self._answers(highest):
+            self._heard = (highest.instance, time.monotonic())
+
+    def _note_unproven(self) -> None:
+        """Note the first claims that prove nothing; the others are counted."""
+        unproven, before = self.claims.unproven, self._unproven
+        self._unproven = unproven
+        if unproven and not before:
+            detail = "a claim without the signature of this service's instances is ignored; see peer_secret"
+            self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
 
     def _check_rival(self, rival: Claim | None) -> None:
         """Claim again if a rival with a lower claim goes on serving.
@@ -278,7 +348,10 @@ class RoleControl:
         server, before = self.server, self._token
         self._epoch = max(self._epoch + 1, self.claims.next_epoch())
         server.set_epoch(self._epoch)
-        self._token = self._session.liveliness().declare_token(server.keys.claim(self._epoch, server.instance))
+        signature = server.secret.sign(*claim_parts(server.keys, self._epoch, server.instance))
+        self._token = self._session.liveliness().declare_token(
+            server.keys.claim(self._epoch, server.instance, signature)
+        )
         if before is not None:
             before.undeclare()
 
@@ -332,7 +405,13 @@ class RoleControl:
             self._outdated = self._outdated or not taken
 
     def _fetch_and_restore(self) -> bool:
-        data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s)
+        try:
+            data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s, self.server.secret)
+        except ServiceError as error:
+            if str(error) != self._refusal:
+                self.server.axis.note("standby_refused", str(error))
+            self._refusal = str(error)
+            return False
         # After a failure on a busy machine the next transfer is slower.
         self._pause_s = min(2.0 * self._pause_s, MAX_PAUSE_S)
         if data is None:

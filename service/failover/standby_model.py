@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from adaptive.errors import ModelFileError
+from service.operating.server import Journal
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loop import SampleSink
@@ -65,7 +66,14 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
         except (ModelFileError, OSError) as error:
             axis.note("checkpoint_refused", f"checkpoint {number} of the other instance: {error}")
             continue
-        count = learn_again(axis, files.recordings) if files.recordings is not None else 0
+        switch = Journal(files.recordings or files.checkpoints).last_switch()
+        if switch is not None and switch.time_unix_s < meta.time_unix_s:
+            switch = None  # the state includes it
+        count = 0
+        if files.recordings is not None:
+            count = learn_again(axis, files.recordings, switch)
+        elif switch is not None:
+            switch.apply(axis)
         return f"checkpoint {number} of the other instance, sample {meta.seq}, and {count} samples of its journal"
     return ""
 

@@ -15,6 +15,9 @@ from typing import Any, Final
 
 import zenoh
 
+from service.protocol.errors import ServiceError
+from service.security.peers import SIGNATURE_DIGITS, PeerSecret, new_nonce
+
 #: Size of a part, bytes; a packet holds 64 KiB.
 _PART_BYTES: Final = 56 * 1024
 #: Most parts that are accepted, 256 MB together: a sender must not use up the memory of the receiver.
@@ -26,16 +29,26 @@ PAUSE_S, MAX_PAUSE_S = 0.001, 0.016
 #: Longest silence before a part counts as lost: these seconds and that many pauses.
 _SILENCE_S, _SILENCE_PAUSES = 0.5, 100
 _POLL_S: Final = 0.002
+#: Longest wait for a sign of life, and pause between two queries for one, s.
+_LIFE_S, _LIFE_PAUSE_S = 0.5, 0.1
+NO_SECRET: Final = PeerSecret()
 
 
-def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
-    """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s."""
+def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any], secret: PeerSecret = NO_SECRET) -> None:
+    """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s.
+
+    Raises ServiceError if it does not prove that an instance of the same service asks.
+    """
+    nonce = str(query.parameters.get("nonce") or "")
+    if not secret.proves(str(query.parameters.get("proof") or ""), "ask", key, nonce):
+        raise ServiceError("the state is for instances of this service only; see peer_secret in docs/operating.md")
     try:
         pause_s = float(query.parameters.get("pause_s") or PAUSE_S)
     except ValueError:
         pause_s = PAUSE_S
     pause_s = min(MAX_PAUSE_S, max(0.0, pause_s)) if pause_s == pause_s else PAUSE_S
-    whole = memoryview(b"".join(buffers))
+    data = b"".join(buffers)
+    whole = memoryview(secret.sign("state", key, nonce, data).encode() + data)
     starts = range(0, len(whole), _PART_BYTES)
     for i, start in enumerate(starts):
         part = bytes(whole[start : start + _PART_BYTES])
@@ -43,17 +56,68 @@ def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any]) -> None:
         time.sleep(pause_s)
 
 
-def fetch_state(session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S) -> bytes | None:
-    """The bytes that `send_state` answers with; None if there is no reply or a part is lost."""
+def fetch_state(
+    session: zenoh.Session, key: str, timeout_s: float, pause_s: float = PAUSE_S, secret: PeerSecret = NO_SECRET
+) -> bytes | None:
+    """The bytes that `send_state` answers with; None if there is no reply or a part is lost.
+
+    Raises ServiceError if the sender does not prove that it is an instance of the same service.
+    """
+    nonce = new_nonce()
+    proof = f";nonce={nonce};proof={secret.sign('ask', key, nonce)}" if secret else ""
     # Replies inherit priority and congestion control from their query.
     replies = session.get(
-        f"{key}?pause_s={pause_s:g}",
+        f"{key}?pause_s={pause_s:g}{proof}",
         timeout=timeout_s,
         consolidation=zenoh.ConsolidationMode.NONE,
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    return join_parts(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s))
+    data = join_parts(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s))
+    if data is None or not secret:
+        return data
+    signature, state = data[:SIGNATURE_DIGITS].decode("ascii", "replace"), data[SIGNATURE_DIGITS:]
+    if not secret.proves(signature, "state", key, nonce, state):
+        raise ServiceError(
+            f"{key}: a state came from somebody who does not know the secret of this service's instances"
+        )
+    return state
+
+
+# --- Whether an instance answers.
+
+
+def send_sign_of_life(query: zenoh.Query, key: str, instance: str, secret: PeerSecret = NO_SECRET) -> bool:
+    """Answer ``query`` if it asks whether ``instance`` answers; whether it asks for a sign of life at all."""
+    wanted = query.parameters.get("alive")
+    if wanted is None:
+        return False
+    nonce = str(query.parameters.get("nonce") or "")
+    if str(wanted) == instance:
+        query.reply(key, (secret.sign("alive", key, instance, nonce) or instance).encode())
+    return True
+
+
+def gives_sign_of_life(
+    session: zenoh.Session, key: str, instance: str, timeout_s: float, secret: PeerSecret = NO_SECRET
+) -> bool:
+    """Whether ``instance`` answers queries, and proves that it knows ``secret``, within ``timeout_s``."""
+    until = time.monotonic() + timeout_s
+    while (left_s := until - time.monotonic()) > 0.0:
+        nonce = new_nonce()
+        replies = session.get(
+            f"{key}?alive={instance};nonce={nonce}",
+            timeout=min(_LIFE_S, left_s),
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        for reply in replies:
+            if reply.ok is None:
+                continue
+            said = reply.ok.payload.to_bytes().decode("ascii", "replace")
+            if secret.proves(said, "alive", key, instance, nonce) if secret else said == instance:
+                return True
+        time.sleep(min(_LIFE_PAUSE_S, max(0.0, until - time.monotonic())))
+    return False
 
 
 def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:

@@ -1,7 +1,11 @@
-"""The bounded queue between the wire and the thread of an axis: samples, and jobs that run between two batches."""
+"""The bounded queue between the wire and the thread of an axis: samples, and jobs that run between two batches.
+
+Urgent jobs, which are the commands of operators, have a lane of their own in front of the samples that wait.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -18,6 +22,10 @@ T = TypeVar("T")
 #: Time to wait after the first message for others to handle with it, s. Waking the thread costs as much as learning
 #: from two samples, and fewer wake-ups disturb fewer queries.
 GATHER_S: Final = 0.005
+#: Samples that are handled together at most unless one message holds more: a command waits for no more than these.
+MOST_TOGETHER: Final = 500
+#: Time, s, that a job which runs already may take. What it does takes far less.
+_LONGEST_JOB_S: Final = 60.0
 
 
 class Arrived(NamedTuple):
@@ -54,6 +62,7 @@ class SampleQueue:
 
     Attributes
     ----------
+    capacity : samples that may wait.
     waiting : samples that wait or are being handled. dropped, malformed : samples refused for lack of space, messages
     that could not be decoded.
     handled_at_s : time of arrival, by ``time.monotonic``, of the last sample that was handled; of the first one until
@@ -66,11 +75,13 @@ class SampleQueue:
         self.malformed = 0
         self.handled_at_s: float | None = None
         self._name = name
-        self._capacity = capacity
+        self.capacity = capacity
         self._items: deque[Arrived | Job] = deque()
+        self._urgent: deque[Job] = deque()
         self._changed = threading.Condition()
         self._taker: threading.Thread | None = None
         self._closing = False
+        self._until_s = math.inf
 
     # ---- putting, from any thread
 
@@ -80,7 +91,7 @@ class SampleQueue:
         with self._changed:
             if self.handled_at_s is None:
                 self.handled_at_s = at_s
-            if self._closing or self.waiting + len(batch) > self._capacity:
+            if self._closing or self.waiting + len(batch) > self.capacity:
                 self.dropped += len(batch)
                 return False
             self._items.append(Arrived(batch, at_s))
@@ -93,26 +104,28 @@ class SampleQueue:
         self.malformed += 1
         return self.malformed
 
-    def call(self, work: Callable[[], T], timeout_s: float = 2.0) -> T:
-        """Run ``work`` in the thread of the axis, after the samples that have come; what it returns or raises.
+    def call(self, work: Callable[[], T], timeout_s: float = 2.0, urgent: bool = False) -> T:
+        """Run ``work`` in the thread of the axis; what it returns or raises.
 
-        Not from that thread itself. Raises ServiceError if the thread does not run, or did not reach the work within
-        ``timeout_s``.
+        ``urgent`` : before the samples that wait; else after those that have come. Not from that thread itself.
+        Raises ServiceError if the thread does not run, or did not begin the work within ``timeout_s``; the work is then
+        not done later either.
         """
         done: Future[T] = Future()
         with self._changed:
             if self._closing or self._taker is None or not self._taker.is_alive():
                 raise ServiceError(f"axis {self._name}: no samples are handled; the service begins or ends")
-            self._items.append(Job(work, done))
+            (self._urgent if urgent else self._items).append(Job(work, done))
             self._changed.notify()
         try:
             return done.result(timeout_s)
         except FutureTimeout:
             if done.done():  # the work itself raised it
                 raise
-            done.cancel()
+            if not done.cancel():  # it has begun: say how it ends
+                return done.result(_LONGEST_JOB_S)
             raise ServiceError(
-                f"axis {self._name}: timed out after {timeout_s:g} s; the command may still be applied"
+                f"axis {self._name}: the learner did not get to it within {timeout_s:g} s; it was not applied"
             ) from None
         finally:
             # An exception in it refers to this frame: without this, both would wait for the garbage collector.
@@ -123,11 +136,26 @@ class SampleQueue:
         at_s = self.handled_at_s
         return None if at_s is None else max(0.0, now_s - at_s)
 
-    def close(self) -> None:
-        """Take no more; what is queued is still handed out."""
+    def close(self, drain_s: float = math.inf) -> None:
+        """Take no more; what is queued is still handed out for ``drain_s``."""
         with self._changed:
             self._closing = True
+            self._until_s = time.monotonic() + drain_s
             self._changed.notify()
+
+    def leave(self) -> list[SampleBatch]:
+        """The samples that were not handed out, which count as dropped; the jobs among them are refused."""
+        with self._changed:
+            items = [*self._urgent, *self._items]
+            self._urgent.clear()
+            self._items.clear()
+        for item in items:
+            if isinstance(item, Job):
+                item.done.cancel()
+        left = [item.batch for item in items if isinstance(item, Arrived)]
+        self.dropped += sum(map(len, left))
+        self.waiting -= sum(map(len, left))
+        return left
 
     # ---- taking, from the thread of the axis
 
@@ -136,22 +164,34 @@ class SampleQueue:
         self._taker = taker
 
     def take(self) -> Arrived | Job | None:
-        """Wait for the next job, or for samples: all up to the next job, as one batch. None: closed and empty."""
+        """Wait for the next job, urgent ones first, or for samples as one batch. None: closed and empty.
+
+        A batch ends before the next job, and holds `MOST_TOGETHER` samples at most unless one message holds more.
+        """
         with self._changed:
-            while not self._items and not self._closing:
+            while not self._items and not self._urgent and not self._closing:
                 self._changed.wait()
-            if not self._items:
+            if self._urgent:
+                return self._urgent.popleft()
+            if not self._items or time.monotonic() > self._until_s:
                 return None
             first = self._items[0]
             if isinstance(first, Job):
                 self._items.popleft()
                 return first
-        if not self._closing:
+            behind = self._closing or self.waiting >= MOST_TOGETHER
+        if not behind:
             time.sleep(GATHER_S)
-        batches, at_s = [], 0.0
+        batches: list[SampleBatch] = []
+        at_s, count = 0.0, 0
         with self._changed:
+            if self._urgent:
+                return self._urgent.popleft()
             while self._items and isinstance(self._items[0], Arrived):
                 arrived = self._items[0]
+                count += len(arrived.batch)
+                if batches and count > MOST_TOGETHER:
+                    break
                 self._items.popleft()
                 batches.append(arrived.batch)
                 at_s = arrived.at_s

@@ -2,28 +2,66 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import zenoh
 
 from adaptive.errors import DehystError
 from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request
-from service.protocol.container import JSON, to_json
+from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
 
 # --- The journal of operations: one JSON line per operation in a folder of the axis.
 
 FILE: Final = "operations.jsonl"
+FILE_BEFORE: Final = "operations.1.jsonl"
+FREEZE, THAW = "freeze", "thaw"
 #: Size, bytes, beyond which the journal is renamed to operations.1.jsonl and a new one is started.
 JOURNAL_BYTES: Final = 8 * 2**20
+
+
+class Switchable(Protocol):
+    """What can be frozen and thawed: an axis."""
+
+    @property
+    def frozen(self) -> bool: ...
+
+    def freeze(self, by: str = "") -> int: ...
+
+    def thaw(self, by: str = "") -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Switch:
+    """A *freeze* or *thaw* in the journal.
+
+    Attributes
+    ----------
+    verb, who : as in the request. samples : count of all samples handled before it held. time_unix_s : of the entry, s.
+    """
+
+    verb: str
+    who: str
+    samples: int
+    time_unix_s: float
+
+    def apply(self, axis: Switchable) -> None:
+        """Freeze or thaw ``axis`` unless it is so already."""
+        if self.verb == FREEZE and not axis.frozen:
+            axis.freeze(self.who)
+        elif self.verb == THAW and axis.frozen:
+            axis.thaw(self.who)
 
 
 class Journal:
@@ -52,7 +90,7 @@ class Journal:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             if self.path.exists() and self.path.stat().st_size + len(line) > self._max_bytes:
-                self.path.replace(self.path.with_name("operations.1.jsonl"))
+                self.path.replace(self.path.with_name(FILE_BEFORE))
             # One write per line in append mode, so that lines of two processes do not mix.
             handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             try:
@@ -65,6 +103,25 @@ class Journal:
             self.lost += 1
             return False
         return True
+
+    def last_switch(self) -> Switch | None:
+        """The last *freeze* or *thaw* that was applied; None if there is none. Damaged lines are skipped."""
+        if self.path is None:
+            return None
+        for path in (self.path, self.path.with_name(FILE_BEFORE)):
+            try:
+                lines = path.read_bytes().splitlines()
+            except OSError:
+                continue
+            for line in reversed(lines):
+                entry = fields_of(line)
+                verb, who = entry.get("verb"), entry.get("who")
+                at_s, samples = entry.get("time_unix_s"), entry.get("samples", 0)
+                if verb not in (FREEZE, THAW) or entry.get("ok") is not True:
+                    continue
+                if isinstance(who, str) and isinstance(at_s, float | int) and isinstance(samples, int):
+                    return Switch(str(verb), who, samples, float(at_s))
+        return None
 
 
 # --- The server.
@@ -85,6 +142,8 @@ class OperationsServer:
     ----------
     keys, instance : of the axis. verbs : the commands. journal : keeps a record of them.
     note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
+    samples : count of all samples when the last command was applied.
+    settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     """
 
     def __init__(
@@ -95,6 +154,8 @@ class OperationsServer:
         journal: Journal,
         note: Callable[[str, str], None],
         role: Callable[[], str] = lambda: "primary",
+        samples: Callable[[], int] = lambda: 0,
+        settle: Callable[[], bool] = lambda: False,
     ) -> None:
         self._keys = keys
         self._instance = instance
@@ -102,6 +163,10 @@ class OperationsServer:
         self._journal = journal
         self._note = note
         self._role = role
+        self._samples = samples
+        self._settle = settle
+        #: Requests refused before they were read, which the thread writes to the journal: (payload, reason).
+        self._turned_away: deque[tuple[bytes, str]] = deque(maxlen=_WAITING)
         self._counts = {"done": 0, "refused": 0}
         self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
@@ -142,7 +207,8 @@ class OperationsServer:
                 self._note("internal_error", f"{self._keys.operate}: {type(error).__name__}: {error}")
             raise
         self._counts["done"] += 1
-        self._write(request, seq=seq)
+        journaled = self._write(request, seq=seq)
+        settled = request.verb not in self._verbs.background and self._settle()
         answer = {
             "schema": SCHEMA,
             "ok": True,
@@ -152,12 +218,13 @@ class OperationsServer:
             "axis": self._keys.axis,
             "instance": self._instance,
             "seq": seq,
+            "durable": journaled or settled,
             "result": result,
         }
         return to_json(answer)
 
-    def _write(self, request: Request, seq: int | None = None, error: str = "") -> None:
-        """Write to the journal, and note an event if the verb itself does not."""
+    def _write(self, request: Request, seq: int | None = None, error: str = "") -> bool:
+        """Write to the journal, and note an event if the verb itself does not. Whether the entry is on the disk."""
         entry: dict[str, Any] = {
             "who": request.who,
             "verb": request.verb,
@@ -165,14 +232,23 @@ class OperationsServer:
             "instance": self._instance,
             "ok": not error,
         }
-        entry |= {"error": error} if error else {"seq": seq}
+        entry |= {"error": error} if error else {"seq": seq, "samples": self._samples()}
         lost = self._journal.lost
-        if not self._journal.write(entry) and not lost:
+        written = self._journal.write(entry)
+        if not written and not lost:
             self._note("journal_failed", f"{self._journal.path} cannot be written; operations go on, see the status")
         if error:
             self._note("operation_refused", f"{request.who}: {request.verb[:32]}: {error}"[:300])
         elif request.verb in self._verbs.background:
             self._note("operation", f"{request.who}: {request.verb} {json.dumps(dict(request.arguments))}"[:300])
+        return written and self._journal.path is not None
+
+    def _write_turned_away(self) -> None:
+        """Write the requests that were refused because too many waited."""
+        while self._turned_away:
+            payload, error = self._turned_away.popleft()
+            with contextlib.suppress(DehystError):
+                self._write(decode_request(payload), error=error)
 
     def _on_query(self, query: zenoh.Query) -> None:
         # Refused before its bytes are copied.
@@ -183,7 +259,10 @@ class OperationsServer:
             payload = None if query.payload is None else query.payload.to_bytes()
             self._queue.put_nowait((query, payload))
         except queue.Full:
-            self._refuse(query, ServiceError(f"{_WAITING} requests wait already: ask again later"))
+            error = ServiceError(f"{_WAITING} requests wait already: ask again later")
+            if payload is not None:
+                self._turned_away.append((payload, str(error)))
+            self._refuse(query, error)
         except Exception as error:
             self._refuse(query, error)
 
@@ -203,3 +282,4 @@ class OperationsServer:
                     continue  # the caller is gone
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
+            self._write_turned_away()

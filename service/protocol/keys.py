@@ -100,11 +100,15 @@ class Keys:
     @property
     def claim_any(self) -> str:
         """Matches the claims of all instances that serve this axis."""
-        return f"{self.base}/claim/*/*"
+        return f"{self.base}/claim/*/*/**"
 
-    def claim(self, epoch: int, instance: str) -> str:
-        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence."""
-        return f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
+    def claim(self, epoch: int, instance: str, signature: str = "") -> str:
+        """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence.
+
+        ``signature`` : of the claim, by the secret of the service's instances; "" without one.
+        """
+        key = f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
+        return f"{key}/{signature}" if signature else key
 
     def standby(self, instance: str) -> str:
         """Liveliness, and publication 1 Hz: JSON, the status of a standby."""

@@ -41,6 +41,8 @@ def build_model(kind: str, state: StateDict, where: str) -> InverseModel:
         model = from_state(state)
     except (ImportError, AttributeError) as error:
         raise ModelFileError(f"{where}: kind {kind!r} cannot be loaded: {error}") from error
+    except ModelFileError as error:
+        raise ModelFileError(f"{where}: {error}") from error
     except (LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ModelFileError(f"{where}: the stored state is not that of a {kind!r} model: {error!r}") from error
     if not isinstance(model, InverseModel):

@@ -1,4 +1,4 @@
-"""A clean stop on Ctrl-C and SIGTERM."""
+"""A clean stop on Ctrl-C, SIGTERM and SIGHUP."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Final
+
+#: Signals that end a process cleanly.
+STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignal:
-    """Ctrl-C and SIGTERM, caught from its making on; make it in the main thread before anything slow.
+    """Ctrl-C, SIGTERM and SIGHUP, caught from its making on; make it in the main thread before anything slow.
+
+    SIGHUP says that the terminal has gone. A process that ignores it, as under nohup, goes on.
 
     ``raising`` is for work that does not look: it is broken off by a KeyboardInterrupt. Where that is raised into
     something that swallows it (an object that is being cleaned up), :meth:`look` raises it once more.
@@ -29,8 +35,9 @@ class StopSignal:
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
         weakref.finalize(self, _close, self._read, self._write)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+        for number in STOPS:
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._on_signal)
 
     def wait(self, duration_s: float | None = None) -> str:
         """Wait for a signal or for ``duration_s``; returns the signal's name, or that the time is over."""
@@ -68,7 +75,7 @@ def _close(*descriptors: int) -> None:
 
 @contextlib.contextmanager
 def unbroken() -> Iterator[None]:
-    """Ctrl-C and SIGTERM that come in this block act at its end: a child process that was started is also noted down.
+    """Signals to stop that come in this block act at its end: a child process that was started is also noted down.
 
     In another thread than the main one it does nothing, because no signal is handled there.
     """
@@ -76,7 +83,7 @@ def unbroken() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in STOPS}
     held = {number: handler for number, handler in before.items() if callable(handler)}
     for number in held:
         signal.signal(number, lambda number, _: came.append(number))

@@ -24,13 +24,16 @@ _MODULES = {
     "add": "access",
     "check_reach": "check",
     "count_refusals": "refusals",
+    "PeerSecret": "peers",
     "create": "access",
     "has_access_control": "check",
     "read_plan": "access",
+    "read_secret": "peers",
     "remove": "access",
 }
 __all__ = [
     "ROLES",
+    "PeerSecret",
     "Plan",
     "Refusals",
     "access_control",
@@ -40,6 +43,7 @@ __all__ = [
     "create",
     "has_access_control",
     "read_plan",
+    "read_secret",
     "remove",
 ]
 

@@ -243,7 +243,7 @@ def _write_all(folder: Path, plan: Plan, new: Sequence[str], days: int) -> list[
         path = folder / f"{name}.json5"
         listens = role in (SERVICE, ROUTER)
         if name in new:
-            config = _configuration(name, listens, _certificate(folder / "ca", name, plan.hosts, days))
+            config = _configuration(name, listens, _certificate(folder / "ca", name, plan.hosts, days, listens))
             config["transport"]["auth"] = {"usrpwd": {"user": name, "password": passwords[name]}}
         elif listens:
             config = json.loads(path.read_text(encoding="utf-8").split("\n", 1)[1])
@@ -280,14 +280,20 @@ def _configuration(name: str, listens: bool, pems: dict[str, bytes]) -> dict[str
     return {"transport": {"link": {"protocols": ["tls"], "tls": tls}}}
 
 
-def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int) -> dict[str, bytes]:
-    """A new key and certificate with the common name ``name``, valid for both ends of a connection."""
+def _certificate(ca: Path, name: str, hosts: Sequence[str], days: int, listens: bool) -> dict[str, bytes]:
+    """A new key and certificate with the common name ``name``.
+
+    ``listens`` : valid for both ends of a connection, with the names in ``hosts``. Else for the end that connects only,
+    so that nobody takes a client for the service.
+    """
     named = ",".join(f"{'IP' if _is_address(host) else 'DNS'}:{host}" for host in hosts)
+    usage = (
+        f"subjectAltName={named}\nextendedKeyUsage=serverAuth,clientAuth" if listens else "extendedKeyUsage=clientAuth"
+    )
     with tempfile.TemporaryDirectory() as scratch:
         at = Path(scratch)
         (at / "extensions").write_text(
-            f"subjectAltName={named}\nextendedKeyUsage=serverAuth,clientAuth\nbasicConstraints=critical,CA:FALSE\n"
-            "keyUsage=critical,digitalSignature\n",
+            f"{usage}\nbasicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\n",
             encoding="utf-8",
         )
         _openssl("req", *_NEW_KEY, "-subj", f"/CN={name}", "-keyout", str(at / "key"), "-out", str(at / "request"))

@@ -30,11 +30,13 @@ from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, Sequen
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety
+from service.protocol.model_classes import build_model, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.competing import champion_of
-from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, fingerprint
+from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, check_same_learner, fingerprint
 from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
+from service.server.state_schema import StateSchema
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
 
@@ -55,6 +57,7 @@ LEVELS: Final = {
     "operation_refused": logging.WARNING,
     "standby_refused": logging.WARNING,
     "standby_differed": logging.WARNING,
+    "claim_ignored": logging.WARNING,
 }
 #: Events that wait for the publisher; of a flood only the newest are kept.
 _KEPT: Final = 256
@@ -119,8 +122,11 @@ class Archive(Protocol):
         """The checkpoints, newest first."""
         ...
 
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint. Raises FieldError if there is none with this number, or it does not fit."""
+    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
+        """The learner of a checkpoint, whose state passes ``check``.
+
+        Raises FieldError if there is none with this number, or it does not fit.
+        """
         ...
 
 
@@ -143,6 +149,8 @@ class Axis:
     limits : those of ``config``, with a displacement range filled in.
     revive : starts another learner from a model, some time after a learner has failed; None: it stays failed.
     stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
+    template : state of a learner like ``learner`` that has learnt some samples: what a state to restore must look like.
+        By default that of ``learner`` itself.
 
     Raises InputError if ``config`` names a model that is missing, or if the sample times differ.
     """
@@ -157,6 +165,7 @@ class Axis:
         *,
         stage: str = "",
         archive: Archive | None = None,
+        template: StateDict | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
             config = replace(config, served=config.learn or LEARN)  # without a competition
@@ -186,6 +195,10 @@ class Axis:
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
         self.counts = SampleCounts(-1, self.sequence.counters(), {})
         self._age_s = 0.0
+        if template is None:
+            template = {} if learner is None else learner.state_dict()
+        sizes = {name: memory.size for name, memory in self.newest.memories.items()}
+        self._schema = StateSchema(template, sizes)
 
     # ---- what other threads read
 
@@ -255,9 +268,9 @@ class Axis:
             blends(name, served.default, config),
             config.blend_share,
             served.trust if learns(name, config) else 1.0,
-            config.stale_s if learns(name, config) else 0.0,
+            config.stale_s if learns(name, config) and not served.frozen else 0.0,
             config.last_good_s,
-            served.standing_in_for(name),
+            served.standing_in_for(name, served.frozen),
         )
 
     def differs(self, seq: int, theirs: str) -> bool:
@@ -386,25 +399,29 @@ class Axis:
         last, supervisor = self.newest, self.supervisor
         models = last.models
         if supervisor.learner is not None:
-            models = models | supervisor.models(last, self.sequence.received)
-        memories = supervisor.memories(models, self.tracker.advance(models, last.memories))
+            learnt = supervisor.models(last, self.sequence.received)
+            # While frozen the samples are still judged, but what they change is not served.
+            models = models if last.frozen else models | learnt
+        memories = supervisor.memories(models, self.tracker.advance(models, last.memories), last.frozen)
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
-            trust=supervisor.watch.trust, trouble=supervisor.watch.trouble,
+            trust=last.trust if last.frozen else supervisor.watch.trust, trouble=supervisor.watch.trouble,
         )  # fmt: skip
         self._snapshots = (*self._snapshots, served)[-self.config.snapshots_kept :]
 
     # ---- operator's commands; each returns the number of the sample after which it holds
 
     def freeze(self, by: str = "") -> int:
-        """Stop learning: samples are still tracked, judged and recorded."""
+        """Stop learning and keep what is served to the last bit; samples are still tracked, judged and recorded."""
         self.supervisor.freeze(by or "operator")
+        self._snapshots = (*self._snapshots[:-1], self.newest.freeze())
         self.note("frozen", "learning is stopped", by=by)
         return self.handled_seq
 
     def thaw(self, by: str = "") -> int:
-        """Resume learning."""
+        """Resume learning; the next snapshot serves what has been learnt."""
         self.supervisor.thaw()
+        self._snapshots = (*self._snapshots[:-1], self.newest.thaw())
         self.note("thawed", "learning goes on", by=by)
         return self.handled_seq
 
@@ -424,7 +441,7 @@ class Axis:
         """
         if self._archive is None or self.learner is None:
             raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
-        learner = self._archive.learner_of(checkpoint, self.learner)
+        learner = self._archive.learner_of(checkpoint, self.learner, self._check_state)
         self.supervisor.replace(learner)
         newest = self.newest
         changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}
@@ -460,11 +477,20 @@ class Axis:
         state |= prefixed("tracker.", self.tracker.state_dict())
         state |= prefixed("gates.", self._gates)
         state |= prefixed("memory.", served.memories)
+        if served.frozen:
+            for name in (self.config.learn, AUTO):
+                if name in served.models and learns(name, self.config):
+                    model = served.models[name]
+                    role = f"frozen.{'auto' if name == AUTO else 'learn'}."
+                    state |= {f"{role}kind": stored_kind(model), **prefixed(role, model.state_dict())}
+            if served.held is not None:
+                state["frozen.held"] = served.held.copy()
         state |= self.supervisor.state_dict(served.trouble in POISON)
         return state
 
     def restore(self, state: StateDict) -> None:
         """Continue from ``state``. Raises ModelFileError if it does not fit; the axis is then unchanged."""
+        self._check_state(state)
         try:
             sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)
             sequence.restore(under("sequence.", state))
@@ -474,13 +500,27 @@ class Axis:
             served = self._restored_snapshot(state, supervisor)
             gates = {name: int(count) for name, count in under("gates.", state).items()}
             seq = int(state["seq"])
-        except (KeyError, TypeError, ValueError, InputError) as error:
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+            RecursionError,
+            InputError,
+        ) as error:
             raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
         self.sequence, self.clock, self.tracker, self.supervisor = sequence, clock, tracker, supervisor
         self._gates = gates
         self._snapshots = (served,)
         self.handled_seq = seq
         self._update_counts()
+
+    def _check_state(self, state: StateDict) -> None:
+        """Raise ModelFileError if ``state`` is of another learner, or an entry is not as it must be."""
+        if self.learner is not None:
+            check_same_learner(under("learner.", state), self.learner)
+        self._schema.check(state)
 
     def _restored_snapshot(self, state: StateDict, supervisor: LearnerSupervisor) -> Served:
         now = self.newest
@@ -489,6 +529,9 @@ class Axis:
             good = supervisor.watch.good
             models[self.config.learn] = supervisor.learner.snapshot() if good is None else good
             models |= champion_of(supervisor.learner)
+        for role, name in (("frozen.learn.", self.config.learn), ("frozen.auto.", AUTO)):
+            if supervisor.frozen and f"{role}kind" in state and name in models:
+                models[name] = build_model(str(state[f"{role}kind"]), under(role, state), f"the frozen model {name!r}")
         memories: dict[str, FloatArray] = {}
         for name, model in models.items():
             memory = np.array(state.get(f"memory.{name}", model.rest_memory(0.0)), dtype=np.float64)
@@ -496,8 +539,16 @@ class Axis:
                 raise FieldError(f"memory.{name}", memory.shape, f"({model.memory_size},) finite numbers")
             memories[name] = memory
         default = str(state["served.default"])
-        return replace(
+        served = replace(
             now, seq=int(state["served.seq"]), t_s=float(state["served.t_s"]), u_V=float(state["served.u_V"]),
             models=models, memories=memories, default=default if default in models else now.default,
-            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]),
+            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]), frozen=False, held=None,
         )  # fmt: skip
+        if not supervisor.frozen:
+            return served
+        served, held = served.freeze(), state.get("frozen.held")
+        if held is None or served.held is None:  # a state of before there was one
+            return served
+        if np.shape(held) != served.held.shape:
+            raise FieldError("frozen.held", np.shape(held), f"{served.held.shape}")
+        return replace(served, held=np.array(held, dtype=np.float64))

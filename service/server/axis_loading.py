@@ -14,7 +14,7 @@ from adaptive.types import InverseModel, OnlineModel, Sample
 from service.answers import guard
 from service.answers.guard import Limits
 from service.config.schema import build_settings
-from service.config.settings import AxisConfig
+from service.config.settings import COMPETE, AxisConfig
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
 from service.server.competing import champion_of, compete
@@ -60,6 +60,10 @@ def load_axis(
             )
     models = dict(bundle.models)
     limits = _with_domain(config.limits, bundle.meta)
+    for name in config.compete:
+        if name not in models and name not in COMPETE:
+            expected = f"one of the models in {config.model}: {', '.join(models)}, or of {', '.join(COMPETE)}"
+            raise FieldError("compete", repr(name), expected)
     others = {name: models[name] for name in config.compete if name in models and name != config.learn}
 
     def begin(model: InverseModel) -> OnlineModel:
@@ -67,7 +71,7 @@ def load_axis(
             config.learn, model, lambda start: factory(start, config.learner, limits), others, config.competition
         )
 
-    learner = None
+    learner = template = None
     if config.learn:
         if config.learn not in models:
             raise FieldError(
@@ -75,12 +79,14 @@ def load_axis(
             )
         learner = begin(models[config.learn])
         # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
-        _warm_learner(begin(models[config.learn]), limits)
+        warmed = begin(models[config.learn])
+        _warm_learner(warmed, limits)
+        template = warmed.state_dict()
         models |= champion_of(learner)
     archive = None
     if config.checkpoints is not None:
         archive = CheckpointFolder(config.checkpoints, stage, config.name, bundle.meta.dt_s, config.checkpoints_kept)
-    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive)
+    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive, template=template)
     _warm_models(axis)
     return axis
 

@@ -22,6 +22,8 @@ from service.server.competing import standing_of
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"
+#: Longest time for which the samples that wait are handled at the end, s.
+DRAIN_S: Final = 2.0
 
 #: Interval at which diagnostics are read, s of samples, and how many such intervals pass between two readings of the
 #: window's points.
@@ -156,6 +158,8 @@ class AxisLoop:
         self._on_snapshot = on_snapshot
         self._gate: Gate | None = None
         self._tunes = False
+        #: Messages that were dropped because they could never fit into the queue.
+        self._too_long = 0
         self._thread = threading.Thread(target=self.run, name=f"learn-{axis.config.name}")
 
     def run(self) -> None:
@@ -202,7 +206,15 @@ class AxisLoop:
         dropped_before = self.queue.dropped
         if self.queue.put(batch):
             return True
-        if not dropped_before:
+        capacity = self.queue.capacity
+        if len(batch) > capacity:
+            if not self._too_long:
+                detail = (
+                    f"a message of {len(batch)} samples is longer than queue_samples, {capacity}: send shorter ones"
+                )
+                self.axis.note("samples_dropped", detail)
+            self._too_long += 1
+        elif not dropped_before:
             self.axis.note("samples_dropped", "the learner is behind and its queue is full; see the status")
         if self.sink is not None:
             # They have no place in the order in which the others are handled.
@@ -228,7 +240,10 @@ class AxisLoop:
         self._thread.start()
 
     def close(self) -> None:
-        """Handle what is queued, then end the thread."""
-        self.queue.close()
+        """Handle what is queued, for `DRAIN_S` at most, then end the thread; what is left is recorded aside."""
+        self.queue.close(DRAIN_S)
         if self._thread.is_alive():
             self._thread.join()
+        for batch in self.queue.leave():
+            if self.sink is not None:
+                self.sink.put_aside(batch.seq, batch.t_s, batch.u_V, batch.y_um, DROPPED)

@@ -10,11 +10,13 @@ import zenoh
 
 from service.answers.answering import trust_by_age
 from service.background.retuning.retuner import Retuner
+from service.failover.state_transfer import NO_SECRET
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
+from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.query_answers import LatencyMeter, QueryAnswers
@@ -23,6 +25,8 @@ from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
+#: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
+_WRITTEN_S: Final = 1.0
 
 
 class AxisServer:
@@ -35,6 +39,7 @@ class AxisServer:
     ----------
     instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
     sink : records samples, or None. watcher : the background diagnosis, or None.
+    secret : by which the instances of this service prove themselves to each other.
 
     Attributes
     ----------
@@ -52,13 +57,17 @@ class AxisServer:
         wake: Callable[[], None],
         sink: SampleSink | None = None,
         watcher: SampleWatcher | None = None,
+        secret: PeerSecret = NO_SECRET,
     ) -> None:
         self.keys = keys
+        self.secret = secret
         self.axis = axis
         self.instance = instance
         self.role = STANDBY
         self.synced = True
         self.epoch = 0
+        #: Count of all samples when the last command was applied.
+        self._operated_at = 0
         config = axis.config
         queue = SampleQueue(config.name, config.queue_samples)
         folder = None
@@ -69,7 +78,7 @@ class AxisServer:
         retuner = Retuner(config.retuning, config.recorder) if tuned else None
         self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
         self._latency = LatencyMeter()
-        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status)
+        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status, instance, secret)
         self._operations = self._operations_server()
         self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
         self._session = session
@@ -150,13 +159,23 @@ class AxisServer:
     # ---- operator's commands
 
     def operate(self, work: Callable[[Axis], int], timeout_s: float = 2.0) -> int:
-        """Run an operator's command between two batches of samples and keep a checkpoint of the outcome.
+        """Run an operator's command before the samples that wait, and copy the outcome for a checkpoint.
 
         Returns what ``work`` returns. Not from a callback of the wire, because it waits for the learner.
         """
-        seq = self.loop.queue.call(lambda: work(self.axis), timeout_s)
-        self.checkpoints.write_now(timeout_s)
-        return seq
+
+        def apply() -> int:
+            seq = work(self.axis)
+            self._operated_at = self.axis.sequence.received
+            self.checkpoints.copy_now()
+            return seq
+
+        return self.loop.queue.call(apply, timeout_s, urgent=True)
+
+    def journal(self) -> Journal:
+        """The operators' journal of the axis."""
+        config = self.axis.config
+        return Journal(config.recorder or config.checkpoints)
 
     def _operations_server(self) -> OperationsServer:
         def diagnose() -> Background | None:
@@ -165,10 +184,17 @@ class AxisServer:
         def retune() -> Background | None:
             return None if self.loop.tuner is None else self.loop.tuner.request
 
-        config = self.axis.config
         verbs = Verbs(self.axis, self.operate, {"diagnose": diagnose, "retune": retune})
-        journal = Journal(config.recorder or config.checkpoints)
-        return OperationsServer(self.keys, self.instance, verbs, journal, self.axis.note, lambda: self.role)
+        return OperationsServer(
+            self.keys,
+            self.instance,
+            verbs,
+            self.journal(),
+            self.axis.note,
+            lambda: self.role,
+            samples=lambda: self._operated_at,
+            settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
+        )
 
     # ---- the publishing thread
 

@@ -15,6 +15,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from adaptive.errors import DehystError, ModelFileError
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import Served
@@ -37,6 +38,12 @@ _ADDED: Final = re.compile(r"(^|\.)config\.envelope\.")
 
 def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
     """A learner of the kind of ``like`` with ``state``. Raises ModelFileError with the reason if it does not fit."""
+    check_same_learner(state, like)
+    return like.restored(state)
+
+
+def check_same_learner(state: StateDict, like: OnlineModel) -> None:
+    """Raise ModelFileError if ``state`` is of a learner with other settings or another identified model."""
     if not state:
         raise ModelFileError("it holds no learner, but this axis learns")
     for name, value in like.state_dict().items():
@@ -47,7 +54,6 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
             raise ModelFileError(
                 f"it belongs to another {what}: {name} is {_short(state.get(name))}, now {_short(value)}"
             )
-    return like.restored(state)
 
 
 def fingerprint(model: InverseModel) -> str:
@@ -65,6 +71,8 @@ def fingerprint(model: InverseModel) -> str:
 def _equal(a: Any, b: Any) -> bool:
     # A file stores a number that is not finite as an array, and a tuple as a list.
     if isinstance(a, np.ndarray | float) or isinstance(b, np.ndarray | float):
+        if np.asarray(a).dtype.kind not in "fiub" or np.asarray(b).dtype.kind not in "fiub":
+            return False
         return np.shape(a) == np.shape(b) and bool(np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True))
     return bool(a == b or (isinstance(a, tuple) and list(a) == b))
 
@@ -72,6 +80,15 @@ def _equal(a: Any, b: Any) -> bool:
 def _short(value: Any) -> str:
     text = f"an array {value.shape}" if isinstance(value, np.ndarray) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _same_frame(model: InverseModel, learner: OnlineModel) -> bool:
+    """Whether ``model`` reads displacements as the present model of ``learner`` does."""
+    try:
+        now = learner.snapshot()
+    except (DehystError, ValueError, ArithmeticError):
+        return False
+    return isinstance(now, LssvmInverse) and isinstance(model, LssvmInverse) and now.features == model.features
 
 
 # --- Supervision.
@@ -180,9 +197,15 @@ class LearnerSupervisor:
             return {}
         return {self.name: good, **self._champion(last, good, now in POISON)}
 
-    def memories(self, models: dict[str, InverseModel], tracked: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """``tracked`` memories by model, with the learner's own for its model, alone and as a contestant."""
-        if self.learner is None or self._failed:
+    def memories(
+        self, models: dict[str, InverseModel], tracked: dict[str, FloatArray], frozen: bool = False
+    ) -> dict[str, FloatArray]:
+        """``tracked`` memories by model, with the learner's own for its model, alone and as a contestant.
+
+        ``frozen`` : the models are those of an earlier moment. The learner's memory does not fit them once it has found
+        that the readings have jumped.
+        """
+        if self.learner is None or self._failed or (frozen and not _same_frame(models[self.name], self.learner)):
             return tracked
         own = self.learner.memory_for(models[self.name])
         if own is None or own.shape != tracked[self.name].shape or not np.isfinite(own).all():

@@ -21,6 +21,7 @@ from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import open_service
+from service.security.peers import read_secret
 from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
@@ -39,6 +40,8 @@ PATIENCE_S: Final = 0.3
 SETTLE_S: Final = 20.0
 #: How long it waits for the state of the one that serves before it says that it is ready all the same, s.
 SYNC_S: Final = 30.0
+#: How long a start waits for a process that still holds the folder of the checkpoints, s.
+_HOLD_S: Final = 5.0
 #: Longest pause of the publishing thread, s.
 _TICK_S: Final = 0.02
 
@@ -78,10 +81,20 @@ def as_standby(config: ServeConfig) -> ServeConfig:
 
 
 def _restore(server: AxisServer) -> None:
-    """Restore the newest checkpoint, then learn the samples after it from the recording."""
+    """Restore the newest checkpoint, then learn the samples after it from the recording.
+
+    A *freeze* or *thaw* that is in the operators' journal but not in the checkpoint is applied at its sample.
+    """
     axis, folder, sink = server.axis, server.checkpoints.folder, server.loop.sink
-    if folder is not None and restore_newest(axis, folder) is not None and axis.config.recorder is not None:
-        learn_again(axis, axis.config.recorder)
+    server.checkpoints.hold(_HOLD_S)
+    number = None if folder is None else restore_newest(axis, folder)
+    switch = server.journal().last_switch()
+    if switch is not None and folder is not None and number is not None:
+        switch = switch if switch.time_unix_s >= folder.written_at(number) else None
+    if number is not None and axis.config.recorder is not None:
+        learn_again(axis, axis.config.recorder, switch)
+    elif switch is not None:
+        switch.apply(axis)
     if sink is not None:
         sink.rebase(axis.sequence.received)
 
@@ -140,6 +153,7 @@ class Service:
         """
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
+        secret = read_secret(config.peer_secret)
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
@@ -157,6 +171,7 @@ class Service:
                     self._wake.set,
                     self._sinks(axis.config),
                     make_watcher(axis),
+                    secret,
                 )
                 self.axes.append(server)
                 _restore(server)

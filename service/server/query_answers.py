@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
-from service.failover.state_transfer import send_state
+from service.failover.state_transfer import NO_SECRET, send_sign_of_life, send_state
 from service.protocol.container import JSON, to_json
-from service.protocol.errors import FieldError, error_to_json
+from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
 from service.protocol.query import decode_query, encode_reply
+from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
 
@@ -55,6 +56,8 @@ class LatencyMeter:
 
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02
+#: States that are sent at the same time at most.
+_MOST_STATES: Final = 4
 
 
 class QueryAnswers:
@@ -63,6 +66,7 @@ class QueryAnswers:
     Parameters
     ----------
     latency : takes the time of every feedforward query. status : makes the status.
+    instance, secret : of this process, for other instances that ask for its state or for a sign of life.
     """
 
     def __init__(
@@ -72,12 +76,17 @@ class QueryAnswers:
         checkpoints: CheckpointKeeper,
         latency: LatencyMeter,
         status: Callable[[], dict[str, Any]],
+        instance: str = "",
+        secret: PeerSecret = NO_SECRET,
     ) -> None:
         self._keys = keys
         self._axis = axis
         self._checkpoints = checkpoints
         self._latency = latency
         self._status = status
+        self._instance = instance
+        self._secret = secret
+        self._sends = threading.BoundedSemaphore(_MOST_STATES)
 
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Answer from now on; returns what is to be undeclared."""
@@ -115,11 +124,22 @@ class QueryAnswers:
             time.sleep(_ROUTING_S)
             with query:
                 try:
-                    send_state(query, self._keys.state, encode_checkpoint(*self._checkpoints.state()))
+                    send_state(query, self._keys.state, self._state_buffers(), self._secret)
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
+                finally:
+                    self._sends.release()
 
+        if send_sign_of_life(query, self._keys.state, self._instance, self._secret):
+            return
+        if not self._sends.acquire(blocking=False):
+            query.reply_err(error_to_json(ServiceError(f"{_MOST_STATES} states are being sent: ask again later")))
+            return
         threading.Thread(target=reply, name=f"state-{self._keys.axis}", daemon=True).start()
+
+    def _state_buffers(self) -> Iterator[Any]:
+        """The buffers of the present state, copied when the first one is asked for."""
+        yield from encode_checkpoint(*self._checkpoints.state())
 
     def _guarded(
         self, key: str, answer: Callable[[zenoh.Query], bytes], meter: LatencyMeter | None = None

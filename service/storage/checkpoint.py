@@ -8,6 +8,7 @@ refused.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import struct
 import threading
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final, Protocol
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.types import OnlineModel, StateDict, under
@@ -25,14 +26,24 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
+from service.server.state_schema import MOST_FLOAT, MOST_INT
 from service.storage.output import atomic_write
-from service.storage.segments import rows_behind
+from service.storage.segments import claim, is_still_at, rows_behind
 
 # --- Files.
 
 MAGIC: Final = b"DHCKPT01"
 _HEAD: Final = struct.Struct("<8sQ16s")
 SUFFIX: Final = ".ckpt"
+_LOCK: Final = ".lock-checkpoints"
+#: Checkpoints that are never removed to make room on a full disk.
+_LEAST_KEPT: Final = 2
+
+
+_META_TYPES: Final[dict[str, tuple[type, ...]]] = {
+    "stage": (str,), "axis": (str,), "dt_s": (float, int), "seq": (int,), "samples": (int,),
+    "time_unix_s": (float, int), "instance": (str,), "schema": (int,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +66,15 @@ class CheckpointMeta:
     instance: str = ""
     schema: int = STATE_SCHEMA
     units: dict[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        for name, kinds in _META_TYPES.items():
+            value = getattr(self, name)
+            if not isinstance(value, kinds) or isinstance(value, bool):
+                raise ModelFileError(f"{name}: got {str(value)[:40]!r}, expected {kinds[0].__name__}")
+        if max(abs(self.seq), abs(self.samples)) > MOST_INT or not (0.0 < self.dt_s < MOST_FLOAT):
+            got = f"{str(self.seq)[:40]}, {str(self.samples)[:40]}, {self.dt_s}"
+            raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers within 3 x 2^61 and a time in s")
 
     def refuse_unless(self, stage: str, axis: str, dt_s: float) -> None:
         """Raise ModelFileError with the reason if the checkpoint is of another axis or of another version."""
@@ -112,9 +132,19 @@ class CheckpointFolder:
         self.directory.mkdir(parents=True, exist_ok=True)
         number = max((number_of(path) for path in self._paths()), default=0) + 1
         path = self.directory / f"checkpoint-{number:09d}{SUFFIX}"
-        with atomic_write(path) as file:
-            for buffer in encode_checkpoint(meta, state):
-                file.write(buffer)
+        buffers = encode_checkpoint(meta, state)
+        while True:
+            try:
+                with atomic_write(path) as file:
+                    for buffer in buffers:
+                        file.write(buffer)
+                break
+            except OSError as error:
+                # A full disk: the oldest checkpoint is worth less than the newest.
+                oldest = self._paths()[:-_LEAST_KEPT]
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not oldest:
+                    raise
+                oldest[0].unlink(missing_ok=True)
         self._remove_surplus(number)
         return path
 
@@ -145,17 +175,28 @@ class CheckpointFolder:
         meta.refuse_unless(*self._belongs)
         return meta, state
 
+    def written_at(self, number: int) -> float:
+        """Time at which the state of a checkpoint was copied, s since 1970; 0 if it cannot be read."""
+        with contextlib.suppress(OSError, ModelFileError):
+            return _read_meta(self.directory / f"checkpoint-{number:09d}{SUFFIX}").time_unix_s
+        return 0.0
+
     def numbers(self) -> list[int]:
         """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
 
-    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
-        """The learner of a checkpoint. Raises InputError if it does not exist or does not match ``like``."""
+    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
+        """The learner of a checkpoint, whose state passes ``check``.
+
+        Raises InputError if it does not exist or does not match ``like``.
+        """
         if number not in self.numbers():
             known = ", ".join(map(str, self.numbers()[:8])) or "none"
             raise FieldError("checkpoint", number, f"one of those there are ({known} ...)", "see 'checkpoints'")
         try:
-            return restored_learner(under("learner.", self.read(number)[1]), like)
+            state = self.read(number)[1]
+            check(state)
+            return restored_learner(under("learner.", state), like)
         except ModelFileError as error:
             raise FieldError("checkpoint", number, "one that is whole and matches", str(error)) from error
 
@@ -203,6 +244,20 @@ def _read_meta(path: Path) -> CheckpointMeta:
 #
 # The thread that handles samples only copies the state; a thread of its own encodes and writes it.
 
+
+class Switch(Protocol):
+    """An operator's command that the operators' journal holds: freeze or thaw."""
+
+    @property
+    def samples(self) -> int:
+        """Count of all samples handled before it held."""
+        ...
+
+    def apply(self, axis: Axis) -> None:
+        """Apply it."""
+        ...
+
+
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
 _PORTION = 100
@@ -226,14 +281,56 @@ class CheckpointKeeper:
         self._clock = clock
         self._names = (stage, axis.config.name, instance)
         self._copied: tuple[CheckpointMeta, StateDict] | None = None
+        #: Copies made; of which the newest that is on the disk, and the newest that was tried.
+        self._copies = self._on_disk = self._tried = 0
         self._ready = threading.Condition()
         self._closing = False
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
+        self._lock: IO[bytes] | None = None
+        self._bytes = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
             self._thread.start()
+
+    def hold(self, timeout_s: float) -> None:
+        """Lock the folder for this process: two services would remove and restore each other's files.
+
+        Waits ``timeout_s`` for a process that ends. Raises FieldError if another process goes on holding it. Where the
+        disk does not allow a lock, writing fails later, and is counted.
+        """
+        if self.folder is None:
+            return
+        until = time.monotonic() + timeout_s
+        while True:
+            try:
+                self._claim()
+            except BlockingIOError as error:
+                if time.monotonic() >= until:
+                    raise FieldError(
+                        "checkpoints",
+                        str(self.folder.directory),
+                        "a folder that no other process keeps its checkpoints in",
+                        "end the other service, or give each its own folder",
+                    ) from error
+                time.sleep(0.05)
+            except OSError:
+                return
+            else:
+                return
+
+    def _claim(self) -> None:
+        """Hold the lock; take it anew where the folder was removed. Raises OSError."""
+        assert self.folder is not None
+        directory = self.folder.directory
+        if self._lock is not None and is_still_at(self._lock.fileno(), directory / _LOCK):
+            return
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+        directory.mkdir(parents=True, exist_ok=True)
+        self._lock = claim(directory, _LOCK, "keeps its checkpoints in")
 
     def on_snapshot(self) -> None:
         """Copy the state if a checkpoint is due. Call it in the thread of the axis, right after a snapshot."""
@@ -242,26 +339,35 @@ class CheckpointKeeper:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
             self._copy()
 
-    def write_now(self, timeout_s: float = 2.0) -> None:
-        """Write a checkpoint of the present state. Raises ServiceError if the learner does not respond in time."""
-        if self.folder is not None:
-            self._queue.call(self._copy, timeout_s)
-
     def copy_now(self) -> None:
-        """As `write_now`, in the thread that handles samples."""
+        """Copy the present state, to be written. Call it in the thread that handles samples."""
         if self.folder is not None:
             self._copy()
+
+    def wait_written(self, timeout_s: float) -> bool:
+        """Wait until the last copy, or a later one, is on the disk; False if it is not, or no checkpoints are kept."""
+        if self.folder is None:
+            return False
+        with self._ready:
+            wanted = self._copies
+            self._ready.wait_for(lambda: self._tried >= wanted, timeout_s)
+            return self._on_disk >= wanted
 
     def state(self, timeout_s: float = 2.0) -> tuple[CheckpointMeta, StateDict]:
         """(meta, copy of the state), for a standby. Raises ServiceError if the learner does not respond in time."""
         return self._queue.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
 
     def counters(self) -> dict[str, Any] | None:
-        """Checkpoints written, age of the newest in s, failures of the disk; None if no checkpoints are written."""
+        """Checkpoints written, age of the newest in s, its size, what a day of them writes, failures of the disk.
+
+        None if no checkpoints are written.
+        """
         if self.folder is None:
             return None
         at = self._written_at_s
-        return {**self._counts, "age_s": None if at is None else time.monotonic() - at}
+        a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
+        age_s = None if at is None else time.monotonic() - at
+        return {**self._counts, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
 
     def close(self) -> None:
         """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
@@ -270,8 +376,11 @@ class CheckpointKeeper:
         self._copy()
         with self._ready:
             self._closing = True
-            self._ready.notify()
+            self._ready.notify_all()
         self._thread.join(10.0)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _meta(self) -> CheckpointMeta:
         stage, name, instance = self._names
@@ -285,7 +394,8 @@ class CheckpointKeeper:
         with self._ready:
             # Replaces a copy that has not been written yet.
             self._copied = copied
-            self._ready.notify()
+            self._copies += 1
+            self._ready.notify_all()
 
     def _run(self) -> None:
         assert self.folder is not None
@@ -296,15 +406,23 @@ class CheckpointKeeper:
                 if self._copied is None:
                     return
                 (meta, state), self._copied = self._copied, None
+                copy = self._copies
+            written = False
             try:
-                self.folder.write(meta, state)
+                self._claim()
+                self._bytes = self.folder.write(meta, state).stat().st_size
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
                 self._written_at_s = time.monotonic()
+                written = True
             except (OSError, DehystError, ValueError) as error:
                 words = (isinstance(error, OSError) and error.strerror) or str(error)
                 if not self._counts["degraded"]:
                     self._axis.note("checkpoint_failed", f"{words}; tried again")
                 self._counts.update(errors=self._counts["errors"] + 1, degraded=True, error=words)
+            with self._ready:
+                self._tried = copy
+                self._on_disk = copy if written else self._on_disk
+                self._ready.notify_all()
 
 
 def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
@@ -324,17 +442,29 @@ def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
     return None
 
 
-def learn_again(axis: Axis, recordings: Path) -> int:
+def learn_again(axis: Axis, recordings: Path, switch: Switch | None = None) -> int:
     """Learn the samples after the restored state again, from the journals in the folder ``recordings``.
 
-    Returns the number of samples. They are not recorded a second time.
+    ``switch`` : an operator's command that the restored state does not include; it is applied after the sample after
+    which it held, or at the end if the journals do not reach that far. Returns the number of samples. They are not
+    recorded a second time.
     """
-    rows = rows_behind(recordings, axis.sequence.received)
+    begun = axis.sequence.received
+    rows = rows_behind(recordings, begun)
+    count = 0 if rows is None else len(rows)
+    first = max(0, count - _MOST_AGAIN)
+    at = count + 1 if switch is None else min(max(switch.samples - begun, first), count)
+    start = first
+    while rows is not None and start < count:
+        if start == at and switch is not None:
+            switch.apply(axis)
+        stop = min(start + _PORTION, count, at if start < at else count)
+        part = rows.part(start, stop)
+        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
+        start = stop
+    if switch is not None and at >= count:
+        switch.apply(axis)
     if rows is None:
         return 0
-    first = max(0, len(rows) - _MOST_AGAIN)
-    for start in range(first, len(rows), _PORTION):
-        part = rows.part(start, start + _PORTION)
-        axis.handle(SampleBatch(part.seq, part.t_s, part.u_V, part.y_um))
     axis.note("learnt_again", f"{len(rows) - first} samples from the journal")
     return len(rows) - first

@@ -6,10 +6,11 @@ It holds arrays and one JSON header, and no code. A file that is damaged, foreig
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,10 @@ from service.storage.output import atomic_write
 SCHEMA: Final = 1
 #: Identifies a model file among other .npz files.
 MAGIC: Final = "dehyst model bundle"
+#: Largest magnitude of an end of a range, µm or V.
+_MOST_RANGE: Final = 1e12
+#: Most bytes of the arrays of a file; one of this program has some hundred kB.
+MAX_BYTES: Final = 128 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,7 @@ def read_bundle(path: Path | str) -> Bundle:
     try:
         # Opened here, because numpy leaves the file open where it is no archive.
         with path.open("rb") as raw:
+            _refuse_bomb(path, raw)
             loaded = np.load(raw, allow_pickle=False)
             if not isinstance(loaded, np.lib.npyio.NpzFile):
                 raise ModelFileError(f"{path}: not a model bundle but a single array; make one with 'dehyst identify'")
@@ -98,13 +104,25 @@ def read_bundle(path: Path | str) -> Bundle:
         raise ModelFileError(f"{path}: no such file; make one with 'dehyst identify DATA --out {path}'") from None
     except OSError as error:
         raise ModelFileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, LookupError, ValueError, TypeError, ArithmeticError, EOFError,
+            NotImplementedError, RecursionError) as error:  # fmt: skip
         raise ModelFileError(f"{path}: damaged, or not a model bundle ({error}); identify the stage again") from error
     meta = _meta(path, header)
     for name, model in models.items():
         if model.dt_s != meta.dt_s:
             raise ModelFileError(f"{path}: model {name!r} has dt_s {model.dt_s}, its bundle {meta.dt_s}")
     return Bundle(models, meta)
+
+
+def _refuse_bomb(path: Path, raw: IO[bytes]) -> None:
+    """Raise ModelFileError if the archive unpacks to more than `MAX_BYTES`: it would use up the memory."""
+    if zipfile.is_zipfile(raw):
+        raw.seek(0)
+        with zipfile.ZipFile(raw) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_BYTES:
+            raise ModelFileError(f"{path}: unpacks to {size} bytes, expected at most {MAX_BYTES}")
+    raw.seek(0)
 
 
 def _header(path: Path, file: Any) -> dict[str, Any]:
@@ -138,6 +156,13 @@ def _meta(path: Path, header: dict[str, Any]) -> BundleMeta:
     dt_s = known.get("dt_s")
     if not isinstance(dt_s, float | int) or not 0 < dt_s < 3600:
         raise ModelFileError(f"{path}: dt_s is {dt_s!r}, expected a sample time in s")
+    for name in ("stage", "axis", "source", "source_sha256"):
+        if not isinstance(known.get(name, ""), str):
+            raise ModelFileError(f"{path}: {name} is {str(known[name])[:40]!r}, expected a text")
+    for name in ("y_min_um", "y_max_um", "u_min_V", "u_max_V"):
+        value = known.get(name)
+        if value is not None and (not isinstance(value, float | int) or not abs(value) < _MOST_RANGE):
+            raise ModelFileError(f"{path}: {name} is {str(value)[:40]!r}, expected a number")
     try:
         return BundleMeta(**known)
     except TypeError as error:

@@ -24,6 +24,8 @@ from service.storage.segments import Closer, Journal, Rows, Syncer, claim, journ
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"
+#: Time between two looks whether the folder is still there, s.
+_LOOK_S: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,7 @@ class Recorder:
         self._closer: Closer | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
-        self._not_before = 0.0
+        self._not_before = self._told_until = self._look_at = 0.0
         self._syncer = Syncer(config.sync_s)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
@@ -220,6 +222,7 @@ class Recorder:
             self._count(lost=len(rows))
             return
         done = 0
+        self._look_for_folder()
         try:
             while done < len(rows):
                 if self._segment is None:
@@ -233,7 +236,7 @@ class Recorder:
                     self._segment, self._left_open, self._own = None, True, True
             if self._segment is not None:
                 self._syncer.look(self._segment)
-            if time.monotonic() >= self._not_before:
+            if time.monotonic() >= max(self._not_before, self._told_until):
                 with self._lock:
                     self._error = ""
         except OSError as error:
@@ -243,6 +246,24 @@ class Recorder:
                 # The rows in this journal are converted to Parquet later.
                 self._segment.close()
                 self._segment, self._left_open = None, True
+
+    def _look_for_folder(self) -> None:
+        """Begin anew where the folder was removed or renamed; the recording is degraded for a while, but goes on."""
+        now = time.monotonic()
+        if self._segment is None or now < self._look_at:
+            return
+        self._look_at = now + _LOOK_S
+        if not self._segment.vanished:
+            return
+        self._segment.close()
+        self._segment = None
+        if self._claim is not None:
+            self._claim.close()
+            self._claim = None
+        self._told_until = now + self.config.retry_s
+        with self._lock:
+            self._counts["errors"] += 1
+            self._error = f"{self.config.directory} vanished while it was recorded into; it is made anew"
 
     def _look_after_closing(self) -> None:
         """Convert the journals that are full, or that a crash or a failing disk left."""

@@ -126,6 +126,11 @@ class Journal:
         self._words = words
         self.rows += len(rows)
 
+    @property
+    def vanished(self) -> bool:
+        """Whether the file is no longer at its path: rows would be written to where nobody finds them."""
+        return not is_still_at(self._fd, self.path)
+
     def handle(self) -> int:
         """A duplicate descriptor of the file; the caller closes it."""
         return os.dup(self._fd)
@@ -330,19 +335,29 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
     return Rows(np.array(seq, dtype=np.int64), np.array(t_s), np.array(u_V), np.array(y_um), reason)
 
 
-def claim(directory: Path) -> IO[bytes]:
+def claim(directory: Path, name: str = ".lock", what: str = "records into") -> IO[bytes]:
     """Lock the directory for this process until the returned file is closed.
 
     Two recorders in one directory would each treat the open segment of the other as left by a crash. Raises
-    BlockingIOError if another process holds the lock.
+    BlockingIOError if another process holds the lock; ``what`` it then does.
     """
-    lock = open(directory / ".lock", "wb")  # noqa: SIM115 - stays open as long as the recorder
+    lock = open(directory / name, "wb")  # noqa: SIM115 - stays open as long as the recorder
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         lock.close()
-        raise BlockingIOError(error.errno, f"another process records into {directory}") from error
+        raise BlockingIOError(error.errno, f"another process {what} {directory}") from error
     return lock
+
+
+def is_still_at(descriptor: int, path: Path) -> bool:
+    """Whether the open file is still the one at ``path``: neither removed nor renamed, nor its folder."""
+    try:
+        there = path.stat()
+    except OSError:
+        return False
+    here = os.fstat(descriptor)
+    return (here.st_dev, here.st_ino) == (there.st_dev, there.st_ino)
 
 
 def number_of(path: Path) -> int:

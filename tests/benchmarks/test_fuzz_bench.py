@@ -42,7 +42,20 @@ def test_five_thousand_payloads_over_every_reader_do_no_more_than_be_refused() -
 @pytest.mark.slow
 def test_the_fuzzer_runs_as_a_command_guided_by_coverage(tmp_path: Path) -> None:
     pytest.importorskip("atheris")
-    done = fuzz("--out", str(tmp_path), "--target", "query", "--target", "framed", "--payloads", "5000", "--live", "0")
+    done = fuzz(
+        "--out",
+        str(tmp_path),
+        "--target",
+        "query",
+        "--target",
+        "framed",
+        "--payloads",
+        "5000",
+        "--live",
+        "0",
+        "--states",
+        "30",
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "fuzz.json").read_text(encoding="utf-8"))
     assert report["held"]

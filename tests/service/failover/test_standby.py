@@ -17,9 +17,10 @@ import pytest
 import zenoh
 
 from service.client.client import Client
-from service.failover.role_control import Claim, Claims, parse_claim
+from service.failover.role_control import Claim, Claims, claim_parts, parse_claim
 from service.protocol.keys import Keys
 from service.runtime.session import open_client
+from service.security.peers import OWN_SECRET, read_secret
 from sim.recordings import read
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
@@ -145,6 +146,7 @@ def test_who_serves_claims_anew_where_another_goes_on_serving(tmp_path: Path, pr
     processes.append(Process("serve", "--config", str(config)))
     instance = processes[0].ready["instance"]
     keys = Keys("demo", "x")
+    signature = read_secret(tmp_path / OWN_SECRET).sign(*claim_parts(keys, 0, "i0-deaf"))
     heard: list[tuple[int, bool]] = []
 
     def on_claim(sample: zenoh.Sample) -> None:
@@ -155,7 +157,7 @@ def test_who_serves_claims_anew_where_another_goes_on_serving(tmp_path: Path, pr
     with open_client(endpoints, 20.0) as session, Client.connect(endpoints, wait_s=20.0) as client:
         session.liveliness().declare_subscriber(keys.claim_any, on_claim, history=True)
         eventually(lambda: heard == [(1, True)])
-        deaf = session.liveliness().declare_token(keys.claim(0, "i0-deaf"))
+        deaf = session.liveliness().declare_token(keys.claim(0, "i0-deaf", signature))
         eventually(lambda: len(heard) >= 5)
         deaf.undeclare()
         # Never without one: whoever stands by would take over.

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
+import pytest
+
 from adaptive.types import InverseModel
+from service.intake.sample_queue import MOST_TOGETHER
+from service.protocol.errors import ServiceError
 from service.protocol.samples import SampleBatch
+from service.server import axis_loop
 from service.server.axis_loop import AxisLoop
 from tests.service.axes import loop_of
+from tests.service.living import eventually
 from tests.service.server.test_axis import make_axis, parts, recording
 
 
@@ -98,10 +105,119 @@ def test_samples_that_could_not_be_handled_make_nothing_newer(models: dict[str, 
     def broken(batch: SampleBatch, on_snapshot: Any) -> list[str]:
         raise RuntimeError("for once")
 
-    axis.handle = broken  # type: ignore[method-assign]
+    axis.handle = broken  # type: ignore[method-assign, assignment]
     loop = loop_of(axis)
     came_s = offered_twice(loop)
     loop.start()
     loop.close()
     assert loop.queue.handled_at_s == came_s
     assert [event["event"] for event in axis.take_events()] == ["internal_error"]
+
+
+# --- Commands of operators: in front of what waits, and what is said of them is true.
+
+
+def slowed(axis: Any, per_sample_s: float) -> list[int]:
+    """Let every sample take ``per_sample_s``; returns the sizes of the batches that are handled."""
+    sizes: list[int] = []
+    handle = axis.handle
+
+    def slowly(batch: SampleBatch, *more: Any) -> list[str]:
+        sizes.append(len(batch))
+        time.sleep(per_sample_s * len(batch))
+        verdicts: list[str] = handle(batch, *more)
+        return verdicts
+
+    axis.handle = slowly
+    return sizes
+
+
+def test_a_command_does_not_wait_for_the_samples_that_wait(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models, queue_samples=20_000)
+    sizes = slowed(axis, 4e-4)
+    loop = loop_of(axis)
+    for part in parts(recording(8000), 100):
+        assert loop.offer(part)
+    loop.start()
+    try:
+        time.sleep(0.05)
+        begin_s = time.monotonic()
+        seq = loop.queue.call(lambda: axis.freeze("alice"), 2.0, urgent=True)
+        took_s = time.monotonic() - begin_s
+        assert axis.frozen
+        assert seq < 2000
+        assert took_s < 1.0, "8000 samples take 3.2 s"
+        eventually(lambda: axis.handled_seq == 7999)
+    finally:
+        loop.close()
+    assert max(sizes) <= MOST_TOGETHER
+
+
+def test_work_that_has_begun_is_told_as_it_ends(models: dict[str, InverseModel]) -> None:
+    loop = loop_of(make_axis(models))
+    loop.start()
+    done: list[str] = []
+
+    def slow() -> str:
+        time.sleep(0.3)
+        done.append("slow")
+        return "done"
+
+    try:
+        assert loop.queue.call(slow, 0.05, urgent=True) == "done"
+    finally:
+        loop.close()
+    assert done == ["slow"]
+
+
+def test_work_that_was_given_up_is_never_done(models: dict[str, InverseModel]) -> None:
+    loop = loop_of(make_axis(models))
+    loop.start()
+    done: list[str] = []
+    blocker = threading.Thread(target=lambda: loop.queue.call(lambda: time.sleep(0.4), 2.0))
+    blocker.start()
+    time.sleep(0.05)
+    try:
+        with pytest.raises(ServiceError, match=r"did not get to it within 0.1 s; it was not applied"):
+            loop.queue.call(lambda: done.append("late"), 0.1, urgent=True)
+        blocker.join()
+        loop.queue.call(lambda: None)
+    finally:
+        loop.close()
+    assert done == []
+
+
+def test_the_end_does_not_wait_for_a_full_queue(
+    models: dict[str, InverseModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(axis_loop, "DRAIN_S", 0.3)
+    axis = make_axis(models, queue_samples=20_000)
+    slowed(axis, 4e-4)
+    aside: list[int] = []
+
+    class Sink:
+        def put(self, seq: Any, *_: Any) -> bool:
+            return True
+
+        def put_aside(self, seq: Any, *rest: Any) -> bool:
+            assert rest[-1] == "dropped"
+            aside.extend(seq.tolist())
+            return True
+
+        def rebase(self, index: int) -> None: ...
+        def counters(self) -> dict[str, Any]:
+            return {}
+
+        def close(self, timeout_s: float = 1.0) -> bool:
+            return True
+
+    loop = loop_of(axis, Sink())
+    for part in parts(recording(8000), 100):
+        assert loop.offer(part)
+    loop.start()
+    begin_s = time.monotonic()
+    loop.close()
+    assert time.monotonic() - begin_s < 1.5, "8000 samples take 3.2 s"
+    assert aside[0] == axis.handled_seq + 1
+    assert aside[-1] == 7999
+    assert (loop.queue.dropped, loop.queue.waiting) == (len(aside), 0)

@@ -23,12 +23,13 @@ from adaptive.errors import InputError
 from lab.cli import main
 from service.client.client import Client
 from service.operating.remote import operate, screen, statuses, table
-from service.operating.server import Journal, OperationsServer
+from service.operating.server import Journal, OperationsServer, Switch
 from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_service
+from tests.service.living import eventually
 
 KEYS = Keys("demo", "x")
 
@@ -109,7 +110,7 @@ def test_each_verb_does_its_own_and_is_written_down(tmp_path: Path) -> None:
     assert [line["verb"] for line in lines] == ["freeze", "thaw", "select", "rollback", "checkpoints", "retune"]
     assert lines[2] == {
         "time_unix_s": 1234.5, "who": "alice", "verb": "select", "arguments": {"model": "linear"},
-        "instance": "i1-00", "ok": True, "seq": 41,
+        "instance": "i1-00", "ok": True, "seq": 41, "samples": 0,
     }  # fmt: skip
     assert server.counters() == {"done": 6, "refused": 0, "unlogged": 0}
 
@@ -238,9 +239,9 @@ def test_over_the_wire(wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServe
 
 
 def test_more_than_can_wait_is_refused_at_once(
-    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer],
+    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer], tmp_path: Path
 ) -> None:
-    axis, client, _ = wire_axis
+    axis, client, server = wire_axis
     operate(client, KEYS, "thaw", "warm")
     axis.hold.clear()
     waiting = [client.get(KEYS.operate, payload=ask("freeze", f"a{i}"), timeout=10.0) for i in range(40)]
@@ -252,6 +253,45 @@ def test_more_than_can_wait_is_refused_at_once(
     # 32 wait, and one is being done if it was taken before the last of them came.
     assert 40 - 33 <= len(refused) <= 40 - 32
     assert all("wait already" in error["message"] for error in refused)
+
+    def journaled() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
+
+    eventually(lambda: len(journaled()) == 41, 10.0)
+    assert sum("wait already" in line.get("error", "") and not line["ok"] for line in journaled()) == len(refused)
+    assert len({line["who"] for line in journaled()}) == 41
+    assert server.counters()["unlogged"] == 0
+
+
+def test_an_answer_says_whether_it_outlives_a_crash(tmp_path: Path) -> None:
+    (tmp_path / "full").write_text("a file where a folder should be")
+    for folder, durable in ((tmp_path, True), (tmp_path / "full", False), (None, False)):
+        server, _ = make(FakeAxis(), folder)
+        assert json.loads(server.handle(ask("freeze")))["durable"] is durable
+    settled = OperationsServer(
+        KEYS, "i1-00", Verbs(FakeAxis(), lambda work: work(FakeAxis()), {}), Journal(None), lambda *_: None,
+        settle=lambda: True,
+    )  # fmt: skip
+    assert json.loads(settled.handle(ask("freeze")))["durable"] is True
+
+
+def test_the_last_switch_is_read_from_a_damaged_journal(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, wall_s=lambda: 5.0)
+    assert journal.last_switch() is None
+    for entry in (
+        {"verb": "freeze", "who": "alice", "ok": True, "samples": 77},
+        {"verb": "thaw", "who": "bob", "ok": False, "error": "no"},
+        {"verb": "select", "who": "bob", "ok": True, "samples": 80},
+        {"verb": "freeze", "who": 3, "ok": True},
+    ):
+        journal.write(entry)
+    with open(tmp_path / "operations.jsonl", "ab") as file:
+        file.write(b'\xff\x00 rubbish\n[1]\n{"verb": "thaw", "ok": tr')
+    assert journal.last_switch() == Switch("freeze", "alice", 77, 5.0)
+    (tmp_path / "operations.jsonl").replace(tmp_path / "operations.1.jsonl")
+    assert journal.last_switch() == Switch("freeze", "alice", 77, 5.0)
+    journal.write({"verb": "thaw", "who": "bob", "ok": True, "samples": 90})
+    assert journal.last_switch() == Switch("thaw", "bob", 90, 5.0)
 
 
 STATUS: dict[str, Any] = {

@@ -30,7 +30,7 @@ def interrupt(number: int = signal.SIGINT) -> None:
     signal.sigtimedwait([], 0.01)  # a step of the interpreter in which it is delivered
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_raises_at_once(number: int) -> None:
     stop = StopSignal(raising=True)
     stop.look()

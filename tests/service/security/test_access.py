@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import stat
@@ -64,6 +65,22 @@ def test_every_file_is_for_its_owner_alone_and_nobody_gets_the_authoritys_key(fo
     for path in folder.glob("*.json5"):
         assert key not in path.read_text()
         assert sum(password in path.read_text() for password in passwords) == 1
+
+
+def test_only_who_listens_can_be_taken_for_a_service(folder: Path) -> None:
+    found = {}
+    for path in folder.glob("*.json5"):
+        text = path.read_text()
+        config = json.loads(text[text.index("{") :])
+        pem = base64.b64decode(config["transport"]["link"]["tls"]["connect_certificate_base64"])
+        shown = subprocess.run(["openssl", "x509", "-noout", "-text"], input=pem, capture_output=True, check=True)
+        words = shown.stdout.decode()
+        assert "TLS Web Client Authentication" in words
+        listens = "listen_certificate_base64" in config["transport"]["link"]["tls"]
+        found[path.stem] = listens
+        assert ("TLS Web Server Authentication" in words) == listens
+        assert ("Subject Alternative Name" in words) == listens
+    assert set(found.values()) == {True, False}
 
 
 def test_what_is_made_counts_as_closed_and_what_lacks_a_part_does_not(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,259 @@
+"""Forged states of an axis: valid checkpoints with a few entries replaced, as a stranger or a broken disk makes them.
+
+A forged state has a correct digest and a correct container. Only its content is wrong: an array is emptied, cut, of
+another type, or full of NaN; a count is huge. `Victims.take` restores an axis from one and lets it learn and answer.
+Compiled code reads arrays without checks of bounds, so that a state that is not refused may end the process: run it in
+a process of its own.
+
+::
+
+    python -m benchmarks.forged_states --count 400 --seed 1 --out FILE    # one JSON line for each forged state
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from adaptive.errors import ModelFileError
+from adaptive.types import FloatArray, InverseModel, StateDict
+from baselines.bouc_wen.inverse import BoucWenInverse
+from baselines.bouc_wen.model import TABLE_2_1
+from baselines.fit_report import Domain
+from baselines.linear import LinearInverse, LinearParameters
+from baselines.prandtl_ishlinskii.inverse import MpiInverse
+from baselines.prandtl_ishlinskii.model import MpiParameters
+from benchmarks.fuzz_targets import models as small_models
+from service.answers.guard import Limits
+from service.config.settings import AxisConfig
+from service.failover.standby_model import StandbyModel
+from service.protocol.query import FeedforwardQuery
+from service.protocol.samples import SampleBatch
+from service.server.axis import Axis
+from service.server.axis_loading import load_axis
+from service.storage.checkpoint import CheckpointFolder, CheckpointMeta, encode_checkpoint, restore_newest
+from service.storage.model_file import Bundle, BundleMeta
+
+DT_S: Final = 1e-3
+#: Samples before a state is copied, and after it was taken; samples of a batch.
+_BEFORE, _AFTER, _BATCH = 1200, 160, 20
+_MPI: Final = MpiParameters((0.0, 1.0, 3.0), (8.0, 2.0, 1.0), (0.0, 20.0), (1.0, 0.1))
+
+
+def bundle() -> Bundle:
+    """Four models of one stage of 11 µm/V, one of each kind that learns."""
+    seen = Domain(0.0, 90.0, 1e4)
+    found: dict[str, InverseModel] = {
+        "lssvm_adaptive": small_models()["lssvm_adaptive"],
+        "linear": LinearInverse(LinearParameters(11.0, 1.0), DT_S, seen, 0.05),
+        "mpi": MpiInverse(_MPI, DT_S, seen, 0.01),
+        "bouc_wen": BoucWenInverse(TABLE_2_1, DT_S, seen, 0.01),
+    }
+    return Bundle(found, BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0))
+
+
+def make_axis(alone: bool = False) -> Axis:
+    """An axis with a window of 60 samples that serves `bundle`; ``alone``: without a competition."""
+    compete = () if alone else ("linear", "mpi", "bouc_wen")
+    limits = Limits(0.0, 10.0, 2000.0, 0.0, 90.0)
+    learner: dict[str, Any] = {"window": 60}
+    return load_axis("demo", AxisConfig("x", Path("x.npz"), limits, compete=compete, learner=learner), bundle=bundle())
+
+
+def recording(first: int, n: int, fault: str = "") -> SampleBatch:
+    """n samples of a stage with 5 % less gain than the models believe; ``fault``: "stuck" or "jumped"."""
+    k = np.arange(first, first + n)
+    y: FloatArray = 45.0 + 25.0 * np.sin(2 * np.pi * 3.0 * k * DT_S) + 10.0 * np.sin(2 * np.pi * 11.0 * k * DT_S)
+    t_s = np.asarray(k * DT_S, dtype=np.float64)
+    u = (y - 1.0) / (11.0 * 0.95)
+    if fault == "stuck":
+        y = 50.0 + 1e-3 * np.sin(1.7 * k)
+    elif fault == "jumped":
+        y = y + 9.0
+    return SampleBatch(k, t_s, u, y)
+
+
+def _state_after(axis: Axis, fault: str, n: int) -> StateDict:
+    for first in range(0, _BEFORE, _BATCH):
+        axis.handle(recording(first, _BATCH))
+    axis.handle(recording(_BEFORE, n, fault))
+    return axis.state_dict()
+
+
+class Victims:
+    """Valid states of axes in several situations, and axes that take forged ones."""
+
+    def __init__(self) -> None:
+        self.axes = {True: make_axis(alone=True), False: make_axis()}
+        healing = make_axis(alone=True)
+        for first in range(0, _BEFORE, _BATCH):
+            healing.handle(recording(first, _BATCH))
+        learner: Any = healing.learner
+        learner.parts.window._healing.begin()
+        #: By situation: (without a competition, state).
+        self.states: dict[str, tuple[bool, StateDict]] = {
+            "competing": (False, _state_after(make_axis(), "", 13)),
+            "competing_stuck": (False, _state_after(make_axis(), "stuck", 400)),
+            "alone": (True, _state_after(make_axis(alone=True), "", 13)),
+            "stuck": (True, _state_after(make_axis(alone=True), "stuck", 200)),
+            "poisoned": (True, _state_after(make_axis(alone=True), "stuck", 1200)),
+            "jumped": (True, _state_after(make_axis(alone=True), "jumped", 9)),
+            "healing": (True, healing.state_dict()),
+        }
+
+    def take(self, alone: bool, state: StateDict, over_wire: bool) -> str:
+        """Restore an axis from ``state`` and work with it. Returns "taken", or the reason of the refusal.
+
+        Raises whatever the axis raises; a state may also end the process.
+        """
+        axis = self.axes[alone]
+        axis.take_events()
+        meta = CheckpointMeta("demo", "x", DT_S, 1, 1)
+        if over_wire:
+            try:
+                StandbyModel(axis, None).take_state(b"".join(encode_checkpoint(meta, state)))
+            except ModelFileError as error:
+                return f"refused: {error}"
+        else:
+            with tempfile.TemporaryDirectory() as directory:
+                folder = CheckpointFolder(Path(directory), "demo", "x", DT_S, 4)
+                folder.write(meta, state)
+                if restore_newest(axis, folder) is None:
+                    return f"refused: {axis.take_events()[-1]['detail']}"
+        return self._work(axis)
+
+    def _work(self, axis: Axis) -> str:
+        first = max(axis.sequence.last, 0) % 2**31 + 1
+        for start in range(first, first + _AFTER, _BATCH):
+            axis.handle(recording(start, _BATCH))
+            for name in axis.newest.models:
+                reply = axis.answer(FeedforwardQuery(np.array([40.0, 41.0]), np.zeros(2), np.zeros(2), model=name))
+                if not (np.isfinite(reply.u_V).all() and (reply.u_V >= 0.0).all() and (reply.u_V <= 10.0).all()):
+                    raise AssertionError(f"{name} answers {reply.u_V}")
+        encode_checkpoint(CheckpointMeta("demo", "x", DT_S, 1, 1), axis.state_dict())
+        failed = [event["detail"] for event in axis.take_events() if event["event"] == "learner_failed"]
+        return f"failed: {failed[0]}" if failed else "taken"
+
+
+# --- Forging.
+
+
+def forged(state: StateDict, rng: np.random.Generator) -> tuple[StateDict, str]:
+    """A copy of ``state`` with one to three entries replaced, and what was done."""
+    made, words = dict(state), []
+    arrays = [name for name, value in state.items() if isinstance(value, np.ndarray)]
+    for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
+        names = arrays if rng.random() < 0.7 else list(state)
+        name = names[int(rng.integers(len(names)))]
+        value = made.get(name)
+        if isinstance(value, np.ndarray):
+            made[name], what = _forged_array(value, rng)
+        elif rng.random() < 0.15:
+            made.pop(name, None)
+            what = "removed"
+        else:
+            made[name] = what = _VALUES[int(rng.integers(len(_VALUES)))]
+        words.append(f"{name}: {str(what)[:40]}")
+    return made, "; ".join(words)
+
+
+_VALUES: Final[tuple[Any, ...]] = (
+    -1, 0, 1, 7, 2**31, 2**62, 2**63, 10**30, -(2**62), -1e308, 1e308, 5e-324, 0.5, True, None, "", "nan", "sorcery",
+    [], [1, 2], {}, np.array(np.nan), np.array(np.inf), np.zeros(0), np.zeros((3, 3)), np.array(-(2**63)),
+)  # fmt: skip
+
+
+#: By name of what is done: an array in, another out.
+_CHANGES: Final[dict[str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]]] = {
+    "emptied": lambda value: np.zeros((0,) * max(value.ndim, 1), value.dtype),
+    "cut to half": lambda value: value[: value.shape[0] // 2].copy() if value.ndim else value[None],
+    "cut by a column": lambda value: value[..., :-1].copy() if value.ndim else value[None],
+    "doubled": lambda value: np.concatenate([value, value]) if value.ndim else np.array([value, value]),
+    "as 32 bits": lambda value: value.astype("<i4"),
+    "as bytes": lambda value: value.astype("|u1"),
+    "as single precision": lambda value: value.astype("<f4"),
+    "NaN": lambda value: np.full(value.shape, np.nan),
+    "infinite": lambda value: np.full(value.shape, np.inf),
+    "1e300": lambda value: np.full(value.shape, 1e300),
+    "2^62": lambda value: np.full(value.shape, 2**62),
+    "-2^40": lambda value: np.full(value.shape, -(2**40)),
+    "of another dimension": lambda value: value[None],
+    "flat": lambda value: value.ravel(),
+    "transposed": lambda value: value.T.copy() if value.ndim > 1 else value.reshape(-1, 1),
+}
+
+
+def _forged_array(value: np.ndarray[Any, Any], rng: np.random.Generator) -> tuple[Any, str]:
+    if rng.random() < 0.9:
+        what = list(_CHANGES)[int(rng.integers(len(_CHANGES)))]
+        return _CHANGES[what](value), what
+    one = value.astype(np.int64 if value.dtype.kind == "i" else np.float64)
+    if one.size:
+        one.flat[int(rng.integers(one.size))] = rng.choice([-1, 2**31, 2**62, -(2**31), 10**6])
+    return one, "one element"
+
+
+def run_in_processes(out: Path, count: int, seed: int) -> dict[str, Any]:
+    """Work through forged states in processes of their own; a new one goes on behind a state that ended the last.
+
+    Returns the number of states by outcome, the states that ended a process, and ``held``: none did, none raised, and
+    no learner failed. ``out`` : file of one JSON line before and one after each state.
+    """
+    out.unlink(missing_ok=True)
+    crashes: list[dict[str, Any]] = []
+    first = 0
+    while first < count:
+        numbers = ("--first", str(first), "--count", str(count), "--seed", str(seed))
+        command = [sys.executable, "-m", "benchmarks.forged_states", *numbers, "--out", str(out)]
+        if subprocess.run(command, check=False).returncode == 0:
+            break
+        last = json.loads(out.read_text().splitlines()[-1])
+        crashes.append(last)
+        first = int(last["number"]) + 1
+    lines = [json.loads(line)["outcome"].split(":")[0] for line in out.read_text().splitlines()]
+    outcomes = Counter(word for word in lines if word != "begun")
+    return {
+        "states": count,
+        "outcomes": dict(outcomes),
+        "crashes": crashes,
+        "held": not crashes and set(outcomes) <= {"taken", "refused"},
+    }
+
+
+def main() -> None:
+    """Work through forged states; a line is written before and after each, so that a crash shows which it was."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.forged_states", description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
+    args = parser.parse_args()
+    victims = Victims()
+    situations = list(victims.states)
+    with np.errstate(all="ignore"), open(args.out, "a", encoding="utf-8", buffering=1) as out:
+        for number in range(args.first, args.count):
+            rng = np.random.default_rng([args.seed, number])
+            situation = situations[number % len(situations)]
+            alone, state = victims.states[situation]
+            bad, what = forged(state, rng)
+            entry = {"number": number, "situation": situation, "what": what}
+            out.write(json.dumps({**entry, "outcome": "begun"}) + "\n")
+            try:
+                outcome = victims.take(alone, bad, over_wire=number % 2 == 1)
+            except Exception as error:
+                outcome = f"raised: {type(error).__name__}: {error}"
+                victims.axes[alone] = make_axis(alone)
+            out.write(json.dumps({**entry, "outcome": outcome}) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Folders that another process holds, that vanish or that are full; and files that only pretend to be models."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import shutil
+import time
+import tracemalloc
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError, ModelFileError
+from service.intake.sample_queue import SampleQueue
+from service.protocol.errors import FieldError
+from service.storage import checkpoint
+from service.storage.checkpoint import CheckpointKeeper
+from service.storage.model_file import BundleMeta, read_bundle, write_bundle
+from service.storage.output import atomic_write
+from service.storage.recorder import Recorder, RecorderConfig
+from service.storage.segments import rows_behind
+from tests.service.axes import loop_of
+from tests.service.conftest import DT_S, make_models
+from tests.service.living import eventually
+from tests.service.storage.test_stored_files import folder, make_axis, meta, recording
+
+
+def keeper(tmp_path: Path) -> tuple[Any, CheckpointKeeper]:
+    axis = make_axis(checkpoints=tmp_path, checkpoint_s=0.01)
+    axis.handle(recording(0, 200))
+    return axis, CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", folder(tmp_path))
+
+
+def test_two_services_with_one_checkpoint_folder_delete_nothing_of_each_other(tmp_path: Path) -> None:
+    _, first = keeper(tmp_path)
+    first.hold(0.0)
+    first.copy_now()
+    assert first.wait_written(5.0)
+    numbers = folder(tmp_path).numbers()
+    axis, second = keeper(tmp_path)
+    with pytest.raises(FieldError, match=r"checkpoints: got .* expected a folder that no other process"):
+        second.hold(0.1)
+    second.copy_now()
+    assert not second.wait_written(5.0)
+    assert folder(tmp_path).numbers() == numbers
+    counters = second.counters()
+    assert counters is not None
+    assert counters["degraded"]
+    assert "another process" in counters["error"]
+    assert "checkpoint_failed" in [event["event"] for event in axis.take_events()]
+    first.close()
+    second.hold(5.0)  # the other one has ended
+    second.copy_now()
+    assert second.wait_written(5.0)
+    second.close()
+
+
+def test_a_checkpoint_folder_that_vanishes_is_made_anew(tmp_path: Path) -> None:
+    _, kept = keeper(tmp_path / "kept")
+    kept.hold(0.0)
+    kept.copy_now()
+    assert kept.wait_written(5.0)
+    shutil.rmtree(tmp_path / "kept")
+    kept.copy_now()
+    assert kept.wait_written(5.0)
+    assert len(folder(tmp_path / "kept").numbers()) == 1
+    _, other = keeper(tmp_path / "kept")
+    with pytest.raises(FieldError):
+        other.hold(0.0)
+    kept.close()
+    other.close()
+
+
+def test_a_full_disk_gets_room_from_old_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    axis, kept = make_axis(), folder(tmp_path)
+    axis.handle(recording(0, 100))
+    state = axis.state_dict()
+    for _ in range(10):
+        kept.write(meta(axis), state)
+    before = len(kept.numbers())
+    real = atomic_write
+    limit = before - 3
+
+    def full(path: Path) -> Any:
+        if len(list(tmp_path.glob("checkpoint-*"))) > limit:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(path)
+
+    monkeypatch.setattr(checkpoint, "atomic_write", full)
+    kept.write(meta(axis), state)
+    assert kept.numbers()[0] == 11
+    assert 2 <= len(kept.numbers()) <= limit + 1
+    limit = 0  # nothing helps: the newest ones stay
+    with pytest.raises(OSError, match="No space left"):
+        kept.write(meta(axis), state)
+    assert kept.numbers()[:2] == [11, 10]
+
+
+@pytest.mark.parametrize("how", ["removed", "renamed"])
+def test_a_recording_folder_that_vanishes_is_degraded_and_made_anew(tmp_path: Path, how: str) -> None:
+    where = tmp_path / "rec"
+    with Recorder(RecorderConfig(where, retry_s=2.0)) as recorder:
+        k = np.arange(100)
+        recorder.put(k, k * DT_S, k * 0.1, k * 0.2, "learnt")
+        eventually(lambda: recorder.counters()["written"] == 100)
+        if how == "removed":
+            shutil.rmtree(where)
+        else:
+            where.rename(tmp_path / "elsewhere")
+        seen: list[dict[str, Any]] = []
+        for first in range(100, 2000, 50):
+            k = np.arange(first, first + 50)
+            recorder.put(k, k * DT_S, k * 0.1, k * 0.2, "learnt")
+            time.sleep(0.03)
+            seen.append(recorder.counters())
+        assert any(counts["degraded"] and "vanished" in counts["error"] for counts in seen)
+        assert seen[-1]["errors"] == 1
+        rows = rows_behind(where, 1900)
+        assert rows is not None
+        assert int(rows.seq[-1]) >= 1900
+    assert recorder.counters()["lost"] == 0
+
+
+def bundle_with(tmp_path: Path, **changes: Any) -> Path:
+    path = tmp_path / "x.npz"
+    write_bundle(path, make_models(), BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0))
+    with np.load(path) as file:
+        entries = {name: file[name] for name in file.files}
+    header = json.loads(entries["header"].tobytes())
+    entries["header"] = np.frombuffer((json.dumps(header | changes)).encode(), dtype=np.uint8)
+    np.savez(path, allow_pickle=False, **entries)
+    return path
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.npz"
+    array = io.BytesIO()
+    np.lib.format.write_array_header_1_0(array, {"descr": "<f8", "fortran_order": False, "shape": (2**25,)})
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("header.npy", "w") as member:
+        member.write(array.getvalue())
+        for _ in range(256):
+            member.write(bytes(2**20))
+    assert path.stat().st_size < 2**20
+    tracemalloc.start()
+    begin_s = time.monotonic()
+    with pytest.raises(ModelFileError, match=r"unpacks to .* bytes, expected at most"):
+        read_bundle(path)
+    assert time.monotonic() - begin_s < 1.0
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"models": {"a": 3}},
+        {"models": {"a": {"kind": "lssvm", "values": [1], "arrays": []}}},
+        {"models": {"a": {"kind": "lssvm", "values": {}, "arrays": [["x"]]}}},
+        {"models": {"linear": {"kind": "linear", "values": {"dt_s": 10**400}, "arrays": []}}},
+        {"models": {"a": {"kind": "champion", "values": {"names": 3, "kinds": {}}, "arrays": []}}},
+        {"y_min_um": "low"},
+        {"y_min_um": 10**400},
+        {"stage": 7},
+        {"dt_s": 10**400},
+        {"magic": []},
+    ],
+)
+def test_a_model_file_with_a_wrong_header_is_refused_in_words(tmp_path: Path, changes: dict[str, Any]) -> None:
+    path = bundle_with(tmp_path, **changes)
+    with pytest.raises((ModelFileError, InputError), match=r"x\.npz"):
+        read_bundle(path)
+
+
+def test_a_message_that_never_fits_says_so() -> None:
+    axis = make_axis(queue_samples=100)
+    loop = loop_of(axis)
+    assert not loop.offer(recording(0, 150))
+    (event,) = axis.take_events()
+    assert event["event"] == "samples_dropped"
+    assert "a message of 150 samples is longer than queue_samples, 100" in event["detail"]
+    assert loop.offer(recording(0, 60))
+
+
+def test_a_competitor_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InputError, match=r"compete: got 'nope', expected"):
+        make_axis(compete=("nope",))
