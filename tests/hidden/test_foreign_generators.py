@@ -412,7 +412,9 @@ def test_a_healthy_case_holds_nothing_but_its_noise() -> None:
         assert case.allowed == frozenset()
         rest = record(case)["y_um"] - record(case.quiet())["y_um"]
         assert float(np.std(rest)) == pytest.approx(case.rig.sigma_um, rel=0.35 if case.rig.noise == "pink" else 0.1)
-    assert healthy(3).allowed == {"hysteresis_shape"}
+    # The first stands on Preisach, whose loops are not point-symmetric; the second on plays, whose loops are.
+    assert (healthy(3).rig.base, healthy(3).allowed) == ("preisach", {"hysteresis_shape", "asymmetry"})
+    assert (healthy(4).rig.base, healthy(4).allowed) == ("play_sum", {"hysteresis_shape"})
 
 
 def test_the_record_of_timing() -> None:
