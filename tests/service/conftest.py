@@ -65,14 +65,15 @@ def free_port() -> int:
 
 
 def write_config(folder: Path, port: int, axes: tuple[str, ...] = ("x",), extra: str = "") -> Path:
-    """Model files and a configuration of a service in ``folder``."""
+    """Model files and a configuration of a service in ``folder``; ``{axis}`` in ``extra`` is the axis' name."""
     text = f'stage = "demo"\nlisten = ["tcp/127.0.0.1:{port}"]\n'
     for axis in axes:
         write_bundle(folder / f"{axis}.npz", make_models(), BundleMeta("demo", axis, DT_S, y_min_um=0.0, y_max_um=90.0))
         text += (
             f'[[axis]]\nname = "{axis}"\nmodel = "{axis}.npz"\n'
-            f"u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n{extra}\n"
+            f"u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n"
         )
+        text += extra.replace("{axis}", axis) + "\n"
     path = folder / "serve.toml"
     path.write_text(text, encoding="utf-8")
     return path

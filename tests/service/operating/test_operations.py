@@ -365,7 +365,8 @@ def test_the_commands_against_a_real_service(
     serve: Callable[..., Any], dehyst: Callable[..., Ended], tmp_path: Path
 ) -> None:
     process = serve(
-        ("x", "y"), extra=f'recorder = "{tmp_path / "rec"}"\ncheckpoints = "{tmp_path / "ckpt"}"\ncheckpoint_s = 0.1'
+        ("x", "y"),
+        extra=f'recorder = "{tmp_path}/rec-{{axis}}"\ncheckpoints = "{tmp_path}/ckpt-{{axis}}"\ncheckpoint_s = 0.1',
     )
     at = ("--endpoint", process.endpoint, "--who", "alice")
     began_at = time.time()
@@ -400,7 +401,7 @@ def test_the_commands_against_a_real_service(
         status = client.status()
         assert status["operations"]["refused"] == 1
         assert status["operations"]["done"] == 5
-    journal = [json.loads(line) for line in (tmp_path / "rec" / "operations.jsonl").read_text().splitlines()]
+    journal = [json.loads(line) for line in (tmp_path / "rec-y" / "operations.jsonl").read_text().splitlines()]
     assert {line["who"] for line in journal} == {"alice"}
     assert [line["verb"] for line in journal] == ["freeze", "thaw", "select", "checkpoints", "rollback", "rollback"]
     times = [began_at, *(line["time_unix_s"] for line in journal), time.time()]
