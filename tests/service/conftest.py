@@ -70,8 +70,7 @@ def write_config(folder: Path, port: int, axes: tuple[str, ...] = ("x",), extra:
     for axis in axes:
         write_bundle(folder / f"{axis}.npz", make_models(), BundleMeta("demo", axis, DT_S, y_min_um=0.0, y_max_um=90.0))
         text += (
-            f'[[axis]]\nname = "{axis}"\nmodel = "{axis}.npz"\n'
-            f"u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n"
+            f'[[axis]]\nname = "{axis}"\nmodel = "{axis}.npz"\nu_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\n'
         )
         text += extra.replace("{axis}", axis) + "\n"
     path = folder / "serve.toml"
