@@ -16,6 +16,7 @@ from service.reports.plot_style import envelope
 from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.readings import standing
 from sim.diagnosis.result import NamedCause
+from sim.recordings.repair import runs
 
 MEASURED, WITHOUT, WITH = "measured", "without it", "with it"
 
@@ -107,9 +108,8 @@ def slowly(cause: NamedCause, data: FitData) -> Picture | None:
 def over_log_time(cause: NamedCause, data: FitData) -> Picture | None:
     """For creep: the residual after a step over the logarithm of time, for each long hold; else since the start."""
     still = np.abs(np.diff(data.u_V, prepend=data.u_V[0])) < 1e-9 * max(data.swing_V, 1e-12)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
     # A hold at the beginning of the record follows no step.
-    holds = [e for e in edges if e[0] > 0 and (e[1] - e[0]) * data.dt_s > 0.5]
+    holds = [e for e in runs(still) if e[0] > 0 and (e[1] - e[0]) * data.dt_s > 0.5]
     long = sorted(holds, key=lambda e: e[0] - e[1])[:4]
     curves: list[Curve] = []
     if not long:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
+from baselines.prandtl_ishlinskii.operators import play_run
 from sim.diagnosis.causes.drive import lag_ends
 from sim.diagnosis.causes.motion import slow_poles
 from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.hysteresis_loops import play_of
 from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.search.held_out import Split
 
@@ -109,7 +109,7 @@ def _columns(fit: ModelFit, lag_s: float) -> list[FloatArray]:
     u = data.u_V if lag_s == 0.0 else np.asarray(lag_ends(data.u_V, lag_s / data.dt_s, False))
     u = np.ascontiguousarray(u)
     x = (u - 0.5 * (data.u_low_V + data.u_high_V)) / max(0.5 * data.swing_V, 1e-12)
-    plays = [play_of(u, float(r) * data.swing_V) / max(data.swing_V, 1e-12) for r in _RADII]
+    plays = list(play_run(u, _RADII * data.swing_V, np.full(_RADII.size, u[0])).T / max(data.swing_V, 1e-12))
     rows = [np.ones(data.n), x, x**2, x**3, *plays, *(x * p for p in plays[::2])]
     # The voltages of samples before: latency, and the rate.
     rows += [np.concatenate([np.full(k, x[0]), x[: data.n - k]]) for k in (1, 2, 4, 8)]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TypeVar
 
 import numpy as np
 from scipy import stats
@@ -40,8 +38,6 @@ from sim.diagnosis.search.held_out import HeldOut, split
 from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
 from sim.diagnosis.witnesses import Readings, Sight, witnesses
 from sim.stage.config import StageConfig
-
-T = TypeVar("T")
 
 
 def _silent(stage: str, share: float) -> None:
@@ -133,8 +129,15 @@ def diagnose(
     progress("testing the readings for signatures", 0.08)
     readings = Readings(data, mask, floor.sigma_um)
     search = Search(
-        *(mask, split(data), floor.sigma_um, options.thresholds, options.seed, progress, coarse),
-        *(readings, witnesses(readings)),
+        mask,
+        split(data),
+        floor.sigma_um,
+        options.thresholds,
+        options.seed,
+        progress,
+        coarse,
+        readings,
+        witnesses(readings),
     )
     held_nominal = search.held(nominal)
     extended, held, steps = search.run(nominal)
@@ -146,14 +149,18 @@ def diagnose(
     causes += quantisation(grid, coarse, floor, extended, n)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     progress("fitting a black box", 0.92)
-    held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
-    ceiling_um = black_box_error(nominal, extended, mask, search.parts)
     on_test: tuple[ModelFit, ModelFit] | None = None
     shown_mask, shown_floor_um, taught_um = mask, floor.sigma_um, None
-    if test is not None:
+    if test is None:
+        held_um = (float(np.sqrt(held_nominal.sse_um2 / n)), float(np.sqrt(held.sse_um2 / n)))
+        ceiling_um = black_box_error(nominal, extended, mask, search.parts)
+    else:
         shown_mask = settled(usable(test.data, test.mask, options.nominal), nominal, test.data)
-        on_test = tuple_of_two(fit_on_other_recording(fit, test.data, shown_mask) for fit in (nominal, extended))
-        held_um = tuple_of_two(float(np.sqrt(np.mean(np.square(f.residual_um[shown_mask])))) for f in on_test)
+        on_test = (
+            fit_on_other_recording(nominal, test.data, shown_mask),
+            fit_on_other_recording(extended, test.data, shown_mask),
+        )
+        held_um = (rms_um(on_test[0], shown_mask), rms_um(on_test[1], shown_mask))
         ceiling_um = black_box_error(*on_test, shown_mask, split(test.data))
         # Where named physics does better than the black box, it is what the recording teaches.
         taught_um = min(black_box_on_other(nominal, on_test[0], mask, shown_mask, search.parts), *held_um)
@@ -161,7 +168,7 @@ def diagnose(
     explained = explained_share(*held_um, ceiling_um, shown_floor_um)
     verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)
     partial: tuple[str, ...] = ()
-    if verdict in ("unexplained", "adequate") and causes:
+    if verdict == "unexplained" and causes:
         partial, causes = tuple(c.name for c in causes), ()
     missing = not_excited(search, nominal, extended, floor)
     progress("simulating the next experiment", 0.95)
@@ -192,10 +199,9 @@ def diagnose(
     )
 
 
-def tuple_of_two(items: Iterable[T]) -> tuple[T, T]:
-    """Exactly two items, as a tuple of a type that says so."""
-    one, two = items
-    return one, two
+def rms_um(fit: ModelFit, mask: BoolArray) -> float:
+    """RMS residual (µm) over the samples that count."""
+    return float(np.sqrt(np.mean(np.square(fit.residual_um[mask]))))
 
 
 def named(

@@ -157,15 +157,3 @@ def plays_nested(u_V: FloatArray, radii_V: FloatArray, weights: FloatArray) -> F
             before = u
         out[k] = held + slope[dragged] * u - way * lead[dragged]
     return out
-
-
-@compiled
-def play_of(u_V: FloatArray, radius_V: float) -> FloatArray:
-    """(n,) one play (2.4) of radius ``radius_V``, relaxed at the first voltage."""
-    n = u_V.shape[0]
-    out = np.empty(n)
-    at = u_V[0]
-    for k in range(n):
-        at = min(max(at, u_V[k] - radius_V), u_V[k] + radius_V)
-        out[k] = at
-    return out

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.model.fit_data import FitData
+from sim.recordings.repair import runs
 
 
 @dataclass(frozen=True)
@@ -18,16 +20,20 @@ class NoiseFloor:
     source: str
 
 
+def samples_since(moved: BoolArray, before: int = 0) -> NDArray[np.int64]:
+    """(n,) samples since the last True in ``moved`` (n,); the first counts as ``before`` samples after one."""
+    last = np.full(moved.size, -before)
+    moves = np.flatnonzero(moved)
+    last[moves] = moves
+    return np.asarray(np.arange(moved.size) - np.maximum.accumulate(last))
+
+
 def standing(data: FitData, settle_s: float = 0.3) -> BoolArray:
     """(n,) True where the voltages of both axes have been constant for ``settle_s``."""
     still = data.rate_V_per_s <= 1e-9 * max(data.swing_V, 1e-30) / data.dt_s
     if data.u2_V is not None:
         still &= np.abs(np.diff(data.u2_V, prepend=data.u2_V[0])) == 0.0
-    moves = np.flatnonzero(~still)
-    last = np.full(data.n, 0)
-    last[moves] = moves
-    last = np.maximum.accumulate(last)
-    return np.asarray(still & (np.arange(data.n) - last >= settle_s / data.dt_s))
+    return np.asarray(still & (samples_since(~still) >= settle_s / data.dt_s))
 
 
 def repeated_period(u_V: FloatArray) -> int:
@@ -80,9 +86,8 @@ def _of_whole_rests(data: FitData, quiet: BoolArray) -> float:
 
     Windows of a tenth of a second miss noise that is correlated over longer. The logarithm takes creep out.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(np.int8), [0]])))
     spreads = []
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs(quiet):
         if (b - a) * data.dt_s < 1.0:
             continue
         t = np.arange(1, b - a + 1) * data.dt_s

@@ -61,20 +61,27 @@ class Thresholds:
 
 #: Causes whose direct test also answers to others: it supports a name but does not replace the null distribution.
 _WEAK = frozenset(
-    {
-        *("amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing"),
-        "rate_dependence",
-    }
+    ["amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing", "rate_dependence"]
 )
 #: Causes that are not named where their direct test is excited and sees nothing.
 _VETOED = frozenset(
-    {
-        *("creep", "thermal_drift", "gain_drift", "delay", "resonance", "slew_limit", "saturation", "cross_talk"),
-        *("mains_hum", "asymmetry", "amplifier_lag", "sensor_lag"),
-    }
+    [
+        "creep",
+        "thermal_drift",
+        "gain_drift",
+        "delay",
+        "resonance",
+        "slew_limit",
+        "saturation",
+        "cross_talk",
+        "mains_hum",
+        "asymmetry",
+        "amplifier_lag",
+        "sensor_lag",
+    ]
 )
 
-#: Causes so smooth in time that they imitate the rest of many others: not excited, they must explain most.
+#: Causes so smooth in time that they imitate the rest of many others: not excited, they must explain `nearly_all`.
 _NEEDS_SIGHT = frozenset({"creep", "thermal_drift", "gain_drift", "timing"})
 
 

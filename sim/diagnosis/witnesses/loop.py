@@ -48,12 +48,9 @@ def even_part(readings: Readings) -> list[Sight]:
     data = readings.data
     names = ("asymmetry", "sensor_nonlinearity")
     bends: list[float] = []
-    sizes: list[float] = []
     errors: list[float] = []
     parabola = _GRID**2 - np.mean(_GRID**2)
     parabola = parabola / float(parabola @ parabola) * float(np.max(parabola) - np.min(parabola))
-    hinges = [np.maximum(_GRID - knee, 0.0) for knee in (-0.5, 0.0, 0.5)]
-    shapes = np.array([np.ones_like(_GRID), _GRID, *hinges])
     for cycle in readings.cycles:
         height = cycle.amplitude_V(data.u_V)
         branches = _branches(readings, cycle) if height > 0.25 * data.swing_V else None
@@ -62,9 +59,6 @@ def even_part(readings: Readings) -> list[Sight]:
         total = 0.5 * (branches[0] + branches[1])
         even = 0.5 * (total + total[::-1])
         bends.append(float(parabola @ even))
-        size = float(np.ptp(branches[0]))
-        straight = total - np.linalg.lstsq(shapes[:2].T, total, rcond=None)[0] @ shapes[:2]
-        sizes.append(float(np.std(straight)) / max(size, 1e-12))
         per_point = max(1.0, (cycle.stop - cycle.start) / (2.0 * _GRID.size))
         errors.append(readings.sigma_um * float(np.linalg.norm(parabola)) / math.sqrt(min(per_point, 4.0)))
     if not bends:

@@ -7,6 +7,7 @@ import numpy as np
 from adaptive.types import FloatArray
 from sim.diagnosis.witnesses.readings import Readings
 from sim.diagnosis.witnesses.sight import Sight
+from sim.recordings.repair import runs
 
 
 def cross_talk(readings: Readings) -> list[Sight]:
@@ -16,10 +17,9 @@ def cross_talk(readings: Readings) -> list[Sight]:
     if other is None or float(np.ptp(other)) == 0.0:
         return [Sight("cross_talk", None, "no other axis is driven")]
     quiet = readings.still & (data.rate_V_per_s == 0.0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(np.int8), [0]])))
     up = down = 0.0
     left: list[FloatArray] = []
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs(quiet):
         if b - a < 50 or float(np.ptp(other[a:b])) < 0.05 * float(np.ptp(other)):
             continue
         t = np.linspace(-1.0, 1.0, b - a)
@@ -53,16 +53,16 @@ def mains_hum(readings: Readings) -> list[Sight]:
         pieces.append(y - np.convolve(padded, np.ones(width) / width, "same")[width:-width])
     y = np.concatenate(pieces)
     t = data.t_s[where]
-    best: tuple[float, float, float, float] | None = None
+    best: tuple[float, float, float] | None = None
     for mains in (50.0, 60.0):
         grid = mains + np.arange(-0.6, 0.6001, max(0.25 / data.duration_s, 0.004))
         size = np.array([_line(y, t, f) for f in grid])
         i = int(np.argmax(size))
         beside = float(np.median([_line(y, t, float(grid[i]) + d) for d in (-4.3, -3.1, -2.2, 2.2, 3.1, 4.3)]))
         if best is None or size[i] / max(beside, 1e-300) > best[1] / max(best[2], 1e-300):
-            best = (float(grid[i]), float(size[i]), beside, mains)
+            best = (float(grid[i]), float(size[i]), beside)
     assert best is not None
-    f, size_um, beside, _ = best
+    f, size_um, beside = best
     error = float(np.std(y)) * float(np.sqrt(2.0 / y.size))
     words = f"at rest a line at {f:.2f} Hz of {1e3 * size_um:.2g} nm; beside it {1e3 * beside:.1g} nm"
     return [Sight("mains_hum", bool(size_um > max(5.5 * error, 3.0 * beside, 0.05 * readings.sigma_um)), words)]

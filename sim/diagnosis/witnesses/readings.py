@@ -12,9 +12,11 @@ from functools import cached_property
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
+from baselines.prandtl_ishlinskii.operators import play_run
 from sim.diagnosis.causes.drive import lag_ends
 from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.hysteresis_loops import play_of
+from sim.diagnosis.model.readings import samples_since
+from sim.recordings.repair import runs
 
 #: A drive counts as standing after this time without a change of voltage, s: lags and modes have settled.
 SETTLE_S = 0.15
@@ -75,11 +77,8 @@ class Readings:
     def still(self) -> BoolArray:
         """(n,) True where no drive has changed for `SETTLE_S`."""
         data = self.data
-        moves = np.flatnonzero(data.rate_V_per_s > 1e-6 * data.swing_V / data.dt_s)
-        last = np.zeros(data.n, dtype=np.int64)
-        last[moves] = moves
-        last = np.maximum.accumulate(last)
-        return np.asarray(np.arange(data.n) - last >= SETTLE_S / data.dt_s) & self.mask
+        moved = data.rate_V_per_s > 1e-6 * data.swing_V / data.dt_s
+        return np.asarray(samples_since(moved) >= SETTLE_S / data.dt_s) & self.mask
 
     @cached_property
     def alone(self) -> BoolArray:
@@ -87,22 +86,16 @@ class Readings:
         out = np.ones(self.data.n, dtype=np.bool_)
         for other in (self.data.u2_V, self.data.u3_V):
             if other is not None:
-                moves = np.flatnonzero(np.abs(np.diff(other, prepend=other[0])) > 1e-6 * float(np.ptp(other)))
-                last = np.full(self.data.n, -(10**9), dtype=np.int64)
-                last[moves] = moves
-                last = np.maximum.accumulate(last)
-                out &= np.arange(self.data.n) - last >= SETTLE_S / self.data.dt_s
+                moved = np.abs(np.diff(other, prepend=other[0])) > 1e-6 * float(np.ptp(other))
+                out &= samples_since(moved, before=10**9) >= SETTLE_S / self.data.dt_s
         return out
 
     @cached_property
     def rests(self) -> tuple[Rest, ...]:
         """Rests of all drives of at least 0.3 s after settling."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], (self.still & self.alone).astype(np.int8), [0]])))
         least = max(8, round(0.3 / self.data.dt_s))
         return tuple(
-            Rest(int(a), int(b), float(self.data.u_V[a]))
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-            if b - a >= least
+            Rest(int(a), int(b), float(self.data.u_V[a])) for a, b in runs(self.still & self.alone) if b - a >= least
         )
 
     @cached_property
@@ -165,7 +158,8 @@ class Readings:
             lagged = data.u_V if lag_s == 0.0 else np.asarray(lag_ends(data.u_V, lag_s / data.dt_s, False))
             for late in _LATE:
                 u = np.concatenate([np.full(late, lagged[0]), lagged[: data.n - late]]) if late else lagged
-                columns = np.stack([np.ones(data.n), u, *(play_of(u, float(r) * data.swing_V) for r in _RADII)])
+                plays = play_run(u, _RADII * data.swing_V, np.full(_RADII.size, u[0]))
+                columns = np.stack([np.ones(data.n), u, *plays.T])
                 part = columns[:, use][:, ::thin]
                 target = data.y_um[use][::thin]
                 weights = _ridge(part, target)

@@ -49,13 +49,11 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
     if span > 0.1 * data.swing_V:
         columns += [*(0.02 * gain * (level - data.u_low_V) * drifts[:2])]
     rows = np.array(columns)
+    grams, slopes = [], []
     for i in np.unique(of):
         inside = of == i
         rows[:, inside] -= rows[:, inside].mean(axis=1, keepdims=True)
         y[inside] -= y[inside].mean()
-    grams, slopes = [], []
-    for i in np.unique(of):
-        inside = of == i
         grams.append(rows[:, inside] @ rows[:, inside].T)
         slopes.append(rows[:, inside] @ y[inside])
     decade = np.zeros(rows.shape[0])
@@ -95,9 +93,7 @@ def creep_and_drifts(readings: Readings) -> list[Sight]:
         least = max(2.0 * readings.sigma_um, 1e-4 * data.range_um) if name == "thermal_drift" else 5e-4
         seen = _judged(abs(v), e, least, 2e-3 * (data.range_um if name == "thermal_drift" else 1.0))
         size = 1.0 if name == "thermal_drift" else 100.0
-        when = {"": "over the record", "early": "in its first half", "late": "in its second half"}[
-            best[len(name) + 1 :]
-        ]
+        when = _WHEN[best[len(name) + 1 :]]
         out.append(Sight(name, seen, f"the rests move by {size * v:.3g} ± {1.96 * size * e:.1g} {of_what} {when}"))
     return out
 
@@ -162,13 +158,13 @@ def cycles_over_time(readings: Readings) -> list[Sight]:
     relative = height / height.mean() - 1.0
     change, error = _slope(t, relative)
     level = float(np.mean(means)) - data.middle_um + abs(data.centre_um)
-    shift, shift_error = _slope(t, np.array(means) - relative * level)
+    means_um = np.array(means) - relative * level
+    shift, shift_error = _slope(t, means_um)
     span = float(t[-1] - t[0])
     gained = abs(change * span) > 3e-4 and abs(change) > _SIGMAS * error
     moved = abs(shift * span) > max(readings.sigma_um, 1e-4 * data.range_um) and abs(shift) > _SIGMAS * shift_error
     since = np.log10(t - same[0].start * data.dt_s + (t[1] - t[0]))
     settles = gained and _misfit(since, relative) < 0.9 * _misfit(t, relative)
-    means_um = np.array(means) - relative * level
     creeps = moved and _misfit(since, means_um) < 0.7 * _misfit(t, means_um)
     goes_on = moved and _misfit(t, means_um) < 0.7 * _misfit(since, means_um)
     n = len(same)
