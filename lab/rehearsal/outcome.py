@@ -11,6 +11,7 @@ from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
+from sim.recordings.repair import runs
 
 #: Window of the worst mean error, s; error that must not last, percent of the range.
 WINDOW_S: Final = 0.5
@@ -196,11 +197,11 @@ def gaps_filled(holds: BoolArray, most: int) -> BoolArray:
 
 def longest_stretch(holds: BoolArray) -> tuple[int, int]:
     """(length, first index) of the longest stretch that is true; (0, 0) if there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
-    if not edges.size:
+    stretches = runs(holds)
+    if not stretches.size:
         return 0, 0
-    lengths = edges[1::2] - edges[::2]
-    return int(lengths.max()), int(edges[2 * int(lengths.argmax())])
+    start, stop = stretches[np.argmax(np.diff(stretches))]
+    return int(stop - start), int(start)
 
 
 def _error_pct(course: LoopRecord, range_um: float) -> FloatArray:
