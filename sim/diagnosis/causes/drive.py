@@ -51,6 +51,8 @@ class AmplifierLag(CauseModel):
     """First-order lag of the voltage before the hysteresis, 30 µs (5 kHz) to 30 ms."""
 
     name: str = "amplifier_lag"
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
     fast: bool = True
     substeps: int = 4
     continuous: bool = True
@@ -72,6 +74,7 @@ class SlewLimit(CauseModel):
     """Rate limit of the voltage, V/s at the command."""
 
     name: str = "slew_limit"
+    unseen_is_absent: bool = True
     fast: bool = True
     substeps: int = 4
     continuous: bool = True
@@ -102,6 +105,7 @@ class Saturation(CauseModel):
     """Saturation of the voltage at an upper and a lower limit."""
 
     name: str = "saturation"
+    unseen_is_absent: bool = True
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         """Beyond the limit the readings hardly follow the command."""

@@ -30,6 +30,7 @@ class HysteresisShape(CauseModel):
     """
 
     name: str = "hysteresis_shape"
+    test_answers_to_others: bool = True
     #: Voltage (V) that the stage had been driven to and back before the recording; 0 where it was relaxed.
     before_V: float = 0.0
 
@@ -106,6 +107,8 @@ class Asymmetry(CauseModel):
     """
 
     name: str = "asymmetry"
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
     model_error: float = 0.12
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
@@ -152,6 +155,7 @@ class RateDependence(CauseModel):
     """
 
     name: str = "rate_dependence"
+    test_answers_to_others: bool = True
     model_error: float = 0.3
     variant: str = "width"
     #: Time constant of the lag that filters the rate, s; with ``free_rate_lag`` the start value of its fit.
@@ -247,6 +251,7 @@ class RestoringForceLoop(CauseModel):
     """
 
     name: str = "hysteresis_shape"
+    test_answers_to_others: bool = True
     variant: str = "restoring_loop"
 
     def missing(self, data: FitData) -> str:

@@ -25,6 +25,7 @@ class Resonance(CauseModel):
     """A second-order mode of unit gain after the hysteresis that the nominal stage lacks."""
 
     name: str = "resonance"
+    unseen_is_absent: bool = True
     fast: bool = True
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
@@ -80,6 +81,8 @@ class SensorLag(CauseModel):
     """A first-order low-pass in the sensor's electronics."""
 
     name: str = "sensor_lag"
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
     fast: bool = True
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -97,6 +100,7 @@ class Delay(CauseModel):
     """A dead time of more than the one sample of the recorder."""
 
     name: str = "delay"
+    unseen_is_absent: bool = True
     fast: bool = True
     pins: tuple[str, ...] = ("latch_samples",)
 
@@ -346,6 +350,7 @@ class StructureModes(Modes):
     """Resonances of a structure, driven by the actuator's displacement."""
 
     name: str = "resonance"
+    unseen_is_absent: bool = True
     fast: bool = True
 
 
@@ -354,6 +359,7 @@ class CrossModes(Modes):
     """Cross-talk from the voltages of other axes, through modes of its own."""
 
     name: str = "cross_talk"
+    unseen_is_absent: bool = True
     #: For each mode the index of the voltage that drives it.
     driven_by: tuple[int, ...] = ()
 

@@ -67,6 +67,8 @@ class Creep(CauseModel):
     """A sum of slow first-order lags, 0.05 s to beyond the record, 0.6 decades apart. Equal weights give log t."""
 
     name: str = "creep"
+    unseen_is_absent: bool = True
+    imitates_others: bool = True
     model_error: float = 0.04
     spacing: float = 0.6  # decades between the poles
 
@@ -120,6 +122,7 @@ class CrossTalk(CauseModel):
     """A share of the other axis' displacement and of its velocity."""
 
     name: str = "cross_talk"
+    unseen_is_absent: bool = True
 
     def missing(self, data: FitData) -> str:
         return "" if data.other_um is not None else "the other axis driven and recorded (u2_V or y2_um)"
@@ -141,6 +144,8 @@ class ThermalDrift(CauseModel):
     """A slow additive drift: a spline in time or, as ``variant`` "temperature", proportional to the temperature."""
 
     name: str = "thermal_drift"
+    unseen_is_absent: bool = True
+    imitates_others: bool = True
     of_one_recording: bool = True
 
     def missing(self, data: FitData) -> str:
@@ -178,6 +183,8 @@ class GainDrift(CauseModel):
     """A gain that changes with time (a spline) or, as ``variant`` "temperature", with the recorded temperature."""
 
     name: str = "gain_drift"
+    unseen_is_absent: bool = True
+    imitates_others: bool = True
     of_one_recording: bool = True
 
     def missing(self, data: FitData) -> str:

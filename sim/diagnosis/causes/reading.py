@@ -42,6 +42,7 @@ class SensorNonlinearity(CauseModel):
     """A static curve of the sensor: a polynomial of second to fourth order, at most 0.4 % of the range."""
 
     name: str = "sensor_nonlinearity"
+    test_answers_to_others: bool = True
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         return bool(np.max(np.abs(p)) < 0.99 * 0.008)
@@ -71,6 +72,7 @@ class MainsHum(CauseModel):
     """Spectral lines at 50 or 60 Hz and the first harmonics, with free phases. ``variant`` is the frequency."""
 
     name: str = "mains_hum"
+    unseen_is_absent: bool = True
     of_one_recording: bool = True
     variant: str = "50"
 
@@ -143,6 +145,8 @@ class Timing(CauseModel):
     """A recorder's clock that runs fast or slow against the stage's: t' = (1 + e) t."""
 
     name: str = "timing"
+    test_answers_to_others: bool = True
+    imitates_others: bool = True
     of_one_recording: bool = True
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:

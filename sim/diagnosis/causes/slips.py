@@ -208,6 +208,8 @@ class Slips(CauseModel):
     """Samples lost or doubled in one column, while the time column continues without a gap."""
 
     name: str = "timing"
+    test_answers_to_others: bool = True
+    imitates_others: bool = True
     variant: str = "slips"
     of_one_recording: bool = True
     #: The slips, found again in every residual.

@@ -32,6 +32,12 @@ class CauseModel:
     fast: bool = False
     #: Its parameters belong to one recording (drift over time, phase of a hum).
     of_one_recording: bool = False
+    #: Its direct test also answers to other causes: it supports the name but does not replace the null distribution.
+    test_answers_to_others: bool = False
+    #: It is not named where its direct test is excited and sees nothing.
+    unseen_is_absent: bool = False
+    #: So smooth in time that it imitates the rest of many others: where its test is not excited, it must explain most.
+    imitates_others: bool = False
     #: Model error: share (RMS) of the removed residual that the model may leave behind in a real stage.
     model_error: float = 0.025
 

@@ -59,32 +59,6 @@ class Thresholds:
     close_sigmas: float = 2.5
 
 
-#: Causes whose direct test also answers to others: it supports a name but does not replace the null distribution.
-_WEAK = frozenset(
-    ["amplifier_lag", "sensor_lag", "hysteresis_shape", "asymmetry", "sensor_nonlinearity", "timing", "rate_dependence"]
-)
-#: Causes that are not named where their direct test is excited and sees nothing.
-_VETOED = frozenset(
-    [
-        "creep",
-        "thermal_drift",
-        "gain_drift",
-        "delay",
-        "resonance",
-        "slew_limit",
-        "saturation",
-        "cross_talk",
-        "mains_hum",
-        "asymmetry",
-        "amplifier_lag",
-        "sensor_lag",
-    ]
-)
-
-#: Causes so smooth in time that they imitate the rest of many others: not excited, they must explain `nearly_all`.
-_NEEDS_SIGHT = frozenset({"creep", "thermal_drift", "gain_drift", "timing"})
-
-
 def first_fits(
     cause: CauseModel, guess: FloatArray, base: ModelFit, mask: BoolArray
 ) -> tuple[CauseModel, list[ModelFit]]:
@@ -184,15 +158,15 @@ class Search:
     #: Held-out squared error of the nominal stage (µm²).
     nominal_um2: float = 0.0
 
-    def seen(self, name: str) -> bool:
+    def seen(self, cause: CauseModel) -> bool:
         """Whether a direct test that answers to this cause alone sees it."""
-        sight = self.sights.get(name)
-        return sight is not None and sight.seen is True and name not in _WEAK
+        sight = self.sights.get(cause.name)
+        return sight is not None and sight.seen is True and not cause.test_answers_to_others
 
-    def vetoed(self, name: str) -> bool:
+    def vetoed(self, cause: CauseModel) -> bool:
         """Whether the readings excite the direct test of this cause, and it sees nothing."""
-        sight = self.sights.get(name)
-        return sight is not None and sight.seen is False and name in _VETOED
+        sight = self.sights.get(cause.name)
+        return sight is not None and sight.seen is False and cause.unseen_is_absent
 
     def cost(self, fit: ModelFit, held: HeldOut, base: ModelFit) -> float:
         """Held-out squared error with the cost of the parameters that ``base`` lacks, and the monitor's error (µm²)."""
@@ -235,7 +209,7 @@ class Search:
             # guess, because several of them look like a clock error at first; and what a direct test sees.
             line = cause.name == "mains_hum" and self.is_line(look, base)
             own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
-            if self.seen(cause.name) or cause.name in beside:
+            if self.seen(cause) or cause.name in beside:
                 own = own or all(self.causes[c.index].name != cause.name for c in chosen)
             if own and all(look is not c for c in chosen):
                 chosen.append(look)
@@ -261,7 +235,7 @@ class Search:
 
     def plausible(self, candidate: CauseCandidate) -> bool:
         """Whether the fitted parameters have a plausible size and sign, and the readings do not speak against it."""
-        if self.vetoed(candidate.cause.name):
+        if self.vetoed(candidate.cause):
             return False
         clock = candidate.cause.name == "timing" and not isinstance(candidate.cause, Slips)
         if clock and self.sights and self.sights["timing"].seen is not True:
@@ -278,7 +252,7 @@ class Search:
         """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
         thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
-        seen = self.seen(best.cause.name)
+        seen = self.seen(best.cause)
         if gain <= 0.0 or (p > thresholds.level and not seen):
             return False
         parameters = best.cause.parameters(best.fit.model.data)
@@ -296,12 +270,7 @@ class Search:
         clean = now > 2.0 * left_um2
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
         sight = self.sights.get(best.cause.name)
-        if (
-            sight is not None
-            and sight.seen is None
-            and best.cause.name in _NEEDS_SIGHT
-            and whole < thresholds.nearly_all
-        ):
+        if sight is not None and sight.seen is None and best.cause.imitates_others and whole < thresholds.nearly_all:
             return False
         if not seen and gain < thresholds.least_of_nominal * self.nominal_um2 and whole < thresholds.least_whole:
             return False
@@ -345,7 +314,7 @@ class Search:
                     break
             if accepted is None:
                 break
-            if not self.seen(accepted.cause.name):
+            if not self.seen(accepted.cause):
                 slanted = self._with_slanted_shape(current)
                 if slanted is not None and slanted.cost < accepted.cost:
                     # The loop itself explains it better: no further cause.
@@ -376,7 +345,7 @@ class Search:
 
     def _with_witness(self, candidate: CauseCandidate) -> float:
         """The cost, halved where the signature of the cause is seen: flexible forms imitate many causes."""
-        return candidate.cost * (0.5 if self.seen(candidate.cause.name) else 1.0)
+        return candidate.cost * (0.5 if self.seen(candidate.cause) else 1.0)
 
     def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the other hold between samples, if that fits better: a large cause can hide it."""
@@ -458,7 +427,7 @@ def review(
         less = search.without(fit, index)
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
-        keep = thresholds.least_gain / (thresholds.seen_eases if search.seen(cause.name) else 1.0)
+        keep = thresholds.least_gain / (thresholds.seen_eases if search.seen(cause) else 1.0)
         keep = keep if cause.name != "mains_hum" else 0.0
         if gain <= keep * held_less.sse_um2:
             fit, held = less, held_less
