@@ -17,9 +17,10 @@ from tests.hidden.foreign import bases, effects
 from tests.hidden.foreign import noise as noises
 from tests.hidden.foreign.bases import BASES, OTHER_CLASS, Array
 from tests.hidden.foreign.cases import CAUSES, EXCLUSIVE, LEAST_OWN, LEAST_RMS, change, healthy, pair, single, triple
+from tests.hidden.foreign.crops import contradict
 from tests.hidden.foreign.drives import SHOWS, drive
 from tests.hidden.foreign.record import Case, Rig, record
-from tests.hidden.foreign.score import covered, judge
+from tests.hidden.foreign.score import covered, judge, run_case
 from tests.hidden.foreign.truth_numbers import true_numbers
 
 FS = 2000.0
@@ -511,3 +512,28 @@ def test_the_dead_time_of_a_record_is_the_stated_one() -> None:
     settled = float(columns["y_um"][edge + 40] - columns["y_um"][edge - 2])
     missing = np.exp(-np.maximum(np.arange(12) - 0.5, 0.0))
     assert 1.0 - step / settled == pytest.approx(missing, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        ([], [("creep",)], False),
+        ([("creep",)], [("creep",), ("delay",)], False),
+        ([("creep", "thermal_drift")], [("thermal_drift",)], False),
+        ([("creep",)], [("thermal_drift",)], True),
+        ([("creep",), ("delay",)], [("creep",), ("resonance",)], True),
+    ],
+)
+def test_answers_contradict_when_each_names_what_the_other_lacks(
+    one: list[tuple[str, ...]], other: list[tuple[str, ...]], expected: bool
+) -> None:
+    assert contradict(tuple(one), tuple(other)) is expected
+    assert contradict(tuple(other), tuple(one)) is expected
+
+
+def test_lost_rows_are_found_as_a_defect_of_the_recording() -> None:
+    """A recorder that loses rows is no cause in the stage; the answer says so in its defects."""
+    outcome = run_case("single", 202)
+    assert "rows" in outcome.hidden["timing"]
+    assert outcome.judgement.found == ("timing",)
+    assert outcome.judgement.right

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.diagnosis import diagnose_prepared, prepare
+from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
 from sim.effects import Chain, effect
 from sim.recordings import Recording
 from sim.stage.config import StageConfig
@@ -68,7 +68,7 @@ def judge(hidden: Sequence[str], allowed: frozenset[str], verdict: str, named: N
 
     ``allowed`` names may stand beside the truth, each once. An answer "unexplained" names nothing.
     """
-    groups = list(named) if verdict in ("effects", "partly") else []
+    groups = [] if verdict == "unexplained" else list(named)
     of_group = _assigned(groups, list(hidden))
     found = tuple(name for name in hidden if name in of_group.values())
     missed = tuple(name for name in hidden if name not in found)
@@ -145,7 +145,7 @@ def covered(case: Case, causes: Sequence[tuple[str, dict[str, tuple[float, float
     return tuple(out)
 
 
-def _nominal(case: Case) -> str | StageConfig:
+def nominal_of(case: Case) -> str | StageConfig:
     """The simulation to judge: the Bouc-Wen stage, or a stage file that states the mode a payload moves."""
     own = case.effects.get("payload_change")
     if own is None:
@@ -162,25 +162,38 @@ def _nominal(case: Case) -> str | StageConfig:
     return StageConfig("with its mode", Chain((loop, mode)), dt_s=1.0 / rig.fs_hz, u_max_V=1.1 * span)
 
 
-def run_case(kind: str, seed: int) -> Outcome:
-    """Draw the case, make its recording, diagnose it as `dehyst diagnose` does, and judge the answer."""
-    case = KINDS[kind](seed)
+def recording_of(case: Case) -> Recording:
+    """The recording of a case, as a user would have it."""
     columns = record(case)
-    rig = case.rig
-    start = time.perf_counter()
-    recording = Recording(
+    return Recording(
         t_s=columns["t_s"],
         u_V=columns["u_V"],
         y_um=columns["y_um"],
-        dt_s=1.0 / rig.fs_hz,
-        source=f"{kind}/{seed}",
+        dt_s=1.0 / case.rig.fs_hz,
+        source=f"{case.kind}/{case.seed}",
         u2_V=columns.get("u2_V"),
         y2_um=columns.get("y2_um"),
     )
-    prepared = prepare(recording, nominal=_nominal(case))
+
+
+def named_in(case: Case, said: Diagnosis) -> tuple[tuple[str, ...], ...]:
+    """Each cause of the answer with its alternatives. Rows that the recorder lost are a defect of the recording, not a
+    cause: where a case has lost rows, the defect counts as its timing."""
+    named = tuple((cause.name, *cause.alternatives) for cause in said.causes)
+    lost = "rows" in case.effects.get("timing", {}) and any(defect.kind == "gaps" for defect in said.defects)
+    return (*named, ("timing",)) if lost else named
+
+
+def run_case(kind: str, seed: int) -> Outcome:
+    """Draw the case, make its recording, diagnose it as `dehyst diagnose` does, and judge the answer."""
+    case = KINDS[kind](seed)
+    rig = case.rig
+    recording = recording_of(case)
+    start = time.perf_counter()
+    prepared = prepare(recording, nominal=nominal_of(case))
     said = diagnose_prepared(prepared)
     seconds = time.perf_counter() - start
-    named = tuple((cause.name, *cause.alternatives) for cause in said.causes)
+    named = named_in(case, said)
     black_box = vars(said).get("ceiling_um")
     ceiling = None if black_box is None else float(black_box)
     # A converter's grid is no noise, but no model of the stage can be better than it.
@@ -193,7 +206,7 @@ def run_case(kind: str, seed: int) -> Outcome:
         start="used before" if rig.used_before else "depolarised",
         drive=rig.drive,
         noise=rig.noise,
-        samples=len(columns["t_s"]),
+        samples=len(recording),
         duration_s=rig.duration_s,
         hidden=case.effects,
         sizes=case.sizes,
