@@ -28,7 +28,7 @@ from adaptive.types import FloatArray
 from service.answers.answering import derivatives
 from service.answers.guard import Limits, guard
 from service.client.follower import Follower
-from service.protocol.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
+from service.protocol.errors import BehindError, BusyError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference
@@ -119,6 +119,8 @@ _BEHIND_PAUSE_S: Final = 0.001
 #: the service has died, within about a second if it has only stopped.
 RETRY_S: Final = 2.0
 _RETRY_PAUSE_S: Final = 0.003
+#: Queries longer than this tell who asks, bytes: about a hundred points. Shorter ones are answered at once.
+_SOURCE_BYTES: Final = 2048
 
 
 class RetryingQueries:
@@ -126,7 +128,7 @@ class RetryingQueries:
 
     Parameters
     ----------
-    timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
+    timeout_s : of each query, s. retry_s : time for which a query is repeated that is unanswered or refused as busy, s.
 
     Attributes
     ----------
@@ -138,6 +140,8 @@ class RetryingQueries:
         self.retries = 0
         self._session, self._keys = session, keys
         self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True)
+        #: Tells the service who asks, so that a long query has the share of this session.
+        self._source = zenoh.SourceInfo(self._querier.id, 0)
 
     def close(self) -> None:
         """Undeclare the querier."""
@@ -164,9 +168,14 @@ class RetryingQueries:
         ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
         BehindError after that.
         """
+        source = self._source if len(payload) > _SOURCE_BYTES else None
+
+        def ask() -> bytes:
+            return self._one(self._querier.get(payload=payload, source_info=source))
+
         start = time.monotonic()
         while True:
-            answer = decode_reply(self._repeated(lambda: self._one(self._querier.get(payload=payload))))
+            answer = decode_reply(self._repeated(ask))
             if not answer.behind:
                 return answer
             if time.monotonic() - start >= wait_s:
@@ -187,6 +196,12 @@ class RetryingQueries:
                     raise
                 self.retries += 1
                 time.sleep(_RETRY_PAUSE_S)
+            except BusyError as error:
+                # It keeps a place for this query from then on.
+                if time.monotonic() + error.retry_after_s - start >= self.retry_s:
+                    raise
+                self.retries += 1
+                time.sleep(error.retry_after_s)
 
     def _one(self, replies: Iterable[zenoh.Reply]) -> bytes:
         error: bytes | None = None
@@ -217,7 +232,8 @@ class Client:
     """A connection to one axis of a service; use as a context manager, or call :meth:`close`.
 
     All methods raise NoReplyError (no service), ReplyTimeoutError, RefusedError (refused by the service, with its
-    message) and InputError (refused before sending). Use one client from one thread.
+    message), BusyError (others ask for too much, for longer than ``retry_s``) and InputError (refused before sending).
+    Use one client from one thread.
     """
 
     def __init__(
