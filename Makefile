@@ -12,7 +12,7 @@ PURE   := tests/test_house.py tests/vectors tests/adaptive tests/baselines tests
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
           protocol/test_payloads.py runtime/test_logging_setup.py \
-          server/test_axis.py server/test_competing.py server/test_model_watch.py \
+          server/test_axis.py server/test_competing.py server/test_long_queries.py server/test_model_watch.py \
           storage/test_stored_files.py viewer/test_scene.py)
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
 PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \
@@ -20,17 +20,17 @@ PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) 
           viewer/test_sink.py viewer/test_live.py operating security server/test_process.py storage/test_recorder.py \
           stage_node)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
-          --no-emit-index-url --extra build
+          --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
 
 # One BLAS thread: two make a 1 ms solve stall for 65 ms now and then (docs/architecture.md).
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test test-clients check bench foreign fuzz blind blind-foreign vectors requirements clean
+.PHONY: help setup setup-test demo test test-clients wheel-check check bench foreign fuzz blind blind-foreign vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
-setup: .setup-run ## virtual environment with what running needs (700 MB)
+setup: .setup-run ## virtual environment with what running needs (1.3 GB)
 	@$(BIN)/python -m service.warm
 setup-test: .setup-test ## the same with torch, peers and the checkers (7 GB)
 	@$(BIN)/python -m service.warm
@@ -63,6 +63,9 @@ test: ## lint, types, import contract, and all tests
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
 	@sh clients/test.sh
+
+wheel-check: setup-test ## build the wheel, install it into a fresh environment, and run its client there (needs a package index)
+	$(BIN)/python .ci/wheel_check.py
 
 check: .setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff check .

@@ -1,37 +1,75 @@
 """Numba: the decorators of all compiled code, and the vector loops that several modules need.
 
 All compiled code is cached on disk and runs without the interpreter's lock.
+
+Without numba, as in a process that only evaluates a followed model, the loops run in the interpreter. Those over many
+samples then have a version in numpy (`in_numpy`), which gives the same numbers to rounding.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 
 from adaptive.types import FloatArray
 
+try:
+    import numba
+except ImportError:
+    #: Whether the loops are compiled.
+    COMPILES = False
+else:
+    COMPILES = True
+
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _jit(function: F, fastmath: bool | set[str]) -> F:
+    if not COMPILES:
+        return _interpreted(function)
+    return cast(F, numba.njit(cache=True, nogil=True, fastmath=fastmath)(function))
+
+
+def _interpreted(function: F) -> F:
+    """``function`` where overflows and the like give infinities and NaN without a warning, as in compiled code."""
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return function(*arguments)
+
+    return cast(F, run)
+
+
+def in_numpy(version: F) -> Callable[[F], F]:
+    """Decorator above `compiled`: where nothing is compiled, ``version`` replaces the loop."""
+    return lambda function: function if COMPILES else version
 
 
 def compiled(function: F) -> F:
     """Compile a loop over samples or rows. The order of operations is kept, so results are reproducible."""
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath=False)(function))
+    return _jit(function, False)
 
 
 def compiled_contracting(function: F) -> F:
     """As `compiled`, but a product and the sum it enters may be fused (FMA). The last bit depends on the processor."""
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath={"contract"})(function))
+    return _jit(function, {"contract"})
 
 
 def compiled_reassociating(function: F) -> F:
     """As `compiled_contracting`, and sums may be reordered so that they vectorise. NaN and infinities stay valid."""
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))
+    return _jit(function, {"reassoc", "contract", "nsz"})
 
 
+def _dot(a: FloatArray, b: FloatArray, n: int) -> float:
+    return float(a[:n] @ b[:n])
+
+
+@in_numpy(_dot)
 @compiled_reassociating
 def dot(a: FloatArray, b: FloatArray, n: int) -> float:  # pragma: no cover - compiled
     """Scalar product of the first n elements."""
@@ -45,6 +83,11 @@ def dot(a: FloatArray, b: FloatArray, n: int) -> float:  # pragma: no cover - co
 DOUBLE = np.dtype(np.float64)
 
 
+def _all_finite(values: FloatArray) -> bool:
+    return bool(np.isfinite(values).all())
+
+
+@in_numpy(_all_finite)
 @compiled
 def all_finite_doubles(values: FloatArray) -> bool:  # pragma: no cover - compiled
     """`all_finite` of contiguous (n,) float64. Another kind of array would be compiled for, which takes seconds."""

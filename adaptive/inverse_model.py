@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adaptive.compiled import compiled, compiled_reassociating, dot
+from adaptive.compiled import compiled, compiled_reassociating, dot, in_numpy
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
@@ -24,6 +24,11 @@ from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDi
 # --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
 
 
+def _spread(covariance: FloatArray, basis: FloatArray) -> float:
+    return float(basis @ covariance @ basis) if covariance.size else 0.0
+
+
+@in_numpy(_spread)
 @compiled_reassociating
 def spread(covariance: FloatArray, basis: FloatArray) -> float:  # pragma: no cover - compiled
     """basis' covariance basis, V², (p, p) and (p,); 0 for a covariance of no size. Half of a point's time, in order."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adaptive.compiled import compiled_contracting, compiled_reassociating
+from adaptive.compiled import compiled_contracting, compiled_reassociating, in_numpy
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 
@@ -108,6 +108,12 @@ def exp_negative(t: FloatArray, bits: FloatArray) -> None:
         t[j] = value
 
 
+def _rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatArray, bits: FloatArray) -> None:
+    apart = scaled[:, :count] - x_scaled[:, None]
+    np.exp(-np.einsum("dn,dn->n", apart, apart), out=out[:count])
+
+
+@in_numpy(_rbf_column)
 @compiled_contracting
 def rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatArray, bits: FloatArray) -> None:
     """K of the first ``count`` samples with one point into ``out[:count]``.
@@ -134,6 +140,11 @@ def rbf_column(scaled: FloatArray, count: int, x_scaled: FloatArray, out: FloatA
     exp_negative(target, bits[:count])
 
 
+def _weigh(k: FloatArray, alpha: FloatArray) -> tuple[float, float]:
+    return float(alpha @ k), float(max(k.max(initial=0.0), 0.0))
+
+
+@in_numpy(_weigh)
 @compiled_reassociating
 def weigh(k: FloatArray, alpha: FloatArray) -> tuple[float, float]:
     """(sum of alpha k, largest k) of a kernel column (N,); 0 and 0 where it is empty."""

@@ -6,18 +6,19 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
+from service.cli.extras import LAB, VIEWER
 from service.cli.main import COMMANDS as SERVICE_COMMANDS
 from service.cli.main import EXPERIMENTS, Command
 from service.cli.main import main as run
 
 
-def _experiment(module: str, help_line: str) -> Command:
-    return Command(f"lab.commands.{module}", EXPERIMENTS, help_line)
+def _experiment(module: str, help_line: str, *extras: str) -> Command:
+    return Command(f"lab.commands.{module}", EXPERIMENTS, help_line, (LAB, *extras))
 
 
 COMMANDS: Final[dict[str, Command]] = {
     **SERVICE_COMMANDS,
-    "demo": _experiment("demo", "watch a simulated stage lose its hysteresis, drift, and be corrected again"),
+    "demo": _experiment("demo", "watch a simulated stage lose its hysteresis, drift, and be corrected again", VIEWER),
     "rehearse": _experiment("rehearse", "try the service on your own simulated stage, with disturbances"),
     "scenarios": _experiment("scenarios", "compare adapting with not adapting in every kind of drift"),
     "soak": _experiment("soak", "run all processes under a seeded schedule of faults, and check what must hold"),

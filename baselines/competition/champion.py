@@ -32,6 +32,8 @@ INVERSE_KINDS: Final[dict[str, Any]] = {
     "bouc_wen": BoucWenInverse,
     "mpi": MpiInverse,
 }
+#: Largest rounding of the sum of the weights in a memory.
+_SHARES_OFF: Final = 1e-6
 #: Advances a memory in place: (n,) motion µm, (n,) voltages answered for it V, memory (m,).
 AdvanceMemory = Callable[[FloatArray, FloatArray, FloatArray], None]
 
@@ -209,6 +211,11 @@ class ChampionInverse:
             ends.append(end if np.isfinite(end).all() else part)
         n = np.asarray(y_um).size
         return np.concatenate([self._weights(shares, n)[-1] if n else shares, *ends])
+
+    def has_weights(self, memory: FloatArray) -> bool:
+        """Whether the (m,) ``memory`` begins with weights: 0 to 1 each, with the sum 1. All that this model gave do."""
+        shares = memory[: len(self.models)]
+        return bool(np.all((shares >= 0.0) & (shares <= 1.0)) and abs(float(shares.sum()) - 1.0) <= _SHARES_OFF)
 
     def with_model(self, name: str, model: InverseModel) -> ChampionInverse:
         """A copy in which the contestant ``name`` has another model."""

@@ -8,21 +8,23 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adaptive.compiled import all_finite
 from adaptive.types import FloatArray, InverseModel
+from baselines.competition.champion import ChampionInverse
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits, check_domain, check_voltages
+from service.answers.slices import Pace
 from service.config.settings import AxisConfig
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import StandIn
-from service.protocol.query import NEWEST, FeedforwardQuery, Pending, Trajectory
-from service.protocol.samples import check_finite
+from service.protocol.query import MAX_PENDING, NEWEST, FeedforwardQuery, Pending, Trajectory
+from service.protocol.samples import MAX_SEQ, check_finite
 
 # --- The hysteresis memory that the service tracks from measured samples, for queries that bring none.
 
@@ -118,6 +120,9 @@ def derivatives(
 
 # --- Answers.
 
+#: What is under way may begin this time, s, and MAX_PENDING samples ahead of the stage.
+AHEAD_S: Final = 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class Served:
@@ -180,17 +185,27 @@ def trust_by_age(age_s: float, stale_s: float, last_good_s: float) -> tuple[floa
 
 
 def answer(
-    query: FeedforwardQuery, ring: tuple[Served, ...], handled: int, config: AxisConfig, limits: Limits, age_s: float
+    query: FeedforwardQuery,
+    ring: tuple[Served, ...],
+    handled: int,
+    config: AxisConfig,
+    limits: Limits,
+    age_s: float | None,
+    pace: Pace | None = None,
 ) -> Trajectory:
     """Voltages for a query, safe to apply. Raises InputError on what cannot be asked for.
 
     ``ring``: snapshots, newest last; ``handled``: the last sequence number of which all snapshots are in the ring;
-    ``age_s``: time since the newest sample that was handled came, s, 0 where none is expected. An ``as_of`` names its
-    snapshot: age does not change what it answers, or a replay could not repeat it.
+    ``age_s``: time since the newest sample that was handled came, s, None before any. An ``as_of`` names its
+    snapshot: age does not change what it answers, or a replay could not repeat it. ``pace`` : see `answer_safely`.
     """
+    if query.y_um.size > config.query_points:
+        raise FieldError(
+            "n", query.y_um.size, f"1 to {config.query_points} points", "ask for fewer at once (query_points)"
+        )
     served, behind, trust, stale = ring[-1], False, 1.0, False
     if query.as_of == NEWEST:
-        trust, stale = trust_by_age(age_s, config.stale_s, config.last_good_s)
+        trust, stale = trust_by_age(age_s or 0.0, config.stale_s, config.last_good_s)
         if served.frozen:
             trust = 1.0  # it follows no samples: without them it is as good as with them
     else:
@@ -204,6 +219,7 @@ def answer(
     if query.pending is not None:
         check_domain(query.pending.y_um, limits, "pending.y_um")
         check_voltages(query.pending.u_V, limits, "pending.u_V")
+        check_near(query.pending, None if age_s is None else handled + math.ceil(age_s / model.dt_s), model.dt_s)
     memory, y_um, v_um_per_s, a_um_per_s2 = query.memory, query.y_um, query.v_um_per_s, query.a_um_per_s2
     resumes_V = math.nan
     if memory is None:
@@ -218,6 +234,13 @@ def answer(
             f"{model.memory_size} for model {name!r}",
             "bring back the memory of this model's last reply, or none",
         )
+    if query.memory is not None and isinstance(model, ChampionInverse) and not model.has_weights(memory):
+        raise FieldError(
+            "memory",
+            f"the shares {memory[: len(model.models)].tolist()}",
+            f"one share from 0 to 1 for each of {', '.join(model.names)}, with the sum 1",
+            "bring back the memory of this model's last reply, or none",
+        )
     got = answer_safely(
         model,
         memory,
@@ -228,6 +251,7 @@ def answer(
         served.standing_in_for(name, query.memory is not None),
         blends(name, default, config),
         resumes_V,
+        pace,
     )
     return got._replace(snapshot_seq=served.seq, model=name, behind=behind, tracked_memory=query.memory is None)
 
@@ -253,6 +277,26 @@ def under_way(
     v, a = query.v_um_per_s, query.a_um_per_s2
     v_um_per_s, a_um_per_s2 = np.concatenate([v[:1] - a[:1] * dt_s, v]), np.concatenate([a[:1], a])
     return way, (y_um, v_um_per_s, a_um_per_s2, float(pending.u_V[-1]))
+
+
+def check_near(pending: Pending, now: int | None, dt_s: float) -> None:
+    """Raise InputError where what is under way begins far ahead of sample ``now``, where the stage is by the clock.
+
+    ``now`` None: no sample has come since the start, so that the end of all counts alone bounds it.
+    """
+    last = pending.first + pending.y_um.size - 1
+    if last > MAX_SEQ:
+        raise FieldError("pending.first", pending.first, f"at most 2**62 - {pending.y_um.size - 1}")
+    if now is None:
+        return
+    most = now + 1 + math.ceil(AHEAD_S / dt_s) + MAX_PENDING
+    if pending.first > most:
+        raise FieldError(
+            "pending.first",
+            pending.first,
+            f"at most {most}: the stage is at sample {now}",
+            "count as the stage does, and begin at snapshot_seq + 1",
+        )
 
 
 def carried(model: InverseModel, memory: FloatArray, way: Pending | None) -> FloatArray:

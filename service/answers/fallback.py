@@ -22,6 +22,7 @@ from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
+from service.answers.slices import Pace, in_slices
 from service.protocol.model import StandIn
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
 
@@ -53,6 +54,7 @@ def answer_safely(
     stand_in: StandIn | None,
     blends: bool = True,
     resumes_V: float = math.nan,
+    pace: Pace | None = None,
 ) -> Trajectory:
     """Voltages for (n,) points (y µm, v µm/s, a µm/s²) from ``memory`` (m,) on; never raises.
 
@@ -61,10 +63,11 @@ def answer_safely(
     ``resumes_V``: where finite, the first of the points was commanded already, with this voltage, V, and is not
     answered again: (n - 1,) come out. What the model asks for more or less there fades with ``FADE_S``, so that no new
     snapshot steps the voltage: a step would make the stage ring.
+    ``pace``: evaluate in slices, with this between them; the answer is the same.
     """
     if math.isfinite(resumes_V):
-        return _resumed(model, memory, points, u_before_V, rules, stand_in, blends, resumes_V)
-    forward = _forward(model, points, memory)
+        return _resumed(model, memory, points, u_before_V, rules, stand_in, blends, resumes_V, pace)
+    forward = _forward(in_slices(model, pace), points, memory)
     u, std = forward.u_V, forward.std_V
     after_ok = all_finite(forward.memory)
     trusted = not blends or rules.trust >= 1.0
@@ -105,9 +108,10 @@ def _resumed(
     stand_in: StandIn | None,
     blends: bool,
     resumes_V: float,
+    pace: Pace | None,
 ) -> Trajectory:
     free = rules._replace(limits=replace(rules.limits, slew_V_per_s=math.inf))
-    got = answer_safely(model, memory, points, math.nan, free, stand_in, blends)
+    got = answer_safely(model, memory, points, math.nan, free, stand_in, blends, pace=pace)
     n = got.u_V.size - 1
     fade = np.exp(-np.arange(1, n + 1) / max(FADE_S / model.dt_s, FADE_SAMPLES))
     limits, marks = rules.limits, got.flags[1:]

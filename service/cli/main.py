@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from adaptive.errors import DehystError
+from service.cli.extras import LAB, SERVE, VIEWER, advice, missing
 
 SERVING: Final = "serving"
 OPERATING: Final = "operating"
@@ -25,24 +26,28 @@ dehyst COMMAND --help lists the options of a command. Exit status: 0 done, 1 fai
 
 
 class Command(NamedTuple):
-    """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, its group, one line of help."""
+    """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, its group, one line of help.
+
+    ``extras`` : of the installation, without which it cannot do its work.
+    """
 
     module: str
     group: str
     help: str
+    extras: tuple[str, ...] = ()
 
 
-def _command(module: str, group: str, help_line: str) -> Command:
-    return Command(f"service.cli.commands.{module}", group, help_line)
+def _command(module: str, group: str, help_line: str, *extras: str) -> Command:
+    return Command(f"service.cli.commands.{module}", group, help_line, extras)
 
 
 #: The commands that need nothing but the service. `lab.cli` adds the experiments.
 COMMANDS: Final[dict[str, Command]] = {
-    "serve": _command("serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning"),
+    "serve": _command("serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning", SERVE),
     "query": _command("query", SERVING, "ask a running service for voltages"),
-    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh"),
+    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh", SERVE),
     "router": _command("router", SERVING, "forward messages between stages, services and clients on several hosts"),
-    "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file"),
+    "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file", VIEWER),
     "status": _command("status", OPERATING, "show a live table of all axes and instances that serve"),
     "freeze": _command("operate", OPERATING, "stop an axis from learning, until it is thawed"),
     "thaw": _command("operate", OPERATING, "let a frozen axis learn again"),
@@ -56,15 +61,21 @@ COMMANDS: Final[dict[str, Command]] = {
     "access": _command(
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),
-    "identify": _command("identify", IDENTIFICATION, "identify the inverse models of a stage from a recording"),
+    "identify": _command("identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE),
     "replay": _command(
-        "replay", IDENTIFICATION, "run the learner over a recording offline, with its decisions and errors"
+        "replay", IDENTIFICATION, "run the learner over a recording offline, with its decisions and errors", SERVE
     ),
     "diagnose": _command(
-        "diagnose", IDENTIFICATION, "name the effects in a recording that the simulation lacks, and what each explains"
+        "diagnose",
+        IDENTIFICATION,
+        "name the effects in a recording that the simulation lacks, and what each explains",
+        LAB,
     ),
     "modes": _command(
-        "modes", IDENTIFICATION, "find the modes of a stage in periodic recordings, and how they soften with amplitude"
+        "modes",
+        IDENTIFICATION,
+        "find the modes of a stage in periodic recordings, and how they soften with amplitude",
+        LAB,
     ),
     "completion": _command("completion", OTHER, "print the completion script of a shell"),
 }
@@ -78,6 +89,9 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
         os.environ.setdefault(variable, "1")
     chosen = next((a for a in args if not a.startswith("-")), None)
     known = chosen is not None and chosen in commands
+    if chosen is not None and known and (package := missing(commands[chosen].extras)):
+        print(f"dehyst {chosen}: {advice(package, commands[chosen].extras)}", file=sys.stderr)
+        return 2
     parser = build_parser(commands, [chosen] if chosen is not None and known else [])
     if chosen is not None and not known:
         parser.error(f"COMMAND: got {chosen!r}, expected one of {', '.join(commands)}; options follow the command")
@@ -89,6 +103,12 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
         return int(parsed.run(parsed))
     except DehystError as error:
         print(f"dehyst {parsed.command}: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        needed = advice((error.name or "").partition(".")[0])
+        if not needed:
+            raise
+        print(f"dehyst {parsed.command}: {needed}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"dehyst {parsed.command}: interrupted", file=sys.stderr)

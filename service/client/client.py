@@ -28,7 +28,7 @@ from adaptive.types import FloatArray
 from service.answers.answering import derivatives
 from service.answers.guard import Limits, guard
 from service.client.follower import Follower
-from service.protocol.errors import BehindError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
+from service.protocol.errors import BehindError, BusyError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference
@@ -119,6 +119,8 @@ _BEHIND_PAUSE_S: Final = 0.001
 #: the service has died, within about a second if it has only stopped.
 RETRY_S: Final = 2.0
 _RETRY_PAUSE_S: Final = 0.003
+#: Queries longer than this, bytes, are more than a hundred points, which are not answered at once.
+_SHORT_BYTES: Final = 4096
 
 
 class RetryingQueries:
@@ -126,7 +128,7 @@ class RetryingQueries:
 
     Parameters
     ----------
-    timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
+    timeout_s : of each query, s. retry_s : time for which a query is repeated that is unanswered or refused as busy, s.
 
     Attributes
     ----------
@@ -138,10 +140,17 @@ class RetryingQueries:
         self.retries = 0
         self._session, self._keys = session, keys
         self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True)
+        # Of low priority, so that a megabyte there and back delays no other message, and the service hands it over at
+        # once: twice as fast, because its queue has room for it. The source gives this session its share.
+        self._long = session.declare_querier(
+            keys.feedforward, timeout=timeout_s, priority=zenoh.Priority.DATA_LOW, congestion_control=SURELY
+        )
+        self._source = zenoh.SourceInfo(self._long.id, 0)
 
     def close(self) -> None:
-        """Undeclare the querier."""
+        """Undeclare the queriers."""
         self._querier.undeclare()  # type: ignore[no-untyped-call]
+        self._long.undeclare()  # type: ignore[no-untyped-call]
 
     def once(self, selector: str) -> bytes:
         """The payload of the one reply, without repetition. Raises NoReplyError, ReplyTimeoutError, RefusedError."""
@@ -164,9 +173,15 @@ class RetryingQueries:
         ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
         BehindError after that.
         """
+
+        def ask() -> bytes:
+            if len(payload) <= _SHORT_BYTES:
+                return self._one(self._querier.get(payload=payload))
+            return self._one(self._long.get(payload=payload, source_info=self._source))
+
         start = time.monotonic()
         while True:
-            answer = decode_reply(self._repeated(lambda: self._one(self._querier.get(payload=payload))))
+            answer = decode_reply(self._repeated(ask))
             if not answer.behind:
                 return answer
             if time.monotonic() - start >= wait_s:
@@ -187,6 +202,12 @@ class RetryingQueries:
                     raise
                 self.retries += 1
                 time.sleep(_RETRY_PAUSE_S)
+            except BusyError as error:
+                # It keeps a place for this query from then on.
+                if time.monotonic() + error.retry_after_s - start >= self.retry_s:
+                    raise
+                self.retries += 1
+                time.sleep(error.retry_after_s)
 
     def _one(self, replies: Iterable[zenoh.Reply]) -> bytes:
         error: bytes | None = None
@@ -217,7 +238,8 @@ class Client:
     """A connection to one axis of a service; use as a context manager, or call :meth:`close`.
 
     All methods raise NoReplyError (no service), ReplyTimeoutError, RefusedError (refused by the service, with its
-    message) and InputError (refused before sending). Use one client from one thread.
+    message), BusyError (others ask for too much, for longer than ``retry_s``) and InputError (refused before sending).
+    Use one client from one thread.
     """
 
     def __init__(

@@ -13,6 +13,7 @@ from service.background.retuning.settings import RetuningConfig
 from service.config.schema import Setting, build_settings, parse_toml, read_text
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO, check_name
+from service.protocol.samples import MAX_COUNT
 from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, is_loopback
 from service.security.check import check_reach
 from service.security.peers import OWN_SECRET
@@ -67,6 +68,9 @@ class AxisConfig:
         int, Setting(help="samples between two snapshots, which answer the queries", low=1, high=100_000)
     ] = 20
     snapshots_kept: Annotated[int, Setting(help="snapshots that a query can ask for by as_of", low=1, high=4096)] = 256
+    query_points: Annotated[
+        int, Setting(help="most points of one query; a query for more is refused", low=1, high=MAX_COUNT)
+    ] = MAX_COUNT
     queue_samples: Annotated[
         int, Setting(help="samples that may wait for the learner; more are counted and dropped", low=1, high=10_000_000)
     ] = 20_000
@@ -159,6 +163,15 @@ class ServeConfig:
             example=OWN_SECRET,
         ),
     ] = None
+    busy_after_s: Annotated[
+        float,
+        Setting(
+            help="a query for more than 128 points that would take longer than this beside others is refused as busy",
+            unit="s",
+            low=0.01,
+            high=60,
+        ),
+    ] = 0.5
     lease_s: Annotated[
         float, Setting(help="silence after which a service counts as dead", unit="s", low=0.1, high=60)
     ] = 1.0

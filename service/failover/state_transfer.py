@@ -15,7 +15,8 @@ from typing import Any, Final
 
 import zenoh
 
-from service.protocol.errors import ServiceError
+from service.protocol.container import JSON
+from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.security.peers import SIGNATURE_DIGITS, PeerSecret, new_nonce
 
 #: Size of a part, bytes; a packet holds 64 KiB.
@@ -88,13 +89,17 @@ def fetch_state(
 
 
 def send_sign_of_life(query: zenoh.Query, key: str, instance: str, secret: PeerSecret = NO_SECRET) -> bool:
-    """Answer ``query`` if it asks whether ``instance`` answers; whether it asks for a sign of life at all."""
+    """Answer ``query`` if it asks for a sign of life; whether it does. Of another instance than this: an error."""
     wanted = query.parameters.get("alive")
     if wanted is None:
         return False
     nonce = str(query.parameters.get("nonce") or "")
-    if str(wanted) == instance:
-        query.reply(key, (secret.sign("alive", key, instance, nonce) or instance).encode())
+    with query:
+        if str(wanted) == instance:
+            query.reply(key, (secret.sign("alive", key, instance, nonce) or instance).encode())
+        else:
+            refusal = FieldError("alive", repr(str(wanted))[:80], f"{instance!r}, the instance that answers here")
+            query.reply_err(error_to_json(refusal), encoding=JSON)
     return True
 
 

@@ -7,15 +7,20 @@
     ├── NoReplyError        no service answered: not running, stopped meanwhile, or access refused
     ├── ReplyTimeoutError   the service is running but did not answer in time (also the built-in TimeoutError)
     ├── RefusedError        the service refused the request; has field, got and expected
+    ├── BusyError           the service has too much to do; has the time to ask again after
     └── BehindError         the service has not yet handled the samples that ``as_of`` covers
 """
 
 from __future__ import annotations
 
 import json
-from typing import Any
+import math
+from typing import Any, Final
 
 from adaptive.errors import DehystError, InputError
+
+#: ``error`` of the error reply to a query that may be repeated after ``retry_after_s``.
+BUSY: Final = "busy"
 
 
 class ServiceError(DehystError):
@@ -55,6 +60,14 @@ class RefusedError(ServiceError):
         self.expected = expected
 
 
+class BusyError(ServiceError):
+    """Others ask for so much that the answer would take too long. The query can be repeated after ``retry_after_s``."""
+
+    def __init__(self, retry_after_s: float, message: str = "") -> None:
+        super().__init__(message or f"others ask for too much at present: ask again in {retry_after_s:.3f} s")
+        self.retry_after_s = retry_after_s
+
+
 class FieldError(InputError):
     """An :class:`InputError` with its parts as attributes, for the JSON of an error reply."""
 
@@ -66,7 +79,13 @@ class FieldError(InputError):
 
 
 def error_to_json(error: BaseException) -> bytes:
-    """The payload of an error reply: ``{"error", "message", "field", "got", "expected"}`` as UTF-8 JSON."""
+    """The payload of an error reply: ``{"error", "message", "field", "got", "expected"}`` as UTF-8 JSON.
+
+    For a `BusyError` ``error`` is "busy", and ``retry_after_s`` is added.
+    """
+    if isinstance(error, BusyError):
+        busy = {"error": BUSY, "message": str(error), "field": "", "got": "", "expected": ""}
+        return json.dumps({**busy, "retry_after_s": round(error.retry_after_s, 6)}).encode()
     # FieldError is not part of the protocol: clients see InputError.
     kind = "InputError" if isinstance(error, InputError) else type(error).__name__
     parts = {"field": "", "got": "", "expected": ""}
@@ -87,5 +106,8 @@ def error_from_json(payload: bytes) -> ServiceError:
         if "timeout" in text.lower():
             return ReplyTimeoutError("the service did not answer in time; ask again or allow more time")
         return RefusedError("unknown", text)
+    retry_after_s = data.get("retry_after_s")
+    if data.get("error") == BUSY and isinstance(retry_after_s, int | float) and 0.0 <= retry_after_s < math.inf:
+        return BusyError(float(retry_after_s), str(data.get("message", "")))
     parts = {name: str(data.get(name, "")) for name in ("field", "got", "expected")}
     return RefusedError(str(data.get("error", "unknown")), str(data.get("message", "")), **parts)

@@ -14,6 +14,7 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import (
     FEEDFORWARD_QUERY,
     FEEDFORWARD_REPLY,
+    HEADER,
     MAX_NAME_BYTES,
     MAX_SEQ,
     VERSION,
@@ -121,6 +122,11 @@ def encode_query(
         under_way = b"".join((first, y.astype("<f8", copy=False).tobytes(), u.astype("<f8", copy=False).tobytes()))
     head = _QUERY.pack(VERSION, FEEDFORWARD_QUERY, options, n, as_of, u_before_V, m, len(name))
     return b"".join((head, *parts, name, under_way))
+
+
+def points_of(data: bytes) -> int:
+    """Number of points in the payload of a query, by its header; 0 where it is too short to have one."""
+    return int(HEADER.unpack_from(data)[3]) if len(data) >= HEADER.size else 0
 
 
 def decode_query(data: bytes) -> FeedforwardQuery:

@@ -7,6 +7,7 @@ import math
 import os
 import select
 import signal
+import sys
 import threading
 import time
 import weakref
@@ -14,8 +15,10 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Final
 
+#: Names of the signals of this system: Windows has no SIGHUP.
+_KNOWN: Final = signal.Signals.__members__
 #: Signals that end a process cleanly.
-STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOPS: Final = tuple(signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in _KNOWN)
 
 
 class StopSignal:
@@ -36,13 +39,16 @@ class StopSignal:
         os.set_blocking(self._write, False)
         weakref.finalize(self, _close, self._read, self._write)
         for number in STOPS:
-            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._on_signal)
 
     def wait(self, duration_s: float | None = None) -> str:
         """Wait for a signal or for ``duration_s``; returns the signal's name, or that the time is over."""
         until = math.inf if duration_s is None else time.monotonic() + duration_s
         while not self.reason and (rest_s := until - time.monotonic()) > 0.0:
+            if sys.platform == "win32":  # which waits for sockets only
+                time.sleep(min(0.05, rest_s))
+                continue
             # In steps, because a wait without end keeps some platforms from delivering the signal.
             select.select([self._read], [], [], min(0.5, rest_s))
         return self.reason or "time is over"

@@ -9,7 +9,6 @@ original standard output.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import re
 import sys
@@ -92,7 +91,9 @@ def count_refusals() -> Refusals:
     output = os.dup(1)
     reading, writing = os.pipe()
     # A flood of refusals must not hold up zenoh's threads while the reader waits for its turn.
-    with contextlib.suppress(OSError, AttributeError):
+    with contextlib.suppress(OSError, AttributeError, ImportError):
+        import fcntl  # there is none on Windows
+
         fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
     os.dup2(writing, 1)
     os.close(writing)

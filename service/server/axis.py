@@ -23,6 +23,7 @@ from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from service.answers.answering import MemoryTracker, Served, answer, blends, learns
 from service.answers.guard import Limits
+from service.answers.slices import Pace
 from service.background.retuning.adoption import Retuned
 from service.config.settings import LEARN, AxisConfig
 from service.intake.clock import SampleClock
@@ -194,7 +195,7 @@ class Axis:
         self._snapshots: tuple[Served, ...] = (self._first_snapshot(dict(models)),)
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
         self.counts = SampleCounts(-1, self.sequence.counters(), {})
-        self._age_s = 0.0
+        self._age_s: float | None = None
         if template is None:
             template = {} if learner is None else learner.state_dict()
         sizes = {name: memory.size for name, memory in self.newest.memories.items()}
@@ -245,14 +246,17 @@ class Axis:
         """The events since the last call, oldest first; of a flood only the newest are kept."""
         return self._events.take()
 
-    def update_age(self, age_s: float) -> None:
-        """Set the time, s, since the newest sample that was handled came; 0 before any. From the publishing thread."""
+    def update_age(self, age_s: float | None) -> None:
+        """The time, s, since the newest sample that was handled came; None before any. For the publishing thread."""
         self._age_s = age_s
 
-    def answer(self, query: FeedforwardQuery) -> Trajectory:
-        """Voltages for a query, safe to apply. Raises InputError on a query that cannot be answered."""
+    def answer(self, query: FeedforwardQuery, pace: Pace | None = None) -> Trajectory:
+        """Voltages for a query, safe to apply. Raises InputError on a query that cannot be answered.
+
+        ``pace`` : evaluate in slices, all from one snapshot, with this between them (`service.answers.slices`).
+        """
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
-        return answer(query, self._snapshots, handled, self.config, self.limits, self._age_s)
+        return answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
 
     def model(self, name: str) -> tuple[InverseModel, int, FloatArray]:
         """(model, snapshot_seq, tracked memory) of the newest snapshot. Raises InputError on an unknown name."""

@@ -19,6 +19,7 @@ from service.protocol.samples import decode_samples
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, axis_status
 from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
@@ -40,6 +41,7 @@ class AxisServer:
     instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
     sink : records samples, or None. watcher : the background diagnosis, or None.
     secret : by which the instances of this service prove themselves to each other.
+    long_queries : of all axes of the process; None: of this one alone.
 
     Attributes
     ----------
@@ -58,6 +60,7 @@ class AxisServer:
         sink: SampleSink | None = None,
         watcher: SampleWatcher | None = None,
         secret: PeerSecret = NO_SECRET,
+        long_queries: LongQueries | None = None,
     ) -> None:
         self.keys = keys
         self.secret = secret
@@ -78,7 +81,10 @@ class AxisServer:
         retuner = Retuner(config.retuning, config.recorder) if tuned else None
         self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
         self._latency = LatencyMeter()
-        self._answers = QueryAnswers(keys, axis, self.checkpoints, self._latency, self.status, instance, secret)
+        self._long_queries = long_queries or LongQueries()
+        self._answers = QueryAnswers(
+            keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, instance, secret
+        )
         self._operations = self._operations_server()
         self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
         self._session = session
@@ -208,8 +214,9 @@ class AxisServer:
 
     def _update_age(self, now_s: float) -> None:
         """Tell the axis the age of its samples, and note when they become stale."""
-        age_s = self.loop.queue.age_s(now_s) or 0.0
+        age_s = self.loop.queue.age_s(now_s)
         self.axis.update_age(age_s)
+        age_s = age_s or 0.0
         config = self.axis.config
         stale = trust_by_age(age_s, config.stale_s, config.last_good_s)[1]
         if stale == self._stale:
@@ -236,6 +243,7 @@ class AxisServer:
             stale=self._stale,
             checkpoints=self.checkpoints.counters(),
             operations=self._operations.counters(),
+            waiting_points=self._long_queries.waiting_points,
         )
 
     def _on_sample(self, sample: zenoh.Sample) -> None:

@@ -26,6 +26,7 @@ from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
+from service.server.long_queries import LongQueries
 from service.storage.checkpoint import learn_again, restore_newest
 
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
@@ -131,6 +132,7 @@ class Service:
         self._stopped = stopped
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self.axes: list[AxisServer] = []
+        self._long_queries = LongQueries(config.busy_after_s)
         self._role_controls: list[RoleControl] = []
         self._factory = factory
         self._sinks = sinks
@@ -172,6 +174,7 @@ class Service:
                     self._sinks(axis.config),
                     make_watcher(axis),
                     secret,
+                    self._long_queries,
                 )
                 self.axes.append(server)
                 _restore(server)
@@ -201,6 +204,8 @@ class Service:
         for control in self._role_controls:
             control.close()
         self._role_controls = []
+        # Whoever still waits gets an error before the session closes.
+        self._long_queries.close()
         for axis in self.axes:
             axis.undeclare()
             if axis.loop.sink is not None:

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import zenoh
 
 from adaptive.errors import DehystError
+from service.answers.slices import Pace
 from service.failover.state_transfer import NO_SECRET, send_sign_of_life, send_state
 from service.protocol.container import JSON, to_json
-from service.protocol.errors import FieldError, ServiceError, error_to_json
+from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
-from service.protocol.query import decode_query, encode_reply
+from service.protocol.query import decode_query, encode_reply, points_of
+from service.protocol.samples import MAX_COUNT
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
+from service.server.long_queries import SHORT, LongQueries
 from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
 
 # --- How long the service took over its queries: the last thousand, and counts since the start.
@@ -27,26 +32,39 @@ _KEPT: Final = 1024
 
 
 class LatencyMeter:
-    """Keeps the last durations; one thread adds, others may read."""
+    """Keeps the last durations of short queries, and counts all; any thread may add and read."""
 
     def __init__(self) -> None:
         self._us = np.zeros(_KEPT)
+        self._lock = threading.Lock()
+        self._short = 0
         self.count = 0
         self.errors = 0
+        self.busy = 0
 
     def add(self, duration_s: float, failed: bool = False) -> None:
-        """Count one query that took ``duration_s`` in the service, wire not included."""
-        self._us[self.count % _KEPT] = duration_s * 1e6
-        self.count += 1
-        self.errors += failed
+        """Count one short query that took ``duration_s`` in the service, wire not included."""
+        with self._lock:
+            self._us[self._short % _KEPT] = duration_s * 1e6
+            self._short += 1
+            self.count += 1
+            self.errors += failed
+
+    def add_long(self, failed: bool = False, busy: bool = False) -> None:
+        """Count one long query; ``busy`` : refused, because others asked for too much, which is no error."""
+        with self._lock:
+            self.count += 1
+            self.errors += failed
+            self.busy += busy
 
     def summary(self) -> dict[str, float | int | None]:
-        """``count``, ``errors``, and of the last thousand ``p50_us`` and ``p99_us``; null before the first."""
-        known = self._us[: min(self.count, _KEPT)].copy()
+        """``count``, ``errors``, ``busy``, and of the last thousand short ones ``p50_us`` and ``p99_us`` or null."""
+        known = self._us[: min(self._short, _KEPT)].copy()
         p50, p99 = np.percentile(known, (50, 99)).tolist() if known.size else (None, None)
         return {
             "count": self.count,
             "errors": self.errors,
+            "busy": self.busy,
             "p50_us": None if p50 is None else round(p50, 1),
             "p99_us": None if p99 is None else round(p99, 1),
         }
@@ -54,6 +72,9 @@ class LatencyMeter:
 
 # --- Answers.
 
+#: Longest payload that is read in the thread that receives it, bytes, and the fewest bytes of a point.
+_COPIED_BYTES: Final = 65_536
+_POINT_BYTES: Final = 16
 #: Longest time from the routing of a sample to others until it is in the queue of this instance, s.
 _ROUTING_S: Final = 0.02
 #: States that are sent at the same time at most.
@@ -65,7 +86,8 @@ class QueryAnswers:
 
     Parameters
     ----------
-    latency : takes the time of every feedforward query. status : makes the status.
+    long_queries : answers the feedforward queries that are not short.
+    latency : takes the time of every short one. status : makes the status.
     instance, secret : of this process, for other instances that ask for its state or for a sign of life.
     """
 
@@ -76,6 +98,7 @@ class QueryAnswers:
         checkpoints: CheckpointKeeper,
         latency: LatencyMeter,
         status: Callable[[], dict[str, Any]],
+        long_queries: LongQueries,
         instance: str = "",
         secret: PeerSecret = NO_SECRET,
     ) -> None:
@@ -84,6 +107,7 @@ class QueryAnswers:
         self._checkpoints = checkpoints
         self._latency = latency
         self._status = status
+        self._long = long_queries
         self._instance = instance
         self._secret = secret
         self._sends = threading.BoundedSemaphore(_MOST_STATES)
@@ -92,10 +116,8 @@ class QueryAnswers:
         """Answer from now on; returns what is to be undeclared."""
         keys = self._keys
         return [
-            session.declare_queryable(
-                keys.feedforward, self._guarded(keys.feedforward, self._feedforward, self._latency)
-            ),
-            session.declare_queryable(keys.model, self._guarded(keys.model, self._model_reply)),
+            session.declare_queryable(keys.feedforward, self._on_feedforward),
+            session.declare_queryable(keys.model, self._guarded(keys.model, self._model_reply, ("name",))),
             session.declare_queryable(keys.status, self._guarded(keys.status, self._status_reply)),
             session.declare_queryable(keys.state, self._on_state),
         ]
@@ -105,10 +127,69 @@ class QueryAnswers:
         model, seq, memory = self._axis.model(name)
         return encode_model(name, model, seq, memory, self._axis.safety(name))
 
-    def _feedforward(self, query: zenoh.Query) -> bytes:
-        if query.payload is None:
-            raise FieldError("payload", "none", "a feedforward query")
-        return encode_reply(self._axis.answer(decode_query(query.payload.to_bytes())))
+    def _on_feedforward(self, query: zenoh.Query) -> None:
+        """Answer a short query at once, and hand on a long one."""
+        start = time.perf_counter()
+        self._long.short_begins()
+        try:
+            check_parameters(query.parameters)
+            if query.payload is None:
+                raise FieldError("payload", "none", "a feedforward query")
+            size = len(query.payload)
+            # To copy a megabyte takes as long as to answer ten points: the other thread does it.
+            data = query.payload.to_bytes() if size <= _COPIED_BYTES else None
+            points = min(size // _POINT_BYTES, MAX_COUNT) if data is None else points_of(data)
+            if points > SHORT:
+                self._hand_on(query, data, points)
+                return
+            assert data is not None
+            reply = encode_reply(self._axis.answer(decode_query(data)))
+            # Leaving the context finishes the query; otherwise the caller waits until its time is over.
+            with query:
+                query.reply(self._keys.feedforward, reply)
+            self._latency.add(time.perf_counter() - start)
+        except BusyError as error:
+            self._latency.add_long(busy=True)
+            self._refuse(query, error)
+        except Exception as error:
+            self._latency.add(time.perf_counter() - start, failed=True)
+            self._refuse(query, error)
+        finally:
+            self._long.short_ends()
+
+    def _hand_on(self, query: zenoh.Query, data: bytes | None, points: int) -> None:
+        """Answer in another thread. Raises BusyError if others ask for too much."""
+        key = self._keys.feedforward
+
+        def refuse(error: BaseException) -> None:
+            self._latency.add_long(failed=True)
+            self._refuse(query, error)
+
+        def send(reply: bytes) -> None:
+            try:
+                with query:
+                    query.reply(key, reply)
+                self._latency.add_long()
+            except Exception as error:
+                refuse(error)
+
+        def work(pace: Pace) -> Callable[[], None]:
+            try:
+                payload = query.payload
+                assert payload is not None
+                asked = decode_query(payload.to_bytes() if data is None else data)
+                return partial(send, encode_reply(self._axis.answer(asked, pace)))
+            except Exception as error:
+                return partial(refuse, error)
+
+        self._long.offer(source_of(query), points, work, refuse)
+
+    def _refuse(self, query: zenoh.Query, error: BaseException) -> None:
+        """Reply with an error; nothing where the caller is gone or an answer was sent."""
+        if not isinstance(error, DehystError | zenoh.ZError):
+            self._axis.note("internal_error", f"{self._keys.feedforward}: {type(error).__name__}: {error}")
+        with contextlib.suppress(zenoh.ZError), query:
+            query.reply_err(error_to_json(error), encoding=JSON)
 
     def _model_reply(self, query: zenoh.Query) -> bytes:
         return self.encoded(str(query.parameters.get("name") or self._axis.served))
@@ -130,10 +211,15 @@ class QueryAnswers:
                 finally:
                     self._sends.release()
 
-        if send_sign_of_life(query, self._keys.state, self._instance, self._secret):
-            return
-        if not self._sends.acquire(blocking=False):
-            query.reply_err(error_to_json(ServiceError(f"{_MOST_STATES} states are being sent: ask again later")))
+        try:
+            check_parameters(query.parameters, "pause_s", "nonce", "proof", "alive")
+            if send_sign_of_life(query, self._keys.state, self._instance, self._secret):
+                return
+            if not self._sends.acquire(blocking=False):
+                raise ServiceError(f"{_MOST_STATES} states are being sent: ask again later")
+        except Exception as error:
+            with query:
+                query.reply_err(error_to_json(error), encoding=JSON)
             return
         threading.Thread(target=reply, name=f"state-{self._keys.axis}", daemon=True).start()
 
@@ -142,21 +228,34 @@ class QueryAnswers:
         yield from encode_checkpoint(*self._checkpoints.state())
 
     def _guarded(
-        self, key: str, answer: Callable[[zenoh.Query], bytes], meter: LatencyMeter | None = None
+        self, key: str, answer: Callable[[zenoh.Query], bytes], parameters: tuple[str, ...] = ()
     ) -> Callable[[zenoh.Query], None]:
         def callback(query: zenoh.Query) -> None:
-            start = time.perf_counter()
-            failed = False
             # Leaving the context finishes the query; otherwise the caller waits until its time is over.
             with query:
                 try:
+                    check_parameters(query.parameters, *parameters)
                     query.reply(key, answer(query))
                 except Exception as error:
-                    failed = True
                     if not isinstance(error, DehystError):
                         self._axis.note("internal_error", f"{key}: {type(error).__name__}: {error}")
                     query.reply_err(error_to_json(error), encoding=JSON)
-            if meter is not None:
-                meter.add(time.perf_counter() - start, failed)
 
         return callback
+
+
+def check_parameters(parameters: zenoh.Parameters, *known: str) -> None:
+    """Raise InputError on a parameter of a selector that is not ``known``; zenoh's own begin with ``_``."""
+    if parameters.is_empty():
+        return
+    for pair in str(parameters).split(";"):
+        name = pair.partition("=")[0]
+        if name and not name.startswith("_") and name not in known:
+            expected = f"no parameter but {', '.join(known)}" if known else "no parameter"
+            raise FieldError("parameter", repr(name)[:80], expected, "check its spelling")
+
+
+def source_of(query: zenoh.Query) -> str:
+    """The session that asks, where the query tells it; else ""."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)

@@ -42,10 +42,11 @@ def axis_status(
     stale: bool = False,
     checkpoints: dict[str, Any] | None = None,
     operations: dict[str, int] | None = None,
+    waiting_points: int = 0,
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
-    ``checkpoints``, ``operations`` : their counters.
+    ``checkpoints``, ``operations`` : their counters. ``waiting_points`` : of long queries that are not answered yet.
     """
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
@@ -82,7 +83,11 @@ def axis_status(
         "competition": figures.standing,
         "retuning": None if loop.tuner is None else loop.tuner.status(),
         "recorder": None if loop.sink is None else loop.sink.counters(),
-        "queries": latency.summary(),
+        "queries": {
+            **latency.summary(),
+            "max_points": axis.config.query_points,
+            "waiting_points": waiting_points,
+        },
         "diagnosis": None if loop.watcher is None else loop.watcher.status(),
         "refused": refusal_counters(),
         "memory": in_use(),

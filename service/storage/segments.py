@@ -12,7 +12,7 @@ process of its own, because the conversion needs memory and the interpreter's lo
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import importlib
 import os
 import subprocess
 import sys
@@ -343,11 +343,22 @@ def claim(directory: Path, name: str = ".lock", what: str = "records into") -> I
     """
     lock = open(directory / name, "wb")  # noqa: SIM115 - stays open as long as the recorder
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock_now(lock.fileno())
     except OSError as error:
         lock.close()
         raise BlockingIOError(error.errno, f"another process {what} {directory}") from error
     return lock
+
+
+def _lock_now(descriptor: int) -> None:
+    """Lock an open file until it is closed. Raises OSError where another process holds it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        msvcrt = importlib.import_module("msvcrt")
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_still_at(descriptor: int, path: Path) -> bool:

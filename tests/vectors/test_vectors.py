@@ -243,7 +243,9 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> None:
     for key, value in old.items():
         if isinstance(value, dict):
             compare(value, new[key])
-        elif isinstance(value, list | tuple) and value and all(isinstance(x, float) for x in value):
+        elif isinstance(value, float) or (
+            isinstance(value, list | tuple) and value and all(isinstance(x, float) for x in value)
+        ):
             np.testing.assert_allclose(new[key], value, rtol=TOLERANCE, atol=TOLERANCE)
         else:
             assert new[key] == value or (new[key] != new[key] and value != value)

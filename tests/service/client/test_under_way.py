@@ -201,3 +201,24 @@ def test_a_client_that_says_when_its_points_are_due(shared_service: Any) -> None
         assert point.u_V == pytest.approx(two.u_V[-1], abs=5e-4)
         with pytest.raises(FieldError, match="begin"):
             client.point(40.0, begin=first, memory=one.memory)
+
+
+def test_what_begins_far_ahead_of_the_stage_is_refused(models: dict[str, InverseModel]) -> None:
+    axis = make_axis(models)
+    for part in parts(recording(1001), 20):
+        axis.handle(part)
+
+    def ask(first: int) -> None:
+        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(first, np.array([40.0]), np.array([4.0]))))
+
+    ask(100_000)  # nothing has come since the start: the stage may be anywhere
+    axis.update_age(0.0)
+    ask(1001 + 1000 + 4096)
+    for first in (1001 + 1000 + 4097, 100_000, 2**62):
+        with pytest.raises(FieldError) as refused:
+            ask(first)
+        assert refused.value.field == "pending.first"
+    axis.update_age(60.0)  # while no samples come, the controller goes on commanding
+    ask(61_000)
+    with pytest.raises(FieldError):
+        ask(100_000)

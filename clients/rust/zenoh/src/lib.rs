@@ -170,6 +170,11 @@ impl Feed {
                     Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
                     Err(error) => {
                         let payload = error.payload().to_bytes();
+                        if let Some(pause) = busy(&payload) {
+                            // Others ask for too much; the service says when to ask again.
+                            std::thread::sleep(pause.min(until.saturating_duration_since(Instant::now())));
+                            continue;
+                        }
                         if !String::from_utf8_lossy(&payload).to_lowercase().contains("timeout") {
                             return Err(refusal(&payload));
                         }
@@ -183,6 +188,14 @@ impl Feed {
             std::thread::sleep(Duration::from_millis(50));
         }
     }
+}
+
+/// How long to wait before the query is repeated, where the service is busy.
+fn busy(payload: &[u8]) -> Option<Duration> {
+    let data = json::parse(payload).ok()?;
+    let seconds = data.get("retry_after_s").and_then(Value::number)?;
+    let is_busy = data.get("error").and_then(Value::text) == Some("busy");
+    (is_busy && (0.0..3600.0).contains(&seconds)).then(|| Duration::from_secs_f64(seconds))
 }
 
 /// The error in an error reply.
