@@ -19,6 +19,7 @@ from service.protocol.model import encode_model
 from service.protocol.query import decode_query, encode_reply
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
+from service.server.deltas import DeltaStreams
 from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
 
 # --- How long the service took over its queries: the last thousand, and counts since the start.
@@ -67,6 +68,7 @@ class QueryAnswers:
     ----------
     latency : takes the time of every feedforward query. status : makes the status.
     instance, secret : of this process, for other instances that ask for its state or for a sign of life.
+    deltas : the models whose changes are published.
     """
 
     def __init__(
@@ -78,7 +80,9 @@ class QueryAnswers:
         status: Callable[[], dict[str, Any]],
         instance: str = "",
         secret: PeerSecret = NO_SECRET,
+        deltas: DeltaStreams | None = None,
     ) -> None:
+        self._deltas = deltas
         self._keys = keys
         self._axis = axis
         self._checkpoints = checkpoints
@@ -111,7 +115,11 @@ class QueryAnswers:
         return encode_reply(self._axis.answer(decode_query(query.payload.to_bytes())))
 
     def _model_reply(self, query: zenoh.Query) -> bytes:
-        return self.encoded(str(query.parameters.get("name") or self._axis.served))
+        name = str(query.parameters.get("name") or self._axis.served)
+        followed = None
+        if self._deltas is not None and query.parameters.get("changes"):
+            followed = self._deltas.payload(name)  # the model that the next change changes
+        return followed or self.encoded(name)
 
     def _status_reply(self, query: zenoh.Query) -> bytes:
         return to_json(self._status())
