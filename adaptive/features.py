@@ -22,7 +22,8 @@ The chapter's two-input model is the special case without memory: basis ``[1]``,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,9 +180,18 @@ class FeatureMap:
     offset_um: float = 0.0
     dead_um: float = 0.0
 
+    #: A map from which only the frame differs: all else is taken from it unchecked.
+    like: InitVar[FeatureMap | None] = None
     _arrays: FeatureArrays = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, like: FeatureMap | None) -> None:
+        if like is not None:
+            if not (isfinite(self.gain) and self.gain > 0.0 and isfinite(self.offset_um)):
+                raise InputError(f"gain, offset_um: got {self.gain}, {self.offset_um}, expected finite, gain above 0")
+            frame = np.array([self.offset_um, 1.0 / self.gain, self.dead_um])
+            frame.flags.writeable = False
+            object.__setattr__(self, "_arrays", like.arrays._replace(frame=frame))
+            return
         for name in ("dt_s", "v_scale_um_per_s", "a_scale_um_per_s2", "gain"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
@@ -254,6 +264,10 @@ class FeatureMap:
             return memory.copy()
         carried: FloatArray = (self.offset_um + self.gain * memory - other.offset_um) / other.gain
         return carried
+
+    def in_frame(self, gain: float, offset_um: float) -> FeatureMap:
+        """The same map in another frame, at little cost. Raises InputError where the frame is none."""
+        return replace(self, gain=gain, offset_um=offset_um, like=self)
 
     def advance(self, y_um: float, memory: FloatArray) -> None:
         """Memory after one point, in place."""

@@ -11,11 +11,11 @@ cost beyond the mean. The learner calibrates its scale on its own prediction err
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 
-from adaptive.compiled import compiled, compiled_reassociating, dot, in_numpy
+from adaptive.compiled import all_finite, compiled, compiled_reassociating, dot, in_numpy
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
@@ -215,6 +215,14 @@ def _mean_of(
 
 #: Share of the learnt range by which a point may lie outside and still count as inside.
 DOMAIN_MARGIN = 0.05
+_OUTWARDS = np.array([-1.0, 1.0] * 3)
+
+
+def _with_margins(domain: FloatArray) -> FloatArray:
+    """(6,) bounds inside which a point of a model with ``domain`` (6,) counts as inside."""
+    spans = np.repeat(domain[1::2] - domain[::2], 2) * DOMAIN_MARGIN
+    bounds: FloatArray = domain + spans * _OUTWARDS
+    return bounds
 
 
 @dataclass(frozen=True)
@@ -254,13 +262,19 @@ class LssvmInverse:
     valid: bool = True
     anchor: FloatArray = field(default_factory=lambda: np.empty(0))
     allowed_V: float = 0.0
+    #: A model from which only frame, linear part, domain and noise differ: the rest is shared with it unchecked.
+    like: InitVar[LssvmInverse | None] = None
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
     _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
     #: All that `_evaluate_packed` needs.
     _constants: FloatArray = field(init=False, repr=False, compare=False)
     _counts: IntArray = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, like: LssvmInverse | None) -> None:
+        if like is not None:
+            for shared, value in self._shared_with(like).items():
+                object.__setattr__(self, shared, value)
+            return
         p, d, n = self.features.basis_size, self.features.kernel_size, self.support.shape[0]
         shapes = {"beta": (p,), "support": (n, d), "alpha": (n,), "widths": (d,), "domain": (6,)}
         for name, shape in shapes.items():
@@ -291,8 +305,7 @@ class LssvmInverse:
         scaled.flags.writeable = False
         object.__setattr__(self, "_scaled", scaled)
         object.__setattr__(self, "_inverse_widths", 1.0 / self.widths)
-        spans = np.repeat(self.domain[1::2] - self.domain[::2], 2) * DOMAIN_MARGIN
-        margins = self.domain + spans * np.array([-1.0, 1.0] * 3)
+        margins = _with_margins(self.domain)
         m = self.features.arrays
         scalars = (self.noise_variance, self.kernel_variance, 1.0 / (1.0 + 1.0 / self.gamma), self.allowed_V)
         parts = (m.frame, scalars, margins, m.scale, m.thresholds, m.arcs, m.retain, self.beta, 1.0 / self.widths,
@@ -302,6 +315,22 @@ class LssvmInverse:
         object.__setattr__(
             self, "_counts", np.array([*sizes, *m.flags, anchor.size > 0, *m.kernel_plays], dtype=np.int64)
         )
+
+    def _shared_with(self, like: LssvmInverse) -> dict[str, FloatArray | IntArray]:
+        """What the constructor makes, for a model that shares the kernel part of ``like``. Raises InputError."""
+        for name, value, size in (("beta", self.beta, like.beta.size), ("domain", self.domain, 6)):
+            if value.shape != (size,) or not all_finite(value):
+                raise InputError(f"{name}: got shape {value.shape}, expected ({size},) finite numbers")
+        if not (math.isfinite(self.noise_variance) and self.noise_variance >= 0.0):
+            raise InputError(f"noise_variance: got {self.noise_variance}, expected a finite number of at least 0")
+        m, constants = self.features.arrays, like._constants.copy()
+        constants[0:3], constants[3], constants[7:13] = m.frame, self.noise_variance, _with_margins(self.domain)
+        at = 17 + m.thresholds.size + m.arcs.size + m.retain.size
+        constants[at : at + self.beta.size] = self.beta
+        return {
+            "_scaled": like._scaled, "_inverse_widths": like._inverse_widths, "_counts": like._counts,
+            "_constants": constants,
+        }  # fmt: skip
 
     @property
     def dt_s(self) -> float:
@@ -325,6 +354,18 @@ class LssvmInverse:
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
         _evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
         return Feedforward(u, std, inside, after)
+
+    def moved(
+        self, frame: tuple[float, float], beta: FloatArray, domain: FloatArray, noise_variance: float
+    ) -> LssvmInverse:
+        """The same model with another frame (gain, offset µm), linear part, domain and noise, at little cost.
+
+        The kernel part is shared, so that a follower can make hundreds a second. Raises InputError as the class does.
+        """
+        return replace(
+            self, features=self.features.in_frame(*frame), beta=beta, domain=domain, noise_variance=noise_variance,
+            like=self,
+        )  # fmt: skip
 
     @property
     def packed(self) -> tuple[FloatArray, IntArray]:
@@ -415,8 +456,12 @@ class LssvmInverse:
                 # Files from before there was a bound have none.
                 anchor=np.asarray(state.get("anchor", ()), dtype=np.float64),
                 allowed_V=float(state.get("allowed_V", 0.0)),
-                **{name: np.asarray(state[name], dtype=np.float64) for name in
-                   ("beta", "support", "alpha", "widths", "domain", "beta_covariance")},
+                beta=np.asarray(state["beta"], dtype=np.float64),
+                support=np.asarray(state["support"], dtype=np.float64),
+                alpha=np.asarray(state["alpha"], dtype=np.float64),
+                widths=np.asarray(state["widths"], dtype=np.float64),
+                domain=np.asarray(state["domain"], dtype=np.float64),
+                beta_covariance=np.asarray(state["beta_covariance"], dtype=np.float64),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f"lssvm model: entry missing or damaged: {error}; identify the stage again") from error

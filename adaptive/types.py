@@ -115,6 +115,26 @@ class WindowData:
     hyper: Hyperparameters
 
 
+class MovingPart(NamedTuple):
+    """The parameters of a learnt model that change with each step of its linear part. Copies.
+
+    Attributes
+    ----------
+    gain, offset_um : the frame. beta : (p,) linear part, V, without the bias of the kernel part.
+    domain : (6,) learnt range. noise_variance : V².
+    memory : (m,) hysteresis memory after the last sample.
+    kernel : stands for the kernel part and its hyper-parameters as a whole; another object where they were replaced.
+    """
+
+    gain: float
+    offset_um: float
+    beta: FloatArray
+    domain: FloatArray
+    noise_variance: float
+    memory: FloatArray
+    kernel: object
+
+
 class OnlineModel(Protocol):
     """A model that learns sample by sample: the learner, every adaptive baseline, and a competition between them.
 
@@ -161,6 +181,10 @@ class OnlineModel(Protocol):
 
     def snapshot(self) -> InverseModel:
         """The current model, immutable; costs at most some tens of µs."""
+        ...
+
+    def moving(self) -> MovingPart | None:
+        """What has moved since the last snapshot, at little cost; None where only a whole snapshot can tell."""
         ...
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:

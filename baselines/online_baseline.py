@@ -32,6 +32,7 @@ from adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
+    MovingPart,
     OnlineModel,
     Sample,
     StateDict,
@@ -110,6 +111,10 @@ class OnlineBaseline(ABC):
 
     def thaw(self) -> None:
         """Do nothing; see ``freeze``."""
+
+    def moving(self) -> MovingPart | None:
+        """Always None: its snapshot is small."""
+        return None
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """None: a baseline tracks no memory of its own."""

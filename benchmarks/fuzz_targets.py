@@ -11,6 +11,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from service.failover.state_transfer import join_parts
 from service.operating.verbs import Request, decode_request, encode_request
+from service.protocol import delta as wire_delta
 from service.protocol import model as wire_model
 from service.protocol import query as wire_query
 from service.protocol import query as wire_reply
@@ -101,6 +103,26 @@ def _framed_checkpoint(data: bytes) -> None:
         checkpoint.decode_checkpoint(head + data[2:])
 
 
+def _changing() -> Target:
+    """A payload of kind 7, taken by a follower's state of a model: decoded, added, and made a model."""
+    model = models()["lssvm_adaptive"]
+    base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", model, 5, model.rest_memory(1.0)))
+    message = base.message()
+
+    def target(data: bytes) -> None:
+        with contextlib.suppress(*EXPECTED):
+            decoded = wire_delta.decode_delta(data)
+            if decoded.model:
+                wire_delta.FollowedState.decode(decoded.model).message()
+                return
+            after, changed = base.applied(decoded)
+            made = after.message(message, changed)
+            if made.snapshot_seq != decoded.snapshot_seq:
+                raise AssertionError("the result has another number than the message")
+
+    return target
+
+
 def _parts(data: bytes) -> None:
     """Parts of a state, each of up to three bytes after its header: joined if complete, else nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
@@ -127,6 +149,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "reply": lambda: _refusing(wire_reply.decode_reply),
     "answer": _answering,
     "model": lambda: _refusing(wire_model.decode_model),
+    "delta": _changing,
     "framed": lambda: _framed_model,
     "checkpoint": lambda: _framed_checkpoint,
     "parts": lambda: _parts,
@@ -134,6 +157,23 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "operate": lambda: _refusing(decode_request),
     "error": lambda: _refusing(error_from_json),
 }
+
+
+def _changes() -> list[bytes]:
+    """Changes of the small LSSVM: of its linear part, of its kernel part, and a whole model."""
+    old = models()["lssvm_adaptive"]
+    assert isinstance(old, LssvmInverse)
+    memory = old.rest_memory(1.0)
+    base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", old, 5, memory))
+    moved = old.moved((0.94, 1.8), old.beta + 0.01, old.domain, 2e-6)
+    grown = replace(moved, support=np.vstack([old.support, old.support[:2] + 0.1]), alpha=np.ones(22))
+    kept = [wire_delta.encode_delta(base.whole())]
+    for model in (moved, grown):
+        state = wire_delta.FollowedState.of(*wire_model.model_parts("lssvm_adaptive", model, memory + 1.0), 9, base)
+        _, message = base.replaced(state)
+        assert message is not None
+        kept.append(wire_delta.encode_delta(message))
+    return kept
 
 
 def seeds(target: str) -> list[bytes]:
@@ -161,6 +201,7 @@ def seeds(target: str) -> list[bytes]:
         "answer": query,
         "reply": [wire_reply.encode_reply(reply)],
         "model": sent,
+        "delta": _changes(),
         "framed": framed,
         "checkpoint": [kept[8:10] + kept[32:], b""],
         "parts": [b"".join(struct.pack("<II3s", i, 3, b"abc") for i in range(3))],

@@ -8,6 +8,7 @@ from adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
+    MovingPart,
     OnlineModel,
     Sample,
     StateDict,
@@ -38,6 +39,9 @@ class PlainModel:
 
     def snapshot(self) -> InverseModel:
         return self.base
+
+    def moving(self) -> MovingPart | None:
+        return None
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         return None

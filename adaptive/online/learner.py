@@ -31,6 +31,7 @@ from adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
+    MovingPart,
     OnlineModel,
     Sample,
     StateDict,
@@ -742,6 +743,17 @@ class Learner:
         if self._cache is None:
             self._cache = self.parts.model()
         return self._cache
+
+    def moving(self) -> MovingPart | None:
+        """What has moved since the last snapshot; None where something else than the learnt model is served."""
+        parts, intake, j = self.parts, self.parts.intake, self.parts.judgement
+        if j.fallback or parts.alone or intake.track is None or self.trouble or self.distrusts:
+            return None
+        frame = intake.served
+        return MovingPart(
+            frame.gain, frame.offset_um, parts.filter.beta, parts.domain.copy(), j.variance_V2, intake.memory_now(),
+            parts.window,
+        )  # fmt: skip
 
     def memory(self) -> FloatArray:
         """(m,) hysteresis memory as tracked from the measured samples; where a caller without one begins.

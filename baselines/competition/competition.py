@@ -30,6 +30,7 @@ from adaptive.types import (
     FloatArray,
     Hyperparameters,
     InverseModel,
+    MovingPart,
     OnlineModel,
     Sample,
     StateDict,
@@ -622,6 +623,10 @@ class Competition:
             self._newest = newest
             self._serving = self._served()
         return self._serving
+
+    def moving(self) -> MovingPart | None:
+        """What has moved in the favourite since its last snapshot."""
+        return None if self._out[0] else self.favourite.moving()
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         """(m,) memory of the favourite for ``model``, a snapshot of the favourite."""

@@ -392,20 +392,27 @@ class Client:
         answer = self._queries.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s)
         return answer if begin is None else with_pending(answer, query["pending"], begin, y)
 
-    def follow(self, model: str = "", memory: ArrayLike | None = None) -> Follower:
+    def follow(
+        self, model: str = "", memory: ArrayLike | None = None, *, deltas: bool = True, keep: int = 1
+    ) -> Follower:
         """Follow a model into this process; see :class:`service.client.follower.Follower`. Closed with this client.
 
-        The learning model and "auto" are published when they change; any other model is constant and fetched once.
-        "auto" holds all competing models: the learning model alone is faster to evaluate.
+        The changes of the learning model and of "auto" are published with every batch that was learnt; any other model
+        is constant and fetched once. "auto" holds all competing models: the learning model alone is faster to evaluate.
+        Without ``deltas`` whole snapshots are followed: fewer, larger, and those that queries are answered from.
         """
         status = self._known()
         name = model or str(status["served"])
 
-        def fetch() -> bytes:
-            return self._queries.get(f"{self.keys.model}?name={name}")
-
-        key = {str(status.get("learning")): self.keys.model, AUTO: self.keys.champion}.get(name)
-        follower = Follower(self._session, key, name, fetch, self.limits, memory)
+        learning, keys = str(status.get("learning")), self.keys
+        deltas = deltas and bool(status.get("delta_hz"))
+        of = {learning: keys.model_delta, AUTO: keys.champion_delta} if deltas else {}
+        key = (of or {learning: keys.model, AUTO: keys.champion}).get(name)
+        deltas = deltas and key is not None
+        selector = f"{keys.model}?name={name}" + (";changes=1" if deltas else "")
+        follower = Follower(
+            self._session, key, name, lambda: self._queries.get(selector), self.limits, memory, deltas=deltas, keep=keep
+        )
         self._followers.append(follower)
         return follower
 

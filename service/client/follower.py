@@ -1,12 +1,17 @@
-"""A follower: holds the newest snapshot of a model in the caller's process and answers there, without the wire."""
+"""A follower: holds the newest state of a model in the caller's process and answers there, without the wire.
+
+It takes whole models, or their changes (`service.protocol.delta`). Of changes, a lost or wrong one is noticed by the
+fingerprints and repaired by fetching the whole model; until then the last good state answers.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import zenoh
@@ -16,31 +21,198 @@ from adaptive.errors import DehystError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
-from service.answers.answering import derivatives, trust_by_age
+from service.answers.answering import carried, derivatives, trust_by_age, under_way
 from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits, check_domain, limit_voltage
+from service.answers.guard import Limits, check_domain, check_voltages, limit_voltage
+from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
 from service.protocol.query import (
     BLENDED,
+    NEWEST,
     NOT_FINITE_REPLACED,
     OUTSIDE_DOMAIN,
     STALE,
     STAND_IN,
+    FeedforwardQuery,
     Trajectory,
 )
 
+#: Changes that are kept while a whole model is fetched. Later ones are dropped and need another fetch.
+_KEPT_CHANGES: Final = 1024
+#: Pauses between two fetches of one repair, s: the first, and the longest.
+_PAUSE_S: Final = (0.005, 1.0)
+#: How long `Follower.close` waits for a fetch, s.
+_CLOSE_S: Final = 2.0
+
+
+class Changes:
+    """The sum of a whole model and its changes, with the repair of what is lost.
+
+    Parameters
+    ----------
+    fetch : asks for the whole model. took : takes each new model; raises what makes it unusable.
+
+    Attributes
+    ----------
+    changes, wholes : messages taken. lost : times that a message was missing. mismatches : sums whose fingerprint was
+    not that of the service. repairs : whole models fetched for either. refused : messages that could not be decoded.
+    """
+
+    def __init__(self, fetch: Callable[[], bytes], took: Callable[[ModelMessage], None]) -> None:
+        self.changes = self.wholes = self.lost = self.mismatches = self.repairs = self.refused = 0
+        self.last_error = ""
+        self._fetch, self._took = fetch, took
+        self._lock = threading.RLock()
+        self._state: FollowedState | None = None
+        self._model: ModelMessage | None = None
+        # Changes that wait for a whole model; None while none is needed. So it begins.
+        self._waiting: deque[DeltaMessage] | None = deque(maxlen=_KEPT_CHANGES)
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def fingerprint(self) -> int:
+        """Of the state that answers; 0 before any."""
+        return 0 if self._state is None else self._state.fingerprint
+
+    @property
+    def whole(self) -> bool:
+        """Whether no change is missing."""
+        return self._waiting is None
+
+    def take(self, payload: bytes) -> None:
+        """One message from the wire. Never raises."""
+        try:
+            message = decode_delta(payload)
+        except DehystError as error:
+            with self._lock:
+                self._refuse(error)
+            return
+        with self._lock:
+            if message.model:
+                self._take_whole(message)
+            elif self._waiting is not None:
+                self._waiting.append(message)
+            else:
+                self._apply(message)
+
+    def begin(self) -> None:
+        """Fetch the first model. Raises what fetching and decoding raise."""
+        self._join(self._fetch())
+
+    def close(self) -> None:
+        """End a repair that runs."""
+        self._closed.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_CLOSE_S)
+
+    def _take_whole(self, message: DeltaMessage) -> None:
+        try:
+            state = FollowedState.decode(message.model)
+            if state.fingerprint != message.after:
+                self.mismatches += 1
+                self._repair()
+                return
+            self._set(state, state.message())
+        except DehystError as error:
+            self._refuse(error)
+            return
+        self.wholes += 1
+        self._waiting = None
+
+    def _apply(self, message: DeltaMessage) -> None:
+        """Add a change to the state, or begin a repair."""
+        state = self._state
+        if state is not None and message.after == state.fingerprint:
+            return  # it is in a model that was fetched
+        if state is None or message.before != state.fingerprint:
+            self.lost += 1
+            self._repair(message)
+            return
+        try:
+            after, changed = state.applied(message)
+            if after.fingerprint != message.after:
+                self.mismatches += 1
+                self._repair()
+                return
+            self._set(after, after.message(self._model, changed))
+        except DehystError as error:
+            self._refuse(error)
+            return
+        self.changes += 1
+
+    def _set(self, state: FollowedState, model: ModelMessage) -> None:
+        self._took(model)
+        self._state, self._model = state, model
+
+    def _refuse(self, error: DehystError) -> None:
+        self.refused += 1
+        self.last_error = str(error)
+        if self._state is not None:
+            self._repair()
+
+    # ---- repair
+
+    def _repair(self, *kept: DeltaMessage) -> None:
+        """Fetch the whole model in a thread: who delivers the messages must not wait for the wire."""
+        if self._waiting is not None:
+            return
+        self._waiting = deque(kept, maxlen=_KEPT_CHANGES)
+        self._thread = threading.Thread(target=self._fetch_until_joined, name="follower-repair", daemon=True)
+        self._thread.start()
+
+    def _fetch_until_joined(self) -> None:
+        pause_s, longest_s = _PAUSE_S
+        while not self._closed.is_set() and self._waiting is not None:
+            try:
+                if self._join(self._fetch()):
+                    return
+            except DehystError as error:
+                self.last_error = str(error)
+            self._closed.wait(pause_s)
+            pause_s = min(2.0 * pause_s, longest_s)
+
+    def _join(self, payload: bytes) -> bool:
+        """Take a whole model and the changes that waited for it; False where one between them is missing."""
+        fetched = FollowedState.decode(payload)
+        with self._lock:
+            if self._waiting is None:
+                return True
+            self.repairs += self._state is not None
+            self._set(fetched, fetched.message())
+            waiting = list(self._waiting)
+            follows = next((i for i, w in enumerate(waiting) if w.before == fetched.fingerprint), None)
+            # Older changes are in the fetched model already; later ones must follow it.
+            joined = follows is not None or all(w.snapshot_seq <= fetched.snapshot_seq for w in waiting)
+            if not joined:
+                return False
+            self._waiting = None
+            for message in waiting[follows:] if follows is not None else []:
+                if self._waiting is None:
+                    self._apply(message)
+                else:
+                    self._waiting.append(message)
+            return True
+
 
 class Follower:
-    """Evaluates the newest snapshot of one model, with the hysteresis memory and the limits of the caller's axis.
+    """Evaluates the newest state of one model, with the hysteresis memory and the limits of the caller's axis.
 
-    Every answer advances :attr:`memory`: consecutive points are one trajectory. The answers equal those of the service.
-    One thread asks; zenoh's thread delivers snapshots.
+    Every answer advances :attr:`memory`: consecutive points are one trajectory. The answers equal those of the service
+    from the same state. One thread asks; zenoh's thread delivers.
+
+    Parameters
+    ----------
+    key : where models, or with ``deltas`` their changes, are published; None: the model does not change.
+    fetch : asks for the whole model. keep : newest states that `answer` can go back to.
 
     Attributes
     ----------
     memory : (m,) hysteresis memory after the last answered point.
-    received, refused : counts of accepted and of unusable snapshots. last_error : why the last one was refused.
+    received, refused : counts of models taken, whole or as changes, and of unusable messages.
+    last_error : why the last one was refused.
+    changes : counts of the changes, and of lost and repaired ones; None where whole models are followed.
     last_flags : flags of the last voltage (see :func:`service.protocol.query.flag_names`).
     last_std_V : one standard deviation of the last voltage, V; NaN if the model does not state it or before any answer.
     last_trajectory : the last answer of :meth:`trajectory`, with deviations and stand-in; None before any.
@@ -54,20 +226,28 @@ class Follower:
         fetch: Callable[[], bytes],
         limits: Limits,
         memory: ArrayLike | None = None,
+        *,
+        deltas: bool = False,
+        keep: int = 1,
     ) -> None:
         self.limits = limits
         self.name = name
         self.received = 0
-        self.refused = 0
-        self.last_error = ""
-        self._lock = threading.Lock()
+        self.changes = Changes(fetch, self._take) if deltas else None
+        self._refused = 0
+        self._last_error = ""
+        self._moved = threading.Condition()
         self._subscriber: Any = None
         self._newest: tuple[ModelMessage, float]
+        self._kept: deque[ModelMessage] = deque(maxlen=keep)
         if key is not None:
             # Subscribe before the first fetch: no snapshot is missed between the two.
             self._subscriber = session.declare_subscriber(key, self._on_model)
         try:
-            self._take(decode_model(fetch()))
+            if self.changes is not None:
+                self.changes.begin()
+            else:
+                self._take(decode_model(fetch()))
         except BaseException:
             self.close()
             raise
@@ -90,8 +270,54 @@ class Follower:
 
     @property
     def snapshot_seq(self) -> int:
-        """Number of the last sample that the newest snapshot has seen."""
+        """Number of the last sample that the newest state has seen."""
         return self._newest[0].snapshot_seq
+
+    @property
+    def refused(self) -> int:
+        """Count of messages that could not be used."""
+        return self._refused + (0 if self.changes is None else self.changes.refused)
+
+    @property
+    def last_error(self) -> str:
+        """Why the last one could not be used; empty where none was."""
+        return self._last_error or ("" if self.changes is None else self.changes.last_error)
+
+    def wait(self, seq: int, timeout_s: float) -> bool:
+        """Wait until the newest state has seen sample ``seq``; False if it has not after ``timeout_s``."""
+        with self._moved:
+            return self._moved.wait_for(lambda: self.snapshot_seq >= seq, timeout_s)
+
+    def answer(self, query: FeedforwardQuery) -> Trajectory:
+        """What the service would answer to ``query`` from this model; changes nothing here.
+
+        From the newest kept state that has seen no sample after ``as_of`` (the oldest kept if all have). For who
+        commands the voltages: with ``pending`` each answer begins at the memory that the samples have left.
+        Raises InputError on a query that cannot be answered.
+        """
+        check_domain(query.y_um, self.limits)
+        if query.pending is not None:
+            check_domain(query.pending.y_um, self.limits, "pending.y_um")
+            check_voltages(query.pending.u_V, self.limits, "pending.u_V")
+        kept = tuple(self._kept)
+        message = kept[-1]
+        if query.as_of != NEWEST:
+            message = next((old for old in reversed(kept) if old.snapshot_seq <= query.as_of), kept[0])
+        model, memory, resumes_V = message.model, query.memory, math.nan
+        points = query.y_um, query.v_um_per_s, query.a_um_per_s2
+        if memory is None:
+            way, resumed = under_way(query, message.snapshot_seq, model.dt_s)
+            memory = carried(model, message.memory, way)
+            if resumed is not None:
+                *points_before, resumes_V = resumed
+                points = points_before[0], points_before[1], points_before[2]
+        elif memory.size != model.memory_size:
+            raise FieldError("memory", f"{memory.size} values", f"{model.memory_size} for model {self.name!r}")
+        trust, stale = (message.safety.trust, False) if query.as_of != NEWEST else self._standing()
+        rules = Rules(self.limits, message.safety.blend_share, trust, stale)
+        safety = message.safety
+        got = answer_safely(model, memory, points, query.u_before_V, rules, safety.stand_in, safety.blends, resumes_V)
+        return got._replace(snapshot_seq=message.snapshot_seq, model=self.name, tracked_memory=query.memory is None)
 
     @property
     def age_s(self) -> float:
@@ -190,24 +416,32 @@ class Follower:
         return got
 
     def close(self) -> None:
-        """Stop following; the last snapshot can still be evaluated."""
+        """Stop following; the last state can still be evaluated."""
         if self._subscriber is not None:
             self._subscriber.undeclare()
             self._subscriber = None
+        if self.changes is not None:
+            self.changes.close()
 
     def _on_model(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        if self.changes is not None:
+            self.changes.take(payload)
+            return
         try:
-            self._take(decode_model(sample.payload.to_bytes()))
+            self._take(decode_model(payload))
         except DehystError as error:
-            self.refused += 1
-            self.last_error = str(error)
+            self._refused += 1
+            self._last_error = str(error)
 
     def _take(self, message: ModelMessage) -> None:
         if message.name != self.name:
             raise FieldError("model", repr(message.name), repr(self.name))
-        with self._lock:
+        with self._moved:
+            self._kept.append(message)
             self._newest = (message, time.monotonic())
             self.received += 1
+            self._moved.notify_all()
 
 
 def _arrays(motion: tuple[float, float, float]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -77,6 +77,10 @@ class AxisConfig:
     model_hz: Annotated[
         float, Setting(help="highest rate at which the model is published", unit="1/s", low=0, above=True, high=1000)
     ] = 50.0
+    delta_hz: Annotated[
+        float,
+        Setting(help="highest rate at which changes of the model are published; 0: none", unit="1/s", low=0, high=1000),
+    ] = 200.0
     recorder: Annotated[
         Path | None, Setting(help="folder for recordings; relative to this file", example="recordings/x")
     ] = None

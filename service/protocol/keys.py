@@ -73,6 +73,16 @@ class Keys:
         return f"{self.base}/champion"
 
     @property
+    def model_delta(self) -> str:
+        """Publication: changes of the learnt model."""
+        return f"{self.base}/model_delta"
+
+    @property
+    def champion_delta(self) -> str:
+        """Publication: changes of the best of the competing models."""
+        return f"{self.base}/champion_delta"
+
+    @property
     def status(self) -> str:
         """Query and publication, 1 Hz: JSON."""
         return f"{self.base}/status"

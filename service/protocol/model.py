@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptive.errors import ModelFileError
 from adaptive.types import FloatArray, InverseModel, StateDict
@@ -76,6 +77,14 @@ def encode_model(
     name: str, model: InverseModel, snapshot_seq: int, memory: FloatArray, safety: Safety | None = None
 ) -> bytes:
     """Payload of a snapshot. Raises ModelFileError if the class of a model or a type of its state is unknown."""
+    header, arrays = model_parts(name, model, memory, safety)
+    return pack_model(encode_body(header, arrays), len(arrays), snapshot_seq)
+
+
+def model_parts(
+    name: str, model: InverseModel, memory: FloatArray, safety: Safety | None = None
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """(JSON, arrays) of a snapshot. Raises ModelFileError as `encode_model`."""
     values, arrays = split_state(model.state_dict())
     arrays[_MEMORY] = memory
     header: dict[str, Any] = {"name": name, "kind": stored_kind(model), "dt_s": model.dt_s, "values": values}
@@ -88,13 +97,23 @@ def encode_model(
             entries["stand_in"] = {"name": other.name, "kind": stored_kind(other.model), "values": other_values}
             arrays |= {_STAND_IN + key: array for key, array in other_arrays.items()}
             arrays[_STAND_IN_MEMORY] = other.memory
-    text, *buffers = encode_body(header, arrays)
+    return header, arrays
+
+
+def pack_model(body: list[Any], count: int, snapshot_seq: int) -> bytes:
+    """Payload of an encoded body with ``count`` arrays (`service.protocol.container.encode_body`)."""
+    text, *buffers = body
     size = sum(map(len, buffers))
-    return b"".join((_HEAD.pack(VERSION, MODEL, 0, len(arrays), snapshot_seq, len(text), size), text, *buffers))
+    return b"".join((_HEAD.pack(VERSION, MODEL, 0, count, snapshot_seq, len(text), size), text, *buffers))
 
 
 def decode_model(data: bytes) -> ModelMessage:
     """The snapshot in a payload. Raises InputError if it is malformed, ModelFileError if the model cannot be built."""
+    return assemble(*check_model(data))
+
+
+def check_model(data: bytes) -> tuple[dict[str, Any], StateDict, int]:
+    """(JSON, arrays, snapshot_seq) of a payload. Raises InputError if it is malformed."""
     check_header(data, MODEL, _HEAD.size)
     *_, count, snapshot_seq, header_bytes, array_bytes = _HEAD.unpack_from(data)
     if header_bytes + array_bytes > MAX_BYTES:
@@ -103,13 +122,28 @@ def decode_model(data: bytes) -> ModelMessage:
     header, state = decode_body(memoryview(data)[_HEAD.size :], header_bytes, MAX_BYTES)
     if len(state) != count:
         raise FieldError("arrays", len(state), f"{count}, by the header")
+    return header, state, snapshot_seq
+
+
+def assemble(
+    header: dict[str, Any],
+    arrays: StateDict,
+    snapshot_seq: int,
+    model: InverseModel | None = None,
+    stand_in: StandIn | None = None,
+) -> ModelMessage:
+    """The snapshot of JSON and arrays. Raises InputError and ModelFileError as `decode_model`.
+
+    ``model``, ``stand_in`` : already built, with the same parameters; of the stand-in only the memory is taken anew.
+    """
+    state = dict(arrays)
     try:
         kind, name, values = str(header["kind"]), str(header["name"]), dict(header["values"])
     except (ValueError, KeyError, TypeError) as error:
         raise FieldError("header", repr(error), "JSON with name, kind, dt_s, values and arrays") from error
     other_state = {key.removeprefix(_STAND_IN): state.pop(key) for key in list(state) if key.startswith(_STAND_IN)}
     other_memory, memory = state.pop(_STAND_IN_MEMORY, None), state.pop(_MEMORY, None)
-    model, vector = _build(kind, name, values | state, memory)
+    model, vector = _build(kind, name, values | state, memory, model)
     try:
         entries = dict(header.get("safety", {}))
         other = entries.pop("stand_in", None)
@@ -117,8 +151,9 @@ def decode_model(data: bytes) -> ModelMessage:
         known: dict[str, Any] = {key: convert(entries[key]) for key, convert in _SAFETY_TYPES.items() if key in entries}
         safety = Safety(**known)
         if other is not None:
-            other_name = str(other["name"])
-            built = _build(str(other["kind"]), other_name, other_state | dict(other["values"]), other_memory)
+            other_name, other_values = str(other["name"]), dict(other["values"])
+            made = None if stand_in is None else stand_in.model
+            built = _build(str(other["kind"]), other_name, other_state | other_values, other_memory, made)
             safety = replace(safety, stand_in=StandIn(other_name, *built))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FieldError("safety", repr(error), "the entries in docs/protocol.md") from error
@@ -127,11 +162,14 @@ def decode_model(data: bytes) -> ModelMessage:
     return ModelMessage(name, model, snapshot_seq, vector, safety)
 
 
-def _build(kind: str, name: str, state: StateDict, memory: Any) -> tuple[InverseModel, FloatArray]:
+def _build(
+    kind: str, name: str, state: StateDict, memory: Any, model: InverseModel | None
+) -> tuple[InverseModel, FloatArray]:
     if memory is None:
         raise FieldError("arrays", f"no memory of {name!r}", f"an array with the key {_MEMORY!r}")
-    with np.errstate(all="ignore"):  # numbers out of range show in the answers, which are guarded
-        model = build_model(kind, state, f"model {name!r}")
+    if model is None:
+        with np.errstate(all="ignore"):  # numbers out of range show in the answers, which are guarded
+            model = build_model(kind, state, f"model {name!r}")
     vector: FloatArray = np.asarray(memory, dtype=np.float64).reshape(-1)
     if vector.size != model.memory_size:
         raise ModelFileError(f"model {name!r}: memory of {vector.size} doubles, expected {model.memory_size}")

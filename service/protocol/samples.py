@@ -26,6 +26,7 @@ REFERENCE: Final = 3
 FEEDFORWARD_QUERY: Final = 4
 FEEDFORWARD_REPLY: Final = 5
 MODEL: Final = 6
+DELTA: Final = 7
 KIND_NAMES: Final = {
     SAMPLES: "samples",
     COMMAND: "command",
@@ -33,6 +34,7 @@ KIND_NAMES: Final = {
     FEEDFORWARD_QUERY: "feedforward query",
     FEEDFORWARD_REPLY: "feedforward reply",
     MODEL: "model",
+    DELTA: "model delta",
 }
 
 #: Longest block that is accepted, so that one message cannot use up the memory.

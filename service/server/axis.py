@@ -37,6 +37,7 @@ from service.protocol.samples import SampleBatch
 from service.server.competing import champion_of
 from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, check_same_learner, fingerprint
 from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
+from service.server.moves import Moves
 from service.server.state_schema import StateSchema
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
@@ -185,6 +186,8 @@ class Axis:
         self.tracker = MemoryTracker(self.dt_s)
         watch = ModelWatch(ModelWatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
         self.supervisor = LearnerSupervisor(config.learn, learner, watch, self.dt_s, self.note, revive)
+        #: What moves between two snapshots, for followers.
+        self.moves = Moves(config.learn, config.delta_hz, self.dt_s)
         #: Number of the last sample whose snapshot, if it has one, is available.
         self.handled_seq = -1
         self._archive = archive
@@ -258,16 +261,16 @@ class Axis:
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
         return answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
 
-    def model(self, name: str) -> tuple[InverseModel, int, FloatArray]:
-        """(model, snapshot_seq, tracked memory) of the newest snapshot. Raises InputError on an unknown name."""
-        served = self.newest
+    def model(self, name: str, served: Served | None = None) -> tuple[InverseModel, int, FloatArray]:
+        """(model, snapshot_seq, tracked memory) of a snapshot, or the newest. Raises InputError on an unknown name."""
+        served = served or self.newest
         if name not in served.models:
             raise FieldError("model", repr(name), f"one of {', '.join(served.models)}")
         return served.models[name], served.seq, served.memories[name]
 
-    def safety(self, name: str) -> Safety:
+    def safety(self, name: str, served: Served | None = None) -> Safety:
         """The rules by which the model ``name`` gives way to its stand-in, for evaluation in another process."""
-        served, config = self.newest, self.config
+        served, config = served or self.newest, self.config
         return Safety(
             blends(name, served.default, config),
             config.blend_share,
@@ -321,9 +324,14 @@ class Axis:
             due = seq // every > self.newest.seq // every
             if due:
                 self._take_snapshot(seq, t_s, u_V)
+                self.moves.begin(self.newest, self.learner)
             self.handled_seq = seq
             if due and on_snapshot is not None:
                 on_snapshot()
+            if self.moves.due(seq):
+                self.moves.take(seq, self.learner)
+        if self.moves.due_at_end(self.handled_seq):
+            self.moves.take(self.handled_seq, self.learner)
         self._update_counts()
         return verdicts
 

@@ -198,6 +198,8 @@ class AxisLoop:
         if axis.newest is not before:
             self.figures.read()
             self._announce()  # the publishing thread sends models, diagnostics, status and events
+        elif axis.moves.waiting:
+            self._announce()
 
     # ---- from other threads
 

@@ -19,6 +19,7 @@ from service.protocol.samples import decode_samples
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from service.server.deltas import DeltaStreams
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, axis_status
@@ -82,11 +83,14 @@ class AxisServer:
         self.loop = AxisLoop(axis, queue, wake, sink, watcher, retuner, self.checkpoints.on_snapshot)
         self._latency = LatencyMeter()
         self._long_queries = long_queries or LongQueries()
+        deltas = DeltaStreams(axis)
         self._answers = QueryAnswers(
-            keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, instance, secret
+            keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, instance, secret, deltas
         )
         self._operations = self._operations_server()
-        self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
+        self._publications = Publications(
+            session, keys, instance, self.loop, self._latency, self._answers, self.status, deltas
+        )
         self._session = session
         self._stale = False
         self._inputs: list[Any] = []

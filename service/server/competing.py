@@ -10,7 +10,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from adaptive.inverse_model import LssvmInverse
-from adaptive.types import FloatArray, Hyperparameters, InverseModel, OnlineModel, Sample, StateDict, WindowData
+from adaptive.types import (
+    FloatArray,
+    Hyperparameters,
+    InverseModel,
+    MovingPart,
+    OnlineModel,
+    Sample,
+    StateDict,
+    WindowData,
+)
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
 from baselines.competition.config import CompetitionConfig
@@ -76,6 +85,9 @@ class Competing:
 
     def thaw(self) -> None:
         self.competition.thaw()
+
+    def moving(self) -> MovingPart | None:
+        return self.competition.moving()
 
     def memory_for(self, model: InverseModel, smoothed: bool = False) -> FloatArray | None:
         return self.competition.memory_for(model, smoothed)

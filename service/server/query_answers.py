@@ -23,6 +23,7 @@ from service.protocol.query import decode_query, encode_reply, points_of
 from service.protocol.samples import MAX_COUNT
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
+from service.server.deltas import DeltaStreams
 from service.server.long_queries import SHORT, LongQueries
 from service.storage.checkpoint import CheckpointKeeper, encode_checkpoint
 
@@ -89,6 +90,7 @@ class QueryAnswers:
     long_queries : answers the feedforward queries that are not short.
     latency : takes the time of every short one. status : makes the status.
     instance, secret : of this process, for other instances that ask for its state or for a sign of life.
+    deltas : the models whose changes are published.
     """
 
     def __init__(
@@ -101,7 +103,9 @@ class QueryAnswers:
         long_queries: LongQueries,
         instance: str = "",
         secret: PeerSecret = NO_SECRET,
+        deltas: DeltaStreams | None = None,
     ) -> None:
+        self._deltas = deltas
         self._keys = keys
         self._axis = axis
         self._checkpoints = checkpoints
@@ -117,7 +121,7 @@ class QueryAnswers:
         keys = self._keys
         return [
             session.declare_queryable(keys.feedforward, self._on_feedforward),
-            session.declare_queryable(keys.model, self._guarded(keys.model, self._model_reply, ("name",))),
+            session.declare_queryable(keys.model, self._guarded(keys.model, self._model_reply, ("name", "changes"))),
             session.declare_queryable(keys.status, self._guarded(keys.status, self._status_reply)),
             session.declare_queryable(keys.state, self._on_state),
         ]
@@ -192,7 +196,11 @@ class QueryAnswers:
             query.reply_err(error_to_json(error), encoding=JSON)
 
     def _model_reply(self, query: zenoh.Query) -> bytes:
-        return self.encoded(str(query.parameters.get("name") or self._axis.served))
+        name = str(query.parameters.get("name") or self._axis.served)
+        followed = None
+        if self._deltas is not None and query.parameters.get("changes"):
+            followed = self._deltas.payload(name)  # the model that the next change changes
+        return followed or self.encoded(name)
 
     def _status_reply(self, query: zenoh.Query) -> bytes:
         return to_json(self._status())

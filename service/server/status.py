@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import zenoh
@@ -17,6 +18,7 @@ from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed
 from service.security.refusals import refusal_counters
 from service.server.axis_loop import AxisLoop
+from service.server.deltas import DeltaStreams
 from service.server.learner_supervisor import fingerprint
 from service.server.query_answers import LatencyMeter, QueryAnswers
 
@@ -69,6 +71,7 @@ def axis_status(
         "snapshot_seq": served.seq,
         "snapshot_every": axis.config.snapshot_every,
         "snapshots_kept": axis.config.snapshots_kept,
+        "delta_hz": axis.config.delta_hz,
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
             **counts.samples,
@@ -118,7 +121,7 @@ class Publications:
     Parameters
     ----------
     instance : sender of the events, and name under which a standby publishes its status.
-    answers : encodes the models. status : makes the status.
+    answers : encodes the models. status : makes the status. deltas : the models whose changes are published.
     """
 
     def __init__(
@@ -130,7 +133,9 @@ class Publications:
         latency: LatencyMeter,
         answers: QueryAnswers,
         status: Callable[[], dict[str, Any]],
+        deltas: DeltaStreams,
     ) -> None:
+        self._deltas = deltas
         self._session, self._keys, self._instance = session, keys, instance
         self._axis, self._loop, self._latency = loop.axis, loop, latency
         self._answers, self._status = answers, status
@@ -158,10 +163,17 @@ class Publications:
             "status": session.declare_publisher(keys.status, congestion_control=drop, encoding=JSON),
             "event": session.declare_publisher(keys.event, congestion_control=SURELY, encoding=JSON),
         }
+        if self._axis.config.delta_hz > 0.0 and self._axis.config.learn:
+            for key, name in ((keys.model_delta, self._axis.config.learn), (keys.champion_delta, AUTO)):
+                if name in self._axis.newest.models:
+                    publisher = session.declare_publisher(key, congestion_control=drop, express=True)
+                    self._publishers[key] = publisher
+                    self._deltas.publish(name, publisher.put, partial(is_followed, publisher))
 
     def stand_down(self) -> None:
         """Publish the events that wait, and then only the status of a standby."""
         self._publish_events()
+        self._deltas.close()
         publishers, self._publishers = self._publishers, {}
         for publisher in publishers.values():
             publisher.undeclare()
@@ -178,6 +190,7 @@ class Publications:
         if due:
             self._status_at_s = now_s
         if self._publishers:
+            self._deltas.tick(now_s)
             self._publish_models(now_s)
             self._publish_diagnostics()
             if due:

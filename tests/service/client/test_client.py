@@ -20,6 +20,7 @@ from lab.cli import main
 from service.answers.answering import derivatives
 from service.client.client import Client
 from service.protocol import samples as wire
+from service.protocol.delta import FollowedState
 from service.protocol.errors import (
     BehindError,
     NoReplyError,
@@ -30,7 +31,8 @@ from service.protocol.errors import (
     error_to_json,
 )
 from service.protocol.keys import Keys
-from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN
+from service.protocol.model import decode_model
+from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN, FeedforwardQuery
 from service.runtime.session import open_client, open_service
 
 pytestmark = pytest.mark.e2e
@@ -102,7 +104,7 @@ def test_as_of_waits_for_what_is_still_being_learnt(client: Client) -> None:
 
 
 def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -> None:
-    follower = client.follow()
+    follower = client.follow(deltas=False)
     k, until = next_seq(client), time.monotonic() + 20.0
     while follower.received < 5 and time.monotonic() < until:
         teach(client, k, 20)
@@ -125,8 +127,50 @@ def test_the_follower_answers_as_the_service_does_and_keeps_up(client: Client) -
     np.testing.assert_array_equal(follower.memory, asked.memory)
 
 
+def test_the_changes_add_up_to_the_model_of_the_service_and_a_lost_one_is_repaired(client: Client) -> None:
+    follower = client.follow()
+    changes = follower.changes
+    assert changes is not None
+    take, left_out = changes.take, []
+
+    def lossy(payload: bytes) -> None:
+        """Leaves out the thirtieth message."""
+        if changes.changes == 30 and not left_out:
+            left_out.append(payload)
+        else:
+            take(payload)
+
+    monkeypatched: Any = changes
+    monkeypatched.take = lossy
+    k, until = next_seq(client), time.monotonic() + 20.0
+    first = k
+    while time.monotonic() < until and k < first + 1000:
+        teach(client, k, 5)
+        k += 5
+        time.sleep(0.004)
+    assert follower.wait(k - 1, 20.0), "the newest state has seen the last sample, not only the last snapshot"
+    while not changes.whole and time.monotonic() < until:
+        time.sleep(0.01)
+    assert left_out
+    assert changes.changes > 100
+    assert changes.lost >= 1
+    assert changes.repairs >= 1
+    assert (changes.mismatches, follower.refused) == (0, 0)
+    payload = client._queries.get(f"{client.keys.model}?name=auto;changes=1")
+    assert FollowedState.decode(payload).fingerprint == changes.fingerprint
+    whole, moved = decode_model(payload), follower.model
+    for name, value in whole.model.state_dict().items():  # type: ignore[attr-defined]
+        if not name.endswith("seq"):
+            np.testing.assert_array_equal(value, moved.state_dict()[name], err_msg=name)  # type: ignore[attr-defined]
+    y, v, a = 40.0 + 0.1 * np.arange(30), np.full(30, 100.0), np.zeros(30)
+    got = follower.answer(FeedforwardQuery(y, v, a))
+    expected = whole.model.feedforward(y, v, a, whole.memory)
+    np.testing.assert_array_equal(got.u_V, expected.u_V)
+    follower.close()
+
+
 def test_the_follower_passes_to_the_baseline_outside_the_domain_as_the_service_does(client: Client) -> None:
-    follower = client.follow("lssvm_adaptive")
+    follower = client.follow("lssvm_adaptive", deltas=False)
     y, v = np.full(40, 40.0), np.linspace(0.0, 70_000.0, 40)
     asked = client.trajectory(
         y, v, np.zeros(40), memory=follower.memory, model="lssvm_adaptive", as_of=max(0, follower.snapshot_seq)

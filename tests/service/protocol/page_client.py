@@ -1,7 +1,8 @@
-"""A client written from docs/protocol.md alone: struct, json and numpy, and nothing of this project.
+"""A client written from docs/protocol.md alone: struct, json, zlib and numpy, and nothing of this project.
 
-`decode_query`, `decode_reply` and `decode_model` read payloads; `Model` evaluates every kind; `answer` gives the
-reply to a query as the service does, by the page's sections "Evaluating a model" and "Limits, stand-in and flags".
+`decode_query`, `decode_reply`, `decode_model` read payloads, `Changes` sums up model changes; `Model` evaluates every
+kind; `answer` gives the reply to a query as the service does, by the page's sections "Evaluating a model" and "Limits,
+stand-in and flags".
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import zlib
 from typing import Any
 
 import numpy as np
@@ -85,6 +87,132 @@ def decode_plain(data: bytes) -> dict[str, list[float]]:
     assert len(data) == 16 + 8 * n
     values = list(struct.unpack_from(f"<{n}d", data, 16))
     return {"seq": list(struct.unpack_from("<q", data, 8)), {2: "u_V", 3: "y_um"}[kind]: values}
+
+
+# --- Changes of a model.
+
+
+class Refused(Exception):
+    """A change that does not fit the model."""
+
+
+class Changes:
+    """A model and its changes: `fetched` and `change` take messages and say what became of them."""
+
+    def __init__(self) -> None:
+        self.fingerprint = 0
+        self._model: dict[str, Any] = {}
+        self._entries: dict[str, list[float]] = {}
+        self._seq = -1
+        self._waiting: list[bytes] | None = []
+
+    def fetched(self, data: bytes) -> str:
+        """The answer to a query for the whole model; then what waited."""
+        self._begin(decode_model(data))
+        waiting, self._waiting = self._waiting or [], None
+        for message in waiting:
+            if struct.unpack_from("<I", message, 16)[0] == self.fingerprint:
+                assert self.change(message) == "taken"
+        return "taken"
+
+    def change(self, data: bytes) -> str:
+        """A payload of kind 7."""
+        version, kind, options, n = struct.unpack_from("<BBHI", data, 0)
+        assert (version, kind) == (1, 7)
+        seq, before, after = struct.unpack_from("<qII", data, 8)
+        if options & 1:
+            self._begin(decode_model(data[24:]))
+            self._waiting = None
+            assert (n, before, after) == (1, 0, self.fingerprint)
+            return "taken"
+        if self._waiting is not None:
+            self._waiting.append(data)
+            return "waits"
+        if after == self.fingerprint:
+            return "known"
+        if before != self.fingerprint:
+            self._waiting = [data]
+            return "lost"
+        kept, at = dict(self._entries), 24
+        try:
+            names = self._names()
+            for _ in range(n):
+                entry, size, first, k = struct.unpack_from("<IIII", data, at)
+                values = struct.unpack_from(f"<{k}d", data, at + 16)
+                at += 16 + 8 * k
+                if entry >= len(names):
+                    raise Refused
+                self._entries[names[entry]] = self._changed(names[entry], size, first, values)
+            assert at == len(data)
+            if self._sum() != after:
+                raise ArithmeticError
+            self._check()
+        except (Refused, ArithmeticError) as error:
+            self._entries, self._waiting = kept, []
+            return "refused" if isinstance(error, Refused) else "mismatch"
+        self._seq, self.fingerprint = seq, after
+        return "taken"
+
+    def model(self) -> dict[str, Any]:
+        """The model as `decode_model` gives it."""
+        old, entries = self._model, self._entries
+        text = json.loads(json.dumps({key: old[key] for key in old if key not in ("data", "arrays")}))
+        for name, (into, key) in self._places(text).items():
+            into[key] = type(into[key])(entries[name][0])
+        data = {name: entries[name] if shape else entries[name][0] for name, _, shape in old["arrays"]}
+        data |= {name: [int(x) for x in data[name]] for name in data if name.endswith("kernel_plays")}
+        return {**text, "data": data, "snapshot_seq": self._seq}
+
+    def _begin(self, model: dict[str, Any]) -> None:
+        self._model, self._seq = model, model["snapshot_seq"]
+        self._entries = {name: [float(into[key])] for name, (into, key) in self._places(model).items()}
+        for name, values in model["data"].items():
+            self._entries[name] = [float(x) for x in (values if isinstance(values, list) else [values])]
+        self.fingerprint = self._sum()
+
+    @staticmethod
+    def _places(text: dict[str, Any]) -> dict[str, tuple[dict[str, Any], str]]:
+        """Where the numbers in the JSON stand, by entry."""
+        safety = text.get("safety", {})
+        groups = (("", text["values"]), ("/safety/", safety))
+        groups = (*groups, ("/stand_in/", safety.get("stand_in", {}).get("values", {})))
+        return {
+            prefix + key: (group, key)
+            for prefix, group in groups
+            for key, value in group.items()
+            if isinstance(value, bool | int | float) and key != "seq" and not key.endswith(".seq")
+        }
+
+    def _names(self) -> list[str]:
+        return sorted(self._entries, key=lambda name: name.encode())
+
+    def _sum(self) -> int:
+        names = self._names()
+        words = [zlib.crc32("\n".join(names).encode())]
+        words += [zlib.crc32(struct.pack(f"<{len(self._entries[n])}d", *self._entries[n])) for n in names]
+        return zlib.crc32(struct.pack(f"<{len(words)}I", *words))
+
+    def _changed(self, name: str, size: int, first: int, values: tuple[float, ...]) -> list[float]:
+        now = list(self._entries[name])
+        if size != len(now):
+            rows = {array: (dtype, shape) for array, dtype, shape in self._model["arrays"]}
+            dtype, shape = rows.get(name, ("", []))
+            if dtype != "<f8" or not shape or size % math.prod(shape[1:]):
+                raise Refused
+            if size > len(now) and not (first <= len(now) and first + len(values) == size):
+                raise Refused
+            now = now[:size]
+        now[first : first + len(values)] = values
+        return now
+
+    def _check(self) -> None:
+        """What a model needs to be one."""
+        for name, (into, key) in self._places(self._model).items():
+            if isinstance(into[key], int) and self._entries[name][0] != int(self._entries[name][0]):
+                raise Refused
+        for name in self._entries:
+            if name.endswith("beta") and not all(map(math.isfinite, self._entries[name])):
+                raise Refused
 
 
 # --- Models. Each gives (voltages, deviations, inside, memory after the last point) for n points.
