@@ -36,6 +36,8 @@ class IdentifyConfig:
     asymmetric : add the products of plays and displacement.
     kernel_plays : number of plays among the kernel inputs.
     heldout : share of the recording, at its end, that is used for the scores only.
+    rows : most samples that enter the fits. Of a longer recording every k-th one is used; the hysteresis memory still
+    sees every sample.
     cutoff_hz : of the smoother. tune : choose gamma and widths by the evidence; otherwise use ``gamma`` and ``width``.
     """
 
@@ -47,6 +49,7 @@ class IdentifyConfig:
     asymmetric: bool = True
     kernel_plays: int = 3
     heldout: float = 0.25
+    rows: int = 100_000
     cutoff_hz: float = 80.0
     tune: bool = True
     gamma: float = 1e2
@@ -55,6 +58,8 @@ class IdentifyConfig:
     def __post_init__(self) -> None:
         if self.n < 10:
             raise InputError(f"n: got {self.n}, expected at least 10 support vectors")
+        if self.rows < 100:
+            raise InputError(f"rows: got {self.rows}, expected at least 100 samples")
         if not 0.0 < self.heldout < 0.9:
             raise InputError(f"heldout: got {self.heldout}, expected a share between 0 and 0.9")
         if not 0 <= self.kernel_plays <= self.plays:
@@ -274,7 +279,9 @@ def identify_lssvm(
     if memory:
         features = replace(features, dead_um=DEAD_SIGMA * float(np.std(y - motion[:, 0])))
     columns = [np.ascontiguousarray(motion[:, i]) for i in range(3)]
-    basis, kernel, _ = features.run(columns[0], columns[1], columns[2], features.rest_memory(float(columns[0][0])))
+    every = -(-u.size // config.rows)
+    basis, kernel = _rows(features, columns, every)
+    samples, u, dt_s = u.size, u[::every], dt_s * every
     split = round(u.size * (1.0 - config.heldout))
     hyper = tune(features, basis, kernel, u, dt_s, config) if config.tune else None
     gamma = hyper[0] if hyper else config.gamma
@@ -286,7 +293,7 @@ def identify_lssvm(
     rmse_V = float(np.sqrt(np.mean(errors[split:] ** 2)))
     full = fit_model(features, basis, kernel, u, dt_s, config, gamma, widths)
     report = IdentificationReport(
-        samples=u.size,
+        samples=samples,
         support=full.support.shape[0],
         y_range_um=y_range,
         u_range_V=u_range,
@@ -315,6 +322,23 @@ def identify_lssvm(
         span_V=u_range,
     )
     return model, report
+
+
+def _rows(features: FeatureMap, columns: list[FloatArray], every: int) -> tuple[FloatArray, FloatArray]:
+    """Basis and kernel inputs of every ``every``-th sample of the motion; the memory runs through all of them."""
+    y, v, a = columns
+    memory = features.rest_memory(float(y[0]))
+    if every == 1:
+        basis, kernel, _ = features.run(y, v, a, memory)
+        return basis, kernel
+    # In pieces: the inputs of all samples may take more memory than there is.
+    size = every * max(1, 20_000 // every)
+    parts = []
+    for start in range(0, y.size, size):
+        part = slice(start, start + size)
+        basis, kernel, memory = features.run(y[part], v[part], a[part], memory)
+        parts.append((basis[::every], kernel[::every]))
+    return np.concatenate([basis for basis, _ in parts]), np.concatenate([kernel for _, kernel in parts])
 
 
 def design_features(motion: FloatArray, dt_s: float, config: IdentifyConfig, memory: bool) -> FeatureMap:

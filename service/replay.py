@@ -37,6 +37,8 @@ from sim.recordings import Recording, repaired
 
 #: Age of the snapshot when the first point that it answers for takes effect, s: asked ahead, plus the samples' way.
 AGE_S: Final = 0.06
+#: Longest gap, samples, over which what comes after it is still scored; beyond it the longest part is.
+LONGEST_BRIDGED: Final = 1_000_000
 #: Called with samples done and samples in all.
 Progress = Callable[[int, int], None]
 #: Called with each snapshot of the learning model as it is published, and its sequence number.
@@ -113,7 +115,8 @@ def replay(
         )
     if not 0.0 <= age_s <= 10.0:
         raise InputError(f"age_s: got {age_s:g}, expected 0 to 10 s")
-    seq, whole = sequence(recording), repaired(recording)
+    # The hysteresis memory goes on through a gap, as it does live: along a straight line, which is what is known.
+    seq, whole = sequence(recording), repaired(recording, longest_fill=LONGEST_BRIDGED)
     grid = whole.recording
     motion = motion_of(grid)
     n, size, age = len(grid), axis.config.snapshot_every, math.ceil(age_s / axis.dt_s - 1e-9)

@@ -315,9 +315,12 @@ def _record(plan: Plan, folder: Path, logs: Path, fast: bool, bar: _Bar) -> None
 def _identify(plan: Plan, data: Path, model: Path, say: Say) -> None:
     recording = read(data)
     whole = Stretch.of(repaired(recording))
-    results = identify_all(
-        whole, whole, recording.dt_s, follows=False, progress=lambda name: say(f"  {MODELS[name]} ...")
-    )
+
+    def progress(name: str, phase: str, _share: float) -> None:
+        if phase == "fit":
+            say(f"  {MODELS[name]} ...")
+
+    results = identify_all(whole, whole, recording.dt_s, follows=False, progress=progress)
     failed = [f"{result.name}: {result.failed}" for result in results if result.model is None]
     if failed:
         raise InputError(f"identification: {'; '.join(failed)}")

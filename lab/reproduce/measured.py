@@ -97,9 +97,12 @@ def run_stack(folder: Path, progress: Progress = lambda _: None) -> Stack | None
     dt_s = recording.dt_s
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     range_um = float(np.ptp(train.motion[:, 0]))
-    results = identify_all(
-        train, test, dt_s, follows=False, progress=lambda name: progress(f"measured stack: identifying {name}")
-    )
+
+    def say(name: str, phase: str, _share: float) -> None:
+        if phase == "fit":
+            progress(f"measured stack: identifying {name}")
+
+    results = identify_all(train, test, dt_s, follows=False, progress=say)
     for result in list(results):
         learning = _learning(result, test, dt_s, gain, range_um, progress)
         if learning is not None:

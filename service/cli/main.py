@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     parser = build_parser(commands, [chosen] if chosen is not None and known else [])
     if chosen is not None and not known:
         parser.error(f"COMMAND: got {chosen!r}, expected one of {', '.join(commands)}; options follow the command")
-    parsed = parser.parse_args(args)
+    parsed = parser.parse_args(args, argparse.Namespace(given=args))
     from service.runtime.logging_setup import set_up_logging
 
     set_up_logging(parsed.log_level)

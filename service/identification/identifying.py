@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,13 @@ import numpy as np
 
 from adaptive.errors import DehystError, InputError
 from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.inverse_model import LssvmInverse
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import BoolArray, FloatArray, InverseModel
+from baselines.bouc_wen.model import BoucWenInverse
 from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
+from baselines.linear import LinearInverse
+from baselines.prandtl_ishlinskii.model import MpiInverse
 from service.protocol.errors import FieldError
 from service.reports.plot_style import figure, label, legend, line, save
 from service.viewer.colours import MEASURED, TRAINING, model_colour
@@ -80,9 +84,12 @@ class Stretch:
     valid: BoolArray
 
     @staticmethod
-    def of(repaired: Repaired) -> Stretch:
+    def of(repaired: Repaired, every: int = 1) -> Stretch:
+        """The samples of a recording; of a long one every ``every``-th, see `thinning`."""
         recording = repaired.recording
-        return Stretch(recording.u_V, recording.y_um, motion_of(recording), repaired.valid)
+        u_V, y_um = (np.ascontiguousarray(values[::every]) for values in (recording.u_V, recording.y_um))
+        motion = smooth_recording(y_um, SmootherConfig.for_rate(recording.dt_s * every))
+        return Stretch(u_V, y_um, motion, np.ascontiguousarray(repaired.valid[::every]))
 
     def part(self, start: int, stop: int) -> Stretch:
         return Stretch(self.u_V[start:stop], self.y_um[start:stop], self.motion[start:stop], self.valid[start:stop])
@@ -94,6 +101,33 @@ class Stretch:
 def motion_of(recording: Recording) -> FloatArray:
     """(n, 3) displacement µm, velocity µm/s and acceleration µm/s² at each sample, smoothed with zero phase."""
     return smooth_recording(recording.y_um, SmootherConfig.for_rate(recording.dt_s))
+
+
+#: Samples of a recording above which only a part of them enters the fits.
+FIT_SAMPLES = 100_000
+#: Sample times, s, that thinning does not exceed: that of the motion, and that of the fits without a memory over time.
+_LONGEST_DT_S, _LONGEST_FIT_DT_S = 1e-3, 4e-3
+
+
+def thinning(n: int, dt_s: float, most: int) -> int:
+    """Every how many-th of ``n`` samples ``dt_s`` apart to use, so that about ``most`` remain; 1 for all.
+
+    Never fewer than one a millisecond: play operators and lags need the turns of the motion. What is still too much
+    for a fit is thinned there.
+    """
+    return max(1, min(-(-n // most), int(_LONGEST_DT_S / dt_s + 1e-9)))
+
+
+def at_sample_time(model: InverseModel, dt_s: float) -> InverseModel:
+    """A model that was identified at another sample time, to be served with points ``dt_s`` s apart.
+
+    Its parameters are in V, µm and s. Only the step of its memory over time changes.
+    """
+    if isinstance(model, LssvmInverse):
+        return replace(model, features=replace(model.features, dt_s=dt_s))
+    if isinstance(model, LinearInverse | MpiInverse | BoucWenInverse):
+        return replace(model, dt_s=dt_s)
+    raise InputError(f"model {model.name!r}: got a {type(model).__name__}, expected one that can be identified")
 
 
 def split_at(n: int, holdout: float) -> int:
@@ -109,24 +143,29 @@ def split_at(n: int, holdout: float) -> int:
     return split
 
 
-def identify_one(name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: int) -> InverseModel:
+def identify_one(
+    name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: int, most: int = FIT_SAMPLES
+) -> InverseModel:
     """The inverse model ``name`` from (m,) voltages V and displacements µm, ``dt_s`` apart; ``n`` support vectors.
 
-    Raises what its identification raises: InputError on data, NumericsError on arithmetic.
+    ``most`` : samples that enter a fit; a longer recording is thinned. Raises what its identification
+    raises: InputError on data, NumericsError on arithmetic.
     """
+    every = max(1, min(-(-len(u_V) // most), int(_LONGEST_FIT_DT_S / dt_s + 1e-9)))
+    u_thin, y_thin, dt_thin = u_V[::every], y_um[::every], dt_s * every
     if name == "linear":
-        return fit_linear(u_V, y_um, dt_s)[0]
+        return fit_linear(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     if name == "bouc_wen":
-        return fit_bouc_wen(u_V, y_um, dt_s)[0]
+        return fit_bouc_wen(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     if name == "mpi":
-        return fit_mpi(u_V, y_um, dt_s)[0]
+        return fit_mpi(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     inputs = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
     if name not in inputs:
         raise FieldError("models", repr(name), f"some of {', '.join(NAMES)}")
-    size = max(10, min(n, len(u_V) // 2))
+    config = IdentifyConfig(n=max(10, min(n, len(u_V) // 2)), rows=max(100, most))
     if name == "lssvm_frozen":
-        return identify_lssvm(u_V, y_um, dt_s, inputs="two", config=IdentifyConfig(n=size), name=name)[0]
-    return identify_lssvm(u_V, y_um, dt_s, inputs="memory", config=IdentifyConfig(n=size), name=name)[0]
+        return identify_lssvm(u_V, y_um, dt_s, inputs="two", config=config, name=name)[0]
+    return identify_lssvm(u_V, y_um, dt_s, inputs="memory", config=config, name=name)[0]
 
 
 def free_run(model: InverseModel, before: Stretch | None, test: Stretch) -> FloatArray:
@@ -157,6 +196,13 @@ def score_of(error_V: FloatArray, gain_um_per_V: float, range_um: float) -> Scor
     return Score(*in_V, *in_um, *(100.0 * value / range_um for value in in_um))
 
 
+#: Called with the name of a model, the phase that begins, and the share of all work that is done before it.
+Progress = Callable[[str, str, float], None]
+#: Rough shares of the time that the models and the phases take, for the time left.
+_WEIGHTS = {"linear": 0.1, "bouc_wen": 4.0, "mpi": 2.0, "lssvm_frozen": 3.0, "lssvm_adaptive": 4.0}
+_PHASES = {"fit": 1.0, "score": 0.4, "fit again from all": 1.2}
+
+
 def identify_all(
     train: Stretch,
     test: Stretch,
@@ -166,13 +212,17 @@ def identify_all(
     whole: Stretch | None = None,
     names: tuple[str, ...] = NAMES,
     n: int = 500,
-    progress: Callable[[str], None] = lambda _: None,
+    most: int = FIT_SAMPLES,
+    serve_dt_s: float | None = None,
+    progress: Progress = lambda _name, _phase, _share: None,
 ) -> list[Identified]:
     """Identify every model from ``train`` and score it on ``test``.
 
     ``follows`` : the test continues the training data in time. Otherwise it is a separate recording, and its first
     ``SETTLE_SHARE`` only settles the memory. ``whole`` : if given, the returned models are identified again from this
     data. If a model cannot be identified, its result has ``failed`` set; the other models are not affected.
+    ``most`` : see `identify_one`. ``serve_dt_s`` : sample time of the returned models, s, by default ``dt_s``.
+    ``progress`` : called before each phase with the model, the phase and the share of the work that is done.
     """
     gain = float(np.polyfit(train.u_V, train.y_um, 1)[0])
     range_um = float(np.ptp(train.motion[:, 0]))
@@ -180,21 +230,33 @@ def identify_all(
     before = train if follows else test.part(0, settle)
     scored = test.part(settle, len(test))
     results: list[Identified] = []
+    phases = ("fit", "score") if whole is None else ("fit", "score", "fit again from all")
+    work = [(name, phase) for name in names for phase in phases]
+    total = sum(_WEIGHTS[name] * _PHASES[phase] for name, phase in work)
+
+    def begin(name: str, phase: str) -> None:
+        before = work[: work.index((name, phase))]
+        progress(name, phase, sum(_WEIGHTS[done] * _PHASES[part] for done, part in before) / total)
+
     for name in names:
         start = time.perf_counter()
-        progress(name)
+        begin(name, "fit")
         error_V = np.full(len(test), np.nan)
         try:
-            model = identify_one(name, train.u_V, train.y_um, dt_s, n)
+            model = identify_one(name, train.u_V, train.y_um, dt_s, n, most)
             seconds = time.perf_counter() - start
+            begin(name, "score")
             error_V[settle:] = free_run(model, before, scored) - scored.u_V
             error_V[~test.valid] = np.nan
             score = score_of(error_V, gain, range_um)
             if whole is not None:
-                model = identify_one(name, whole.u_V, whole.y_um, dt_s, n)
+                begin(name, "fit again from all")
+                model = identify_one(name, whole.u_V, whole.y_um, dt_s, n, most)
         except (DehystError, np.linalg.LinAlgError) as error:
             results.append(Identified(name, None, None, error_V, time.perf_counter() - start, str(error)))
             continue
+        if serve_dt_s is not None and serve_dt_s != dt_s:
+            model = at_sample_time(model, serve_dt_s)
         results.append(Identified(name, model, score, error_V, seconds))
     return results
 

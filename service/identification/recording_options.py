@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from adaptive.errors import InputError
 from service.protocol.errors import FieldError
 from sim.recordings import ColumnMap, Finding, Recording, load_map, read
-from sim.recordings.columns import QUANTITIES
+from sim.recordings.columns import QUANTITIES, MissingError
 
 READING = """\
 Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
@@ -69,15 +72,17 @@ def add_mapping_arguments(parser: argparse.ArgumentParser, *, test: bool = False
         metavar="Q",
         help="the file holds one period of this quantity, to be repeated as long as the other columns last: u",
     )
-    group.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
+    clock = group.add_mutually_exclusive_group()
+    clock.add_argument("--dt-s", type=float, metavar="S", help="sample time, s, where the file has no time column")
+    clock.add_argument("--rate", type=float, metavar="HZ", help="the same as a rate, samples per second")
     group.add_argument("--sensor-late", type=int, metavar="N", help="the sensor column is N samples late in the file")
     group.add_argument(
         "--header",
         metavar="LINE",
         help="line with the columns' names, from 1, or none (default: as the first line shows)",
     )
-    group.add_argument("--delimiter", help="between the columns of a text file (default: as its header line shows)")
-    group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default .)")
+    group.add_argument("--delimiter", help="between the columns of a text file (default: as its first lines show)")
+    group.add_argument("--decimal", choices=[".", ","], help="decimal sign of a text file (default: as its lines show)")
 
 
 def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
@@ -101,6 +106,10 @@ def mapping_from(args: argparse.Namespace, *, test: bool = False) -> ColumnMap:
         for name in ("dt_s", "sensor_late", "delimiter", "decimal", "header")
         if (value := getattr(args, name)) is not None
     }
+    if args.rate is not None:
+        if not 0.0 < args.rate < 1e9:
+            raise FieldError("--rate", args.rate, "a positive number of samples per second")
+        scalars["dt_s"] = 1.0 / args.rate
     files = base.files | {quantity: Path(name) for quantity, name in _pairs("--file", args.file).items()}
     if test:
         tested = {quantity: Path(name) for quantity, name in _pairs("--test-file", args.test_file).items()}
@@ -159,9 +168,21 @@ def load(path: Path, args: argparse.Namespace, range_option: str | None = None, 
     """
     if args.test_file and args.test is None:
         raise FieldError("--test-file", args.test_file[0], "a test recording", "give it by --test")
-    recording = read(path, mapping_from(args, test=test))
+    try:
+        recording = read(path, mapping_from(args, test=test))
+    except MissingError as error:
+        raise InputError(f"{error}\n{to_paste(args, error.options)}") from error
     start_s, stop_s = parse_range("--range", range_option)
     return recording if start_s is None and stop_s is None else recording.between(start_s, stop_s)
+
+
+def to_paste(args: argparse.Namespace, options: Sequence[str]) -> str:
+    """The command of the user with ``options`` added, to be pasted, and what to check in it."""
+    given = " ".join(shlex.quote(word) for word in vars(args).get("given", ()))
+    command = f"dehyst {given}" if given else f"dehyst {args.command}"
+    open_ones = [word for word in ("HZ", "FILE", "FACTOR") if any(option.endswith(word) for option in options)]
+    fill = f", and fill in {', '.join(open_ones)}" if open_ones else ""
+    return f"To go on, check the columns and units in this command{fill}:\n  {command} {' '.join(options)}"
 
 
 def describe(recording: Recording, findings: list[Finding]) -> str:

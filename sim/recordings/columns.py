@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ class ColumnMap:
     dt_s : sample time, s, where the file has no time column.
     sensor_late : samples by which the sensor's column is late in the file. The readings are moved back by as many
         samples, and as many samples at the end are dropped.
-    delimiter, decimal : of a text file, where its header line does not show them.
+    delimiter, decimal : of a text file, where its first lines do not show them.
     header : number of the text line (or row of a workbook's sheet) that holds the columns' names, from 1, or ``none``
         where the columns have no names. Without it, the first line decides, if it can.
 
@@ -90,7 +91,7 @@ class ColumnMap:
     dt_s: float | None = None
     sensor_late: int = 0
     delimiter: str | None = None
-    decimal: str = "."
+    decimal: str | None = None
     header: str | None = None
 
     def __post_init__(self) -> None:
@@ -112,7 +113,7 @@ class ColumnMap:
             raise InputError(f"dt_s: got {self.dt_s!r}, expected a positive sample time in s")
         if self.sensor_late < 0:
             raise InputError(f"sensor_late: got {self.sensor_late}, expected a number of samples, 0 or more")
-        if self.decimal not in (".", ","):
+        if self.decimal not in (None, ".", ","):
             raise InputError(f"decimal: got {self.decimal!r}, expected '.' or ','")
 
     def _check_layout(self) -> None:
@@ -170,16 +171,28 @@ def _typed(path: Path, key: str, value: object, kind: type) -> object:
     return value
 
 
+def stated_unit(text: str) -> str | None:
+    """The name in `QUANTITIES` of the unit ``text`` as programs and people write it; None where it is none."""
+    if any(text in factors for _, factors in QUANTITIES.values()):
+        return text
+    return _UNIT_WORDS.get(text.casefold())
+
+
 def is_unit(text: str) -> bool:
     """Whether ``text`` is a unit of any quantity."""
-    return text.casefold() in _UNIT_WORDS or any(text in factors for _, factors in QUANTITIES.values())
+    return stated_unit(text) is not None
+
+
+#: The unit at the end of a name: ``y_nm``, ``pos [nm]``, ``Voltage (V)``, ``t / ms``, ``Position, um``, ``t in ms``.
+_UNIT_AT_END = re.compile(r"(?:_|[\s_]*[\[({]\s*|\s*/\s*|\s*,\s*|\s+in\s+)([°A-Za-zµμ]+(?: C)?)\s*[\])}]?\s*$")
 
 
 def unit_of_name(quantity: str, column: str) -> str | None:
-    """The unit at the end of a column's name (``_nm``, `` [nm]``, ``(nm)``); None unless it is one of the quantity."""
+    """The unit at the end of a column's name (``_nm``, `` [nm]``, ``(nm)``, `` / nm``); None unless of the quantity."""
     factors = QUANTITIES[quantity][1]
-    match = re.search(r"(?:_|[\s_]*[\[(])([A-Za-zµμ]+)[\])]?$", column)
-    return match.group(1) if match and match.group(1) in factors else None
+    match = _UNIT_AT_END.search(column)
+    unit = stated_unit(match.group(1)) if match else None
+    return unit if unit in factors else None
 
 
 def default_column(source: str, quantity: str, names: list[str]) -> str | None:
@@ -196,6 +209,62 @@ def default_column(source: str, quantity: str, names: list[str]) -> str | None:
             f"{source}: {quantity}: got columns {', '.join(with_unit)}, expected one: choose by --column {quantity}=..."
         )
     return with_unit[0] if with_unit else (quantity if quantity in names else None)
+
+
+#: Quantities that a column may be by its unit alone.
+BY_UNIT = ("t", "u", "y")
+
+
+def column_by_unit(quantity: str, names: list[str], units: Mapping[str, str], taken: Collection[str]) -> str | None:
+    """The only column in a unit of the quantity: ``Voltage (V)`` is ``u`` where no other column is in volts.
+
+    ``units`` : name -> unit, where the file states it apart from the name. ``taken`` : columns of other quantities.
+    None where there is no such column, or there are several.
+    """
+    factors = QUANTITIES[quantity][1]
+    others = {canonical for canonical, _ in QUANTITIES.values()} | set(taken)
+    found = [
+        name
+        for name in names
+        if name not in others and (unit_of_name(quantity, name) or stated_unit(units.get(name, "")) in factors)
+    ]
+    return found[0] if quantity in BY_UNIT and len(found) == 1 else None
+
+
+#: Words in the names of columns, for a proposal that the user checks; never used without a word from the user.
+_WORDS = {
+    "t": ("time", "zeit", "temps", "t", "x_value", "timestamp", "x", "x-axis", "x axis"),
+    "u": ("volt", "drive", "command", "spannung", "tension", "piezo", "output", "ao", "dac", "ch1", "u", "1"),
+    "y": ("pos", "displ", "sensor", "weg", "auslenkung", "measured", "input", "ai", "adc", "ch2", "y", "2"),
+}  # fmt: skip
+
+
+def proposed_column(quantity: str, names: list[str], taken: Collection[str]) -> str | None:
+    """A column to propose for a quantity: by its name, else the first that is not taken; None where there is none.
+
+    For the time by its name only.
+    """
+    free = [name for name in names if name not in taken]
+    for word in _WORDS.get(quantity, ()):
+        for name in free:
+            if name.casefold() == word or (len(word) > 2 and word in name.casefold()):
+                return name
+    return free[0] if free and quantity != "t" else None
+
+
+class MissingError(InputError):
+    """Something that the user must say before a file can be read.
+
+    Attributes
+    ----------
+    what : the same in a few words, for a list.
+    options : the options to add as they are typed, with a proposal for each.
+    """
+
+    def __init__(self, message: str, what: str, *options: str) -> None:
+        super().__init__(message)
+        self.what = what
+        self.options = options
 
 
 def factor_and_unit(
@@ -216,7 +285,7 @@ def factor_and_unit(
     )
     unit = mapping.units.get(quantity)
     if unit is None and stated:
-        unit = stated if stated in factors else _UNIT_WORDS.get(stated.casefold(), stated)
+        unit = stated if stated in factors else stated_unit(stated) or stated
         if unit not in factors:
             raise InputError(
                 f"{source}: column {column!r} for {quantity}: the file states the unit {stated!r}, {accepted}"
@@ -229,8 +298,10 @@ def factor_and_unit(
             )
     unit = unit or unit_of_name(quantity, column)
     if unit is None:
-        raise InputError(
+        raise MissingError(
             f"{source}: column {column!r} for {quantity} has no unit in its name, and units are never guessed; "
-            f"{accepted}"
+            f"{accepted}",
+            f"the unit of column {column!r} for {quantity}: {', '.join(factors)}",
+            f"--unit {quantity}={own}",
         )
     return factors[unit], unit

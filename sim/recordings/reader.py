@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,18 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.recordings import array_formats as arrays
+from sim.recordings import delimited_text
 from sim.recordings import text_formats as text
 from sim.recordings.columns import (
     KELVIN_AT_0_C,
     QUANTITIES,
     SAMPLED,
     ColumnMap,
+    MissingError,
+    column_by_unit,
     default_column,
     factor_and_unit,
+    proposed_column,
 )
 from sim.recordings.recording import Recording
 from sim.recordings.table import MAX_BYTES, Table
@@ -45,7 +50,7 @@ def read(path: Path | str, mapping: ColumnMap | None = None) -> Recording:
     others: dict[Path, Table] = {}
     for file in mapping.files.values():
         if file not in others:
-            others[file] = main if file == path else _table(file, _bytes(file, digest), mapping)
+            others[file] = main if file == path else _table(file, digest, mapping)
     by_quantity = {quantity: others[file] for quantity, file in mapping.files.items()}
     return _Reading(main, by_quantity, mapping).recording(str(path), digest.hexdigest())
 
@@ -69,22 +74,39 @@ def _main_table(path: Path, mapping: ColumnMap, digest: Any) -> Table:
             raise InputError(f"{path}: got a folder without .parquet files, expected a recording")
     else:
         segments = [path]
-    tables = [_table(segment, _bytes(segment, digest), mapping) for segment in segments]
+    tables = [_table(segment, digest, mapping) for segment in segments]
     return tables[0] if len(tables) == 1 else _joined(path, tables)
 
 
-def _bytes(path: Path, digest: Any) -> bytes:
+#: Beginning of a file by which its format is known, bytes.
+_HEAD_BYTES = 1 << 16
+#: Text takes several times the memory of its numbers.
+_MOST_TEXT_BYTES = 4 * MAX_BYTES
+
+
+def _head(path: Path, digest: Any) -> bytes:
+    """The beginning of a file; ``digest`` takes all of it, in pieces. Raises InputError."""
     try:
         size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"{path}: got {size / 1e9:.1f} GB, expected at most {MAX_BYTES / 1e9:g} GB: cut it first")
-        content = path.read_bytes()
+        if size > _MOST_TEXT_BYTES:
+            most = _MOST_TEXT_BYTES / 1e9
+            raise InputError(f"{path}: got {size / 1e9:.1f} GB, expected at most {most:g} GB: cut it first")
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            digest.update(head)
+            while piece := file.read(1 << 22):
+                digest.update(piece)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a recording") from error
-    if not content:
+    if not head:
         raise InputError(f"{path}: got an empty file, expected a recording")
-    digest.update(content)
-    return content
+    return head
+
+
+def _content(path: Path) -> bytes:
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise InputError(f"{path}: got {size / 1e9:.1f} GB, expected at most {MAX_BYTES / 1e9:g} GB: cut it first")
+    return path.read_bytes()
 
 
 _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
@@ -113,23 +135,24 @@ _REFUSED = {
 }
 
 
-def _table(path: Path, content: bytes, mapping: ColumnMap) -> Table:
+def _table(path: Path, digest: Any, mapping: ColumnMap) -> Table:
     ending = path.suffix.lower()
-    if ending in _BY_ENDING:
-        return _BY_ENDING[ending](path, content)
-    if ending in (".xlsx", ".xlsm"):
-        return arrays.read_xlsx(path, content, mapping)
     if ending in _REFUSED:
         raise InputError(f"{path}: is {_REFUSED[ending]}")
+    head = _head(path, digest)
+    if ending in _BY_ENDING:
+        return _BY_ENDING[ending](path, _content(path))
+    if ending in (".xlsx", ".xlsm") or (head.startswith(b"PK\x03\x04") and b"[Content_Types].xml" in head):
+        return arrays.read_xlsx(path, _content(path), mapping)
     for first, reader in _BY_FIRST_BYTES.items():
         # A text may begin with the same letters, and holds no zero bytes.
-        if content.startswith(first) and b"\x00" in content[:4096]:
-            return reader(path, content)
-    if text.is_gcs(content):
-        return text.read_gcs(path, content, mapping)
-    if text.is_lvm(content):
-        return text.read_lvm(path, content, mapping)
-    return text.read_text(path, content, mapping)
+        if head.startswith(first) and b"\x00" in head[:4096]:
+            return reader(path, _content(path))
+    if text.is_gcs(head):
+        return text.read_gcs(path, _content(path), mapping)
+    if text.is_lvm(head):
+        return text.read_lvm(path, _content(path), mapping)
+    return delimited_text.read_delimited(path, head, mapping)
 
 
 def _joined(path: Path, tables: list[Table]) -> Table:
@@ -155,13 +178,24 @@ class _Reading:
         self.notes = [note for table in self.tables for note in table.notes]
         #: quantity -> name of its array in its table, for the columns that were read.
         self.names: dict[str, str] = {}
+        #: Arrays that were proposed for quantities whose column is unknown.
+        self._proposals: list[str] = []
 
     def recording(self, source: str, sha256: str) -> Recording:
-        """The columns under their names, all of one length. Raises InputError."""
+        """The columns under their names, all of one length. Raises InputError; MissingError with all that is
+        missing.
+        """
         columns: dict[str, NDArray[Any] | None] = {}
+        missing: list[MissingError] = []
         for quantity in SAMPLED:
             if quantity != "t":
-                columns[quantity] = self._column(quantity, needed=quantity in ("u", "y"))
+                try:
+                    columns[quantity] = self._column(quantity, needed=quantity in ("u", "y"))
+                except MissingError as error:
+                    missing.append(error)
+        if missing:
+            missing += self._missing_time()
+            raise missing[0] if len(missing) == 1 else _all_missing(source, self.main.describe(), missing)
         n, periods = self._repeat(source, columns)
         named = {QUANTITIES[quantity][0]: values for quantity, values in columns.items()}
         named["t_s"], dt_s = self._time(source, n, periods)
@@ -183,6 +217,12 @@ class _Reading:
         if said is not None:
             return table.named(quantity, said)
         name = default_column(table.source, quantity, list(table.arrays))
+        # A format's own clock goes over a column in seconds.
+        if name is None and table.positional and len(table.arrays) > 1 and not (quantity == "t" and table.clocks):
+            taken = [*self.names.values(), *self._said_in(table)]
+            name = column_by_unit(quantity, list(table.arrays), table.units, taken)
+            if name is not None:
+                self.notes.append(f"{quantity} is the column {name!r}, by its unit")
         if name is None and len(table.arrays) == 1:
             # Quantities that can only mean this array: the user names the file or the part of the array for them, or
             # the other one of u and y is in another file.
@@ -192,6 +232,48 @@ class _Reading:
                 return next(iter(table.arrays))
         return name
 
+    def _said_in(self, table: Table) -> list[str]:
+        """The arrays of a table that the user has given to quantities."""
+        said = [(q, n) for q, n in self.mapping.columns.items() if self.by_quantity.get(q, self.main) is table]
+        return [table.named(quantity, name) for quantity, name in said]
+
+    def _proposed(self, quantity: str, table: Table, otherwise: tuple[str, ...]) -> tuple[str, ...]:
+        """The options to add for a quantity whose column is unknown; ``otherwise`` where none can be it."""
+        taken = [*self.names.values(), *self._said_in(table), *self._proposals]
+        likely_time = _likely_time(table)
+        if quantity == "t" and likely_time not in taken:
+            return self._with_unit("t", likely_time, table) if likely_time is not None else otherwise
+        taken += [likely_time] if likely_time is not None else []
+        name = proposed_column(quantity, list(table.arrays), taken)
+        if name is None:
+            return otherwise
+        self._proposals.append(name)
+        return self._with_unit(quantity, name, table)
+
+    def _with_unit(self, quantity: str, name: str, table: Table) -> tuple[str, ...]:
+        """The options that make an array a quantity."""
+        column = f"--column {shlex.quote(f'{quantity}={name}')}"
+        try:
+            factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
+        except MissingError as error:
+            return (column, *error.options)
+        except InputError:  # in a unit of another kind: a sensor's volts
+            return (column, f"--scale {quantity}=FACTOR")
+        return (column,)
+
+    def _missing_time(self) -> list[MissingError]:
+        """What is missing for the time, where other things are missing too."""
+        if self.main.dt_s is not None or self.main.clocks:
+            return []
+        lengths = [array.shape[0] for array in self.main.arrays.values() if array.ndim]
+        try:
+            self._time(self.main.source, max(lengths, default=0), [])
+        except MissingError as error:
+            return [error]
+        except InputError:
+            return []
+        return []
+
     def _column(self, quantity: str, *, needed: bool) -> FloatArray | None:
         table = self.by_quantity.get(quantity, self.main)
         name = self._name(quantity, table)
@@ -200,10 +282,13 @@ class _Reading:
                 return None
             canonical, factors = QUANTITIES[quantity]
             way = "NAME (or its position from 1)" if table.positional else "NAME"
-            raise InputError(
+            raise MissingError(
                 f"{table.source}: got columns {table.describe()}, expected {canonical}: add --column {quantity}={way} "
                 f"and, unless the name ends in one, its unit (--unit {quantity}=...: {', '.join(factors)}); if it is "
-                f"in another file, --file {quantity}=FILE"
+                f"in another file, --file {quantity}=FILE",
+                f"which column is {canonical}, {WORDS.get(quantity, quantity)} (--column {quantity}={way}), and "
+                f"its unit ({', '.join(factors)}); if it is in another file, --file {quantity}=FILE",
+                *self._proposed(quantity, table, (f"--file {quantity}=FILE",)),
             )
         self.names[quantity] = name
         return self._values(quantity, table, name)
@@ -253,10 +338,12 @@ class _Reading:
                 return t_s, nominal_dt(source, t_s)
             dt_s = self._stated_dt() or self._format_dt()
         if dt_s is None:
-            raise InputError(
+            raise MissingError(
                 f"{self.main.source}: got columns {self.main.describe()} and no time, expected a column t_s: add "
-                "--column t=NAME --unit t=..., or the sample time as --dt-s SECONDS, or --column rate=NAME where the "
-                "file holds a rate"
+                "--column t=NAME --unit t=..., or the sample time as --dt-s SECONDS or the rate as --rate HZ, or "
+                "--column rate=NAME where the file holds a rate",
+                "the time: which column it is and its unit, or the rate as --rate HZ",
+                *self._proposed("t", self.main, ("--rate HZ",)),
             )
         return np.arange(n, dtype=np.float64) * dt_s, float(dt_s)
 
@@ -362,6 +449,27 @@ class _Reading:
                     "resample one of them, or add --dt-s SECONDS if one of the two is wrong"
                 )
         return found[0][1] if found else None
+
+
+#: What the quantities are that every recording has, for people.
+WORDS = {"t": "the time", "u": "the voltage", "y": "the displacement"}
+
+
+def _likely_time(table: Table) -> str | None:
+    """An array to propose as the time: by its name, else the only one that rises with every sample."""
+    numbers = {name: a for name, a in table.arrays.items() if a.ndim == 1 and a.dtype.kind in "fiu" and len(a) > 2}
+    name = proposed_column("t", list(table.arrays), ())
+    rising = [name for name, array in numbers.items() if bool(np.all(np.diff(array[:100_000]) > 0.0))]
+    return name if name is not None else rising[0] if len(rising) == 1 else None
+
+
+def _all_missing(source: str, held: str, missing: list[MissingError]) -> MissingError:
+    """One error for several things that are missing."""
+    options = tuple(dict.fromkeys(option for error in missing for option in error.options))
+    lines = [f"  {number}. {error.what}" for number, error in enumerate(missing, 1)]
+    what = "\n".join(lines)
+    message = f"{source}: got columns {held}, and units are never guessed. {len(missing)} things are missing:\n{what}"
+    return MissingError(message, what, *options)
 
 
 def _sensor_moved(

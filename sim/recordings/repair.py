@@ -74,11 +74,11 @@ class Repaired:
     done: tuple[str, ...]
 
 
-def repaired(recording: Recording, since: int = 0) -> Repaired:
+def repaired(recording: Recording, since: int = 0, longest_fill: int = LONGEST_FILL) -> Repaired:
     """The longest usable stretch of a recording on a regular time grid.
 
     Samples that repeat a time or a step are dropped. Dropouts, values that are not finite and gaps of up to
-    ``LONGEST_FILL`` samples are interpolated. A longer gap or a step back in time splits the recording; the part with
+    ``longest_fill`` samples are interpolated. A longer gap or a step back in time splits the recording; the part with
     most of the rows from ``since`` on is returned, with the rows before them. Raises InputError where fewer than two
     samples are left, or a column has no finite value.
     """
@@ -89,7 +89,7 @@ def repaired(recording: Recording, since: int = 0) -> Repaired:
         recording = _pick(recording, ~bad_time)
         since -= int(bad_time[:since].sum())
         done.append(f"{int(bad_time.sum())} samples without a time left out")
-    recording = _longest_stretch(recording, dt, since, done)
+    recording = _longest_stretch(recording, dt, since, longest_fill, done)
     if len(recording) < 2:
         raise InputError(f"{recording.source or 'recording'}: got {n} samples, none of them in a usable stretch")
     step = np.rint((recording.t_s - recording.t_s[0]) / dt).astype(np.int64)
@@ -131,10 +131,10 @@ def _pick(recording: Recording, keep: BoolArray) -> Recording:
     return replace(recording, **chosen)
 
 
-def _longest_stretch(recording: Recording, dt_s: float, since: int, done: list[str]) -> Recording:
+def _longest_stretch(recording: Recording, dt_s: float, since: int, longest_fill: int, done: list[str]) -> Recording:
     steps = np.diff(recording.t_s)
     # A clock set back by less than half a step, inside a run of doubles, does not begin a new recording.
-    cuts = np.flatnonzero((steps > (LONGEST_FILL + 0.5) * dt_s) | (steps < -0.5 * dt_s)) + 1
+    cuts = np.flatnonzero((steps > (longest_fill + 0.5) * dt_s) | (steps < -0.5 * dt_s)) + 1
     if not len(cuts):
         return recording
     bounds = np.concatenate([[0], cuts, [len(recording)]])

@@ -1,10 +1,9 @@
-"""Readers of text: delimited columns with or without names, LabVIEW's .lvm, and array files of piezo controllers."""
+"""Text: what all readers of it share, LabVIEW's .lvm, and array files of piezo controllers."""
 
 from __future__ import annotations
 
-import io
+import codecs
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,87 +13,6 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from sim.recordings.columns import ColumnMap, is_unit
 from sim.recordings.table import Table, seconds
-
-
-def read_text(path: Path, content: bytes, mapping: ColumnMap) -> Table:
-    """Delimited text: one row per sample, below a line with the columns' names if it has one.
-
-    Empty lines and lines that start with ``#`` or ``%`` before the data are comments; the last of them gives the names
-    where it has one for each column. A line of units below the names is used. Columns without names are called by
-    their position from 1. Raises InputError where the first line may be names as well as a sample.
-    """
-    import pyarrow as pa
-    from pyarrow import csv
-
-    lines = decode(path, content).splitlines()
-    top = _top(path, lines, mapping)
-    body = lines[top.start :]
-    delimiter = top.delimiter
-    if delimiter == " ":
-        body, delimiter = ["\t".join(line.split()) for line in body], "\t"
-    try:
-        table = csv.read_csv(
-            io.BytesIO("\n".join(body).encode()),
-            read_options=csv.ReadOptions(column_names=top.names),
-            parse_options=csv.ParseOptions(delimiter=delimiter),
-            convert_options=csv.ConvertOptions(decimal_point=mapping.decimal, strings_can_be_null=True),
-        )
-    except pa.ArrowInvalid as error:
-        hint = "" if "Empty" not in str(error) else ": the file has a header line and no samples"
-        raise InputError(f"{path}: is not a table of {len(top.names)} columns{hint} ({error})") from error
-    arrays, units = {}, dict(top.units)
-    for name in top.names:
-        arrays[name], stamped = from_arrow(table.column(name))
-        if stamped:
-            units[name] = "s"
-    return Table(str(path), arrays, notes=top.notes, units=units, positional=True)
-
-
-@dataclass(frozen=True, slots=True)
-class _Top:
-    """What stands above the samples: the columns' names and units, and the line on which the samples start."""
-
-    names: list[str]
-    start: int
-    delimiter: str
-    units: dict[str, str]
-    notes: tuple[str, ...]
-
-
-def _top(path: Path, lines: list[str], mapping: ColumnMap) -> _Top:
-    first = next((k for k, line in enumerate(lines) if line.strip() and line.lstrip()[0] not in "#%"), None)
-    if mapping.header is not None and mapping.header != "none":
-        first = int(mapping.header) - 1
-        if first >= len(lines) or not lines[first].strip():
-            raise InputError(
-                f"{path}: header: got line {mapping.header}, which is "
-                f"{'empty' if first < len(lines) else f'beyond the {len(lines)} lines of the file'}, expected the "
-                "line with the columns' names"
-            )
-    if first is None:
-        raise InputError(f"{path}: got no data, expected a header line and one row per sample")
-    line = lines[first].lstrip("#% \t") if mapping.header not in (None, "none") else lines[first]
-    delimiter = mapping.delimiter or next((d for d in "\t;," if d in line), " ")
-    cells = split_cells(line, delimiter)
-    notes: tuple[str, ...] = ()
-    if has_names(str(path), cells, mapping, "line", first + 1):
-        start = first + 1
-        names = different(cells)
-        below = split_cells(lines[start], delimiter) if start < len(lines) else []
-        if stated := units_row(names, below):
-            start += 1
-            notes = (f"units from line {start}: {', '.join(f'{name} in {unit}' for name, unit in stated.items())}",)
-            return _Top(names, start, delimiter, stated, notes)
-        return _Top(names, start, delimiter, {}, notes)
-    above = next((line for line in reversed(lines[:first]) if line.strip()), "")
-    names = split_cells(above.lstrip("#% \t"), delimiter)
-    is_header = len(names) == len(cells) == len(set(names)) and not any(is_number(name, ".") for name in names)
-    if mapping.header is None and is_header and "" not in names:
-        notes = (f"columns named by the comment above the samples: {', '.join(names)}",)
-    else:
-        names = [str(k) for k in range(1, len(cells) + 1)]
-        notes = ("no names of columns in the file: they are called by their position, from 1",)
-    return _Top(names, first, delimiter, {}, notes)
 
 
 def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, number: int) -> bool:
@@ -118,11 +36,6 @@ def has_names(source: str, cells: list[str], mapping: ColumnMap, kind: str, numb
         raise InputError(
             f"{source}: got names and numbers in {kind} {number} ({', '.join(filled)[:80]}), expected one of the two: "
             f"{settle}"
-        )
-    if mapping.decimal == "." and filled and all(is_number(cell, ",") for cell in filled):
-        raise InputError(
-            f"{source}: got {', '.join(filled)[:80]!r} in {kind} {number}, expected names or numbers: if the comma is "
-            f"the decimal sign, add --decimal , ; if these are names, --header {number}"
         )
     return True
 
@@ -149,22 +62,48 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip().strip('"') for cell in cells]
 
 
-def decode(path: Path, content: bytes) -> str:
-    """Text in UTF-8 (with or without mark), UTF-16 with mark, or Latin-1 (µ and ° of old controllers)."""
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return content.decode("utf-16")
-    if b"\x00" in content[:4096]:
+def encoding_of(path: Path, head: bytes) -> str:
+    """The encoding of a text by its beginning: UTF-8 or UTF-16 with or without a mark, else Latin-1.
+
+    Latin-1 has the µ and ° of old controllers. Raises InputError where it is no text.
+    """
+    for mark, name in (
+        (codecs.BOM_UTF8, "utf-8-sig"),
+        (codecs.BOM_UTF16_LE, "utf-16"),
+        (codecs.BOM_UTF16_BE, "utf-16"),
+    ):
+        if head.startswith(mark):
+            return name
+    zeros = [head[k:4096:2].count(0) for k in (0, 1)]
+    if any(zeros):
+        # Every second byte of plain letters in UTF-16 is zero.
+        half = min(len(head), 4096) // 2
+        for name, (many, few) in (("utf-16-le", (zeros[1], zeros[0])), ("utf-16-be", (zeros[0], zeros[1]))):
+            if few == 0 and many > 0.9 * half:
+                return name
         raise InputError(f"{path}: is not text, expected text, .parquet, .mat, .h5, .npy, .npz, .tdms or .xlsx")
     try:
-        return content.decode("utf-8-sig")
+        # A letter may be cut in two at the end.
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
+def decode(path: Path, content: bytes) -> str:
+    """A whole file of text; see `encoding_of`."""
+    try:
+        return content.decode(encoding_of(path, content))
     except UnicodeDecodeError:
         return content.decode("latin-1")
 
 
-def is_number(text: str, decimal: str) -> bool:
+def is_number(text: str, decimal: str | None) -> bool:
     """Whether a cell of text is a number with this decimal sign."""
+    if "_" in text:  # which Python reads, and no instrument writes
+        return False
     try:
-        float(text.replace(decimal, ".") if decimal == "," else text)
+        float(text.replace(",", ".") if decimal == "," else text)
     except ValueError:
         return False
     return True
@@ -292,7 +231,7 @@ def read_lvm(path: Path, content: bytes, mapping: ColumnMap) -> Table:
         raise InputError(f"{path}: got no line '***End_of_Header***', expected one before the data: is the file whole?")
     file_tags = _lvm_tags(lines[: ends[0]], None)
     separator = mapping.delimiter or {"Comma": ","}.get(file_tags.get("Separator", ["Tab"])[0], "\t")
-    decimal = "," if file_tags.get("Decimal_Separator", ["."])[0] == "," else mapping.decimal
+    decimal = "," if file_tags.get("Decimal_Separator", ["."])[0] == "," else mapping.decimal or "."
     names: list[str] = []
     tags: dict[str, list[str]] = {}
     rows: list[list[float]] = []

@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 from service.protocol.keys import check_name
+
+#: A finding after which a model ends where the sensor did.
+CLIPPED = ("clipped", "warning")
 
 log = logging.getLogger("dehyst.identify")
 
@@ -45,6 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the models that never saw the held-out part (default: identify again from all of the recording)",
     )
     parser.add_argument("--models", metavar="A,B", help="which models (all five)")
+    parser.add_argument(
+        "--fit-samples",
+        type=int,
+        default=100_000,
+        metavar="N",
+        help="most samples for the fits; of a longer recording every k-th one is used (%(default)s)",
+    )
     parser.add_argument("--support", type=int, default=500, metavar="N", help="support vectors of the LSSVMs (500)")
     add_shared(
         parser,
@@ -58,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, identify, judge, write. Returns 0, or 1 where no model could be identified."""
-    from service.identification.identifying import NAMES, Stretch, identify_all, split_at
+    from service.identification.identifying import NAMES, Stretch, identify_all, split_at, thinning
     from service.storage.model_file import BundleMeta, write_bundle
     from sim.recordings import check, repaired, require_usable
 
@@ -69,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--models", repr(unknown[0]), f"some of {', '.join(NAMES)}")
     if args.support < 10:
         raise FieldError("--support", args.support, "at least 10 support vectors")
+    if args.fit_samples < 1000:
+        raise FieldError("--fit-samples", args.fit_samples, "at least 1000 samples")
     if not args.out.parent.is_dir():
         raise FieldError("--out", str(args.out), "a file in a folder that exists", f"make {args.out.parent} first")
 
@@ -82,8 +95,14 @@ def run(args: argparse.Namespace) -> int:
     whole_repaired = repaired(recording)
     for line in whole_repaired.done:
         say(f"  repaired: {line}")
-    whole = Stretch.of(whole_repaired)
     dt_s = recording.dt_s
+    every = thinning(len(whole_repaired.valid), dt_s, args.fit_samples)
+    if every > 1:
+        say(
+            f"  long recording: fits and errors use one of {every} samples, one each {dt_s * every:g} s; motion "
+            f"faster than {0.1 / (dt_s * every):.0f} Hz is judged more roughly (--fit-samples)"
+        )
+    whole = Stretch.of(whole_repaired, every)
     if args.test is not None:
         tested = load(args.test, args, args.test_range, test=True)
         if abs(tested.dt_s / dt_s - 1.0) > 1e-3:
@@ -93,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         test_findings = check(tested)
         say(describe(tested, test_findings))
         require_usable(tested, test_findings)
-        train, test, follows, again = whole, Stretch.of(repaired(tested)), False, None
+        train, test, follows, again = whole, Stretch.of(repaired(tested), every), False, None
         judged_on = str(args.test)
     else:
         split = split_at(len(whole), args.holdout)
@@ -101,12 +120,10 @@ def run(args: argparse.Namespace) -> int:
         again = None if args.keep_apart else whole
         judged_on = f"the last {100 * args.holdout:g} % of the recording"
 
-    def progress(name: str) -> None:
-        say(f"[{names.index(name) + 1}/{len(names)}] identifying {name} from {len(train)} samples ...")
-
     results = identify_all(
-        train, test, dt_s, follows=follows, whole=again, names=names, n=args.support, progress=progress
-    )
+        train, test, dt_s * every, follows=follows, whole=again, names=names, n=args.support, most=args.fit_samples,
+        serve_dt_s=dt_s, progress=_progress(say, names, len(train), len(again or train)),
+    )  # fmt: skip
     models = {result.name: result.model for result in results if result.model is not None}
     for result in results:
         if result.failed:
@@ -129,6 +146,8 @@ def run(args: argparse.Namespace) -> int:
             "judged_on": Path(judged_on).name if args.test is not None else judged_on,
             "heldout_rmse_um": {r.name: r.score.rmse_um for r in results if r.score is not None},
             "sensor_late": args.sensor_late or 0,
+            "fitted_from_every": every,
+            "clipped": [finding.message for finding in findings if (finding.kind, finding.severity) == CLIPPED],
         },
     )
     write_bundle(args.out, models, meta)
@@ -137,13 +156,13 @@ def run(args: argparse.Namespace) -> int:
         from service.identification.identifying import draw_identification
 
         picture = args.picture or args.out.with_suffix(".png")
-        draw_identification(
-            picture, f"{args.data.name}: inverse models, judged on {judged_on}", train, test, dt_s, results, gain
-        )
+        title = f"{args.data.name}: inverse models, judged on {judged_on}"
+        draw_identification(picture, title, train, test, dt_s * every, results, gain)
     summary: dict[str, Any] = {
         "data": str(args.data),
         "sha256": recording.sha256,
         "samples": len(recording),
+        "fitted_from_every": every,
         "dt_s": dt_s,
         "range_um": float(np.ptp(train.motion[:, 0])),
         "gain_um_per_V": gain,
@@ -157,6 +176,22 @@ def run(args: argparse.Namespace) -> int:
     }
     print(json.dumps(summary) if args.json else table(summary))
     return 0
+
+
+def _progress(
+    say: Callable[[str], None], names: Sequence[str], samples: int, all_samples: int
+) -> Callable[[str, str, float], None]:
+    """Prints each phase with its samples, the time passed and, from a tenth of the work on, the time left."""
+    begun = time.perf_counter()
+
+    def begin(name: str, phase: str, share: float) -> None:
+        passed_s = time.perf_counter() - begun
+        left = f", about {passed_s * (1.0 - share) / share:.0f} s left" if share > 0.1 else ""
+        count = all_samples if phase.endswith("all") else samples
+        number = f"[{names.index(name) + 1}/{len(names)}]"
+        say(f"{number} identifying {name}: {phase}, {count} samples ({passed_s:.0f} s{left})")
+
+    return begin
 
 
 def table(summary: dict[str, Any]) -> str:

@@ -13,11 +13,12 @@ import pytest
 from pyarrow import parquet
 
 from adaptive.errors import InputError
+from baselines.prandtl_ishlinskii.model import MpiParameters
 from lab.cli import main
-from service.identification.identifying import NAMES, Stretch, free_run, identify_all, motion_of, split_at
+from service.identification.identifying import NAMES, Stretch, free_run, identify_all, motion_of, split_at, thinning
 from service.identification.recording_options import parse_range
 from service.storage.model_file import read_bundle
-from sim.recordings import Recording, repaired
+from sim.recordings import Recording, Repaired, repaired
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 
@@ -204,3 +205,34 @@ def test_measured_stack(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 #: Some 1.3 times what is reached, µm RMSE of a 46 µm stroke.
 BOUNDS_UM = {"bouc_wen": 0.5, "mpi": 0.3, "lssvm_frozen": 0.35, "lssvm_adaptive": 0.08}
+
+
+def test_a_long_recording_is_thinned_and_served_at_its_own_rate() -> None:
+    """Ten times as many samples of the same motion give the same models, for the sample time of the recording."""
+    dt_s = 1e-4
+    t_s = np.arange(40_000) * dt_s
+    u_V = 4.0 - 4.0 * np.cos(2 * np.pi * 1.5 * t_s) * np.exp(-0.3 * t_s)
+    y_um = MpiParameters((0.0, 1.0, 2.0), (7.0, 1.5, 1.0), (0.0, 30.0), (1.0, -0.1)).simulate(u_V, dt_s)
+    recording = Repaired(Recording(t_s, u_V, y_um, dt_s), np.ones(t_s.size, dtype=np.bool_), ())
+    assert thinning(t_s.size, dt_s, 4000) == 10
+    assert thinning(t_s.size, dt_s, 400) == 10  # not below one sample a millisecond
+    assert thinning(t_s.size, dt_s, 100_000) == 1
+    said: list[tuple[str, str, float]] = []
+    results = {}
+    for every in (1, 10):
+        whole = Stretch.of(recording, every)
+        results[every] = identify_all(
+            whole.part(0, 3 * len(whole) // 4), whole.part(3 * len(whole) // 4, len(whole)), dt_s * every, follows=True,
+            names=("linear", "mpi", "lssvm_adaptive"), n=60, most=4000, serve_dt_s=dt_s,
+            progress=lambda *phase: said.append(phase),
+        )  # fmt: skip
+    shares = [share for _, _, share in said[: len(said) // 2]]
+    assert shares == sorted(shares)
+    assert shares[0] == 0.0
+    for fine, coarse in zip(results[1], results[10], strict=True):
+        assert fine.model is not None
+        assert coarse.model is not None
+        assert fine.model.dt_s == coarse.model.dt_s == dt_s
+        assert fine.score is not None
+        assert coarse.score is not None
+        assert coarse.score.rmse_pct < 1.3 * fine.score.rmse_pct + 0.02

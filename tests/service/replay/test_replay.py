@@ -328,3 +328,20 @@ def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixtur
     for name in ("errors.png", "gates.png"):
         assert (tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG")
     assert len(decisions(tmp_path / "out" / "gates.csv")) == printed["samples"]
+
+
+@pytest.mark.parametrize("missing", [3, 30, 60])
+def test_a_short_gap_costs_nothing_after_it(model_file: Path, samples: Recording, missing: int) -> None:
+    """The memory goes on over the gap: 60 missing samples used to raise the error for the rest of the recording."""
+    keep = np.ones(len(samples), dtype=np.bool_)
+    keep[4000 : 4000 + missing] = False
+    seq = sequence(samples)
+    cut = Recording(samples.t_s[keep], samples.u_V[keep], samples.y_um[keep], DT_S, source="gap", seq=seq[keep])
+    whole, gapped = replay(samples, axis_of(model_file)), replay(cut, axis_of(model_file))
+    assert gapped.t_s.size == whole.t_s.size
+    assert np.isnan(gapped.adaptive_V[4003 : 4000 + missing]).all()
+    after = slice(4100 + missing, None)
+    for with_gap, without in ((gapped.adaptive_V, whole.adaptive_V), (gapped.frozen_V, whole.frozen_V)):
+        rms = [float(np.sqrt(np.nanmean(error[after] ** 2))) for error in (with_gap, without)]
+        assert rms[0] < 1.5 * rms[1]
+    assert np.isfinite(gapped.adaptive_V[:4000]).sum() > 3900

@@ -155,9 +155,9 @@ def test_controllers_array_file(tmp_path: Path) -> None:
 
 def test_controllers_array_file_without_stated_units_is_refused(tmp_path: Path) -> None:
     path = write_gcs(tmp_path / "a.dat")
-    with pytest.raises(InputError, match=r"no unit.*--unit u=V"):
+    with pytest.raises(InputError, match=r"(?s)the unit of column .* for u: V,.*for y: um"):
         read(path, ColumnMap(columns=GCS_MAP.columns))
-    with pytest.raises(InputError, match=r"Control Voltage of Piezo  1, Current Position of Axis  1.*--column u="):
+    with pytest.raises(InputError, match=r"(?s)Control Voltage of Piezo  1, Current Position of Axis  1.*--column u="):
         read(path)
 
 
@@ -180,7 +180,7 @@ def test_damaged_array_files(tmp_path: Path, options: dict[str, object], message
         ("", "empty file"),
         ("\n\n", "no data"),
         ("0,1,2\n0.1,1,2\n", "got 0, 1, 2 in line 1, which may be names.*--header 1 .*--header none"),
-        ("t_s,u_V,u_V\n0,1,2\n", r"t_s, u_V \(column 2\), u_V \(column 3\), expected u_V: add --column u="),
+        ("t_s,u_V,u_V\n0,1,2\n", r"(?s)t_s, u_V \(column 2\), u_V \(column 3\),.*u_V, the voltage .--column u="),
         ("t_s,u_V,y_um\n", "no samples|not a table"),
         ("t_s,u_V,y_um\n0,1,2\n1,2\n", "not a table of 3 columns"),
         ("t_s,u_V,y_um\n0,1,2\n1,2,off\n", "'off' in data row 2"),

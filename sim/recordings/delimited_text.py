@@ -1,0 +1,540 @@
+"""Delimited text: its encoding, delimiter, decimal sign and preamble are found, and it is read in blocks.
+
+The first lines of a file decide its layout. The table is read by numpy's compiled reader in one thread: the reader of
+pyarrow starts threads that can abort the process when it ends soon after a refused file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from sim.recordings.columns import ColumnMap, stated_unit
+from sim.recordings.table import MAX_BYTES, Table, seconds
+from sim.recordings.text_formats import different, encoding_of, has_names, is_number, split_cells, units_row
+
+#: Lines from which the layout is found, and rows that are converted at a time.
+_HEAD_LINES: Final = 400
+_BLOCK_ROWS: Final = 200_000
+#: Delimiters in the order in which they are tried; a blank stands for any number of blanks.
+_DELIMITERS: Final = ("\t", ";", ",", " ")
+_NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", " ": "blanks"}
+#: Words for a missing value.
+_MISSING: Final = frozenset({"", "na", "n/a", "#n/a", "nan", "-nan", "1.#qnan", "-1.#ind", "null", "none"})
+#: Words in front of the units and the sample time in preambles of oscilloscopes, in lower case without a colon.
+_X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit")
+_Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit")
+_X_STEP: Final = ("sample interval", "xinc", "x increment", "xincrement", "increment")
+_TIME_OF_DAY: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:\.\d*)?)")
+_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d*)?)?)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a file of delimited text is laid out.
+
+    Attributes
+    ----------
+    encoding : of its characters. delimiter : between its cells, a blank for any blanks. decimal : "." or ",".
+    start : number of lines above the first sample. width : cells in a row.
+    columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
+    units : name -> unit, where the file states it apart from the name.
+    dt_s : sample time that the preamble states, s, or None. notes : what was found, for people.
+    """
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    start: int
+    width: int
+    columns: tuple[int, ...]
+    names: tuple[str, ...]
+    kinds: str
+    units: dict[str, str] = field(default_factory=dict)
+    dt_s: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
+    """Delimited text: one row per sample, below a preamble, names and units where it has them. ``head``: its beginning.
+
+    Lines of names and units directly above the samples are used; columns without names are called by their position
+    from 1. Raises InputError where the first line may be names as well as a sample, and where a row does not fit.
+    """
+    encoding = encoding_of(path, head)
+    try:
+        return _read(path, encoding, mapping)
+    except UnicodeDecodeError:
+        # The beginning was plain, a later letter is not UTF-8: an instrument of one byte a letter.
+        return _read(path, "latin-1", mapping)
+
+
+def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
+    with path.open(encoding=encoding, newline=None) as file:
+        layout = find_layout(str(path), list(itertools.islice(file, _HEAD_LINES)), encoding, mapping)
+    with path.open(encoding=encoding, newline=None) as file:
+        for _ in range(layout.start):
+            next(file, None)
+        rows = _Rows(path, layout, path.stat().st_size)
+        while lines := list(itertools.islice(file, _BLOCK_ROWS)):
+            rows.add(lines, last=_at_end(file, lines))
+    arrays, stamped = rows.arrays()
+    if not rows.n:
+        raise InputError(
+            f"{path}: is not a table of {len(layout.columns)} columns: the file has a header line and no samples"
+        )
+    units = {**layout.units, **dict.fromkeys(stamped, "s")}
+    return Table(str(path), arrays, dt_s=layout.dt_s, notes=(*layout.notes, *rows.notes), units=units, positional=True)
+
+
+def _at_end(file: TextIO, lines: list[str]) -> bool:
+    """Whether ``lines``, just read from ``file``, are its last."""
+    return len(lines) < _BLOCK_ROWS
+
+
+# --- The layout.
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """The rows of a head under one delimiter and decimal sign: the first line of them, and the kind of each column."""
+
+    delimiter: str
+    decimal: str
+    first: int
+    kinds: str
+    rows: int
+
+
+def find_layout(source: str, lines: list[str], encoding: str, mapping: ColumnMap) -> Layout:
+    """The layout of a file by its first ``lines``. Raises InputError where it has none, or may be read in two ways."""
+    if not any(line.strip() for line in lines):
+        raise InputError(f"{source}: got no data, expected a header line and one row per sample")
+    named = _named_line(source, lines, mapping)
+    delimiters = (mapping.delimiter,) if mapping.delimiter else _DELIMITERS
+    decimals = (mapping.decimal,) if mapping.decimal else (".", ",")
+    found = [
+        block
+        for delimiter in delimiters
+        for decimal in decimals
+        if not (delimiter == decimal == ",") and (block := _block(lines, delimiter, decimal, named))
+    ]
+    # The reading with the most numbers; of equal ones the first. One with more texts than numbers is none.
+    best = max(found, key=_numbers, default=None)
+    if best is None or _numbers(best) <= 0:
+        raise InputError(f"{source}: {_why_no_rows(lines, mapping)}")
+    return _layout(source, lines, encoding, mapping, best, named)
+
+
+def _named_line(source: str, lines: list[str], mapping: ColumnMap) -> int | None:
+    """The index of the line of names that the user states, -1 for a table without names, None where nothing is said."""
+    if mapping.header is None:
+        return None
+    if mapping.header == "none":
+        return -1
+    index = int(mapping.header) - 1
+    if index >= len(lines) or not lines[index].strip():
+        where = f"beyond the {len(lines)} lines of the file" if index >= len(lines) else "empty"
+        raise InputError(
+            f"{source}: header: got line {mapping.header}, which is {where}, expected the line with the columns' names"
+        )
+    return index
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip()[:1] in ("#", "%") or not line.strip()
+
+
+def _kind(cell: str, decimal: str) -> str:
+    """n: number, e: empty or missing, d: a date or time of day, t: any other text."""
+    if cell.casefold() in _MISSING:
+        return "e"
+    if not (decimal == "," and "." in cell) and is_number(cell, decimal):
+        return "n"
+    return "d" if _DATE.fullmatch(cell) or _TIME_OF_DAY.fullmatch(cell) else "t"
+
+
+def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) -> _Block | None:
+    """The rows at the end of a head; None where there are none with a number.
+
+    The last rows tell the kinds of the columns. Every row further up with as many cells, a number in the first column
+    of numbers and in half of the others is one of them: a wrong cell in it is a fault, not a preamble.
+    """
+    least = 0 if named is None else named + 1
+    rows = [
+        (k, [_kind(cell, decimal) for cell in split_cells(line, delimiter)])
+        for k, line in enumerate(lines)
+        if k >= least and not _is_comment(line)
+    ]
+    while rows and "n" not in rows[-1][1]:  # names without samples, or a last row that was cut off
+        rows.pop()
+    if not rows:
+        return None
+    width = len(rows[-1][1])
+    if len(rows) > 1 and width < len(rows[-2][1]) and "n" in rows[-2][1]:
+        width = len(rows[-2][1])
+    same = [(k, kinds) for k, kinds in rows if len(kinds) == width]
+    kinds = "".join(_common([row[j] for _, row in same[-10:]]) for j in range(width))
+    numbers = [j for j in range(width) if kinds[j] == "n"]
+    if not numbers:
+        return None
+    fits = [
+        k
+        for k, row in same
+        if (row[numbers[0]] == "n" or kinds[: numbers[0]].strip("e"))
+        and 2 * sum(row[j] in "ne" for j in numbers) >= len(numbers)
+        and any(row[j] == "n" for j in numbers)
+    ]
+    return _Block(delimiter, decimal, fits[0], kinds, len(fits)) if fits else None
+
+
+def _common(kinds: list[str]) -> str:
+    """The kind of a column by those of its cells: the most frequent one that is not empty."""
+    filled = [kind for kind in kinds if kind != "e"]
+    return max(sorted(set(filled)), key=filled.count) if filled else "e"
+
+
+def _numbers(block: _Block) -> int:
+    return block.rows * (len(block.kinds.replace("e", "")) - 2 * block.kinds.count("t"))
+
+
+def _why_no_rows(lines: list[str], mapping: ColumnMap) -> str:
+    filled = [line for line in lines if not _is_comment(line)]
+    if not filled:
+        return "got no data, expected a header line and one row per sample"
+    if len(filled) == 1:
+        delimiter = mapping.delimiter or next((d for d in _DELIMITERS if d in filled[0].strip()), " ")
+        width = len(split_cells(filled[0], delimiter))
+        return f"is not a table of {width} columns: the file has a header line and no samples"
+    return (
+        f"got no rows of numbers in its first {len(lines)} lines (the last one is {filled[-1].strip()[:80]!r}), "
+        "expected one row per sample; if something else than tabs, ';', ',' or blanks separates the columns, add "
+        "--delimiter"
+    )
+
+
+def _layout(
+    source: str, lines: list[str], encoding: str, mapping: ColumnMap, block: _Block, named: int | None
+) -> Layout:
+    # A trailing delimiter makes an empty last column; a preamble in front of the samples empty first ones.
+    columns = tuple(j for j, kind in enumerate(block.kinds) if kind != "e") or tuple(range(len(block.kinds)))
+    start = block.first
+    above = [k for k in range(start) if lines[k].strip()]
+    notes: list[str] = []
+    names: list[str] | None = None
+    units: dict[str, str] = {}
+    if named is not None and named >= 0:
+        names = _fitting(_cells_of(lines[named], block.delimiter, strip=True), block, columns, named + 1 == start)
+        if names is None:
+            cells = _cells_of(lines[named], block.delimiter, strip=True)
+            raise InputError(
+                f"{source}: is not a table of {len(cells)} columns as line {named + 1} names them: the rows below have "
+                f"{len(columns)}"
+            )
+        names = different(names)
+        between = [k for k in above if k > named]
+        units = units_row(names, _fit(lines[between[0]], block, columns)) if between else {}
+        if units:
+            notes.append(_units_note(between[0], units))
+    elif named is None:
+        names, units, found_notes = _names_above(source, lines, mapping, block, columns, above)
+        notes += found_notes
+    if named is None and names is None and not above:
+        first = [split_cells(lines[start], block.delimiter)[j] for j in columns]
+        if len(columns) == len(block.kinds):
+            has_names(source, first, mapping, "line", start + 1)
+    preamble = _preamble(lines[: max(start, 40)], block.delimiter)
+    if names is None:
+        names = [str(j + 1) for j in columns]
+        notes.append("no names of columns in the file: they are called by their position, from 1")
+    kinds = "".join(block.kinds[j] if block.kinds[j] != "e" else "n" for j in columns)
+    over, dt_s = _of_preamble(names, preamble, block.decimal)
+    units = {**over, **units}
+    said = _said(encoding, block, mapping, start, above, lines)
+    if over:
+        notes.append("units from the preamble: " + ", ".join(f"{name} in {unit}" for name, unit in over.items()))
+    if dt_s is not None:
+        notes.append(f"the preamble states a sample time of {dt_s:g} s")
+    return Layout(
+        encoding, block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
+        (*said, *notes),
+    )  # fmt: skip
+
+
+def _cells_of(line: str, delimiter: str, *, strip: bool = False) -> list[str]:
+    cells = split_cells(line.strip("\r\n").lstrip("#% ") if strip else line, delimiter)
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...], directly: bool) -> list[str] | None:
+    """The name of each column from the cells of a line; None where they do not fit."""
+    if len(cells) == len(columns):
+        return cells
+    if directly and columns[-1] < len(cells) <= len(block.kinds) and all(cells[j] for j in columns):
+        return [cells[j] for j in columns]
+    return None
+
+
+def _fit(line: str, block: _Block, columns: tuple[int, ...]) -> list[str]:
+    return _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True) or []
+
+
+def _names_above(
+    source: str, lines: list[str], mapping: ColumnMap, block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str] | None, dict[str, str], list[str]]:
+    """Names and units of the columns from the lines directly above the samples, and what to tell the user."""
+    if not above:
+        return None, {}, []
+    last = above[-1]
+    if scope := _rigol(lines, block, columns, above):
+        return scope
+    comment = lines[last].lstrip()[:1] in ("#", "%")
+    cells = _fit(lines[last], block, columns)
+    if not cells or not all(cells):
+        return None, {}, []
+    upper = _fit(lines[above[-2]], block, columns) if len(above) > 1 else []
+    if upper and all(upper):
+        names = different(upper)
+        units = units_row(names, cells)
+        # Above a whole row of units, numbers are names of channels.
+        if units and (len(units) == len(names) or not any(is_number(cell, block.decimal) for cell in upper)):
+            return names, units, [_units_note(last, units)]
+    if comment:
+        if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells):
+            return None, {}, []
+        return cells, {}, [f"columns named by the comment above the samples: {', '.join(cells)}"]
+    if any(is_number(cell, block.decimal) for cell in cells):
+        if all(_is_comment(lines[k]) for k in above[:-1]):
+            has_names(source, cells, mapping, "line", last + 1)
+        return None, {}, []
+    return different(cells), {}, []
+
+
+def _rigol(
+    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str] | None, dict[str, str], list[str]] | None:
+    """Names and units of an export with the columns ``Start`` and ``Increment``, with their values below."""
+    if len(above) < 2:
+        return None
+    upper, lower = (_cells_of(lines[k], block.delimiter) for k in above[-2:])
+    if [cell.casefold() for cell in upper[-2:]] != ["start", "increment"] or len(lower) != len(upper):
+        return None
+    names = upper[: len(columns)]
+    # The first column counts the samples.
+    units = units_row(names, ["", *lower[1 : len(names)]]) if len(names) == len(columns) else {}
+    return (names, units, [_units_note(above[-1], units)]) if units else None
+
+
+def _units_note(line: int, units: dict[str, str]) -> str:
+    return f"units from line {line + 1}: {', '.join(f'{name} in {unit}' for name, unit in units.items())}"
+
+
+def _preamble(lines: list[str], delimiter: str) -> dict[str, list[str]]:
+    """Word -> the values behind it, of the lines above the samples or in front of the first ones."""
+    found: dict[str, list[str]] = {}
+    upper: list[str] = []
+    for line in lines:
+        cells = split_cells(line.strip("\r\n"), delimiter)
+        word = cells[0].strip(' :"').casefold() if cells else ""
+        if len(cells) > 1 and word and not is_number(word, "."):
+            found.setdefault(word, [cell for cell in cells[1:] if cell])
+        if len(upper) > 2 and upper[-1].casefold() == "increment" and len(cells) == len(upper):
+            found.setdefault("increment", cells[-1:])
+        while cells and not cells[-1]:
+            cells.pop()
+        upper = cells
+    return found
+
+
+def _of_preamble(names: list[str], preamble: dict[str, list[str]], decimal: str) -> tuple[dict[str, str], float | None]:
+    """name -> unit, and the sample time in s where it is stated in s, from the preamble of an oscilloscope."""
+    x = next((preamble[word] for word in _X_UNITS if preamble.get(word)), [])
+    y = next((preamble[word] for word in _Y_UNITS if preamble.get(word)), [])
+    step = next((preamble[word] for word in _X_STEP if preamble.get(word)), [])
+    units: dict[str, str] = {}
+    if x and len(names) > 1 and stated_unit(x[0]):
+        units[names[0]] = x[0]
+        channels = names[1:]
+        labels = y if len(y) >= len(channels) else y * len(channels) if len(y) == 1 == len(channels) else []
+        units |= {name: unit for name, unit in zip(channels, labels, strict=False) if stated_unit(unit)}
+    dt_s = None
+    if step and is_number(step[0], decimal) and (not x or stated_unit(x[0]) == "s"):
+        value = float(step[0].replace(",", ".") if decimal == "," else step[0])
+        dt_s = value if 0.0 < value < 1e3 else None
+    return units, dt_s
+
+
+def _said(
+    encoding: str, block: _Block, mapping: ColumnMap, start: int, above: list[int], lines: list[str]
+) -> list[str]:
+    """What was found and is not the plainest case, as a note."""
+    found = []
+    if encoding not in ("utf-8", "utf-8-sig"):
+        found.append(f"letters in {encoding.upper()}")
+    if mapping.delimiter is None and block.delimiter != "," and len(block.kinds) > 1:
+        found.append(f"columns separated by {_NAMES[block.delimiter]}")
+    if mapping.decimal is None and block.decimal == ",":
+        found.append("decimal commas")
+    preamble = [k for k in above if not _is_comment(lines[k])]
+    if len(preamble) > 2:
+        found.append(f"samples from line {start + 1} on, below {len(preamble)} lines of a preamble")
+    return ["text: " + ", ".join(found)] if found else []
+
+
+# --- The rows.
+
+
+class _Rows:
+    """Collects the columns of a file, block by block, in memory that grows by the size of the file."""
+
+    def __init__(self, path: Path, layout: Layout, file_bytes: int) -> None:
+        self.path, self.layout = path, layout
+        self.n = 0
+        self.notes: list[str] = []
+        self._line = layout.start
+        self._bytes = file_bytes
+        self._numbers = [i for i, kind in enumerate(layout.kinds) if kind == "n"]
+        self._texts: dict[int, list[str]] = {i: [] for i, kind in enumerate(layout.kinds) if kind != "n"}
+        #: Cells that are no numbers in columns of numbers: column -> row -> text.
+        self._wrong: dict[int, dict[int, str]] = {}
+        self._values: FloatArray = np.empty((len(self._numbers), 0))
+        self._whole = len(self._numbers) == layout.width
+
+    def add(self, lines: list[str], *, last: bool) -> None:
+        """Take the next lines of the file; ``last`` says that there are no more."""
+        numbered = self._line
+        self._line += len(lines)
+        block = None if self._texts else self._fast(lines)
+        if block is None:
+            block = self._slow(lines, numbered, last)
+        n = block.shape[1]
+        self._reserve(n, sum(map(len, lines)))
+        self._values[:, self.n : self.n + n] = block
+        self.n += n
+
+    def _reserve(self, n: int, characters: int) -> None:
+        if self.n + n <= self._values.shape[1]:
+            return
+        expected = int(1.02 * self._bytes / max(1, characters) * n) + n
+        capacity = max(self.n + n, expected if not self.n else self._values.shape[1] * 5 // 4)
+        if (self.n + n) * 8 * max(1, len(self._numbers)) > MAX_BYTES:
+            raise InputError(
+                f"{self.path}: takes more than {MAX_BYTES / 1e9:g} GB of memory, expected at most that: cut it, or "
+                "leave out columns that are not needed"
+            )
+        grown = np.empty((len(self._numbers), capacity))
+        grown[:, : self.n] = self._values[:, : self.n]
+        self._values = grown
+
+    def _fast(self, lines: list[str]) -> FloatArray | None:
+        """(k, n) numbers by the compiled reader; None where a line is not k numbers."""
+        layout = self.layout
+        first = next((line for line in lines if line.strip()), None)
+        if first is None:
+            return np.empty((len(self._numbers), 0))
+        delimiter = None if layout.delimiter == " " else layout.delimiter
+        if not self._whole and delimiter is not None:
+            count = layout.width - 1
+            if any(line.count(delimiter) != count for line in lines if line.strip()):
+                return None
+        source = (line.replace(",", ".") for line in lines) if layout.decimal == "," else lines
+        usecols = None if self._whole else [layout.columns[i] for i in self._numbers]
+        try:
+            table = np.loadtxt(source, delimiter=delimiter, comments=None, quotechar='"', ndmin=2, usecols=usecols)
+        except ValueError:
+            return None
+        return table.T if table.shape[1] == len(self._numbers) else None
+
+    def _slow(self, lines: list[str], numbered: int, last: bool) -> FloatArray:
+        """The same cell by cell: empty ones become NaN, texts are kept, and a wrong row is named."""
+        layout = self.layout
+        rows: list[list[str]] = []
+        for k, line in enumerate(lines, numbered + 1):
+            if _is_comment(line):
+                continue
+            cells = split_cells(line.strip("\r\n"), layout.delimiter)
+            if len(cells) > layout.width and not any(cells[layout.width :]):
+                cells = cells[: layout.width]
+            if len(cells) < layout.width and layout.columns[-1] < len(cells):
+                cells += [""] * (layout.width - len(cells))
+            if len(cells) != layout.width:
+                if last and k == numbered + len(lines) and len(cells) < layout.width and not line.endswith("\n"):
+                    self.notes.append(f"the last line ({k}) is cut off and left out")
+                    continue
+                raise InputError(
+                    f"{self.path}: is not a table of {len(layout.columns)} columns: line {k} has {len(cells)} cells "
+                    f"({line.strip()[:60]!r}), expected {layout.width}"
+                )
+            rows.append(cells)
+        block = np.empty((len(self._numbers), len(rows)))
+        for at, i in enumerate(self._numbers):
+            block[at] = self._column(i, [row[layout.columns[i]] for row in rows])
+        for i, texts in self._texts.items():
+            texts.extend(row[layout.columns[i]] for row in rows)
+        return block
+
+    def _column(self, i: int, cells: list[str]) -> FloatArray:
+        comma = self.layout.decimal == ","
+        plain = [cell.replace(",", ".") for cell in cells] if comma else cells
+        try:
+            return np.array(plain, dtype=np.float64)
+        except ValueError:
+            pass
+        values = np.full(len(cells), np.nan)
+        for row, cell in enumerate(plain):
+            try:
+                values[row] = float(cell)
+            except ValueError:
+                if cell.casefold() not in _MISSING:
+                    self._wrong.setdefault(i, {})[self.n + row] = cells[row]
+        return values
+
+    def arrays(self) -> tuple[dict[str, NDArray[Any]], list[str]]:
+        """The columns by name, and the names of those that were times of day or dates and are now seconds."""
+        found: dict[str, NDArray[Any]] = {}
+        stamped = []
+        for i, name in enumerate(self.layout.names):
+            if i in self._texts:
+                found[name], times = _times_or_texts(self._texts[i])
+                stamped += [name] if times else []
+                continue
+            values: NDArray[Any] = self._values[self._numbers.index(i), : self.n]
+            if i in self._wrong:
+                values = values.astype(object)
+                for row, text in self._wrong[i].items():
+                    values[row] = text
+            found[name] = values
+        return found, stamped
+
+
+def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
+    """Dates or times of day (n,) as seconds since the first and True, or the texts and False."""
+    filled = [cell for cell in cells if cell]
+    if filled and all(_DATE.fullmatch(cell) for cell in filled):
+        try:
+            return seconds(np.array([cell or "NaT" for cell in cells], dtype="datetime64[ns]")), True
+        except ValueError:
+            return np.array(cells), False
+    if filled and all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
+        of_day = np.array(list(_seconds_of_day(cells)))
+        # Midnight is no step back.
+        days = np.concatenate([[0.0], np.cumsum(np.diff(of_day) < -43_200.0)]) * 86_400.0
+        return of_day + days - of_day[0], True
+    return np.array(cells), False
+
+
+def _seconds_of_day(cells: list[str]) -> Iterator[float]:
+    for cell in cells:
+        match = _TIME_OF_DAY.fullmatch(cell)
+        yield 3600.0 * int(match[1]) + 60.0 * int(match[2]) + float(match[3]) if match else np.nan
