@@ -23,8 +23,9 @@ TRACKED = [
 #: Abilities that are still found by name. A library's object or any exception may lack the attribute; nothing of ours.
 ATTRIBUTES_BY_NAME_AT_MOST = 5
 #: Attributes of libraries that the product sets: the output while a command redirects it, a C function's result type,
-#: and the clock of a process that runs with a shifted one. An object of ours changes itself, by its own methods.
-SET_ON_LIBRARIES = {"sys.stdout", "library.mallinfo2.restype", "time.time", "time.time_ns"}
+#: the clock of a process that runs with a shifted one, and whether pipython asks a controller for its errors. An object
+#: of ours changes itself, by its own methods.
+SET_ON_LIBRARIES = {"sys.stdout", "library.mallinfo2.restype", "time.time", "time.time_ns", "self._device.errcheck"}
 
 
 @pytest.fixture(scope="module")

@@ -58,6 +58,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "ask-diagnosis": _command(
         "operate", OPERATING, "let a running service diagnose its recent samples, in the background"
     ),
+    "epics": Command("service.adapters.epics", OPERATING, "show an axis as EPICS process variables, and take commands"),
     "access": _command(
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import zenoh
@@ -31,7 +31,7 @@ from service.client.follower import Follower
 from service.protocol.errors import BehindError, BusyError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
-from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference
+from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference, encode_samples
 from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
 
 # --- How a query continues from the answer before it: its memory, its last voltage, and what is under way.
@@ -232,6 +232,12 @@ class RetryingQueries:
 #: Longest time until an open session knows what is declared at its other end, s; until then queries get no reply.
 _SETTLE_S: Final = 0.5
 _SETTLE_PAUSE_S: Final = 0.05
+
+
+class Subscription(Protocol):
+    """A subscription of zenoh."""
+
+    def undeclare(self) -> None: ...
 
 
 class Client:
@@ -441,6 +447,32 @@ class Client:
         """Publish the desired motion, (n,) µm, at the samples ``seq``, ``seq + 1``, …; for diagnostics only."""
         payload = encode_reference(check_seq("seq", seq), y_um)
         self._session.put(self.keys.reference, payload, congestion_control=SURELY)
+
+    def samples(self, seq: ArrayLike, t_s: ArrayLike, u_V: ArrayLike, y_um: ArrayLike) -> None:
+        """Publish samples of the stage: what the service learns from.
+
+        Parameters
+        ----------
+        seq : (n,) sample numbers, rising, one for each sample time. t_s : (n,) their times, s.
+        u_V : (n,) voltages applied from these times on, V. y_um : (n,) readings of the sensor at these times, µm; NaN
+            where there is none.
+
+        May be called by another thread than the queries. Waits while the network is slow; nothing is dropped. Raises
+        InputError if the lengths differ.
+        """
+        self._session.put(
+            self.keys.sample, encode_samples(seq, t_s, u_V, y_um), express=True, congestion_control=SURELY
+        )
+
+    def subscribe_commands(self, receive: Callable[[bytes], None]) -> Subscription:
+        """Call ``receive`` with the payload of each message on ``.../command``, in a thread of zenoh.
+
+        For a stage, which applies them (:class:`service.adapters.StageLoop`). ``undeclare()`` of the result ends it.
+        """
+        subscriber: Subscription = self._session.declare_subscriber(
+            self.keys.command, lambda sample: receive(sample.payload.to_bytes())
+        )
+        return subscriber
 
     def _known(self) -> dict[str, Any]:
         return self._status or self.status()

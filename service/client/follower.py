@@ -22,8 +22,8 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import carried, derivatives, trust_by_age, under_way
-from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits, check_domain, check_voltages, limit_voltage
+from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
+from service.answers.guard import Limits, check_domain, check_voltages, guard, limit_voltage
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
@@ -37,6 +37,10 @@ from service.protocol.query import (
     FeedforwardQuery,
     Trajectory,
 )
+from service.protocol.samples import column
+
+#: Voltage below which what fades has faded, V.
+_FADED_V: Final = 1e-9
 
 #: Changes that are kept while a whole model is fetched. Later ones are dropped and need another fetch.
 _KEPT_CHANGES: Final = 1024
@@ -255,6 +259,8 @@ class Follower:
             self._newest[0].memory.copy() if memory is None else np.array(memory, dtype=np.float64).reshape(-1)
         )
         self._u_before_V = math.nan
+        #: What is still added to the next voltage since the memory was resynchronised, V.
+        self._fade_V = 0.0
         self.last_flags = 0
         self.last_std_V = math.nan
         self.last_trajectory: Trajectory | None = None
@@ -351,6 +357,8 @@ class Follower:
         if not (math.isfinite(u) and (within or not message.safety.blends) and trust == 1.0):
             return float(self._safely(_arrays(motion)).u_V[0])
         self.memory = after
+        if self._fade_V:
+            u += self._faded(1).item()
         step_V = limits.slew_V_per_s * model.dt_s
         u, flags = limit_voltage(u, self._u_before_V, limits.u_min_V, limits.u_max_V, step_V)
         flags |= (0 if within else OUTSIDE_DOMAIN) | (STALE if stale else 0)
@@ -371,6 +379,52 @@ class Follower:
         check_domain(y, self.limits)
         self.last_trajectory = got = self._safely((y, v, a))
         return got.u_V, got.flags
+
+    def resynchronise(self, seq: ArrayLike, u_V: ArrayLike, y_um: ArrayLike) -> None:
+        """Take the hysteresis memory that the service tracks, and advance it along measured samples to now.
+
+        Removes what a disturbance, or a motion that the stage did not follow, left in :attr:`memory`. What that
+        changes in the voltage fades in over some samples, so that it makes no step.
+
+        Parameters
+        ----------
+        seq : (n,) sample numbers, rising, up to the sample before the next point. Begin at or before the one after
+            :attr:`snapshot_seq`: two samples before it give velocity and acceleration. Over numbers that are missing
+            the memory goes straight, and is wrong where the stage turned meanwhile.
+        u_V, y_um : (n,) voltages that were applied, V, and readings, µm. Samples that are not finite are left out.
+
+        Raises FieldError if the lengths differ or the numbers do not rise; then nothing changes.
+        """
+        message = self._newest[0]
+        model = message.model
+        numbers, u, y = np.atleast_1d(np.asarray(seq, dtype=np.int64)), column("u_V", u_V), column("y_um", y_um)
+        if not numbers.size == u.size == y.size:
+            raise FieldError("u_V, y_um", f"{u.size} and {y.size} values", f"{numbers.size}, as many as seq")
+        if numbers.size > 1 and not (np.diff(numbers) > 0).all():
+            raise FieldError("seq", f"{numbers[:5].tolist()} ...", "rising sample numbers")
+        ok = np.isfinite(u) & np.isfinite(y)
+        numbers, u, y = numbers[ok], u[ok], y[ok]
+        if not numbers.size:
+            return
+        # Backward differences, as the service takes them.
+        step_s = np.diff(numbers) * model.dt_s
+        v = np.concatenate([[0.0], np.diff(y) / step_s])
+        a = np.concatenate([[0.0], np.diff(v) / step_s])
+        new = numbers > message.snapshot_seq
+        memory = message.memory if message.snapshot_seq >= 0 else model.rest_memory(float(y[0]))
+        memory = model.track(y[new], v[new], a[new], u[new], memory)
+        last = _arrays((float(y[-1]), 0.0, 0.0))
+        if math.isfinite(self._u_before_V) and self.memory.size == memory.size:
+            change_V = [model.feedforward(*last, m).u_V.item(0) for m in (self.memory, memory)]
+            step_V = change_V[0] - change_V[1]
+            self._fade_V += step_V if math.isfinite(step_V) else 0.0
+        self.memory, self._u_before_V = memory.copy(), float(u[-1])
+
+    def _faded(self, n: int) -> FloatArray:
+        """(n,) what is still added to the next n voltages after a resynchronisation, V."""
+        left = self._fade_V * np.exp(-np.arange(1, n + 1) / max(FADE_S / self.model.dt_s, FADE_SAMPLES))
+        self._fade_V = float(left[-1]) if abs(left[-1]) > _FADED_V else 0.0
+        return left
 
     @property
     def source(self) -> str:
@@ -410,6 +464,11 @@ class Follower:
         safety = message.safety
         rules = Rules(self.limits, safety.blend_share, *self._standing())
         got = answer_safely(message.model, self.memory, points, self._u_before_V, rules, safety.stand_in, safety.blends)
+        if self._fade_V:
+            inside = (got.flags & OUTSIDE_DOMAIN) == 0
+            faded_V = got.u_V + self._faded(inside.size)
+            u_V, flags = guard(faded_V, inside, message.model.dt_s, self.limits, self._u_before_V)
+            got = got._replace(u_V=u_V, flags=got.flags | flags)
         self.memory, self._u_before_V = got.memory, float(got.u_V[-1])
         self._answered, self._stand_in = message.model, got.stand_in
         self.last_flags, self.last_std_V = int(got.flags[-1]), float(got.std_V[-1])

@@ -53,8 +53,7 @@ def next_seq(client: Client) -> int:
 def teach(client: Client, first: int, n: int) -> None:
     k = np.arange(first, first + n)
     y = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * k * DT_S)
-    payload = wire.encode_samples(k, k * DT_S, (y - 1.0) / (11.0 * 0.95), y)
-    client._session.put(client.keys.sample, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+    client.samples(k, k * DT_S, (y - 1.0) / (11.0 * 0.95), y)
 
 
 def test_points_and_trajectories_continue_each_other(client: Client) -> None:

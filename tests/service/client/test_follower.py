@@ -14,6 +14,7 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.competition.champion import ChampionInverse
+from service.answers.answering import MemoryTracker
 from service.answers.guard import Limits
 from service.client.follower import Follower
 from service.config.settings import AxisConfig
@@ -174,3 +175,75 @@ def test_a_voltage_that_nobody_gave_has_no_source() -> None:
     assert follower.point(41.0) == held
     assert follower.last_flags & NOT_FINITE_REPLACED
     assert follower.source == ""
+
+
+def moved(n: int) -> tuple[Any, FloatArray, FloatArray]:
+    """(numbers, voltages, readings) of a stage that moves as it was told, with a turn on the way."""
+    k = np.arange(n)
+    y = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * k * 1e-3)
+    return k, (y - 1.0) / 11.0, y
+
+
+def snapshot_after(model: Any, n: int) -> bytes:
+    """What the service publishes once it has tracked the first n of the samples."""
+    tracker = MemoryTracker(model.dt_s)
+    for sample in zip(*(column[:n].tolist() for column in moved(n)), strict=True):
+        tracker.add(*sample)
+    memory = tracker.advance({"": model}, {"": np.empty(0)})[""]
+    return encode_model("lssvm_adaptive", model, n - 1, memory)
+
+
+def test_a_resynchronised_memory_is_that_of_the_service_after_the_same_samples() -> None:
+    model = make_models()["lssvm_adaptive"]
+    follower = Follower(Session(), None, "lssvm_adaptive", lambda: snapshot_after(model, 200), LIMITS)  # type: ignore[arg-type]
+    seq, u_V, y_um = moved(320)
+    follower.resynchronise(seq[150:], u_V[150:], y_um[150:])
+    now = decode_model(snapshot_after(model, 320)).memory
+    np.testing.assert_allclose(follower.memory, now, rtol=0, atol=1e-9)
+    assert np.abs(follower.memory - decode_model(snapshot_after(model, 200)).memory).max() > 1e-3
+    # Samples that are no numbers, and samples from before the snapshot alone, change nothing.
+    with_a_hole = y_um.copy()
+    with_a_hole[260] = math.nan
+    follower.resynchronise(seq[150:], u_V[150:], with_a_hole[150:])
+    np.testing.assert_allclose(follower.memory, now, rtol=0, atol=0.2)
+    follower.resynchronise(seq[150:200], u_V[150:200], y_um[150:200])
+    np.testing.assert_array_equal(follower.memory, decode_model(snapshot_after(model, 200)).memory)
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_what_resynchronising_changes_fades_in(blocks: bool) -> None:
+    """The follower's memory went another way than the stage: the voltage approaches the right one without a step."""
+    model = make_models()["lssvm_adaptive"]
+    wide = Limits(-50.0, 50.0, math.inf, -50.0, 150.0)
+    wrong, right = (
+        Follower(Session(), None, "lssvm_adaptive", lambda: snapshot_after(model, 200), wide)  # type: ignore[arg-type]
+        for _ in range(2)
+    )
+    seq, u_V, y_um = moved(300)
+    for follower in (wrong, right):
+        follower.resynchronise(seq[150:], u_V[150:], y_um[150:])
+    y = float(y_um[-1])
+    wrong.memory = wrong.memory + 3.0
+    before = wrong.point(y)
+    wrong.resynchronise(seq[150:], u_V[150:], y_um[150:])
+    if blocks:
+        got, wanted = wrong.trajectory(np.full(80, y))[0], right.trajectory(np.full(80, y))[0]
+    else:
+        got, wanted = (np.array([f.point(y) for _ in range(80)]) for f in (wrong, right))
+    step = before - wanted[0]
+    assert abs(step) > 1e-4
+    difference = got - wanted
+    assert difference[0] == pytest.approx(step * math.exp(-1 / 6), rel=0.05)
+    assert (np.diff(np.abs(difference[:40])) < 0.0).all()
+    assert abs(difference[-1]) < 1e-5 * abs(step) + 1e-8
+
+
+def test_samples_that_do_not_belong_together_resynchronise_nothing() -> None:
+    model = make_models()["lssvm_adaptive"]
+    follower = Follower(Session(), None, "lssvm_adaptive", lambda: snapshot_after(model, 20), LIMITS)  # type: ignore[arg-type]
+    before = follower.memory.copy()
+    with pytest.raises(InputError, match="u_V, y_um"):
+        follower.resynchronise([20, 21], [1.0, 1.0], [30.0])
+    with pytest.raises(InputError, match="rising"):
+        follower.resynchronise([21, 20], [1.0, 1.0], [30.0, 31.0])
+    np.testing.assert_array_equal(follower.memory, before)

@@ -21,8 +21,9 @@ from service.cli.commands.stage import parse_change
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
+from service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, SampleRing, Sender
 from service.stage_node.faults import fault_key
-from service.stage_node.node import MAX_MESSAGE, RING_SIZE, CommandBuffer, NodeConfig, SampleRing, Sender, status_key
+from service.stage_node.node import NodeConfig, status_key
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 

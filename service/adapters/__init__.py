@@ -1,0 +1,36 @@
+"""A stage of your own on the wire: an adapter for its controller, and the loop that runs it.
+
+    from service.adapters import StageLoop
+    from service.adapters.pi import PiStage
+    from service.client import Client
+
+    with PiStage("192.168.0.10", axis="1", rate_Hz=200.0) as stage, Client.connect() as client:
+        StageLoop(stage, client).run()  # publishes samples and applies the voltages of .../command
+
+`StageAdapter` says what an adapter has to offer; write your own for any controller. Ready ones, through the vendors'
+own libraries: `service.adapters.pi`, `service.adapters.jena`, `service.adapters.ni`. Names are loaded on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from adaptive.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from service.adapters.adapter import AdapterError, StageAdapter
+    from service.adapters.recording import excitation, record, write_recording
+    from service.adapters.stage_loop import StageLoop
+
+__all__ = ["AdapterError", "StageAdapter", "StageLoop", "excitation", "record", "write_recording"]
+
+_MODULES: Final = {
+    "AdapterError": "adapter",
+    "StageAdapter": "adapter",
+    "StageLoop": "stage_loop",
+    "excitation": "recording",
+    "record": "recording",
+    "write_recording": "recording",
+}
+
+__getattr__ = lazy_names(__name__, _MODULES)

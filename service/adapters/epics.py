@@ -1,0 +1,222 @@
+"""``dehyst epics``: one axis of a service as EPICS process variables, over PVAccess, through `p4p`.
+
+| variable | type | |
+|---|---|---|
+| ``PREFIX:STATUS`` | string | ``ok``, ``stale``, ``frozen``, ``no_service``, or the name of the trouble |
+| ``PREFIX:TRUST`` | double | weight of the learning model, 0 to 1 |
+| ``PREFIX:MODEL_ERROR`` | double, % | recent error of the learning model, in percent of the voltage span |
+| ``PREFIX:SAMPLE`` | long | number of the last sample that the service has handled |
+| ``PREFIX:SERVED`` | string | the model that answers where a query names none |
+| ``PREFIX:FREEZE`` | bool, writable | 1 stops learning, 0 lets it go on |
+| ``PREFIX:ENABLE`` | bool, writable | 0 serves the mean gain (``linear``), 1 the model that was served before |
+
+Variables of an axis whose service does not answer have the alarm INVALID. Sources: documentation of p4p 4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, Final
+
+import zenoh
+
+from adaptive.errors import DehystError
+from service.adapters.adapter import load_library
+from service.cli.options import add_connection, add_epilog, add_shared
+from service.operating.remote import operate
+from service.protocol.errors import FieldError, ServiceError
+from service.protocol.keys import AUTO, Keys
+from service.runtime.session import is_loopback, open_client
+from service.runtime.stopping import StopSignal
+
+EPILOG = """\
+The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
+PVAccess knows no passwords: everybody who reaches the address may freeze the axis. Needs p4p (pip install p4p).
+
+  dehyst epics --prefix LAB:STAGE:X
+"""
+#: The model that ENABLE = 0 serves.
+PLAIN: Final = "linear"
+_OK, _MAJOR, _INVALID = 0, 2, 3
+#: Name, type of p4p, and unit of the variables.
+_READ: Final = (
+    ("STATUS", "s", ""),
+    ("TRUST", "d", ""),
+    ("MODEL_ERROR", "d", "%"),
+    ("SAMPLE", "l", ""),
+    ("SERVED", "s", ""),
+)
+_WRITTEN: Final = ("FREEZE", "ENABLE")
+
+
+class EpicsAxis:
+    """The process variables of one axis. Use as a context manager, and call :meth:`poll` once a period.
+
+    Parameters
+    ----------
+    session, keys : of the service. prefix : of the variables' names.
+    interface, port : where PVAccess listens; port 0 takes a free one. isolate : do not announce it to the network.
+
+    Raises AdapterError if p4p is missing.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, prefix: str, interface: str = "127.0.0.1", port: int = 5075,
+        timeout_s: float = 2.0,
+    ) -> None:  # fmt: skip
+        self._session, self._keys, self._timeout_s = session, keys, timeout_s
+        server = load_library("p4p.server", "p4p")
+        threads = load_library("p4p.server.thread", "p4p")
+        scalars = load_library("p4p.nt", "p4p")
+        self._variables: dict[str, Any] = {}
+        #: The model that ENABLE = 1 serves.
+        self._enabled_model = AUTO
+        for name, kind, unit in _READ:
+            self._variables[name] = _variable(threads, scalars, kind, unit)
+        for name, command in zip(_WRITTEN, (self._freeze, self._enable), strict=True):
+            self._variables[name] = _variable(threads, scalars, "?", "")
+            self._variables[name].put(_handler(command))
+        provider = server.StaticProvider("dehyst")
+        for name, variable in self._variables.items():
+            provider.add(f"{prefix}:{name}", variable)
+        local = {
+            "EPICS_PVAS_INTF_ADDR_LIST": interface, "EPICS_PVAS_SERVER_PORT": str(port),
+            "EPICS_PVAS_BROADCAST_PORT": str(port + 1 if port else 0),
+            "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_PVAS_BEACON_ADDR_LIST": interface,
+        }  # fmt: skip
+        self._server = server.Server(providers=[provider], conf=local, useenv=False)
+
+    def __enter__(self) -> EpicsAxis:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.stop()
+
+    @property
+    def configuration(self) -> dict[str, str]:
+        """Settings of the server, by the names of EPICS (``EPICS_PVAS_SERVER_PORT``, ...)."""
+        return dict(self._server.conf())
+
+    def poll(self) -> str:
+        """Read the status of the axis once and post it; returns what STATUS shows."""
+        try:
+            status = self._status()
+        except ServiceError as error:
+            for name in (*(name for name, *_ in _READ), *_WRITTEN):
+                self._post(name, None, _INVALID, str(error))
+            self._post("STATUS", "no_service", _INVALID, str(error))
+            return "no_service"
+        shown = str(status["trouble"] or ("frozen" if status["frozen"] else "stale" if status["stale"] else "ok"))
+        severity = _OK if shown in ("ok", "frozen") else _MAJOR
+        served = str(status["served"])
+        if served != PLAIN:
+            self._enabled_model = served
+        error_pct = (status["quality"] or {}).get("recent_rms_error_pct")
+        values = {
+            "STATUS": shown,
+            "TRUST": float(status["trust"]),
+            "MODEL_ERROR": math.nan if error_pct is None else float(error_pct),
+            "SAMPLE": int(status["seq"]),
+            "SERVED": served,
+            "FREEZE": bool(status["frozen"]),
+            "ENABLE": served != PLAIN,
+        }
+        for name, value in values.items():
+            self._post(name, value, severity, "" if severity == _OK else shown)
+        return shown
+
+    def _status(self) -> dict[str, Any]:
+        for reply in self._session.get(self._keys.status, timeout=self._timeout_s):
+            if reply.ok is not None:
+                status = json.loads(reply.ok.payload.to_bytes())
+                if isinstance(status, dict) and "trust" in status:
+                    return status
+        raise ServiceError(f"{self._keys.base}: no reply within {self._timeout_s:g} s; is the service running?")
+
+    def _post(self, name: str, value: Any, severity: int, message: str) -> None:
+        variable = self._variables[name]
+        if value is None:
+            value = variable.current().raw.value
+        variable.post(value, timestamp=time.time(), severity=severity, message=message[:80])
+
+    def _freeze(self, on: bool) -> None:
+        operate(self._session, self._keys, "freeze" if on else "thaw", "epics", timeout_s=self._timeout_s)
+        self.poll()
+
+    def _enable(self, on: bool) -> None:
+        model = self._enabled_model if on else PLAIN
+        operate(self._session, self._keys, "select", "epics", {"model": model}, self._timeout_s)
+        self.poll()
+
+
+def _variable(threads: ModuleType, scalars: ModuleType, kind: str, unit: str) -> Any:
+    scalar = scalars.NTScalar(kind, display=kind in "dl")
+    initial: Any = {"s": "", "d": math.nan, "l": -1, "?": False}[kind]
+    variable = threads.SharedPV(nt=scalar, initial={"value": initial, **({"display.units": unit} if unit else {})})
+    return variable
+
+
+def _handler(command: Callable[[bool], None]) -> Callable[[Any, Any], None]:
+    def put(_: Any, operation: Any) -> None:
+        try:
+            command(bool(operation.value()))
+        except DehystError as error:
+            operation.done(error=str(error))
+        else:
+            operation.done()
+
+    return put
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``dehyst epics``."""
+    add_epilog(parser, EPILOG)
+    add = parser.add_argument
+    add("--prefix", required=True, metavar="NAME", help="of the variables' names, such as LAB:STAGE:X")
+    add_shared(parser, "stage", "axis")
+    add_connection(parser, wait_s=10.0, timeout_s=2.0)
+    add("--interface", default="127.0.0.1", metavar="ADDRESS", help="address where PVAccess listens (%(default)s)")
+    add(
+        "--port",
+        type=int,
+        default=5075,
+        metavar="N",
+        help="its TCP port; names are searched at the next one (%(default)s)",
+    )
+    add(
+        "--every", type=float, default=1.0, metavar="S", help="time between two readings of the status, s (%(default)s)"
+    )
+    add_shared(parser, "insecure-beyond-loopback", "duration")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the variables until Ctrl-C or SIGTERM. Returns 0."""
+    stop = StopSignal()
+    if not (math.isfinite(args.every) and args.every > 0.0):
+        raise FieldError("--every", args.every, "a positive time in s")
+    if not 1 <= args.port <= 65534:
+        raise FieldError("--port", args.port, "1 to 65534")
+    if not args.insecure_beyond_loopback and not is_loopback(f"tcp/{args.interface}:{args.port}"):
+        raise FieldError(
+            "--interface", repr(args.interface), "an address of this machine, such as 127.0.0.1",
+            "PVAccess has no passwords: with --insecure-beyond-loopback everybody there may freeze the axis",
+        )  # fmt: skip
+    keys = Keys(args.stage, args.axis)
+    session = open_client(args.endpoint, args.wait, args.zenoh_config)
+    try:
+        with EpicsAxis(session, keys, args.prefix, args.interface, args.port, args.timeout) as axis:
+            shown = axis.poll()
+            print(f"ready: {args.prefix}:STATUS {shown} at {args.interface}, port {args.port}", flush=True)
+            until = math.inf if args.duration is None else time.monotonic() + args.duration
+            while not stop.reason and time.monotonic() < until:
+                stop.wait(min(args.every, max(0.0, until - time.monotonic())))
+                if not stop.reason:
+                    axis.poll()
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    return 0

@@ -1,0 +1,206 @@
+"""Runs a real stage beside a service: reads, applies, publishes, one sample each sample time."""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from adaptive.types import FloatArray
+from service.adapters.adapter import AdapterError, StageAdapter, Ticks, asked, check_range
+from service.client.client import Client
+from service.protocol.errors import FieldError
+from service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, Sender
+
+#: (sample number, reading at that instant, µm) -> voltage from that instant on, V.
+Control = Callable[[int, float], float]
+#: Relative difference of two sample times from which they count as different.
+_SAME_RATE: Final = 1e-6
+#: Samples that are kept, for a slow network and for resynchronising: half a minute at 1 kHz.
+KEPT: Final = RING_SIZE
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSummary:
+    """What a run did.
+
+    Attributes
+    ----------
+    samples : taken. late : sample times at which the loop was too late (`service.adapters.adapter.LATE_SHARE`): they
+        are no samples. worst_late_ms : lateness of the samples, ms.
+    limited : voltages changed by the limits of voltage or slew rate. published, lost : samples by the network.
+    missing : voltages that had not come in time, where they come over the network.
+    """
+
+    samples: int
+    late: int
+    worst_late_ms: float
+    limited: int
+    published: int
+    lost: int
+    missing: int
+
+
+class SampleLog:
+    """The last `KEPT` samples, written by the loop, sent by another thread.
+
+    Samples that waited for longer than that are lost and counted.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self.written = self.published = self.lost = 0
+        self._client = client
+        self._seq = np.zeros(KEPT, dtype=np.int64)
+        self._t_s, self._u_V, self._y_um = np.zeros(KEPT), np.zeros(KEPT), np.zeros(KEPT)
+        self._sent = 0
+
+    def write(self, seq: int, t_s: float, u_V: float, y_um: float) -> None:
+        """Write a sample; numbers rise, with gaps where the loop was late."""
+        slot = self.written % KEPT
+        self._seq[slot], self._t_s[slot], self._u_V[slot], self._y_um[slot] = seq, t_s, u_V, y_um
+        self.written += 1
+
+    def since(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+        """(numbers, V, µm), (n,) each, of the samples from number ``seq`` on, as far as kept. For the loop's thread."""
+        first = self.written
+        while first > max(self.written - KEPT, 0) and self._seq[(first - 1) % KEPT] >= seq:
+            first -= 1
+        slots = np.arange(first, self.written) % KEPT
+        return self._seq[slots], self._u_V[slots], self._y_um[slots]
+
+    def send(self) -> bool:
+        """Send what waits, at most `MAX_MESSAGE` samples in one message. Returns whether more is left."""
+        end = self.written
+        # The slots that the loop writes next are left alone.
+        oldest = end - KEPT + MAX_MESSAGE
+        if self._sent < oldest:
+            self.lost += oldest - self._sent
+            self._sent = oldest
+        n = min(end - self._sent, MAX_MESSAGE)
+        if n <= 0:
+            return False
+        slots = np.arange(self._sent, self._sent + n) % KEPT
+        self._sent += n
+        try:
+            self._client.samples(self._seq[slots], self._t_s[slots], self._u_V[slots], self._y_um[slots])
+        except zenoh.ZError:
+            self.lost += n
+        else:
+            self.published += n
+        return self._sent < end
+
+    def finish(self) -> None:
+        """Nothing is held back."""
+
+
+class StageLoop:
+    """Turns an adapter into the stage of one axis of a service.
+
+    At each sample time the position is read, then the voltage of that sample is applied. The sample (number, time,
+    applied voltage, reading) is published by a thread of its own, so that a slow network delays no reading. A sample
+    that is read too late is not published, because the service would learn a position that belongs to another time.
+    Every voltage is kept within the limits of the adapter and of the service, and within the slew limit from the
+    voltage that was applied before the run.
+
+    Parameters
+    ----------
+    adapter : the stage. Its rate must be that of the served model; raises FieldError where it is not.
+    client : connected to the axis; the loop only publishes with it, so that another thread may query.
+    first : number of the first sample; None continues after the last one that the service has handled.
+    """
+
+    def __init__(self, adapter: StageAdapter, client: Client, first: int | None = None) -> None:
+        low_V, high_V = check_range(adapter)
+        limits = client.limits
+        self.dt_s = client.dt_s
+        if abs(adapter.rate_Hz * self.dt_s - 1.0) > _SAME_RATE:
+            raise FieldError(
+                "rate_Hz", f"{adapter.rate_Hz:g} Hz", f"{1 / self.dt_s:g} Hz, the rate of the served model",
+                "record and identify at the rate at which the stage runs",
+            )  # fmt: skip
+        self._low_V, self._high_V = max(low_V, limits.u_min_V), min(high_V, limits.u_max_V)
+        if not self._low_V < self._high_V:
+            raise FieldError(
+                "u_min_V, u_max_V", f"{low_V:g} to {high_V:g} V of the adapter",
+                f"a range that overlaps {limits.u_min_V:g} to {limits.u_max_V:g} V of the service",
+            )  # fmt: skip
+        self.first = int(client.status()["seq"]) + 1 if first is None else first
+        self._step_V = limits.slew_V_per_s * self.dt_s
+        self._adapter, self._client = adapter, client
+        self._next = self.first
+        self._stop = False
+        self._limited = 0
+        self._log = SampleLog(client)
+        self._commands = CommandBuffer(begin=self.first)
+
+    def stop(self) -> None:
+        """End the run before the next sample; callable from any thread or signal handler."""
+        self._stop = True
+
+    def measured(self, seq: int) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+        """(numbers, voltages V, readings µm), (n,) each, of the last samples from number ``seq`` on.
+
+        The last `KEPT` samples are kept. For ``Follower.resynchronise``, and for a controller that closes a loop.
+        """
+        return self._log.since(seq)
+
+    def run(self, control: Control | None = None, samples: int | None = None) -> LoopSummary:
+        """Run until ``samples`` sample times have passed, :meth:`stop` or an error; then the last voltage stays.
+
+        Parameters
+        ----------
+        control : gives the voltage of each sample. None: the voltages published on ``.../command``; until the first
+            one comes, the stage keeps its voltage.
+
+        Raises AdapterError where the stage does not answer, and what ``control`` raises. Samples taken until then are
+        published.
+        """
+        subscriber = None if control is not None else self._client.subscribe_commands(self._commands.receive)
+        sender = Sender([self._log])
+        ticks = Ticks(1.0 / self.dt_s, samples, lambda: self._stop)
+        begin = self._next
+        gc.collect()
+        try:
+            u_V = asked(self._adapter.applied_V)
+            if not math.isfinite(u_V):
+                raise AdapterError(f"applied_V: got {u_V}, expected the voltage that is applied now, in V")
+            self._commands.hold(u_V)
+            for k, t_s, late in ticks:
+                seq = begin + k
+                y_um = asked(self._adapter.read_um)
+                u_V = self._limit(self._commanded(seq) if control is None else control(seq, y_um), u_V)
+                asked(self._adapter.write_V, u_V)
+                self._next = seq + 1
+                if not late:
+                    self._log.write(seq, begin * self.dt_s + t_s, u_V, y_um)
+                    sender.wake()
+        finally:
+            sender.close()
+            if subscriber is not None:
+                subscriber.undeclare()
+        return LoopSummary(
+            self._log.written, ticks.late, 1e3 * ticks.worst_late_s, self._limited,
+            self._log.published, self._log.lost, self._commands.counts["missing"],
+        )  # fmt: skip
+
+    def _commanded(self, seq: int) -> float:
+        """The voltage that was published for sample ``seq``; where none was, the last one before."""
+        for k in range(self._next, seq):
+            self._commands.take(k)
+        return self._commands.take(seq)
+
+    def _limit(self, wanted_V: float, before_V: float) -> float:
+        if not math.isfinite(wanted_V):
+            wanted_V = before_V
+        # Outside the range only at the start: the way back is a ramp too.
+        low_V, high_V = min(self._low_V, before_V), max(self._high_V, before_V)
+        u_V = min(max(wanted_V, self._low_V), self._high_V)
+        u_V = min(max(u_V, before_V - self._step_V, low_V), before_V + self._step_V, high_V)
+        self._limited += u_V != wanted_V
+        return u_V

@@ -1,0 +1,209 @@
+"""What every stage on the wire needs: voltages in by sequence number, samples out by a thread of their own.
+
+A simulated stage (`service.stage_node.node`) and a real one (`service.adapters`) share it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from service.protocol import samples as wire
+from service.protocol.errors import FieldError
+from service.stage_node.faults import Injector
+
+# --- The commands of a stage node: voltages by sequence number. Late and missing ones are counted.
+
+#: Commands for more than this many ticks ahead are refused.
+AHEAD = 65_536
+
+
+class CommandBuffer:
+    """Voltages by sequence number, written by zenoh's thread and read by the loop.
+
+    A ring of values and of their sequence numbers: a slot whose number differs from the one asked for is empty for it.
+    The value is written before its number, so that the reader never sees half a command. ``begin`` is the first tick;
+    its command sets ``first``.
+    """
+
+    def __init__(self, size: int = AHEAD, begin: int = 0) -> None:
+        self.size = size
+        self.begin = begin
+        self.counts = {"blocks": 0, "voltages": 0, "late": 0, "missing": 0, "refused": 0}
+        self.first = threading.Event()
+        self.error = ""
+        self._values = np.zeros(size)
+        self._numbers = np.full(size, -1, dtype=np.int64)
+        self._next = begin
+        self._last_V = 0.0
+
+    def receive(self, payload: bytes) -> None:
+        """Take a message. A malformed one is counted, and the error text of the last one is kept."""
+        try:
+            self.put(wire.decode_command(payload))
+        except InputError as error:
+            self.counts["refused"] += 1
+            self.error = str(error)
+
+    def put(self, block: wire.Block) -> None:
+        """Take voltages from ``block.seq`` on. Voltages for past ticks are counted as late.
+
+        Raises FieldError if the block ends beyond the ring.
+        """
+        now = self._next
+        if block.seq + len(block) > now + self.size:
+            raise FieldError("seq", block.seq + len(block) - 1, f"at most {now + self.size - 1}, the ring's end")
+        self.counts["blocks"] += 1
+        self.counts["voltages"] += len(block)
+        numbers = np.arange(block.seq, block.seq + len(block))
+        fresh = numbers >= now
+        self.counts["late"] += int(len(numbers) - np.count_nonzero(fresh))
+        slots = numbers[fresh] % self.size
+        self._values[slots] = block.values[fresh]
+        self._numbers[slots] = numbers[fresh]
+        if block.seq == self.begin:
+            self.first.set()
+
+    def hold(self, u_V: float) -> None:
+        """Repeat this voltage, V, until the first command is due."""
+        self._last_V = u_V
+
+    def take(self, k: int) -> float:
+        """The voltage for tick k, V; if none came in time the last one, counted as missing."""
+        self._next = k + 1
+        slot = k % self.size
+        if self._numbers.item(slot) == k:
+            self._last_V = self._values.item(slot)
+        elif self.counts["blocks"]:
+            self.counts["missing"] += 1
+        return self._last_V
+
+
+# --- Sends the samples of a stage node, apart from the loop that keeps its clock.
+#
+# The loop writes each sample into a ring; the thread ``stage-sender`` sends what has collected. On a slow network the
+# messages grow and the clock keeps its time. If the network stalls for longer than the ring lasts, samples are lost and
+# counted.
+
+#: Samples that may wait to be sent: half a minute at 1 kHz.
+RING_SIZE: Final = 32_768
+#: Longest message in samples, and the distance of the sender from the slot that the loop writes.
+MAX_MESSAGE: Final = 4096
+
+
+class SampleRing:
+    """Samples by number, written by one thread and sent by another.
+
+    ``injector`` may change the messages. Samples that it leaves out count neither as published nor as lost; samples
+    that it sends twice count twice as published.
+    """
+
+    def __init__(
+        self, dt_s: float, put: Callable[[bytes], None], injector: Injector | None = None, begin: int = 0
+    ) -> None:
+        self.dt_s = dt_s
+        self.published = 0
+        self.lost = 0
+        self._injector = injector
+        self._put = put
+        self._u_V: FloatArray = np.zeros(RING_SIZE)
+        self._y_um: FloatArray = np.zeros(RING_SIZE)
+        self._written = begin
+        self._sent = begin
+
+    def write(self, k: int, u_V: float, y_um: float) -> None:
+        """Write sample k; samples come in order, without gaps, from ``begin`` on."""
+        slot = k % RING_SIZE
+        self._u_V[slot] = u_V
+        self._y_um[slot] = y_um
+        self._written = k + 1
+
+    def send(self) -> bool:
+        """Send what waits, at most ``MAX_MESSAGE`` samples in one message. Returns whether more is left."""
+        end = self._written
+        oldest = end - RING_SIZE + MAX_MESSAGE
+        if self._sent < oldest:
+            self.lost += oldest - self._sent
+            self._sent = oldest
+        n = min(end - self._sent, MAX_MESSAGE)
+        if n <= 0:
+            return False
+        seq = np.arange(self._sent, self._sent + n, dtype=np.int64)
+        slots = seq % RING_SIZE
+        rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
+        self._sent += n
+        for message in [rows] if self._injector is None else self._injector.deliver(rows):
+            self._send(*message)
+        return self._sent < end
+
+    def finish(self) -> None:
+        """Send what a fault holds back."""
+        for message in [] if self._injector is None else self._injector.flush():
+            self._send(*message)
+
+    def _send(self, seq: NDArray[np.int64], t_s: FloatArray, u_V: FloatArray, y_um: FloatArray) -> None:
+        try:
+            self._put(wire.encode_samples(seq, t_s, u_V, y_um))
+        except zenoh.ZError:
+            self.lost += len(seq)
+        else:
+            self.published += len(seq)
+
+
+class Outbox(Protocol):
+    """Samples that wait to be sent: ``send`` sends one message of them and returns whether more is left."""
+
+    def send(self) -> bool: ...
+
+    def finish(self) -> None:
+        """Called once, after the last ``send``."""
+        ...
+
+
+class Sender:
+    """The thread ``stage-sender``: it empties the rings and calls ``status`` when the loop asks for it."""
+
+    def __init__(self, rings: Sequence[Outbox], status: Callable[[], None] = lambda: None) -> None:
+        self._rings = rings
+        self._status = status
+        self._wake = threading.Event()
+        self._status_due = False
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="stage-sender", daemon=True)
+        self._thread.start()
+
+    def wake(self, *, status: bool = False) -> None:
+        """Wake the thread: there are samples to send, and with ``status`` a status too."""
+        if status:
+            self._status_due = True
+        self._wake.set()
+
+    def close(self, timeout_s: float = 10.0) -> bool:
+        """Send what waits and end the thread. Returns False if that took longer than ``timeout_s``."""
+        self._closing = True
+        self._wake.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            closing = self._closing
+            # Each ring sends one message before any sends a second one.
+            while any([ring.send() for ring in self._rings]):
+                pass
+            if self._status_due:
+                self._status_due = False
+                self._status()
+            if closing:
+                for ring in self._rings:
+                    ring.finish()
+                return
