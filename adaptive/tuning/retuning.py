@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from adaptive.errors import InputError, NumericsError
 from adaptive.online.kernel_window import SAME
@@ -55,10 +56,15 @@ def bounds_of(hyper: Hyperparameters, config: RetuneConfig) -> tuple[FloatArray,
 def propose(data: WindowData, config: RetuneConfig | None = None, search: Search | None = None) -> Proposal:
     """The hyper-parameters with the best evidence on ``data``, or the present ones where none are better.
 
-    ``search`` gives the starts in place of `pattern`. Raises InputError on too few samples or targets that are all
-    equal, NumericsError where the present values cannot be evaluated.
+    With one BLAS thread, as `adaptive.tuning.search.infer`. ``search`` gives the starts in place of `pattern`. Raises
+    InputError on too few samples or targets that are all equal, NumericsError where the present values cannot be
+    evaluated.
     """
-    config = config or RetuneConfig()
+    with threadpool_limits(1, "blas"):
+        return _propose(data, config or RetuneConfig(), search)
+
+
+def _propose(data: WindowData, config: RetuneConfig, search: Search | None) -> Proposal:
     n = data.targets_V.shape[0]
     if n < config.least:
         raise InputError(f"data: got {n} samples, expected at least {config.least} to tune on; let the window fill")

@@ -1,5 +1,8 @@
 """Search for the hyper-parameters with the best evidence: level 2, (2.35), for gamma; level 3, (2.36), or the joint
 optimum for the kernel widths.
+
+The evidence has several optima, and its deepest one can be narrow: on a part of the samples it is not there at all. So
+the answer is checked against a coarse scan, whose widths go from the distance of neighbouring samples to their extent.
 """
 
 from __future__ import annotations
@@ -9,7 +12,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
 
 from adaptive.errors import InputError, NumericsError
 from adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
@@ -32,6 +37,7 @@ class InferenceConfig:
     gamma_range, width_range : bounds; the upper bound on gamma also bounds the condition number.
     search_rows : starts are compared on at most this many evenly taken samples, the best goes on with all.
     iterations : at most, of each descent.
+    scan_rows : rows, evenly taken, of the coarse scan that the answer is checked against; 0 for no check.
     """
 
     method: Literal["joint", "three_level"] = "joint"
@@ -41,6 +47,7 @@ class InferenceConfig:
     width_range: tuple[float, float] = (0.02, 50.0)
     search_rows: int = 160
     iterations: int = 40
+    scan_rows: int = 500
 
     def __post_init__(self) -> None:
         if self.method not in ("joint", "three_level"):
@@ -100,15 +107,20 @@ def descend(
 
 
 def infer(data: EvidenceSamples, config: InferenceConfig | None = None) -> Inference:
-    """Find gamma and the kernel widths. Deterministic.
+    """Find gamma and the kernel widths. Deterministic, with one BLAS thread whatever the environment says.
+
+    Beside other work two threads wait for each other: they made the same search three hundred times slower.
 
     Raises
     ------
     NumericsError : no start could be evaluated.
     """
-    config = config or InferenceConfig()
-    rows = np.unique(np.linspace(0, data.size - 1, min(config.search_rows, data.size)).round().astype(np.int64))
-    few, whole = CountedEvidence(data.subset(rows)), CountedEvidence(data)
+    with threadpool_limits(1, "blas"):
+        return _infer(data, config or InferenceConfig())
+
+
+def _infer(data: EvidenceSamples, config: InferenceConfig) -> Inference:
+    few, whole = CountedEvidence(data.subset(_evenly(data.size, config.search_rows))), CountedEvidence(data)
     count = data.dimension if config.ard else 1
     tried = []
     for gamma, sigma in config.starts:
@@ -120,17 +132,88 @@ def infer(data: EvidenceSamples, config: InferenceConfig | None = None) -> Infer
         raise NumericsError("evidence: no start could be evaluated; lower gamma_range or drop duplicated samples")
     tried.sort(key=lambda e: e.J2)
     best = tried[0]
-    polished: Evidence | None = best
-    for method in ("joint", config.method)[-1 if config.method == "joint" else 0 :]:
-        # The optimum of J3 lies close to the joint one, which takes a third of the evaluations to approach.
-        if polished is not None:
-            widths = polished.widths if config.ard else polished.widths[:1]
-            polished = _descend(whole, np.log(np.concatenate([[polished.gamma], widths])), config, method)
+    polished = _descend(whole, _logarithms(best, config), config, "joint")
+    scanned = CountedEvidence(data.subset(_evenly(data.size, config.scan_rows)))
+    if polished is not None and config.scan_rows:
+        for start in _scan(scanned, polished, config):
+            other = _descend(whole, start, config, "joint")
+            if other is not None and other.J2 < polished.J2 - _DEEPER:
+                polished = other
+    # The optimum of J3 lies close to the joint one, which takes a third of the evaluations to approach.
+    if polished is not None and config.method == "three_level":
+        polished = _descend(whole, _logarithms(polished, config), config, "three_level")
     if polished is None:
         raise NumericsError(
             "evidence: the optimum of a part of the samples cannot be evaluated on all; lower gamma_range"
         )
-    return Inference(polished, tuple(tried), few.calls + whole.calls)
+    return Inference(polished, tuple(tried), few.calls + whole.calls + scanned.calls)
+
+
+# --- The check of an answer against a coarse scan.
+
+#: Factor between two widths of the scan, and most of them; the gammas of the scan.
+_STEP, _MOST_WIDTHS = 1.5, 16
+_GAMMAS = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7)
+#: Most descents from the scan, and by how much J2 must fall to be another optimum.
+_DESCENTS, _DEEPER = 2, 0.5
+
+
+def length_scales(X: FloatArray, ard: bool) -> tuple[FloatArray, float, float]:
+    """(scale of each feature (d,), least and largest width in these scales that the samples (n, d) can tell apart).
+
+    The scale of a feature is its standard deviation with ``ard``, else 1. The least width is the median distance of a
+    sample to its nearest neighbour, the largest twice the extent.
+    """
+    spread = np.std(X, axis=0)
+    scale = np.where(spread > 0.0, spread, 1.0) if ard else np.ones(X.shape[1])
+    scaled = X / scale
+    squared = np.sum((scaled[:, None, :] - scaled[None, :, :]) ** 2, axis=2)
+    largest = 2.0 * float(np.sqrt(squared.max()))
+    # Samples that coincide tell nothing of the distance.
+    squared[squared == 0.0] = np.inf
+    near = np.sqrt(squared.min(axis=1))
+    near = near[np.isfinite(near)]
+    return scale, float(np.median(near)) if near.size else largest, largest
+
+
+def _scan(value: CountedEvidence, found: Evidence, config: InferenceConfig) -> list[FloatArray]:
+    """Logarithms of gamma and widths at the deepest valleys of a coarse scan, without the one that ``found`` is in."""
+    scale, least, largest = length_scales(value.data.X, config.ard)
+    count = int(np.clip(np.ceil(np.log(max(largest / least, 1.0)) / np.log(_STEP)) + 1, 1, _MOST_WIDTHS))
+    widths = [np.clip(factor * scale, *config.width_range) for factor in np.geomspace(least, largest, count)]
+    gammas = [gamma for gamma in _GAMMAS if config.gamma_range[0] <= gamma <= config.gamma_range[1]]
+    gammas = gammas or [float(np.sqrt(np.prod(config.gamma_range)))]
+    J2 = np.full((count + 2, len(gammas) + 2), np.inf)
+    for i, width in enumerate(widths):
+        for j, gamma in enumerate(gammas):
+            if i and np.array_equal(width, widths[i - 1]):
+                continue  # at a bound of the widths
+            at = value(gamma, width)
+            J2[i + 1, j + 1] = np.inf if at is None else at.J2
+    mine = np.log(found.gamma), float(np.mean(np.log(found.widths / scale)))
+    valleys = []
+    for i in range(count):
+        for j, gamma in enumerate(gammas):
+            depth = J2[i + 1, j + 1]
+            if not np.isfinite(depth) or depth > J2[i : i + 3, j : j + 3].min():
+                continue
+            here = np.log(gamma), float(np.mean(np.log(widths[i] / scale)))
+            if abs(here[0] - mine[0]) > np.log(10.0) or abs(here[1] - mine[1]) > np.log(_STEP):
+                own = widths[i] if config.ard else widths[i][:1]
+                valleys.append((depth, np.log(np.concatenate([[gamma], own]))))
+    valleys.sort(key=lambda valley: valley[0])
+    return [theta for _, theta in valleys[:_DESCENTS]]
+
+
+def _evenly(size: int, most: int) -> NDArray[np.int64]:
+    """At most ``most`` of ``size`` rows, evenly taken."""
+    rows: NDArray[np.int64] = np.unique(np.linspace(0, size - 1, min(most, size)).round().astype(np.int64))
+    return rows
+
+
+def _logarithms(found: Evidence, config: InferenceConfig) -> FloatArray:
+    widths = found.widths if config.ard else found.widths[:1]
+    return np.asarray(np.log(np.concatenate([[found.gamma], widths])), dtype=np.float64)
 
 
 def _spread(widths: FloatArray, dimension: int) -> FloatArray:

@@ -102,8 +102,8 @@ class MinMaxScaling:
 
 # --- Forward models.
 
-#: The chapter's starting values, with one width for both inputs.
-CHAPTER_INFERENCE = InferenceConfig(method="three_level", ard=False, starts=((100.0, 1.0),))
+#: The chapter's starting values, with one width for both inputs, and the optimum that they lead to.
+CHAPTER_INFERENCE = InferenceConfig(method="three_level", ard=False, starts=((100.0, 1.0),), scan_rows=0)
 #: Memory of the forward model; it has more plays than the served inverse, because the commanded voltage has no noise.
 MEMORY = IdentifyConfig(plays=20, slow=4, kernel_plays=3, arcs=(0.03, 0.1, 0.3, 0.8))
 #: Its inference: one width for all inputs, because the small residual would let single widths fit noise.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from adaptive import kernels, lssvm
 from adaptive.errors import InputError, NumericsError
@@ -141,3 +143,51 @@ def test_bad_input() -> None:
         InferenceConfig(starts=())
     with pytest.raises(NumericsError):
         evidence.evaluate(evidence.evidence_samples(np.ones((20, 2)), np.arange(20.0)), 1e19, np.ones(2))
+
+
+# --- The answer is checked against a coarse scan, and does not depend on the environment.
+
+
+@needs_reference
+def test_the_deepest_optimum_with_one_width_is_found_where_no_start_leads_to_it() -> None:
+    data = reference_problem()
+    unchecked = inference.infer(data, InferenceConfig(ard=False, scan_rows=0)).best
+    found = inference.infer(data, InferenceConfig(ard=False)).best
+    assert pytest.approx(-2133.43, abs=0.01) == unchecked.J2
+    assert pytest.approx(-2205.23, abs=0.01) == found.J2
+    assert found.widths == pytest.approx(np.full(2, 0.0611), rel=1e-3)
+    # No point of a finer scan is deeper.
+    for width in np.geomspace(0.03, 3.0, 13):
+        for gamma in np.geomspace(1e2, 1e7, 6):
+            at = evidence.evaluate(data, gamma, np.full(2, width))
+            assert at.J2 > found.J2
+
+
+@pytest.mark.parametrize("ard", [False, True])
+def test_starts_far_from_the_optimum_do_not_decide(ard: bool) -> None:
+    data = small_problem(n=120)
+    far = InferenceConfig(ard=ard, starts=((10.0, 40.0),))
+    assert inference.infer(data, far).best.J2 <= inference.infer(data, InferenceConfig(ard=ard)).best.J2 + 0.5
+
+
+def test_length_scales_are_those_of_the_samples() -> None:
+    X = np.column_stack([np.arange(10.0), np.zeros(10)])
+    scale, least, largest = inference.length_scales(X, ard=False)
+    assert (scale.tolist(), least, largest) == ([1.0, 1.0], 1.0, 18.0)
+    scale, least, _ = inference.length_scales(np.vstack([X, X[:3]]), ard=True)
+    assert scale[1] == 1.0  # a feature that does not change tells nothing
+    assert least == pytest.approx(1.0 / scale[0])  # nor do samples that coincide
+
+
+def test_the_search_uses_one_blas_thread_whatever_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: set[int] = set()
+    real = inference.evaluate
+
+    def watched(*arguments: Any) -> evidence.Evidence:
+        seen.update(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return real(*arguments)
+
+    monkeypatch.setattr(inference, "evaluate", watched)
+    with threadpool_limits(2, "blas"):
+        inference.infer(small_problem(n=40), InferenceConfig(iterations=2))
+    assert seen == {1}
