@@ -17,7 +17,7 @@ from adaptive.identification import identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
-from lab.demo.plan import TEACHER, Plan
+from lab.demo.plan import ASKING_AHEAD, TEACHER, Plan, make_plan
 from sim.stage.stage import Stage
 
 #: Targets, percent of the commanded range: first second, 1 to 4 s, last ten seconds.
@@ -90,11 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a run; the change comes half-way")
     parser.add_argument("--json", type=Path, help="write every run's numbers here")
     given = parser.parse_args(arguments)
-    if any(age < 0 or age % Plan().block for age in given.ages):
-        parser.error(f"--ages: got {given.ages}, expected multiples of {Plan().block} ticks, or 0")
+    block = int(ASKING_AHEAD["block"])
+    if any(age < 0 or age % block for age in given.ages):
+        parser.error(f"--ages: got {given.ages}, expected multiples of {block} ticks, or 0")
     rows: dict[int, list[dict[str, float]]] = {age: [] for age in given.ages}
     for seed in given.seeds:
-        plan = Plan(seed=seed, run_s=given.seconds)
+        plan = make_plan(given.seconds, seed, ahead=True)
         model = identified(plan)
         for age in given.ages:
             rows[age].append(errors(plan, model, age))

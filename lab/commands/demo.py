@@ -18,8 +18,10 @@ log = logging.getLogger("dehyst.demo")
 
 EPILOG = """\
 In real time the demo runs these processes over zenoh on loopback: a simulated stage (five twins of one seed, one for
-each model), the service that learns from one of them, a controller that asks it for voltages ahead of time, the viewer
-stream, and a bare paced loop for comparison. --fast runs the same plan in one process and gives the same voltages.
+each model), the service that learns from one of them, a controller that follows its model and evaluates it itself, the
+viewer stream, and a bare paced loop for comparison. Each block of 5 ms is commanded one block ahead, with 60 ms more in
+reserve: if the controller stalls, the stage goes on by those, and after them it holds the last voltage. --ahead has the
+controller ask the service 60 ms ahead instead. --fast runs the same plan in one process and gives the same voltages.
 Displacements in µm, errors in percent of the commanded range.
 
   dehyst demo
@@ -42,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         stage={"type": Path, "default": None, "metavar": "STAGE.toml", "help": "a stage file in place of the preset"},
         seed={"default": 20, "help": "seed of the stage's noise and of the reference (%(default)s)"},
     )
+    add("--ahead", action="store_true", help="query the service 60 ms ahead instead of following the model")
     add("--view", action="store_true", help="also start the Rerun viewer and watch live (needs a display)")
     add("--connect", metavar="URL", help="also stream to a viewer that already runs, rerun+http://HOST:PORT/proxy")
     add_shared(parser, "quiet", json={"help": "print summary.json in place of the table"})
@@ -66,7 +69,14 @@ def run(args: argparse.Namespace) -> int:
         show(text)
 
     done = session.run(
-        args.out, fast=args.fast, duration_s=args.duration, seed=args.seed, view=view, say=say, stage=args.stage
+        args.out,
+        fast=args.fast,
+        duration_s=args.duration,
+        seed=args.seed,
+        view=view,
+        say=say,
+        stage=args.stage,
+        ahead=args.ahead,
     )
     if args.json:
         print(json.dumps(done.summary))
@@ -78,10 +88,25 @@ def run(args: argparse.Namespace) -> int:
     return 1 if lost else 0
 
 
+def _controlled(summary: dict[str, Any]) -> str:
+    """What the controller did, in one line."""
+    queries, found = summary["queries"], summary["followed"]
+    times = f"median {queries['p50_us']:.0f} µs, 99 % within {queries['p99_us']:.0f} µs"
+    if not found:
+        return f"queries: {queries['count']}, {times}, {queries['late']} too late"
+    return (
+        f"blocks evaluated by the followed model: {queries['count']}, {times}; its last sample was "
+        f"{found['age_p50_ms']:.0f} ms (99 %: {found['age_p99_ms']:.0f} ms) old when a block began; "
+        f"{found['late_models']} blocks with an older model than planned, "
+        f"{found['lost']} changes lost and {found['repairs']} repaired; "
+        f"{found['extrapolated']} voltages from the reserve of an earlier block"
+    )
+
+
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
     from lab.demo.result import clock_missed, table
 
-    queries, samples, ticks = summary["queries"], summary["samples"], summary["ticks"]
+    samples, ticks = summary["samples"], summary["ticks"]
     files = {
         "summary.json": "the numbers above, for programs",
         "tracking.png": "reference and errors over time",
@@ -96,8 +121,7 @@ def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:
         "",
         f"the stage changed at t = {summary['change']['t_s']:g} s: {summary['change']['text']}",
         f"samples: {samples['sent']} sent, {samples['received']} received, {samples['learnt']} learnt from",
-        f"queries: {queries['count']}, median {queries['p50_us']:.0f} µs, 99 % within {queries['p99_us']:.0f} µs, "
-        f"{queries['late']} too late",
+        _controlled(summary),
         f"control ticks: {ticks['count']}, {ticks['late']} without their voltage in time; "
         f"a bare paced loop beside it was late by a period {ticks['bare_late']} times",
         *filter(None, [clock_missed(ticks)]),

@@ -1,6 +1,6 @@
-"""The controller as a process: asks the service ahead of time, sends the voltages, and records the readings.
+"""The controller as a process: follows the models or asks the service ahead, sends voltages, records the readings.
 
-``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it asks for a block
+``python -m lab.demo.controller PLAN.json ENDPOINT OUT.npz``. The stage's samples are its clock: it computes a block
 when the stage has published the tick that the plan gives. Progress goes to standard output as lines of JSON.
 """
 
@@ -10,6 +10,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import zenoh
 
 from adaptive.types import FloatArray
+from lab.demo.following import CHUNK, FollowedModels
 from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan
 from lab.demo.result import empty
 from lab.testbed.processes import run_client_process
@@ -29,6 +31,10 @@ from service.runtime.session import SURELY, open_client, wait_followed
 
 #: How long to wait for the stage's next samples, and for the service to learn far enough, s.
 STALL_S, BEHIND_S = 10.0, 0.1
+#: How long to wait for the model that a block is planned with, s, and states of it that are kept.
+MODEL_S, KEPT = 0.002, 64
+#: Ticks of the reference that are published at once.
+TOLD = 20
 
 
 class Twins:
@@ -57,19 +63,97 @@ class Twins:
 
         return take
 
-    def wait(self, ticks: int) -> bool:
-        """Wait until every twin has published ``ticks`` samples; False if they stopped."""
+    def wait(self, ticks: int, names: Sequence[str] = tuple(MODELS)) -> bool:
+        """Wait until the twins ``names`` have published ``ticks`` samples; False if they stopped."""
         with self._moved:
-            return self._moved.wait_for(lambda: min(self.seen.values()) >= ticks, STALL_S)
+            return self._moved.wait_for(lambda: min(self.seen[name] for name in names) >= ticks, STALL_S)
 
     def close(self) -> None:
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def control(plan: Plan, endpoint: str, out: Path) -> int:
-    """Run the plan against the service and the stage behind ``endpoint``; writes ``out``. Returns 1 if the stage
+def follow(plan: Plan, endpoint: str, out: Path) -> int:
+    """Run the plan by followed models against the stage behind ``endpoint``; writes ``out``. Returns 1 if the stage
     stalled."""
+    wanted = plan.reference()
+    n, size = plan.ticks, plan.block
+    # Two sessions, so that a model does not wait behind the samples of five twins.
+    with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
+        followers = {name: client.follow(name, keep=KEPT if name == TEACHER else 1) for name in MODELS}
+        models = FollowedModels(plan, followers)
+        twins = Twins(plan, session)
+        commands, event = _publishers(session)
+        try:
+            _wait_for_stage(commands)
+            block = 0
+            while block * size < n:
+                if not twins.wait(block * size - plan.lead, (TEACHER,)):
+                    print(json.dumps({"stalled": block * size}), flush=True)
+                    return 1
+                seen = twins.seen[TEACHER]
+                fresh, stop = blocks_now(plan, block, seen)
+                models.wait(fresh, MODEL_S)
+                if block == 0:  # the stage's clock starts when every twin has commands
+                    for name, begin, u_V in models.constant(0):
+                        commands[name].put(wire.encode_command(begin, u_V))
+                begin, u_V = models.block(block, fresh, stop)
+                commands[TEACHER].put(wire.encode_command(begin, u_V))
+                done, block = block, stop
+                if fresh * size % CHUNK == 0:
+                    for name, begin, u_V in models.constant(stop * size):
+                        commands[name].put(wire.encode_command(begin, u_V))
+                if done * size // TOLD < block * size // TOLD:
+                    part = slice(done * size // TOLD * TOLD, min(block * size // TOLD * TOLD, n))
+                    client.reference(part.start, wanted[0][part])
+                if done * size <= plan.change_tick < block * size:
+                    _tell_change(event, plan)
+                if block * size // 1000 > done * size // 1000:
+                    _report(plan, wanted[0], twins, max(0, min(seen, done * size - plan.lead)))
+            complete = twins.wait(n)
+        finally:
+            twins.close()
+            for publisher in (*commands.values(), event):
+                publisher.undeclare()  # type: ignore[no-untyped-call]
+        counts = models.counts()
+    _write(out, twins, models.std_V, models.durations_s, int(counts["late_models"]), counts)
+    print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
+    return 0 if complete else 1
+
+
+def _publishers(session: zenoh.Session) -> tuple[dict[str, zenoh.Publisher], zenoh.Publisher]:
+    """Publishers of the commands by model, and of events."""
+    commands = {
+        name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, congestion_control=SURELY, express=True)
+        for name in MODELS
+    }
+    return commands, session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
+
+
+def _wait_for_stage(commands: dict[str, zenoh.Publisher]) -> None:
+    """Wait until every twin takes commands. Raises ServiceError if one does not."""
+    # The subscriptions must have reached the stage before the first commands start its clock.
+    time.sleep(0.3)
+    for name, publisher in commands.items():
+        if not wait_followed(publisher, STALL_S):
+            raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
+
+
+def _tell_change(event: zenoh.Publisher, plan: Plan) -> None:
+    """For the viewer only: the service must find out by itself."""
+    event.put(json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text}))
+
+
+def _write(
+    out: Path, twins: Twins, std_V: dict[str, FloatArray], durations: list[float], late: int, counts: dict[str, float]
+) -> None:
+    kinds = {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": std_V}
+    arrays: dict[str, Any] = {f"{kind}/{name}": values[name] for kind, values in kinds.items() for name in MODELS}
+    np.savez(out, query_s=np.asarray(durations), late=late, followed=json.dumps(counts), **arrays)
+
+
+def control(plan: Plan, endpoint: str, out: Path) -> int:
+    """Run the plan by queries ahead of time; else as `follow`."""
     wanted = plan.reference()
     n, size = plan.ticks, plan.block
     std_V = empty(plan)
@@ -83,17 +167,9 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     # Two sessions, so that an answer does not wait behind the samples of five twins.
     with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
-        commands = {
-            name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, congestion_control=SURELY, express=True)
-            for name in MODELS
-        }
-        event = session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
-        # The subscriptions must have reached the stage before the first commands start its clock.
-        time.sleep(0.3)
+        commands, event = _publishers(session)
         try:
-            for name, publisher in commands.items():
-                if not wait_followed(publisher, STALL_S):
-                    raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
+            _wait_for_stage(commands)
             stop = 0
             while stop < n // size:
                 block = stop
@@ -122,10 +198,7 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                         held.clear()
                 late += twins.seen[TEACHER] > part.start
                 if part.start <= plan.change_tick < part.stop:
-                    # For the viewer only: the service must find out by itself.
-                    event.put(
-                        json.dumps({"seq": plan.change_tick, "event": "stage_change", "detail": plan.change_text})
-                    )
+                    _tell_change(event, plan)
                 if part.stop // 1000 > part.start // 1000:
                     _report(plan, wanted[0], twins, max(0, part.start - plan.lead))
             complete = twins.wait(n)
@@ -133,8 +206,7 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
             twins.close()
             for publisher in (*commands.values(), event):
                 publisher.undeclare()  # type: ignore[no-untyped-call]
-    arrays = {f"{kind}/{name}": values[name] for kind, values in _kinds(twins, std_V).items() for name in MODELS}
-    np.savez(out, query_s=np.asarray(durations), late=late, **arrays)
+    _write(out, twins, std_V, durations, late, {})
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
 
@@ -178,10 +250,6 @@ def ask(
             wanted, waited = NEWEST, True
 
 
-def _kinds(twins: Twins, std_V: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {"y_um": twins.y_um, "u_V": twins.u_V, "std_V": std_V}
-
-
 def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
     tail = slice(max(0, done - round(1.0 / plan.dt_s)), done)
     if done > 0:
@@ -192,7 +260,8 @@ def _report(plan: Plan, wanted_um: Any, twins: Twins, done: int) -> None:
 def main(argv: list[str]) -> int:
     """Entry of the process. Returns its exit status."""
     plan = Plan(**json.loads(Path(argv[0]).read_text()))
-    return run_client_process(lambda: control(plan, argv[1], Path(argv[2])))
+    run = control if plan.ahead else follow
+    return run_client_process(lambda: run(plan, argv[1], Path(argv[2])))
 
 
 if __name__ == "__main__":

@@ -2,11 +2,13 @@
 
 Time line of one run (ticks of ``dt_s``)::
 
-    block j covers the ticks [jB, (j+1)B); it is asked for when the stage has published tick jB - lead - 1,
-    and answered from the newest snapshot that has seen no sample after jB - lead - margin.
+    block j covers the ticks [jB, (j+1)B); it is computed when the stage has published tick jB - lead - 1,
+    by the newest model that has seen no sample after jB - lead - margin.
 
-The margin gives the samples time to arrive, so that a run in real time and a fast one ask the same questions of the
-same snapshots and get the same voltages.
+The controller follows the model and evaluates it itself; with ``ahead`` it queries the service, which takes longer. The
+margin gives the samples time to be learnt, and the model time to arrive, so that a run in real time and a fast one use
+the same models and get the same voltages. Each block of a followed model also commands the ``reserve`` ticks after it:
+where the controller stalls, the stage goes on along the reference by a model that is as much older.
 """
 
 from __future__ import annotations
@@ -38,6 +40,10 @@ MODELS: dict[str, str] = {
 #: The model from whose stage the service learns.
 TEACHER = "lssvm_adaptive"
 STAGE, AXIS = "demo", "x"
+#: Fields of a plan whose controller queries ahead.
+ASKING_AHEAD = {"ahead": True, "block": 20, "lead": 60, "margin": 20, "reserve": 0}
+#: Ticks between two snapshots of the service.
+SNAPSHOT_EVERY = 20
 #: Axis name, in keys, of the twin that each model drives; the teacher has the axis itself.
 UNITS: dict[str, str] = {name: AXIS if name == TEACHER else f"{AXIS}_{name}" for name in MODELS}
 
@@ -51,7 +57,9 @@ class Plan:
     dt_s : sample time, s. identify_s, run_s : lengths of the two parts, s.
     gain_change, payload_ratio : relative change of the stage's gain half way through; mass added over mass moved.
     low_um, high_um : range of the reference, µm.
-    block, lead, margin : ticks per query, ticks that it is asked ahead, ticks left for samples to arrive.
+    ahead : query the service ahead of time instead of following the model.
+    block, lead, margin : ticks per block, ticks that it is computed ahead, ticks left for samples and model to arrive.
+    reserve : ticks after each block that are commanded as well; 0 with ``ahead``.
     seed : of the stage's noise and of the reference.
     drive_low_V, drive_high_V : range of the identification signal, V.
     slowness : factor by which the reference is slower than the usual one.
@@ -67,9 +75,11 @@ class Plan:
     payload_ratio: float = 1.0
     low_um: float = 4.0
     high_um: float = 80.0
-    block: int = 20
-    lead: int = 60
-    margin: int = 20
+    ahead: bool = False
+    block: int = 5
+    lead: int = 5
+    margin: int = 10
+    reserve: int = 60
     seed: int = 20
     drive_low_V: float = 0.0
     drive_high_V: float = 8.0
@@ -84,8 +94,8 @@ class Plan:
 
     @property
     def ticks(self) -> int:
-        """Length of the second part in ticks, whole blocks."""
-        return round(self.run_s / self.dt_s) // self.block * self.block
+        """Length of the second part in ticks, whole blocks of either way."""
+        return round(self.run_s / self.dt_s) // SNAPSHOT_EVERY * SNAPSHOT_EVERY
 
     @property
     def change_tick(self) -> int:
@@ -109,6 +119,7 @@ class Plan:
         return {
             "before": slice(self.change_tick - quiet, self.change_tick),
             "first_second": slice(self.change_tick, self.change_tick + second),
+            "catching_up": slice(self.change_tick + second, self.ticks - quiet),
             "settled": slice(self.ticks - quiet, self.ticks),
         }
 
@@ -149,6 +160,12 @@ class Plan:
         return replace(config, changes=(*config.changes, (at_s, change)))
 
 
+def make_plan(run_s: float, seed: int, ahead: bool = False) -> Plan:
+    """The plan on the usual stage."""
+    base = Plan(run_s=run_s, seed=seed)
+    return replace(base, **ASKING_AHEAD) if ahead else base  # type: ignore[arg-type]
+
+
 # --- Fits the plan of the demonstration to a stage from a file, by measuring the stage.
 
 #: Share of the voltage limits that identification uses, and range of the reference as shares of the range found by it.
@@ -157,13 +174,13 @@ DRIVE_SHARE, LOW_SHARE, HIGH_SHARE = 0.8, 0.045, 0.9
 QUICK_S = 4e-3
 
 
-def plan_for(path: Path, folder: Path, run_s: float, seed: int) -> Plan:
+def plan_for(path: Path, folder: Path, run_s: float, seed: int, ahead: bool = False) -> Plan:
     """The plan for the stage in the file ``path``; the stage that is run is written into ``folder``.
 
     Voltages stay within ``DRIVE_SHARE`` of the file's limits; the commanded range is a share of what they reach. The
     sample time is the plan's own. Raises InputError if the stage does not move, or diverges.
     """
-    base = Plan(run_s=run_s, seed=seed)
+    base = make_plan(run_s, seed, ahead)
     config = replace(_able_to_drift(_from_zero(load_stage(path))), dt_s=base.dt_s, seed=seed)
     high = DRIVE_SHARE * config.u_max_V
     # A stage of one polarity keeps it; a bipolar stage is driven both ways.

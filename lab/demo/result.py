@@ -18,7 +18,10 @@ from service.viewer.colours import EVENT, REFERENCE, model_colour
 #: Share of the ticks without their voltage above which the errors are those of the machine: at 0.016 the table did not
 #: change, at 0.5 every model was off by a fifth of the range.
 MOST_LATE = 0.02
+#: Phases with three numbers in the table; "catching_up" has its mean absolute error alone.
 PHASE_TITLES = {"before": "before the change", "first_second": "first second after", "settled": "settled"}
+#: Length of the worst stretch of the run that is told, s.
+WORST_S = 0.5
 
 
 def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
@@ -32,6 +35,15 @@ def score(error_um: FloatArray, plan: Plan) -> dict[str, dict[str, float]]:
         }
         for name, part in plan.phases().items()
     }
+
+
+def worst_stretch(error_um: FloatArray, plan: Plan) -> dict[str, float]:
+    """Largest mean absolute error over ``WORST_S`` of the whole run, percent of the range, and where it begins, s."""
+    n = round(WORST_S / plan.dt_s)
+    sums = np.concatenate(([0.0], np.cumsum(np.abs(error_um))))
+    means = (sums[n:] - sums[:-n]) / n
+    at = int(np.argmax(means))
+    return {"mae_pct": float(100.0 * means[at] / plan.range_um), "t_s": at * plan.dt_s}
 
 
 def latency(seconds: FloatArray, late: int) -> dict[str, Any]:
@@ -55,18 +67,30 @@ def clock_missed(ticks: dict[str, int]) -> str:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """The result as a table: one row per model, three numbers per phase."""
+    """The result as a table: one row per model. The second line says which seconds of the run a column scores."""
     width = max(len(title) for title in MODELS.values())
-    head = " " * width + "".join(f" | {title:^23}" for title in PHASE_TITLES.values())
-    units = f"{'% of ' + format(summary['range_um'], '.0f') + ' µm':<{width}}" + " |    MAE    RMSE     max" * 3
-    lines = [head, units, "-" * len(head)]
+    seconds = summary["seconds"]
+    columns = ["before", "first_second", "catching_up", "settled"]
+    titles = PHASE_TITLES | {"catching_up": "1 s after to settled"}
+    head, when = " " * width, f"{'seconds of the run':<{width}}"
+    units = f"{'% of ' + format(summary['range_um'], '.0f') + ' µm':<{width}}"
+    for phase in columns:
+        wide = 23 if phase in PHASE_TITLES else 20
+        head += f" | {titles[phase]:^{wide}}"
+        when += f" | {'{:g} to {:g}'.format(*seconds[phase]):^{wide}}"
+        units += " |    MAE    RMSE     max" if phase in PHASE_TITLES else f" | {'MAE':^20}"
+    head += f" | {'worst half second':^18}"
+    when += f" | {'{:g} to {:g}'.format(0.0, seconds['settled'][1]):^18}"
+    units += f" | {'MAE':>7}{'from, s':>11}"
+    lines = [head, when, units, "-" * len(head)]
     for model, title in MODELS.items():
-        cells = "".join(
-            " | "
-            + " ".join(f"{summary['models'][model][phase][key]:7.3f}" for key in ("mae_pct", "rmse_pct", "max_pct"))
-            for phase in PHASE_TITLES
-        )
-        lines.append(f"{title:<{width}}{cells}")
+        found, worst = summary["models"][model], summary["worst_half_second"][model]
+        cells = ""
+        for phase in columns:
+            keys = ("mae_pct", "rmse_pct", "max_pct") if phase in PHASE_TITLES else ("mae_pct",)
+            numbers = " ".join(f"{found[phase][key]:7.3f}" for key in keys)
+            cells += f" | {numbers}" if len(keys) > 1 else f" | {numbers:^20}"
+        lines.append(f"{title:<{width}}{cells} | {worst['mae_pct']:7.3f}{worst['t_s']:11.1f}")
     return "\n".join(lines)
 
 
@@ -81,6 +105,7 @@ class DemoRun:
     samples : counts ``sent``, ``received``, ``learnt`` of the stage that the service learns from.
     ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
     notes : records for the viewer (events, diagnostics, status), in order.
+    followed : of a followed model, see `Followed.counts`; empty where the service was queried ahead.
     """
 
     y_um: dict[str, FloatArray]
@@ -91,6 +116,7 @@ class DemoRun:
     samples: dict[str, int]
     ticks: dict[str, int]
     notes: list[Any] = field(default_factory=list)
+    followed: dict[str, float] = field(default_factory=dict)
 
     def summary(self, plan: Plan, reference_um: FloatArray) -> dict[str, Any]:
         """The content of ``summary.json``."""
@@ -98,6 +124,10 @@ class DemoRun:
             "schema": 1,
             "range_um": plan.range_um,
             "models": {name: score(reference_um - self.y_um[name], plan) for name in MODELS},
+            "seconds": {name: [part.start * plan.dt_s, part.stop * plan.dt_s] for name, part in plan.phases().items()},
+            "worst_half_second": {name: worst_stretch(reference_um - self.y_um[name], plan) for name in MODELS},
+            "controller": "queries ahead" if plan.ahead else "follows the model",
+            "followed": self.followed,
             "queries": latency(self.query_s, self.late_queries),
             "samples": self.samples,
             "ticks": self.ticks,

@@ -7,28 +7,34 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from types import SimpleNamespace
+from typing import Any, Final, cast
 
 import numpy as np
 import zenoh
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from lab.demo.plan import AXIS, MODELS, STAGE, TEACHER, UNITS, Plan, plan_for
+from lab.demo.controller import KEPT
+from lab.demo.following import FollowedModels
+from lab.demo.plan import AXIS, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
 from lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
 from lab.testbed.identified_stage import READY_S, Rig, write_service_config
 from lab.testbed.processes import Child
 from service.client.client import Client, PendingCommands
+from service.client.follower import Follower
 from service.config.settings import read_config
 from service.identification.identifying import NAMES, Stretch, identify_all
 from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
+from service.protocol.model import encode_model
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.runtime.session import SURELY, open_client, wait_followed
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
+from service.server.deltas import DeltaStreams
 from service.storage.model_file import BundleMeta, write_bundle
 from service.storage.output import clear_output
 from service.storage.recorder import Recorder, RecorderConfig
@@ -115,6 +121,7 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
 def _stage_options(plan: Plan, ticks: int, *, changing: bool) -> list[str]:
     options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(ticks * plan.dt_s)]
     options += ["--file", plan.stage_file] if plan.stage_file else []
+    options += ["--batch", str(1 if plan.ahead else plan.block)]
     for t_s, values in plan.stage(changing=changing).changes:
         options += ["--change", f"{t_s!r}:" + ",".join(f"{name}={value!r}" for name, value in values.items())]
     return options
@@ -150,7 +157,7 @@ def _wait_until_handled(endpoint: str, plan: Plan) -> None:
 def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
     with np.load(result) as kept:
         y_um, u_V, std_V = ({name: kept[f"{kind}/{name}"] for name in MODELS} for kind in ("y_um", "u_V", "std_V"))
-        query_s, late = kept["query_s"], int(kept["late"])
+        query_s, late, followed = kept["query_s"], int(kept["late"]), json.loads(str(kept["followed"]))
     result.unlink()
     summary = stage.last_json()
     units = summary["units"]
@@ -162,48 +169,126 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
         "stage_late": summary["late"],
         "bare_late": loop.last_json()["late"],
     }
-    return DemoRun(y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks)
+    return DemoRun(
+        y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks, followed=followed
+    )
 
 
-# --- In one process, as fast as possible: the same queries and answers, without a network.
+# --- In one process, as fast as possible: the same models, queries and answers, without a network.
 
 
 #: Called with the number of ticks done and, by model, the mean absolute error of the last second, µm.
 Progress = Callable[[int, dict[str, float]], None]
 
 
+class _Samples:
+    """The twin stages of a fast run: drives them block by block, and hands the teacher's samples to ``axis``."""
+
+    def __init__(self, plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> None:
+        self.u_V, self.y_um = empty(plan), empty(plan)
+        self.notes: list[Diagnostics] = []
+        self._plan, self._axis, self._recorder, self._progress = plan, axis, recorder, progress
+        self._wanted_um = plan.reference()[0]
+        self._stage = Stage(plan.stage(changing=True))
+        self._states = {name: self._stage.initial_state() for name in MODELS}
+
+    def drive(self, done: int) -> None:
+        """Run the block of ticks from ``done`` on with its voltages in ``u_V``."""
+        plan, axis, size = self._plan, self._axis, self._plan.block
+        part = slice(done, done + size)
+        for name in MODELS:
+            self.y_um[name][part] = self._stage.run(self._states[name], self.u_V[name][part])[0]
+        seq = np.arange(part.start, part.stop)
+        t_s = seq.astype(np.float64) * plan.dt_s
+        batch = SampleBatch(seq, t_s, self.u_V[TEACHER][part], self.y_um[TEACHER][part])
+        verdicts = axis.handle(batch)
+        self._recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
+        if done % 100 == 0 and axis.learner is not None:
+            told = axis.learner.diagnostics()
+            if done % 1000:
+                told = {
+                    key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
+                }
+            self.notes.append(Diagnostics(float(batch.t_s[-1]), int(seq[-1]), told))
+        if (done + size) % 1000 == 0:
+            tail = slice(max(0, done + size - 1000), done + size)
+            errors = {k: float(np.mean(np.abs(self._wanted_um[tail] - self.y_um[k][tail]))) for k in MODELS}
+            self._progress(done + size, errors)
+
+    def result(self, std_V: dict[str, FloatArray], durations: list[float], followed: dict[str, float]) -> DemoRun:
+        """The run."""
+        axis, n = self._axis, self._plan.ticks
+        samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
+        ticks = {"count": n, "late": 0, "bare_late": 0}
+        return DemoRun(self.y_um, self.u_V, std_V, np.asarray(durations), 0, samples, ticks, self.notes, followed)
+
+
 def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> DemoRun:
     """Run the plan on twin stages; the teacher's samples go into ``axis``."""
-    wanted = plan.reference()
+    samples = _Samples(plan, axis, recorder, progress)
+    return (_queried if plan.ahead else _followed)(plan, axis, samples)
+
+
+class _Loopback:
+    """The part of a session that a follower needs: what is published here is delivered at once."""
+
+    def __init__(self) -> None:
+        self._deliver: Callable[[Any], None] | None = None
+
+    def declare_subscriber(self, key: str, deliver: Callable[[Any], None]) -> Any:
+        """Deliver to ``deliver`` from now on."""
+        self._deliver = deliver
+        return SimpleNamespace(undeclare=lambda: None)
+
+    def put(self, payload: bytes) -> None:
+        """Publish."""
+        if self._deliver is not None:
+            self._deliver(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload)))
+
+
+def _followed(plan: Plan, axis: Axis, samples: _Samples) -> DemoRun:
+    """By followers that get their models as in real time, message by message."""
     n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
-    stage = Stage(plan.stage(changing=True))
-    states = {name: stage.initial_state() for name in MODELS}
-    u_V, y_um, std_V = empty(plan), empty(plan), empty(plan)
-    memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
-    commanded = PendingCommands()
-    last_V = {name: float("nan") for name in MODELS}
-    durations, notes = [], []
+    loopback, streams = _Loopback(), DeltaStreams(axis)
+    streams.publish(TEACHER, loopback.put, lambda: True)
+    streams.tick(0.0)
+    session = cast(zenoh.Session, loopback)
+    followers = {}
+    for name in MODELS:
+        model, seq, memory = axis.model(name)
+        payload = encode_model(name, model, seq, memory, axis.safety(name))
+        learns = name == TEACHER
+        followers[name] = Follower(
+            session, "delta" if learns else None, name, payload.__bytes__, axis.limits, deltas=learns, keep=KEPT
+        )
+    models = FollowedModels(plan, followers)
     for block in range(n // size + ahead + 1):
         done = (block - ahead - 1) * size
         if done >= 0:
-            part = slice(done, done + size)
-            for name in MODELS:
-                y_um[name][part] = stage.run(states[name], u_V[name][part])[0]
-            seq = np.arange(part.start, part.stop)
-            t_s = seq.astype(np.float64) * plan.dt_s
-            batch = SampleBatch(seq, t_s, u_V[TEACHER][part], y_um[TEACHER][part])
-            verdicts = axis.handle(batch)
-            recorder.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, verdicts)
-            if done % (5 * size) == 0 and axis.learner is not None:
-                told = axis.learner.diagnostics()
-                if done % 1000:
-                    told = {
-                        key: value for key, value in told.items() if not key.startswith("window_y") and "_v_" not in key
-                    }
-                notes.append(Diagnostics(float(batch.t_s[-1]), int(seq[-1]), told))
-            if (done + size) % 1000 == 0:
-                tail = slice(max(0, done + size - 1000), done + size)
-                progress(done + size, {k: float(np.mean(np.abs(wanted[0][tail] - y_um[k][tail]))) for k in MODELS})
+            samples.drive(done)
+            streams.tick((done + size) * plan.dt_s)
+        if block * size >= n:
+            continue
+        for name, begin, u_V in models.constant(block * size):
+            samples.u_V[name][begin : begin + u_V.size] = u_V
+        begin, u_V = models.block(block, block, block + 1)
+        samples.u_V[TEACHER][begin : begin + u_V.size] = u_V
+    return samples.result(models.std_V, models.durations_s, models.counts())
+
+
+def _queried(plan: Plan, axis: Axis, samples: _Samples) -> DemoRun:
+    """By queries ahead of time."""
+    wanted = plan.reference()
+    n, size, ahead = plan.ticks, plan.block, plan.lead // plan.block
+    u_V, std_V = samples.u_V, empty(plan)
+    memory: dict[str, FloatArray | None] = dict.fromkeys(MODELS)
+    commanded = PendingCommands()
+    last_V = {name: float("nan") for name in MODELS}
+    durations = []
+    for block in range(n // size + ahead + 1):
+        done = (block - ahead - 1) * size
+        if done >= 0:
+            samples.drive(done)
         if block * size >= n:
             continue
         part = slice(block * size, (block + 1) * size)
@@ -223,9 +308,7 @@ def run_fast(plan: Plan, axis: Axis, recorder: Recorder, progress: Progress) -> 
                 commanded.take(part.start, wanted[0][part], reply)
             else:
                 memory[name] = reply.memory
-    samples = {"sent": n, "received": axis.handled_seq + 1, "learnt": axis.gates.get("learnt", 0)}
-    ticks = {"count": n, "late": 0, "bare_late": 0}
-    return DemoRun(y_um, u_V, std_V, np.asarray(durations), 0, samples, ticks, notes)
+    return samples.result(std_V, durations, {})
 
 
 Say = Callable[[str], None]
@@ -243,9 +326,19 @@ class Done:
 
 
 def run(
-    out: Path, *, fast: bool, duration_s: float, seed: int, view: list[str], say: Say, stage: Path | None = None
+    out: Path,
+    *,
+    fast: bool,
+    duration_s: float,
+    seed: int,
+    view: list[str],
+    say: Say,
+    stage: Path | None = None,
+    ahead: bool = False,
 ) -> Done:
     """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
+
+    ``ahead`` : the controller queries the service ahead of time instead of following the model.
 
     Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
@@ -253,7 +346,7 @@ def run(
     clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
-    plan = Plan(run_s=duration_s, seed=seed) if own is None else plan_for(own, logs, duration_s, seed)
+    plan = make_plan(duration_s, seed, ahead) if own is None else plan_for(own, logs, duration_s, seed, ahead)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
     _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))
     say("[2/4] identifying five inverse models from 10 s at 1 kHz")
@@ -350,7 +443,8 @@ def _configure(plan: Plan, out: Path, path: Path, endpoint: str) -> Path:
         "u_max_V": stage.u_max_V,
         "slew_V_per_s": 4000.0,
         "learn": TEACHER,
-        "snapshot_every": plan.block,
+        "snapshot_every": SNAPSHOT_EVERY,
+        "delta_hz": 1.0 / (plan.block * plan.dt_s),
         "recorder": out / "recording",
         # Background tuning ends at a time that depends on the machine; a fast run must give the same numbers.
         "retuning": {"period_s": 0.0},

@@ -289,6 +289,12 @@ class Follower:
         """Why the last one could not be used; empty where none was."""
         return self._last_error or ("" if self.changes is None else self.changes.last_error)
 
+    @property
+    def kept(self) -> tuple[int, ...]:
+        """`snapshot_seq` of the states that `answer` can go back to, oldest first."""
+        with self._moved:
+            return tuple(message.snapshot_seq for message in self._kept)
+
     def wait(self, seq: int, timeout_s: float) -> bool:
         """Wait until the newest state has seen sample ``seq``; False if it has not after ``timeout_s``."""
         with self._moved:
@@ -305,7 +311,8 @@ class Follower:
         if query.pending is not None:
             check_domain(query.pending.y_um, self.limits, "pending.y_um")
             check_voltages(query.pending.u_V, self.limits, "pending.u_V")
-        kept = tuple(self._kept)
+        with self._moved:
+            kept = tuple(self._kept)
         message = kept[-1]
         if query.as_of != NEWEST:
             message = next((old for old in reversed(kept) if old.snapshot_seq <= query.as_of), kept[0])

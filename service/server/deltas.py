@@ -78,11 +78,13 @@ class DeltaStreams:
                     stream.send(stream.state.changed(self._entries(stream.name, move), move.seq))
             if newest is not stream.served and now_s - stream.sent_at_s >= 0.5 / self._axis.config.delta_hz:
                 stream.served, stream.sent_at_s = newest, now_s
-                later = [self._entries(stream.name, move) for move in moves if move.served is newest]
+                later = [move for move in moves if move.served is newest]
                 state = self._snapshot(stream, newest)
-                if later:  # one message for the snapshot and what has moved since
-                    state = state.changed(later[-1], moves[-1].seq)[0]
+                if later:  # one message for the snapshot and the first move from it
+                    state = state.changed(self._entries(stream.name, later[0]), later[0].seq)[0]
                 stream.send(stream.state.replaced(state))
+                for move in later[1:]:
+                    stream.send(stream.state.changed(self._entries(stream.name, move), move.seq))
 
     def _look(self) -> None:
         """Begin with the streams that somebody follows now, and end those that nobody does."""

@@ -138,6 +138,53 @@ static int follow(const char *folder, const row *rows, size_t count) {
     return followed;
 }
 
+/* Whole models and changes in order: what dehyst_update says, and the answers of the sum. */
+static int changes(const char *folder, const dehyst_limits *limits) {
+    char path[1024], line[256], name[64], message[16], name_of_file[80], outcome[16], fingerprint[16];
+    long long seq;
+    snprintf(path, sizeof path, "%s/deltas.txt", folder);
+    FILE *file = fopen(path, "r");
+    CHECK(file != NULL, "%s", path);
+    dehyst *handle = NULL;
+    payload query = load(folder, "deltas.query.payload");
+    int steps = 0;
+    while (file && fgets(line, sizeof line, file)) {
+        if (sscanf(line, "%63s %15s %79s %15s %15s %lld", name, message, name_of_file, outcome, fingerprint, &seq) != 6 ||
+            name[0] == '#')
+            continue;
+        payload got = load(folder, name_of_file);
+        if (!handle) {
+            CHECK(dehyst_open_payload(got.bytes, got.length, limits, &handle) == 0, "%s", dehyst_error());
+        } else {
+            int whole = !strcmp(outcome, "lost") || !strcmp(outcome, "mismatch");
+            int expected = whole ? DEHYST_WHOLE_NEEDED : !strcmp(outcome, "refused") ? -1 : 0;
+            int status = dehyst_update(handle, got.bytes, got.length);
+            CHECK(status == expected, "%s: got %d, expected %d", name, status, expected);
+        }
+        snprintf(path, sizeof path, "%s/deltas-%s.reply.payload", folder, name);
+        FILE *exists = fopen(path, "rb");
+        if (exists) {
+            fclose(exists);
+            snprintf(path, sizeof path, "deltas-%s.reply.payload", name);
+            payload expected = load(folder, path);
+            static uint8_t reply[ROOM];
+            size_t length = 0;
+            CHECK(dehyst_query(handle, query.bytes, query.length, NAN, reply, ROOM, &length) == 0, "%s", dehyst_error());
+            CHECK(length == expected.length, "%s: %zu bytes, expected %zu", name, length, expected.length);
+            for (size_t i = 0; length == expected.length && i < 2 * (size_t)u32_at(reply + 4); i++)
+                same(name, "doubles", i, f64_at(reply + 24 + 8 * i), f64_at(expected.bytes + 24 + 8 * i));
+            free(expected.bytes);
+        }
+        free(got.bytes);
+        steps++;
+    }
+    if (file)
+        fclose(file);
+    dehyst_close(handle);
+    free(query.bytes);
+    return steps;
+}
+
 /* Wrong use is refused with a text, and changes nothing. */
 static void refusals(const char *folder, const row *c) {
     payload model = load(folder, c->model);
@@ -194,7 +241,9 @@ int main(int argc, char **argv) {
         query_case(argv[1], &rows[i]);
     int followed = follow(argv[1], rows, count);
     CHECK(count > 50 && followed == 9, "%zu cases, %d followed", count, followed);
+    int steps = changes(argv[1], &rows[0].limits);
+    CHECK(steps > 20, "%d steps of changes", steps);
     refusals(argv[1], &rows[0]);
-    printf("C: %zu queries, %d followed blocks: %d failures\n", count, followed, failures);
+    printf("C: %zu queries, %d followed blocks, %d steps of changes: %d failures\n", count, followed, steps, failures);
     return failures ? 1 : 0;
 }

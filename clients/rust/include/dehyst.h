@@ -63,7 +63,12 @@ const char *dehyst_error(void);
 /* A handle from the payload of `.../model` (kind 6) and the limits. */
 int dehyst_open_payload(const uint8_t *payload, size_t bytes, const dehyst_limits *limits, dehyst **handle);
 
-/* A newer payload of the same model, from any thread. Refused payloads are counted and change nothing. */
+/* A newer payload of the same model, from any thread: a whole model (kind 6, of `.../model`) or changes (kind 7, of
+ * `.../model_delta` or `.../champion_delta`). Refused payloads are counted and change nothing. Returns 1
+ * (DEHYST_WHOLE_NEEDED) where a change is missing or a sum is wrong. After that, and after a refused change: query
+ * `.../model?name=NAME;changes=1` and give the answer to this function, until it returns 0. Changes that come meanwhile
+ * are kept. */
+#define DEHYST_WHOLE_NEEDED 1
 int dehyst_update(dehyst *handle, const uint8_t *payload, size_t bytes);
 
 /* Begin from the memory of the newest payload: that after sample snapshot_seq of the report. u_before_V: voltage from

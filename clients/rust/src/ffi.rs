@@ -1,6 +1,7 @@
 //! The C interface of `include/dehyst.h`. Panics do not cross it.
 
 use crate::answer::{Limits, Out};
+use crate::delta::Update;
 use crate::error::{Error, Result};
 use crate::follower::{Follower, Publisher};
 use std::cell::{RefCell, UnsafeCell};
@@ -60,6 +61,8 @@ pub struct CReport {
 const OK: c_int = 0;
 const REFUSED: c_int = -1;
 const INTERNAL: c_int = -2;
+/// Of `dehyst_update`: a change is missing.
+const WHOLE_NEEDED: c_int = 1;
 
 thread_local! {
     /// Text of the last error of this thread, with a zero at its end.
@@ -163,10 +166,18 @@ pub unsafe extern "C" fn dehyst_open_payload(
 /// `handle` is open, `payload` has `bytes` bytes.
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_update(handle: *mut Handle, payload: *const u8, bytes: usize) -> c_int {
-    guarded(|| {
+    let mut needed = false;
+    let status = guarded(|| {
         let handle = handle.as_ref().ok_or_else(|| missing("handle"))?;
-        handle.publisher.publish(read(payload, bytes, "payload")?)
-    })
+        let update = handle.publisher.update(read(payload, bytes, "payload")?)?;
+        needed = matches!(update, Update::Lost | Update::Mismatch);
+        Ok(())
+    });
+    if status == OK && needed {
+        WHOLE_NEEDED
+    } else {
+        status
+    }
 }
 
 /// # Safety

@@ -7,6 +7,7 @@
 use crate::answer::{
     self, limit_voltage, Done, Limits, Motion, Out, BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE,
 };
+use crate::delta::{Changes, Update};
 use crate::error::{Error, Result};
 use crate::snapshot::Snapshot;
 use crate::wire::{Query, Reply};
@@ -34,8 +35,14 @@ struct Mailbox {
     received: AtomicU64,
     refused: AtomicU64,
     name: String,
-    /// Serialises publishers; the follower never touches it. Holds why the last payload was refused.
-    last_error: Mutex<String>,
+    /// Serialises publishers; the follower never touches it.
+    feeding: Mutex<Feeding>,
+}
+
+/// What publishers share: the sum of the messages so far, and why the last one was refused.
+struct Feeding {
+    changes: Changes,
+    last_error: String,
 }
 
 impl Mailbox {
@@ -59,35 +66,48 @@ impl Drop for Mailbox {
 pub struct Publisher(Arc<Mailbox>);
 
 impl Publisher {
-    /// Decode a payload and leave it for the follower. An error changes nothing there, and is counted.
+    /// Decode a payload of kind 6 and leave the model for the follower. An error changes nothing there, and is counted.
     pub fn publish(&self, payload: &[u8]) -> Result<()> {
-        let decoded = Snapshot::decode(payload).and_then(|snapshot| {
-            if snapshot.model.name != self.0.name {
-                return Err(Error::new("model", &snapshot.model.name, format!("{:?}", self.0.name)));
+        self.update(payload).map(drop)
+    }
+
+    /// The same for a whole model (kind 6) or for changes (kind 7). `Lost`, `Mismatch` and an error of a change say that
+    /// a whole model must be fetched (`.../model?name=...;changes=1`) and given to this function.
+    pub fn update(&self, payload: &[u8]) -> Result<Update> {
+        let mut feeding = self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let taken = feeding.changes.take(payload).and_then(|(update, snapshot)| match &snapshot {
+            Some(new) if new.model.name != self.0.name => {
+                Err(Error::new("model", &new.model.name, format!("{:?}", self.0.name)))
             }
-            Ok(snapshot)
+            _ => Ok((update, snapshot)),
         });
-        let mut last_error = self.0.last_error.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        match decoded {
-            Ok(snapshot) => {
-                let arrived = Box::new(Arrived { snapshot, at: Instant::now() });
-                Mailbox::free(self.0.waiting.swap(Box::into_raw(arrived), Ordering::AcqRel));
-                // After the swap: the follower takes a snapshot only where the place for the old one is empty.
-                Mailbox::free(self.0.retired.swap(ptr::null_mut(), Ordering::AcqRel));
-                self.0.received.fetch_add(1, Ordering::Relaxed);
-                Ok(())
+        match taken {
+            Ok((update, snapshot)) => {
+                if let Some(snapshot) = snapshot {
+                    let arrived = Box::new(Arrived { snapshot, at: Instant::now() });
+                    Mailbox::free(self.0.waiting.swap(Box::into_raw(arrived), Ordering::AcqRel));
+                    // After the swap: the follower takes a snapshot only where the place for the old one is empty.
+                    Mailbox::free(self.0.retired.swap(ptr::null_mut(), Ordering::AcqRel));
+                    self.0.received.fetch_add(1, Ordering::Relaxed);
+                }
+                Ok(update)
             }
             Err(error) => {
                 self.0.refused.fetch_add(1, Ordering::Relaxed);
-                *last_error = error.to_string();
+                feeding.last_error = error.to_string();
                 Err(error)
             }
         }
     }
 
+    /// Fingerprint of the newest model, as in the payloads of kind 7.
+    pub fn fingerprint(&self) -> u32 {
+        self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).changes.fingerprint()
+    }
+
     /// Why the last payload was refused; empty where none was.
     pub fn last_error(&self) -> String {
-        self.0.last_error.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).clone()
+        self.0.feeding.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).last_error.clone()
     }
 }
 
@@ -147,7 +167,7 @@ impl Follower {
             received: AtomicU64::new(1),
             refused: AtomicU64::new(0),
             name: snapshot.model.name.clone(),
-            last_error: Mutex::new(String::new()),
+            feeding: Mutex::new(Feeding { changes: Changes::new(payload)?, last_error: String::new() }),
         };
         Ok(Follower {
             mailbox: Arc::new(mailbox),

@@ -2,7 +2,7 @@
 //!
 //! A [`Follower`] is made of the payload of a model and of the limits of the axis. It answers a point in microseconds,
 //! without a lock or an allocation, with the voltages of the service to 1e-12 V. Another thread hands it newer payloads
-//! through its [`Publisher`]; how they come is the caller's business (the crate in `zenoh/` subscribes to a service).
+//! through its [`Publisher`], whole models or their changes; how they come is the caller's business (the crate in `zenoh/` subscribes to a service).
 //!
 //! ```no_run
 //! use dehyst::{Follower, Limits};
@@ -19,6 +19,7 @@
 //! The same through C: `include/dehyst.h`.
 
 pub mod answer;
+mod delta;
 mod error;
 pub mod ffi;
 mod follower;
@@ -29,6 +30,7 @@ mod snapshot;
 pub mod wire;
 
 pub use answer::{Limits, Motion, Out};
+pub use delta::{Changes, Update};
 pub use error::{Error, Result};
 pub use follower::{flag_names, Follower, Point, Publisher, Report};
 pub use snapshot::Snapshot;

@@ -626,7 +626,8 @@ impl Champion {
         let names: Vec<String> = entries.text("names")?.split(',').map(String::from).collect();
         let kinds: Vec<&str> = entries.text("kinds")?.split(',').collect();
         let champion = entries.finite("champion")?;
-        if kinds.len() != names.len() || !(champion >= 0.0 && champion < names.len() as f64) {
+        if kinds.len() != names.len() || !(champion >= 0.0 && champion < names.len() as f64 && champion.fract() == 0.0)
+        {
             let got = format!("{} names, {} kinds, {champion}", names.len(), kinds.len());
             return Err(Error::new("names, kinds, champion", got, "one kind a name, and the index of one of them"));
         }

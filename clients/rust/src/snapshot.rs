@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::json::Value;
 use crate::model::{Entries, Model};
 use crate::wire::{Array, Container};
+use std::collections::HashMap;
 
 /// The baseline that answers in place of a model, and its memory in the snapshot.
 pub struct StandIn {
@@ -35,6 +36,11 @@ pub struct Snapshot {
 impl Snapshot {
     pub fn decode(data: &[u8]) -> Result<Snapshot> {
         let Container { snapshot_seq, header, arrays } = Container::decode(data)?;
+        Snapshot::build(snapshot_seq, &header, &arrays)
+    }
+
+    /// From the JSON and the arrays of a payload.
+    pub fn build(snapshot_seq: i64, header: &Value, arrays: &HashMap<String, Array>) -> Result<Snapshot> {
         let text = |of: &Value, name: &str| -> Result<String> {
             let found = of.get(name).and_then(Value::text).map(String::from);
             found.ok_or_else(|| Error::new("header", format!("no text {name:?}"), "JSON with name, kind and dt_s"))
@@ -43,8 +49,8 @@ impl Snapshot {
         let dt_s = dt_s.ok_or_else(|| Error::new("header", "no number \"dt_s\"", "JSON with name, kind and dt_s"))?;
         let empty = Value::Object(Vec::new());
         let values = header.get("values").unwrap_or(&empty);
-        let entries = Entries { values, arrays: &arrays, prefixes: ("", "") };
-        let model = Model::new(&text(&header, "name")?, &text(&header, "kind")?, dt_s, &entries)?;
+        let entries = Entries { values, arrays, prefixes: ("", "") };
+        let model = Model::new(&text(header, "name")?, &text(header, "kind")?, dt_s, &entries)?;
         let memory = memory_of(&model, arrays.get("/memory"), "/memory")?;
         let safety = header.get("safety").unwrap_or(&empty);
         let number = |name: &str, missing: f64| safety.get(name).map_or(Some(missing), Value::number);
@@ -57,7 +63,7 @@ impl Snapshot {
         let mut stand_in = None;
         if let Some(other) = safety.get("stand_in") {
             let values = other.get("values").unwrap_or(&empty);
-            let entries = Entries { values, arrays: &arrays, prefixes: ("", "/stand_in/") };
+            let entries = Entries { values, arrays, prefixes: ("", "/stand_in/") };
             let model = Model::new(&text(other, "name")?, &text(other, "kind")?, dt_s, &entries)?;
             let memory = memory_of(&model, arrays.get("/stand_in_memory"), "/stand_in_memory")?;
             stand_in = Some(StandIn { model, memory });

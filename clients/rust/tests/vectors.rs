@@ -1,7 +1,7 @@
 //! The test vectors of docs/protocol/vectors, by queries and by a follower that goes along.
 
-use dehyst::wire::{Query, Reply};
-use dehyst::{Follower, Limits, Out, Snapshot};
+use dehyst::wire::{Delta, Query, Reply};
+use dehyst::{Follower, Limits, Out, Snapshot, Update};
 use std::fs;
 use std::path::PathBuf;
 
@@ -138,6 +138,68 @@ fn start_and_advance_are_what_is_under_way() {
 }
 
 #[test]
+fn changes_add_up_and_what_is_missing_is_noticed() {
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    let query = read("deltas.query.payload");
+    let steps = rows("deltas.txt");
+    let mut follower = Follower::new(&read(&steps[0][2]), limits).unwrap();
+    let publisher = follower.publisher();
+    let mut answered = 0;
+    for row in &steps[1..] {
+        let got = publisher.update(&read(&row[2]));
+        let outcome = match &got {
+            Ok(Update::Taken) => "taken",
+            Ok(Update::Known) => "known",
+            Ok(Update::Waits) => "waits",
+            Ok(Update::Lost) => "lost",
+            Ok(Update::Mismatch) => "mismatch",
+            Err(_) => "refused",
+        };
+        assert_eq!(outcome, row[3], "{}: {got:?}", row[0]);
+        assert_eq!(format!("{:08x}", publisher.fingerprint()), row[4], "{}", row[0]);
+        let reply = folder().join(format!("deltas-{}.reply.payload", row[0]));
+        if let Ok(expected) = fs::read(reply) {
+            let expected = Reply::decode(&expected).unwrap();
+            let got = follower.reply(&query, None).unwrap();
+            same(&format!("{} u_V", row[0]), &got.u_v, &expected.u_v);
+            same(&format!("{} std_V", row[0]), &got.std_v, &expected.std_v);
+            same(&format!("{} memory", row[0]), &got.memory, &expected.memory);
+            assert_eq!(got.flags, expected.flags);
+            assert_eq!(got.snapshot_seq.to_string(), row[5]);
+            answered += 1;
+        }
+    }
+    assert!(answered >= 8);
+}
+
+#[test]
+fn no_damage_of_a_change_panics_or_is_taken() {
+    let base = read("deltas-base.fetched.payload");
+    let limits = Limits { u_min_v: 0.0, u_max_v: 10.0, slew_v_per_s: 2e3, y_min_um: -40.0, y_max_um: 140.0 };
+    for name in ["deltas-frame.change.payload", "deltas-kernel.change.payload"] {
+        let whole = read(name);
+        let publisher = Follower::new(&base, limits).unwrap().publisher();
+        if name.contains("kernel") {
+            assert_eq!(publisher.update(&read("deltas-frame.change.payload")).unwrap(), Update::Taken);
+        }
+        let before = publisher.fingerprint();
+        for end in (0..whole.len()).step_by(7) {
+            assert!(publisher.update(&whole[..end]).is_err(), "{name} cut to {end}");
+        }
+        for at in (0..whole.len()).step_by(3).filter(|at| !(8..16).contains(at)) {
+            let mut changed = whole.clone();
+            changed[at] ^= 1 << (at % 8);
+            let publisher = Follower::new(&base, limits).unwrap().publisher();
+            if name.contains("kernel") {
+                publisher.update(&read("deltas-frame.change.payload")).unwrap();
+            }
+            assert!(!matches!(publisher.update(&changed), Ok(Update::Taken)), "{name} byte {at}");
+            assert_eq!(publisher.fingerprint(), before);
+        }
+    }
+}
+
+#[test]
 fn malformed_payloads_are_refused_with_the_field_of_the_service() {
     let mut checked = 0;
     for row in rows("refused.txt") {
@@ -145,6 +207,7 @@ fn malformed_payloads_are_refused_with_the_field_of_the_service() {
         let error = match row[1].as_str() {
             "4" => Query::decode(&payload).map(drop).unwrap_err(),
             "6" => Snapshot::decode(&payload).map(drop).unwrap_err(),
+            "7" => Delta::decode(&payload).map(drop).unwrap_err(),
             _ => continue, // this client sends samples and commands, and reads none
         };
         assert_eq!(&error.field, field, "{}", row[0]);

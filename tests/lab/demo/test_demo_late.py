@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.demo.controller import blocks_now
-from lab.demo.plan import Plan
+from lab.demo.plan import make_plan
 from lab.demo.result import MOST_LATE, clock_missed
 
 
@@ -24,9 +24,9 @@ def test_a_machine_that_does_not_is_told_of_with_what_to_do() -> None:
     assert clock_missed({"count": 60_000, "late": round(60_000 * MOST_LATE) + 1, "bare_late": 0})
 
 
-@given(st.integers(0, 599), st.integers(0, 12_000))
-def test_a_controller_that_is_late_goes_on_where_one_in_time_would_be(block: int, seen: int) -> None:
-    plan = Plan(run_s=12.0)
+@given(st.integers(0, 599), st.integers(0, 12_000), st.booleans())
+def test_a_controller_that_is_late_goes_on_where_one_in_time_would_be(block: int, seen: int, ahead: bool) -> None:
+    plan = make_plan(12.0, 20, ahead)
     size, last = plan.block, plan.ticks // plan.block
     fresh, stop = blocks_now(plan, block, seen)
     assert block <= fresh < stop <= last

@@ -11,7 +11,9 @@
 pub mod ffi;
 
 use dehyst::json::{self, Value};
-use dehyst::{Error, Follower, Limits, Result};
+use dehyst::{Error, Follower, Limits, Publisher, Result, Update};
+use std::sync::mpsc::{SyncSender, TryRecvError};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 use zenoh::pubsub::Subscriber;
 use zenoh::{Config, Session, Wait};
@@ -82,22 +84,32 @@ pub fn open(options: &Options) -> Result<Live> {
     let limits = limits_of(&status)?;
     // Subscribe before the fetch, so that no model is missed between the two; a follower is made by the fetch.
     let (early, waiting) = std::sync::mpsc::sync_channel::<Vec<u8>>(64);
-    let publisher = std::sync::Arc::new(std::sync::OnceLock::<dehyst::Publisher>::new());
+    let publisher = Arc::new(OnceLock::<Publisher>::new());
     let key = match name.as_str() {
         "auto" => Some("champion"),
         other if other == text("learning") => Some("model"),
         _ => None, // what does not learn is not published
     };
+    // A service that publishes no changes publishes whole models.
+    let changes = status.get("delta_hz").and_then(Value::number).is_some_and(|rate| rate > 0.0);
+    let whole = format!("{}/model?name={name}{}", feed.base, if changes { ";changes=1" } else { "" });
+    let repair = repairer(feed.session.clone(), whole.clone(), publisher.clone());
     if let Some(key) = key {
+        let key = if changes { format!("{key}_delta") } else { key.to_string() };
         let publisher = publisher.clone();
+        let repair = repair.clone();
         let subscriber = feed
             .session
             .declare_subscriber(format!("{}/{key}", feed.base))
             .callback(move |sample| {
                 let payload = sample.payload().to_bytes();
                 match publisher.get() {
-                    // A refused payload is counted there; the next one is complete again.
-                    Some(publisher) => drop(publisher.publish(&payload)),
+                    Some(publisher) => {
+                        // What is refused is counted there. A whole model is complete again; changes are not.
+                        if !matches!(publisher.update(&payload), Ok(Update::Taken | Update::Known | Update::Waits)) {
+                            drop(repair.try_send(()));
+                        }
+                    }
                     None => drop(early.try_send(payload.into_owned())),
                 }
             })
@@ -105,13 +117,42 @@ pub fn open(options: &Options) -> Result<Live> {
             .map_err(|error| failed("model", error, "a subscription"))?;
         feed._subscriber = Some(subscriber);
     }
-    let follower = Follower::new(&feed.get(&format!("{}/model?name={name}", feed.base))?, limits)?;
+    let follower = Follower::new(&feed.get(&whole)?, limits)?;
     let own = follower.publisher();
+    let mut missing = false;
     while let Ok(payload) = waiting.try_recv() {
-        drop(own.publish(&payload));
+        missing = !matches!(own.update(&payload), Ok(Update::Taken | Update::Known));
     }
     drop(publisher.set(own));
+    if missing {
+        drop(repair.try_send(()));
+    }
     Ok(Live { follower, feed })
+}
+
+/// A thread that fetches the whole model when it is told that a change is missing. It ends with the sender.
+fn repairer(session: Session, selector: String, publisher: Arc<OnceLock<Publisher>>) -> SyncSender<()> {
+    let (sender, missing) = std::sync::mpsc::sync_channel::<()>(1);
+    let work = move || {
+        while missing.recv().is_ok() {
+            let mut pause = Duration::from_millis(5);
+            while let Some(publisher) = publisher.get() {
+                let got =
+                    get(&session, &selector, Duration::from_secs(2)).and_then(|payload| publisher.update(&payload));
+                // Until the changes that came meanwhile follow the model that was fetched.
+                if matches!(got, Ok(Update::Taken)) {
+                    break;
+                }
+                std::thread::sleep(pause);
+                pause = (2 * pause).min(Duration::from_secs(1));
+                if matches!(missing.try_recv(), Err(TryRecvError::Disconnected)) {
+                    return;
+                }
+            }
+        }
+    };
+    drop(std::thread::Builder::new().name("dehyst-repair".into()).spawn(work));
+    sender
 }
 
 fn config(options: &Options) -> Result<Config> {
@@ -156,37 +197,41 @@ impl Feed {
 
     /// The one reply to a query, which is repeated until the time-out while nobody answers.
     pub fn get(&self, selector: &str) -> Result<Vec<u8>> {
-        let until = Instant::now() + self.timeout;
-        loop {
-            let left = until.saturating_duration_since(Instant::now());
-            let replies = self
-                .session
-                .get(selector)
-                .timeout(left.max(Duration::from_millis(100)))
-                .wait()
-                .map_err(|error| failed("query", error, "an open session"))?;
-            while let Ok(reply) = replies.recv() {
-                match reply.result() {
-                    Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
-                    Err(error) => {
-                        let payload = error.payload().to_bytes();
-                        if let Some(pause) = busy(&payload) {
-                            // Others ask for too much; the service says when to ask again.
-                            std::thread::sleep(pause.min(until.saturating_duration_since(Instant::now())));
-                            continue;
-                        }
-                        if !String::from_utf8_lossy(&payload).to_lowercase().contains("timeout") {
-                            return Err(refusal(&payload));
-                        }
+        get(&self.session, selector, self.timeout)
+    }
+}
+
+/// The one reply to a query, which is repeated until the time-out while nobody answers.
+fn get(session: &Session, selector: &str, timeout: Duration) -> Result<Vec<u8>> {
+    let until = Instant::now() + timeout;
+    loop {
+        let left = until.saturating_duration_since(Instant::now());
+        let replies = session
+            .get(selector)
+            .timeout(left.max(Duration::from_millis(100)))
+            .wait()
+            .map_err(|error| failed("query", error, "an open session"))?;
+        while let Ok(reply) = replies.recv() {
+            match reply.result() {
+                Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
+                Err(error) => {
+                    let payload = error.payload().to_bytes();
+                    if let Some(pause) = busy(&payload) {
+                        // Others ask for too much; the service says when to ask again.
+                        std::thread::sleep(pause.min(until.saturating_duration_since(Instant::now())));
+                        continue;
+                    }
+                    if !String::from_utf8_lossy(&payload).to_lowercase().contains("timeout") {
+                        return Err(refusal(&payload));
                     }
                 }
             }
-            if Instant::now() >= until {
-                let expected = "a running service for this stage and axis, which this role may query";
-                return Err(Error::new(selector, "no reply", expected));
-            }
-            std::thread::sleep(Duration::from_millis(50));
         }
+        if Instant::now() >= until {
+            let expected = "a running service for this stage and axis, which this role may query";
+            return Err(Error::new(selector, "no reply", expected));
+        }
+        std::thread::sleep(Duration::from_millis(50));
     }
 }
 
