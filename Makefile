@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
 # Tests that only compute, which may share all cores.
-PURE   := tests/test_house.py tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
+PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
           tests/hidden tests/lab/reproduce tests/lab/test_scenarios.py tests/lab/rehearsal \
           tests/benchmarks/test_house_bench.py \
           $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_voltages.py) \
@@ -27,7 +27,8 @@ COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes 
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup setup-test demo test test-clients wheel-check check bench foreign fuzz blind blind-foreign vectors requirements clean
+.PHONY: help setup setup-test demo test test-clients wheel-check check docs bench foreign fuzz blind blind-foreign \
+        vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -73,6 +74,10 @@ check: .setup-test ## ruff, mypy --strict, the import contract
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: .setup-test ## the site of the documentation, offline, into out/site; a warning is an error
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "out/site/index.html: to search in it, call $(BIN)/python -m http.server --directory out/site"
 
 bench: setup-test ## the solver beside its yardsticks and its peers
 	$(BIN)/dehyst bench

@@ -7,6 +7,7 @@ import importlib
 import os
 import sys
 from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, Final, NamedTuple
 
 from adaptive.errors import DehystError
@@ -95,7 +96,11 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
         return 2
     parser = build_parser(commands, [chosen] if chosen is not None and known else [])
     if chosen is not None and not known:
-        parser.error(f"COMMAND: got {chosen!r}, expected one of {', '.join(commands)}; options follow the command")
+        near = get_close_matches(chosen, commands, n=3)
+        meant = f"did you mean {' or '.join(near)}? " if near else ""
+        parser.error(
+            f"COMMAND: got {chosen!r}; {meant}expected one of {', '.join(commands)}; options follow the command"
+        )
     parsed = parser.parse_args(args, argparse.Namespace(given=args))
     from service.runtime.logging_setup import set_up_logging
 

@@ -8,10 +8,10 @@ from service.cli.main import build_parser
 from service.cli.options import add_epilog
 
 EPILOG = """\
-  bash   dehyst completion bash > ~/.local/share/bash-completion/completions/dehyst
-  zsh    dehyst completion zsh > DIR/_dehyst, where DIR is one of $fpath
-  fish   dehyst completion fish > ~/.config/fish/completions/dehyst.fish
-  tcsh   dehyst completion tcsh > ~/.dehyst.tcsh, and source it from ~/.tcshrc
+  dehyst completion bash > ~/.local/share/bash-completion/completions/dehyst
+  dehyst completion zsh > ~/.zfunc/_dehyst                # a folder of $fpath
+  dehyst completion fish > ~/.config/fish/completions/dehyst.fish
+  dehyst completion tcsh > ~/.dehyst.tcsh                 # and source it from ~/.tcshrc
 
 The script holds commands and options of this version: print it again after an update.
 """

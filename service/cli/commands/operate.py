@@ -6,7 +6,7 @@ import argparse
 import getpass
 import json
 import time
-from typing import Any
+from typing import Any, Final
 
 from service.cli.options import add_connection, add_epilog, add_shared
 from service.operating.remote import operate
@@ -16,13 +16,23 @@ from service.runtime.session import open_client
 EPILOG = """\
 The service records who commanded what, when, and from which sample on it took effect. Where other machines can reach
 the service, zenoh's access control decides what an operator may do (docs/access.md, docs/operating.md).
+
 """
+_EXAMPLES: Final = {
+    "freeze": "  dehyst freeze --axis x --who alice\n",
+    "thaw": "  dehyst thaw --axis x --who alice\n",
+    "rollback": "  dehyst checkpoints --axis x\n  dehyst rollback 41 --axis x\n",
+    "checkpoints": "  dehyst checkpoints --axis x\n",
+    "select": "  dehyst select linear --axis x\n  dehyst select auto --axis x\n",
+    "retune": "  dehyst retune --axis x\n",
+    "ask-diagnosis": "  dehyst ask-diagnosis --axis x --recent 30\n",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command that the parser is named after, with units in the help."""
     verb = parser.prog.split()[-1]
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG + _EXAMPLES[verb])
     parser.set_defaults(verb=verb)
     add = parser.add_argument
     if verb == "rollback":

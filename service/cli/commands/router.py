@@ -5,11 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 
-from service.cli.options import add_shared
+from service.cli.options import add_epilog, add_shared
+
+EPILOG = """\
+  dehyst router --listen tcp/127.0.0.1:7450
+  dehyst router --listen tls/192.0.2.10:7447 --zenoh-config access/r1.json5    # from 'dehyst access init'
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add("--listen", action="append", metavar="ENDPOINT", help="listen here; repeatable (tcp/127.0.0.1:7447)")
     add("--connect", action="append", default=[], metavar="ENDPOINT", help="another router; repeatable")

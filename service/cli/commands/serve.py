@@ -16,6 +16,14 @@ from service.runtime.session import check_endpoint, is_loopback
 from service.security.check import has_access_control
 from service.security.refusals import count_refusals
 
+EPILOG = """\
+All keys of the configuration: docs/configuration.md.
+
+  dehyst serve --example > serve.toml    # then set model file and limits
+  dehyst serve --config serve.toml
+  dehyst serve --config serve.toml --standby
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
@@ -28,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_shared(parser, "insecure-beyond-loopback", "duration")
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
-    add_epilog(parser, "All keys of the configuration: docs/configuration.md.")
+    add_epilog(parser, EPILOG)
 
 
 def run(args: argparse.Namespace) -> int:

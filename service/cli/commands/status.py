@@ -11,7 +11,7 @@ from typing import Any
 
 import zenoh
 
-from service.cli.options import add_connection, add_shared
+from service.cli.options import add_connection, add_epilog, add_shared
 from service.operating.remote import Standbys, in_order, screen, statuses, table
 from service.protocol.container import fields_of
 from service.protocol.errors import FieldError
@@ -22,9 +22,15 @@ from service.runtime.stopping import StopSignal
 #: A little more than the period at which a standby publishes its status, s.
 _STANDBY_PERIOD_S = 1.2
 
+EPILOG = """\
+  dehyst status                   # a live table; Ctrl-C ends it
+  dehyst status --once --json
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser)
     add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})

@@ -11,7 +11,7 @@ import uuid
 from pathlib import Path
 
 from adaptive.errors import InputError
-from service.cli.options import add_connection, add_shared
+from service.cli.options import add_connection, add_epilog, add_shared
 from service.protocol.errors import ServiceError
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
@@ -25,9 +25,15 @@ DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 #: Past that live plots show by default, s; a file shows all.
 LIVE_HISTORY_S = 30.0
 
+EPILOG = """\
+  dehyst view --spawn                           # a viewer on this machine
+  dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
+"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser, wait_s=10.0, timeout_s=None)
     add_shared(parser, "stage", axis={"help": "axis that the service serves and learns from (%(default)s)"})

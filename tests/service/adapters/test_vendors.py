@@ -9,7 +9,6 @@ import subprocess
 import sys
 import types
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,7 +20,6 @@ from service.adapters.ni import NiStage
 from service.adapters.pi import PiStage
 from tests.service.adapters.simulated_nv200 import SimulatedNv200
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 needs_pipython = pytest.mark.skipif(
     importlib.util.find_spec("pipython") is None, reason="pipython is not installed (extra 'hardware')"
 )
@@ -41,9 +39,9 @@ def at_its_limits(stage: StageAdapter) -> None:
 
 @pytest.fixture
 def pi_port() -> Iterator[int]:
-    """The port of the simulated PI controller of the examples."""
+    """The port of the simulated PI controller."""
     process = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / "simulated_pi.py"), "--port", "0"], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "service.adapters.simulated_pi", "--port", "0"], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     found = re.search(r"port (\d+)", process.stdout.readline())
@@ -60,7 +58,7 @@ def test_a_pi_controller_is_read_and_driven_by_gcs(pi_port: int) -> None:
     for check_errors in (True, False):
         with PiStage("127.0.0.1", port=pi_port, rate_Hz=100.0, check_errors=check_errors) as stage:
             assert "E-709" in stage.identity
-            assert (stage.rate_Hz, stage.u_min_V, stage.u_max_V) == (100.0, 0.0, 100.0)
+            assert (stage.rate_Hz, stage.u_min_V, stage.u_max_V) == (100.0, -20.0, 100.0)
             at_its_limits(stage)
             before_um = stage.read_um()
             stage.write_V(60.0)
