@@ -31,7 +31,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
-from service.stage_node.faults import Injector, fault_key
+from service.stage_node.faults import Injector, fault_key, sound_key
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 
@@ -114,11 +114,16 @@ class SampleRing:
     """Samples by number, written by one thread and sent by another.
 
     ``injector`` may change the messages. Samples that it leaves out count neither as published nor as lost; samples
-    that it sends twice count twice as published.
+    that it sends twice count twice as published. ``put_sound`` sends the samples without its faults.
     """
 
     def __init__(
-        self, dt_s: float, put: Callable[[bytes], None], injector: Injector | None = None, begin: int = 0
+        self,
+        dt_s: float,
+        put: Callable[[bytes], None],
+        injector: Injector | None = None,
+        begin: int = 0,
+        put_sound: Callable[[bytes], None] | None = None,
     ) -> None:
         self.dt_s = dt_s
         self.published = 0
@@ -127,14 +132,18 @@ class SampleRing:
         self._put = put
         self._u_V: FloatArray = np.zeros(RING_SIZE)
         self._y_um: FloatArray = np.zeros(RING_SIZE)
+        self._put_sound = put_sound
+        self._sound_um: FloatArray = np.zeros(RING_SIZE if put_sound is not None else 0)
         self._written = begin
         self._sent = begin
 
-    def write(self, k: int, u_V: float, y_um: float) -> None:
-        """Write sample k; samples come in order, without gaps, from ``begin`` on."""
+    def write(self, k: int, u_V: float, y_um: float, sound_um: float = math.nan) -> None:
+        """Write sample k; samples come in order, without gaps, from ``begin`` on. ``sound_um``: without a fault."""
         slot = k % RING_SIZE
         self._u_V[slot] = u_V
         self._y_um[slot] = y_um
+        if self._put_sound is not None:
+            self._sound_um[slot] = sound_um
         self._written = k + 1
 
     def send(self) -> bool:
@@ -151,6 +160,10 @@ class SampleRing:
         slots = seq % RING_SIZE
         rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
         self._sent += n
+        if self._put_sound is not None:
+            # Not counted: it is for tests, and one that is lost is judged by nobody.
+            with contextlib.suppress(zenoh.ZError):
+                self._put_sound(wire.encode_samples(*rows[:3], self._sound_um[slots]))
         for message in [rows] if self._injector is None else self._injector.deliver(rows):
             self._send(*message)
         return self._sent < end
@@ -288,7 +301,12 @@ class AxisPort:
         self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
         # Samples must not be lost: a full channel blocks the sender thread, not the loop, and drops nothing.
         self._publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
-        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first)
+        sound = None
+        if self.injector is not None:
+            sound = session.declare_publisher(sound_key(config.name, axis), express=True)
+        self._sound = sound
+        put_sound = None if sound is None else sound.put
+        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
         self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
         if self.injector is not None:
@@ -314,7 +332,10 @@ class AxisPort:
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""
-        self.ring.write(k, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+        if self.injector is None:
+            self.ring.write(k, u_V, y_um)
+        else:
+            self.ring.write(k, u_V, self.injector.reading(k, y_um), y_um)
 
     def summary(self) -> dict[str, Any]:
         summary: dict[str, Any] = {
@@ -332,6 +353,8 @@ class AxisPort:
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        if self._sound is not None:
+            self._sound.undeclare()  # type: ignore[no-untyped-call]
         self.status.undeclare()  # type: ignore[no-untyped-call]
 
 
