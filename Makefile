@@ -8,7 +8,7 @@ SEED   ?= 0
 PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
           tests/hidden tests/lab/reproduce tests/lab/test_scenarios.py tests/lab/rehearsal \
           tests/benchmarks/test_house_bench.py \
-          $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_voltages.py) \
+          $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_sensor_faults.py test_voltages.py) \
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
           protocol/test_payloads.py runtime/test_logging_setup.py \

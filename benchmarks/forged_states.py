@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import struct
 import subprocess
 import sys
 import tempfile
@@ -159,19 +160,19 @@ def forged(state: StateDict, rng: np.random.Generator) -> tuple[StateDict, str]:
             made.pop(name, None)
             what = "removed"
         else:
-            made[name] = what = _VALUES[int(rng.integers(len(_VALUES)))]
+            made[name] = what = VALUES[int(rng.integers(len(VALUES)))]
         words.append(f"{name}: {str(what)[:40]}")
     return made, "; ".join(words)
 
 
-_VALUES: Final[tuple[Any, ...]] = (
+VALUES: Final[tuple[Any, ...]] = (
     -1, 0, 1, 7, 2**31, 2**62, 2**63, 10**30, -(2**62), -1e308, 1e308, 5e-324, 0.5, True, None, "", "nan", "sorcery",
     [], [1, 2], {}, np.array(np.nan), np.array(np.inf), np.zeros(0), np.zeros((3, 3)), np.array(-(2**63)),
 )  # fmt: skip
 
 
 #: By name of what is done: an array in, another out.
-_CHANGES: Final[dict[str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]]] = {
+CHANGES: Final[dict[str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]]] = {
     "emptied": lambda value: np.zeros((0,) * max(value.ndim, 1), value.dtype),
     "cut to half": lambda value: value[: value.shape[0] // 2].copy() if value.ndim else value[None],
     "cut by a column": lambda value: value[..., :-1].copy() if value.ndim else value[None],
@@ -190,10 +191,39 @@ _CHANGES: Final[dict[str, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]
 }
 
 
+#: Bytes of one edit of `edited`: number of the entry, number of the change, and a value.
+EDIT: Final = struct.Struct("<HB8s")
+#: Most edits of one state.
+MOST_EDITS: Final = 8
+
+
+def edited(state: StateDict, data: bytes) -> StateDict:
+    """A copy of ``state`` with entries replaced as ``data`` says, so that a fuzzer reaches every entry by few bytes."""
+    made, names, changes = dict(state), list(state), list(CHANGES.values())
+    for at in range(0, min(len(data), MOST_EDITS * EDIT.size) - EDIT.size + 1, EDIT.size):
+        entry, change, raw = EDIT.unpack_from(data, at)
+        name = names[entry % len(names)]
+        value, number = state[name], np.frombuffer(raw, dtype="<f8")
+        kinds = len(changes) + len(VALUES) + 4
+        what = change % kinds
+        if what < len(changes):
+            made[name] = changes[what](np.asarray(value)) if np.asarray(value).dtype.kind in "fiub" else raw
+        elif what < len(changes) + len(VALUES):
+            made[name] = VALUES[what - len(changes)]
+        elif what == kinds - 1:
+            made.pop(name, None)
+        elif what == kinds - 2 and isinstance(value, np.ndarray) and value.size:
+            made[name] = value.astype(np.float64)
+            made[name].flat[raw[0] * value.size // 256] = number[0]
+        else:
+            made[name] = float(number[0]) if what == kinds - 3 else int.from_bytes(raw, "little", signed=True)
+    return made
+
+
 def _forged_array(value: np.ndarray[Any, Any], rng: np.random.Generator) -> tuple[Any, str]:
     if rng.random() < 0.9:
-        what = list(_CHANGES)[int(rng.integers(len(_CHANGES)))]
-        return _CHANGES[what](value), what
+        what = list(CHANGES)[int(rng.integers(len(CHANGES)))]
+        return CHANGES[what](value), what
     one = value.astype(np.int64 if value.dtype.kind == "i" else np.float64)
     if one.size:
         one.flat[int(rng.integers(one.size))] = rng.choice([-1, 2**31, 2**62, -(2**31), 10**6])

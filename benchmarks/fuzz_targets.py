@@ -21,6 +21,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
 from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
+from service.failover.role_control import Claims
 from service.failover.state_transfer import join_parts
 from service.operating.verbs import Request, decode_request, encode_request
 from service.protocol import delta as wire_delta
@@ -29,6 +30,8 @@ from service.protocol import query as wire_query
 from service.protocol import query as wire_reply
 from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
+from service.protocol.keys import Keys
+from service.security.peers import PeerSecret
 from service.stage_node.faults import decode_fault
 from service.storage import checkpoint
 
@@ -134,6 +137,41 @@ def _parts(data: bytes) -> None:
         raise AssertionError("parts were taken for a whole that they do not make")
 
 
+def _claims() -> Target:
+    """Keys of liveliness tokens: whatever they say, nobody who lacks the secret has a claim."""
+    keys = Keys("demo", "x")
+    claims = Claims(keys, "i-me", PeerSecret(b"0123456789abcdef"))
+
+    def target(data: bytes) -> None:
+        claims.update(f"{keys.base}/claim/{data.decode(errors='replace')}", True)
+        if claims.highest() is not None or claims.next_epoch() != 1:
+            raise AssertionError("a claim without proof was believed")
+
+    return target
+
+
+def _state() -> Target:
+    """A valid state with entries replaced: an axis refuses it, or takes it and learns and answers from it."""
+    from benchmarks.forged_states import edited, make_axis, recording
+
+    axis = make_axis(alone=True)
+    axis.handle(recording(0, 400))
+    state = axis.state_dict()
+
+    def target(data: bytes) -> None:
+        with np.errstate(all="ignore"), contextlib.suppress(ModelFileError):
+            axis.restore(edited(state, data))
+            # Small numbers: a count that was forged to be huge cannot go on.
+            first = axis.sequence.last + 1 if 0 <= axis.sequence.last < 2**31 else 400
+            axis.handle(recording(first, 5))
+            u_V = axis.answer(wire_query.FeedforwardQuery(np.array([40.0]), np.zeros(1), np.zeros(1))).u_V
+            if not (0.0 <= u_V[0] <= 10.0):
+                raise AssertionError(f"a forged state was taken, and the answer is {u_V[0]} V")
+        axis.take_events()
+
+    return target
+
+
 #: Words that a mutation may insert, from the JSON of the payloads.
 WORDS = (
     '"name"', '"kind"', '"dt_s"', '"values"', '"arrays"', '"/memory"', '"lssvm"', '"linear"', '"<f8"', '"<i8"', '"|u1"',
@@ -152,6 +190,8 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "delta": _changing,
     "framed": lambda: _framed_model,
     "checkpoint": lambda: _framed_checkpoint,
+    "state": _state,
+    "claim": _claims,
     "parts": lambda: _parts,
     "fault": lambda: _refusing(decode_fault),
     "operate": lambda: _refusing(decode_request),
@@ -204,6 +244,8 @@ def seeds(target: str) -> list[bytes]:
         "delta": _changes(),
         "framed": framed,
         "checkpoint": [kept[8:10] + kept[32:], b""],
+        "state": [struct.pack("<HB8s", entry, change, bytes(8)) for entry, change in ((0, 0), (40, 3), (90, 41))],
+        "claim": [b"3/i-rogue/00ff00ff00ff00ff00ff00ff00ff00ff", b"999999999/i-rogue"],
         "parts": [b"".join(struct.pack("<II3s", i, 3, b"abc") for i in range(3))],
         "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],
         "operate": [

@@ -166,6 +166,8 @@ REPORT_S = 1.0
 #: An answer that comes less than this many ticks before its block is due is not sent: it might reach the stage in the
 #: middle of the block, and the voltage would jump.
 MARGIN = 10
+#: A sample number further ahead of the newest one than this is wrong.
+STRAY = 30_000
 
 
 class StageClock:
@@ -188,9 +190,10 @@ class StageClock:
             # Another client sent this. The stage's own samples follow.
             return
         with self._moved:
-            last = int(batch.seq[-1])
-            if self.first >= 0 and last >= self.first:
-                self.newest = max(self.newest, last)
+            # A number far ahead is wrong: of the present start of the stage, the others go on where they were.
+            near = batch.seq[(batch.seq >= self.first) & (batch.seq <= self.newest + STRAY)]
+            if self.first >= 0 and near.size:
+                self.newest = max(self.newest, int(near[-1]))
                 self._moved.notify_all()
 
     def _status(self, sample: zenoh.Sample) -> None:

@@ -29,6 +29,8 @@ class FaultKind:
     silent_s : longest time without an answer that it may cause, s.
     ends_service : whether it ends a service. Such faults come early, so that memory can be measured after them.
     fast : whether it can be applied in a run in one process.
+    sensor : whether the readings are wrong without being impossible: it must have a name within half a second of
+        motion, and the error must stay small.
     """
 
     what: str
@@ -38,6 +40,7 @@ class FaultKind:
     silent_s: float = 0.0
     ends_service: bool = False
     fast: bool = False
+    sensor: bool = False
 
 
 FAULT_KINDS: Final[dict[str, FaultKind]] = {
@@ -54,6 +57,21 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
     "bad_queries": FaultKind(
         "a burst of malformed, foreign and oversized messages to every key", PROCESS, (1.0, 2.0), 3.0
     ),
+    "forged_state": FaultKind(
+        "a stranger that answers standbys with forged states, and asks for the state", PROCESS, (3.0, 4.0), 6.0
+    ),
+    "rogue_claim": FaultKind("a stranger that claims to serve", PROCESS, (3.0, 4.0), 3.0),
+    "folder_removed": FaultKind(
+        "the folders of the serving process' recording and checkpoints are taken away", MACHINE, (3.0, 3.5), 12.0
+    ),
+    "freeze_restart": FaultKind(
+        "freeze, kill -9 of the serving process within 20 ms, a step of the readings, thaw",
+        PROCESS,
+        (10.0, 10.0),
+        10.0,
+        0.2,
+        True,
+    ),
     "gap": FaultKind("samples that never come", STAGE, (0.3, 2.0), 5.0, fast=True),
     "duplicate": FaultKind("every sample twice", STAGE, (0.5, 2.0), 3.0, fast=True),
     "reorder": FaultKind("messages in the wrong order", STAGE, (0.5, 2.0), 3.0, fast=True),
@@ -61,6 +79,16 @@ FAULT_KINDS: Final[dict[str, FaultKind]] = {
     "spike": FaultKind("every 25th reading off by 30 µm", STAGE, (0.5, 2.0), 5.0, fast=True),
     "freeze": FaultKind("a sensor that repeats its last reading", STAGE, (0.5, 2.0), 8.0, fast=True),
     "saturate": FaultKind("a sensor that ends half way", STAGE, (0.5, 2.0), 8.0, fast=True),
+    "stuck_noisy": FaultKind(
+        "a sensor that shows its last reading and 1 pm of noise", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True
+    ),
+    "sensor_gain": FaultKind(
+        "a sensor that shows a multiple of the motion", STAGE, (2.0, 5.0), 2.0, fast=True, sensor=True
+    ),
+    "sign": FaultKind("a sensor with the other sign", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
+    "other_stage": FaultKind("the readings of another stage", STAGE, (2.0, 4.0), 2.0, fast=True, sensor=True),
+    "seq_jump": FaultKind("one sample with a number far ahead", STAGE, (0.5, 0.5), 2.0, fast=True),
+    "losses": FaultKind("19 of 20 samples lost, at random", STAGE, (1.5, 4.0), 3.0, fast=True),
     "stage_clock": FaultKind("the stage's clock set back by an hour", STAGE, (1.0, 2.0), 5.0, fast=True),
     "gain": FaultKind("the stage's gain changes by some percent, for good", STAGE, (0.0, 0.0), 12.0, fast=True),
     "payload": FaultKind("the moved mass doubles, or halves again", STAGE, (0.0, 0.0), 10.0, fast=True),
@@ -153,13 +181,23 @@ def make_plan(duration_s: float, seed: int, kinds: tuple[str, ...]) -> SoakPlan:
     return SoakPlan(duration_s, seed, tuple(faults), tuple(name for name in kinds if name not in done))
 
 
+#: Values that a fault has from round to round: noise, µm; factors of the motion; steps of a sample's number.
+_TURNS: Final = {
+    "stuck_noisy": (1e-6, 1e-3),
+    "sensor_gain": (0.01, 3.0, 0.3),
+    "seq_jump": (100_000.0, float(2**62)),
+}
+
+
 def _value(name: str, rng: np.random.Generator, turn: int) -> float:
     """The value of a fault. For a change: the new parameter value, which alternates from round to round."""
     if name == "gain":
         return round(float(rng.uniform(-0.06, -0.03)), 4) if turn % 2 == 0 else 0.0
     if name == "payload":
         return 1.0 if turn % 2 == 0 else 0.0
-    return {"spike": 30.0, "stage_clock": -3600.0, "clock_back": -3600.0}.get(name, 0.0)
+    if name in _TURNS:
+        return _TURNS[name][turn % len(_TURNS[name])]
+    return {"spike": 30.0, "stage_clock": -3600.0, "clock_back": -3600.0, "losses": 0.95}.get(name, 0.0)
 
 
 # --- The schedule

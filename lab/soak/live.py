@@ -11,15 +11,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import psutil
+import zenoh
 
-from lab.soak.controller import AXIS, STAGE, ControlTask, dwell_key
-from lab.soak.fault_plan import PlannedFault, Schedule, SoakPlan
+from lab.soak.controller import AXIS, SERVED, STAGE, ControlTask, dwell_key
+from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, Schedule, SoakPlan
 from lab.soak.machine_load import OtherLoad, processor_times_s
 from lab.soak.rig import SERVICES, SoakRig
+from lab.soak.stalls import StallWatch
 from lab.soak.verdict.interim import InterimJudge
 from lab.soak.verdict.observations import (
     WELL_PCT,
@@ -28,11 +32,14 @@ from lab.soak.verdict.observations import (
     Monitor,
     Observations,
     flatten_status,
+    judge_sensor_fault,
     query_second,
 )
 from lab.testbed.shifted_clock import write_offset
+from service.operating.remote import operate
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
+from service.protocol.query import Trajectory, decode_reply, encode_query
 from service.stage_node.faults import DELIVERY, READING, fault_key
 from sim.stage.config import StageConfig
 
@@ -48,7 +55,49 @@ _STAGE_NAMES: Final = {"stage_clock": "clock"}
 #: A process that was killed is started again after this time, s.
 _RESTART_S: Final = 1.0
 
+#: Time for a stranger's process to end, s; age of a status that counts as present, s; step of the readings while
+#: frozen, µm; time within which the folder of the checkpoints must be there again, s.
+_END_S: Final = 10.0
+_FRESH_S: Final = 1.6
+_STEP_UM: Final = 20.0
+_ANEW_S: Final = 13.0
+
 Undo = Callable[[], None]
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenAnswer:
+    """A query with everything that an answer depends on, and the answer of a frozen model, bit by bit."""
+
+    query: bytes
+    instance: str
+    bits: bytes
+
+    @classmethod
+    def ask(cls, session: zenoh.Session, task: ControlTask) -> FrozenAnswer | None:
+        """Ask for a slow motion through the range; None if nobody answers."""
+        y_um = np.linspace(task.low_um, task.high_um, 50)
+        v_um_per_s, still = np.full(50, task.range_um), np.zeros(50)
+        first = _answer(session, encode_query(y_um, v_um_per_s, still, model=SERVED))
+        if first is None:
+            return None
+        query = encode_query(y_um, v_um_per_s, still, first.memory, SERVED)
+        found = _answer(session, query)
+        return None if found is None else cls(query, found.model, found.u_V.tobytes())
+
+    def difference(self, session: zenoh.Session) -> str:
+        """How the present answer to the same query differs, in words; "" if it does not, or nobody answers."""
+        found = _answer(session, self.query)
+        if found is None or found.u_V.tobytes() == self.bits:
+            return ""
+        return f"the same query moved by {np.abs(found.u_V - np.frombuffer(self.bits)).max():.2g} V"
+
+
+def _answer(session: zenoh.Session, query: bytes) -> Trajectory | None:
+    for reply in session.get(Keys(STAGE, AXIS).feedforward, payload=query, timeout=2.0):
+        if reply.ok is not None:
+            return decode_reply(reply.ok.payload.to_bytes())
+    return None
 
 
 class FaultActions:
@@ -57,11 +106,14 @@ class FaultActions:
     Attributes
     ----------
     primary : name of the service that answers now. killed : ids of the processes that were ended on purpose.
-    notes : what could not be done.
+    notes : what could not be done. breaches, unjudged : of the fault under way, what had to hold and did not, and what
+    could not be judged, in words; `end` leaves them complete.
     """
 
     def __init__(self, soak: SoakRig, monitor: Monitor) -> None:
         self.notes: list[str] = []
+        self.breaches: list[str] = []
+        self.unjudged: list[str] = []
         self.killed: set[int] = set()
         self.primary = SERVICES[0]
         self._soak = soak
@@ -84,11 +136,16 @@ class FaultActions:
             "restart_router": lambda _: self._restart("router", lambda: self._soak.rig.start_router(wait=False)),
             "clock_back": self._set_clock_back,
             "disk_full": lambda _: self._fill_disk(),
+            "forged_state": lambda fault: self._strange(fault, "forge", str(self._soak.model)),
+            "rogue_claim": lambda fault: self._strange(fault, "claim"),
+            "folder_removed": self._take_folders_away,
+            "freeze_restart": self._freeze_and_kill,
             **dict.fromkeys((*READING, *DELIVERY, *_STAGE_NAMES), self._disturb_samples),
         }
 
     def begin(self, index: int, fault: PlannedFault) -> None:
         """Begin a fault; `end` is called with the same index when it is over."""
+        self.breaches, self.unjudged = [], []
         undo = self._begin[fault.kind](fault)
         if undo is not None:
             self._undo[index] = undo
@@ -102,7 +159,7 @@ class FaultActions:
 
         A service is ready if its own status says that it has handled the samples of the last seconds.
         """
-        if fault.kind not in ("kill_primary", "kill_standby", "stop_primary"):
+        if fault.kind not in ("kill_primary", "kill_standby", "stop_primary", "freeze_restart", "forged_state"):
             return True
         monitor = self._monitor
         behind = round(_BEHIND_S / self._soak.task.dt_s)
@@ -142,6 +199,8 @@ class FaultActions:
         task, value = self._soak.task, fault.value
         if fault.kind == "saturate":
             value = 0.5 * (task.low_um + task.high_um)
+        elif fault.kind == "other_stage":
+            value = task.low_um + task.high_um
         name = _STAGE_NAMES.get(fault.kind, fault.kind)
         order = {"fault": name, "duration_s": max(fault.duration_s, task.dt_s), "value": value}
         self._monitor.put(fault_key(STAGE, AXIS), order)
@@ -191,6 +250,78 @@ class FaultActions:
         self._disturbers += 1
         return self._soak.start_disturber(what, self._disturbers, Keys(STAGE, AXIS).base, *arguments)
 
+    def _strange(self, fault: PlannedFault, what: str, *arguments: str) -> Undo:
+        """A stranger tries to move a service: who serves goes on serving, and it is told nothing."""
+        served = self._serving()
+        child = self._soak.start_stranger(what, round(1000 * fault.at_s), *arguments)
+
+        def end() -> None:
+            child.send(signal.SIGTERM)
+            child.wait(_END_S)
+            told = child.last_json()
+            if told["states"]:
+                self.breaches.append(f"a stranger was given the state {told['states']} times")
+            if not told["tried"]:
+                self.unjudged.append("the stranger came to nothing")
+            now = self._serving()
+            if served and now and served[:2] != now[:2]:
+                self.breaches.append(f"{now[0]} serves as number {now[1]}, before {served[0]} as number {served[1]}")
+            deposed = [e["event"] for e in self._events_since(fault) if e["event"] in ("stood_down", "took_over")]
+            if deposed:
+                self.breaches.append(f"a stranger moved a service: {', '.join(deposed)}")
+
+        return end
+
+    def _serving(self) -> tuple[str, int] | None:
+        """(instance, epoch) of who serves, by its last status; None if there was none lately."""
+        for instance, (t_s, status) in list(self._monitor.statuses.items()):
+            if self._monitor.now() - t_s < _BEHIND_S and status.get("role") == "primary":
+                return instance, int(status["epoch"])
+        return None
+
+    def _events_since(self, fault: PlannedFault) -> list[dict[str, Any]]:
+        begin_s = self._monitor.now() - fault.duration_s
+        return [event for event in list(self._monitor.events[-200:]) if event["t_s"] >= begin_s]
+
+    # ---- an operator
+
+    def _freeze_and_kill(self, fault: PlannedFault) -> Undo:
+        """Freeze, kill who serves at once, and move the readings: frozen is frozen, to the bit, until *thaw*."""
+        session, keys, name = self._monitor.session, Keys(STAGE, AXIS), self.primary
+        answer = operate(session, keys, "freeze", "soak")
+        self._kill_service(name)
+        if not answer["durable"]:
+            self.breaches.append("freeze was answered and is not durable")
+        frozen: list[FrozenAnswer] = []
+
+        def after_takeover() -> None:
+            frozen.extend(found for found in [FrozenAnswer.ask(session, self._soak.task)] if found is not None)
+            offset = {"fault": "offset", "duration_s": 3.0, "value": _STEP_UM}
+            self._monitor.put(fault_key(STAGE, AXIS), offset)
+
+        def again() -> None:
+            if frozen and (difference := frozen[0].difference(session)):
+                self.breaches.append(f"frozen is not frozen: {difference}")
+
+        now = time.monotonic()
+        self._later += [(now + 3.0, after_takeover), (now + 5.0, again)]
+
+        def end() -> None:
+            again()
+            if not frozen:
+                self.unjudged.append("frozen to the bit: nobody answered after the take-over")
+            for status in self._present():
+                if not status["frozen"] and status.get("synced", True):
+                    self.breaches.append(f"{status['instance']} is not frozen: the verb was lost")
+            operate(session, keys, "thaw", "soak")
+
+        return end
+
+    def _present(self) -> list[dict[str, Any]]:
+        """The statuses of the last seconds."""
+        statuses = list(self._monitor.statuses.values())
+        return [status for t_s, status in statuses if self._monitor.now() - t_s < _FRESH_S]
+
     def _occupy_cores(self) -> Undo:
         ends = [self._disturb("busy") for _ in range(os.cpu_count() or 1)]
 
@@ -205,6 +336,28 @@ class FaultActions:
     def _set_clock_back(self, fault: PlannedFault) -> Undo:
         write_offset(self._soak.wall_clock, fault.value)
         return lambda: write_offset(self._soak.wall_clock, 0.0)
+
+    def _take_folders_away(self, fault: PlannedFault) -> Undo:
+        """Rename the folders of who serves, so that what they hold still counts: it must be told, and made anew."""
+        name = self.primary
+        taken = self._soak.take_folders_away(name, self._monitor.now())
+
+        def told() -> None:
+            now = next((s for s in self._present() if self._soak.service_of(str(s["instance"])) == name), None)
+            recorder = None if now is None else now["recorder"]
+            if recorder is None:
+                self.unjudged.append("degraded: no status")
+            elif not recorder["degraded"]:
+                self.breaches.append("the folder of the recording vanished, and the status does not say degraded")
+            if not any(folder.is_dir() for folder in taken if folder.name.startswith("recording")):
+                self.breaches.append("the folder of the recording was not made anew")
+
+        def made_anew() -> None:
+            if not any(folder.is_dir() for folder in taken if folder.name.startswith("checkpoints")):
+                self.notes.append(f"folder_removed: the checkpoints of {name} were not made anew within {_ANEW_S:g} s")
+
+        self._later.append((time.monotonic() + _ANEW_S, made_anew))
+        return told
 
     def _fill_disk(self) -> Undo | None:
         """No file of the services may grow: lower the system's limit on their file size."""
@@ -255,10 +408,13 @@ def run_live(
             _wait_for_samples(monitor)
             observed.follow(monitor.track.seconds, monitor.events)
             watch = _Watch(soak, monitor, observed, interim, say)
+            stalls = StallWatch(soak.rig.logs, watch.reported_silence_s, watch.between, monitor.now)
             try:
-                duration_s = watch.run(plan, stopped)
+                with stalls:
+                    duration_s = watch.run(plan, stopped)
             finally:
                 watch.close()
+                observed.notes += [stalls.note()] if stalls.note() else []
         finally:
             say("  stopping all")
             soak.stop()
@@ -313,9 +469,21 @@ class _Watch:
         self._actions.notes.extend(schedule.left_out())
         return monitor.now()
 
+    def reported_silence_s(self) -> float:
+        """The silence that the prober has reported at last, s; 0 for none. From the thread of the stalls."""
+        line = self._soak.children["prober"].last_line()
+        if not line.startswith('{"silence_s"'):
+            return 0.0
+        return float(json.loads(line)["silence_s"])
+
+    def between(self) -> dict[str, int]:
+        """The processes between the prober and an answer, by name."""
+        children = dict(self._soak.children)
+        return {name: children[name].pid for name in ("router", "prober", *SERVICES) if children[name].running}
+
     def _begin(self, index: int, fault: PlannedFault) -> tuple[int, float, FaultRecord]:
         """Begin a fault; returns its number in the plan, when it is to end, and its record."""
-        record = FaultRecord(fault.kind, self._monitor.now(), value=fault.value)
+        record = FaultRecord(fault.kind, self._monitor.now(), value=fault.value, begin_seq=self._monitor.track.newest)
         self._actions.begin(index, fault)
         self._observed.faults.append(record)
         return index, self._monitor.now() + fault.duration_s, record
@@ -326,6 +494,11 @@ class _Watch:
         now_s = self._monitor.now()
         record.end(now_s)
         schedule.over(index, now_s)
+        record.breaches += self._actions.breaches
+        record.unjudged += self._actions.unjudged
+        if FAULT_KINDS[record.kind].sensor:
+            monitor = self._monitor
+            judge_sensor_fault(record, monitor.track, monitor.named(record.begin_seq), monitor.track.newest)
 
     def close(self) -> None:
         """Undo the faults that are under way, and end the thread."""
@@ -424,4 +597,5 @@ class _Watch:
 
 def withheld(stage: dict[str, Any]) -> int:
     """Number of samples that the stage withheld because of a fault, from its status."""
-    return int(stage.get("faults", {}).get("gap", 0))
+    faults = stage.get("faults", {})
+    return int(faults.get("gap", 0)) + int(faults.get("losses", 0))

@@ -115,6 +115,9 @@ def _asked(way: Callable[[Asks], Gets], question: Asks) -> QueryOutcome[Asks, Ge
 #: timeout of both, s.
 PAUSE_S, AGAIN_S, TIMEOUT_S = 0.01, 0.1, 1.0
 
+#: A silence that lasts longer is reported at once, s.
+SILENCE_S: Final = 0.1
+
 PointOutcome = QueryOutcome[Point | None, Point]
 
 
@@ -140,10 +143,11 @@ class Prober:
             "service_us": [], "echo_us": [], "failed": 0, "unsafe": 0, "silent_s": 0.0, "error": "", "ages_s": [],
         }  # fmt: skip
 
-    def ask(self) -> None:
-        """Ask for a point; count what is wrong with the answers that have come."""
+    def ask(self) -> float:
+        """Ask for a point; count what is wrong with the answers that have come. Returns how long there was none, s."""
         for outcome in self._points.ask(self._last):
             self._take(outcome)
+        return time.monotonic() - self._answered_s
 
     def _take(self, outcome: PointOutcome) -> None:
         counts = self.counts
@@ -216,7 +220,9 @@ def run(task: ControlTask, endpoint: str) -> int:
             print("ready", flush=True)
             next_s = time.monotonic() + 1.0
             while not stop.reason:
-                prober.ask()
+                if (silent_s := prober.ask()) > SILENCE_S:
+                    # At once: what the services do is looked at while it lasts.
+                    print(json.dumps({"silence_s": round(silent_s, 3)}), flush=True)
                 prober.echo(payload)
                 time.sleep(PAUSE_S)
                 prober.look(follower.age_s)

@@ -28,6 +28,8 @@ SLEW_SHARE_PER_MS: Final = 1.0 / 3.0
 #: number is unique, and the service must notice each restart.
 _STARTS, _NUMBERS_PER_START = 1000, 1_000_000_000
 SERVICES: Final = ("a", "b")
+#: Folders of a service; a standby's have a suffix.
+FOLDERS: Final = ("recording", "checkpoints")
 #: Period of the bare paced loop, s.
 _LOOP_STEP_S: Final = 2e-3
 #: Between the last sample and the end of the services, so that they handle what is under way, s.
@@ -72,8 +74,10 @@ class SoakRig:
         self.task = task
         self.rig = Rig(out / "logs")
         self.wall_clock = self.rig.logs / "clock.bin"
+        self.model = model
         self._out, self._stage = out, stage
         self._stage_starts = 0
+        self._strangers = 0
         self._task_file = self.rig.logs / "control.json"
         task.write(self._task_file)
         write_offset(self.wall_clock, 0.0)
@@ -149,6 +153,21 @@ class SoakRig:
         program = ["-m", "lab.soak.disturbers", what, self.rig.endpoint, *arguments]
         child = self.rig.start(f"{what}{index}", program)
         return lambda: child.send(signal.SIGTERM)
+
+    def start_stranger(self, what: str, seed: int, *arguments: str) -> Child:
+        """Start a process of `lab.soak.strangers` and wait until it is ready."""
+        self._strangers += 1
+        program = ["-m", "lab.soak.strangers", what, self.rig.endpoint, str(seed), *arguments]
+        return self.rig.start(f"stranger{self._strangers}", program)
+
+    def take_folders_away(self, name: str, now_s: float) -> list[Path]:
+        """Rename the folders of recordings and checkpoints of a service; returns where they were."""
+        away = self._out / name / f"taken-{now_s:.0f}"
+        away.mkdir()
+        taken = [path for what in FOLDERS for path in sorted((self._out / name).glob(f"{what}*"))]
+        for path in taken:
+            path.rename(away / path.name)
+        return taken
 
     def service_of(self, instance: str) -> str:
         """Name of the service with this instance id, which contains its process id; "" if there is none."""

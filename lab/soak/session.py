@@ -15,7 +15,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from lab.soak.controller import AXIS, SERVED, STAGE, ControlTask, SoakReference
-from lab.soak.fault_plan import PlannedFault, SoakPlan
+from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, SoakPlan
 from lab.soak.live import Say, run_live, withheld
 from lab.soak.rig import identify, stage_config
 from lab.soak.verdict.interim import InterimJudge
@@ -31,6 +31,8 @@ from lab.soak.verdict.observations import (
     SampleTracker,
     assess_recovery,
     flatten_status,
+    judge_sensor_fault,
+    troubles_since,
 )
 from lab.soak.verdict.outcome import SECONDS, report, soak_summary, write_seconds, write_summary
 from lab.testbed.identified_stage import SAMPLES_PER_MESSAGE
@@ -66,7 +68,7 @@ def run_fast(
     while turn.now_s < plan.duration_s and not stopped():
         while waiting and waiting[0].at_s <= turn.now_s:
             fault = waiting.pop(0)
-            record = FaultRecord(fault.kind, turn.now_s, value=fault.value)
+            record = FaultRecord(fault.kind, turn.now_s, value=fault.value, begin_seq=turn.k)
             turn.begin_fault(fault)
             observed.faults.append(record)
             under_way.append((fault.end_s, record))
@@ -74,11 +76,15 @@ def run_fast(
             if end_s <= turn.now_s:
                 record.end(turn.now_s)
                 under_way.remove((end_s, record))
+                if FAULT_KINDS[record.kind].sensor:
+                    take_events(turn, observed)
+                    judge_sensor_fault(
+                        record, turn.track, troubles_since(observed.events, record.begin_seq), turn.k - 1
+                    )
         turn.step()
         if turn.second_is_over():
             observed.counters.append((turn.now_s, "service", Counters(flatten_status(turn.status()))))
-            # In a service the axis loop publishes them.
-            observed.events.extend({"t_s": turn.now_s, **event} for event in turn.axis.take_events())
+            take_events(turn, observed)
             interim.due(turn.now_s, lambda: _samples(turn))
         if time.monotonic() - reported_s >= _PROGRESS_S:
             reported_s = time.monotonic()
@@ -95,11 +101,20 @@ def run_fast(
     return _samples(turn)
 
 
+def take_events(turn: _Turns, observed: Observations) -> None:
+    """The events since the last call; in a service the axis loop publishes them."""
+    observed.events.extend({"t_s": turn.now_s, **event} for event in turn.axis.take_events())
+
+
 def _samples(turn: _Turns) -> dict[str, int]:
     status = turn.status()
     samples = {name: int(status["samples"][name]) for name in ("received", "lost", "late", "restarts")}
     learnt = turn.axis.gates.get("learnt", 0)
-    return {"read": turn.k, **samples, "learnt": learnt, "withheld_by_faults": turn.injector.counts["gap"]}
+    return {"read": turn.k, **samples, "learnt": learnt, "withheld_by_faults": _withheld(turn)}
+
+
+def _withheld(turn: _Turns) -> int:
+    return turn.injector.counts["gap"] + turn.injector.counts["losses"]
 
 
 class _Turns:
@@ -140,7 +155,7 @@ class _Turns:
         elif fault.kind == "dwell":
             self._reference.dwells.append((self.k + round(0.3 / c.dt_s), round(fault.duration_s / c.dt_s)))
         else:
-            value = 0.5 * (c.low_um + c.high_um) if fault.kind == "saturate" else fault.value
+            value = {"saturate": 0.5, "other_stage": 1.0}.get(fault.kind, 0.0) * (c.low_um + c.high_um) or fault.value
             kind = "clock" if fault.kind == "stage_clock" else fault.kind
             self.injector.add(Fault(kind, max(fault.duration_s, c.dt_s), value))
 
@@ -150,14 +165,17 @@ class _Turns:
         while self._asked <= self.k + self._control.lead:
             self._ask()
         u_V = self._commands.pop(self.k)
-        y_um = np.empty(size)
+        y_um, sound_um = np.empty(size), np.empty(size)
         for i, value in enumerate(u_V.tolist()):
-            y_um[i] = self.injector.reading(self.k + i, self._stage.step(self._state, value)[0])
+            sound_um[i] = self._stage.step(self._state, value)[0]
+            y_um[i] = self.injector.reading(self.k + i, sound_um[i])
         seq = np.arange(self.k, self.k + size, dtype=np.int64)
         self.k += size
         for first in range(0, size, SAMPLES_PER_MESSAGE):
             part = slice(first, first + SAMPLES_PER_MESSAGE)
-            rows = (seq[part], seq[part].astype(np.float64) * self._control.dt_s, u_V[part], y_um[part])
+            t_s = seq[part].astype(np.float64) * self._control.dt_s
+            rows = (seq[part], t_s, u_V[part], y_um[part])
+            self.track.take_sound(SampleBatch(*rows[:3], sound_um[part]))
             for message in self.injector.deliver(rows):
                 batch = SampleBatch(*message)
                 self.axis.handle(batch)
@@ -249,7 +267,8 @@ def run(
     (out / "report.md").write_text(text, encoding="utf-8")
     happened = [
         {"kind": f.kind, "begin_s": f.begin_s, "end_s": f.end_s, "recovered_s": f.recovered_s, "silent_s": f.silent_s,
-         "told": f.reported_by, "value": f.value}
+         "told": f.reported_by, "value": f.value, "error_pct": f.error_pct, "named_s": f.named_s,
+         "breaches": f.breaches, "unjudged": f.unjudged}
         for f in observed.faults
     ]  # fmt: skip
     kept = {"seed": plan.seed, "duration_s": plan.duration_s, "left_out": plan.left_out, "faults": happened}
@@ -291,7 +310,12 @@ def _median_and_tenth(values: list[float]) -> tuple[float, float]:
 def _kept(out: Path, observed: Observations, seen: Intervals, received: int) -> tuple[int, dict[str, int]]:
     """Number of samples that the monitor saw and no service recorded though it could, and all counts of samples."""
     # A standby records too, in a folder of its own.
-    folders = [out / name / folder for name in ("a", "b") for folder in ("recording", "recording-standby")]
+    folders = [
+        folder
+        for name in ("a", "b")
+        for where in (out / name, *sorted((out / name).glob("taken-*")))
+        for folder in (where / "recording", where / "recording-standby")
+    ]
     found, rows = recorded(folders)
     nowhere = Intervals()
     for start, stop in seen.minus(found):

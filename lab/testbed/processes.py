@@ -120,6 +120,11 @@ class Child:
         self._process.wait()
         self._reader.join(5.0)
 
+    def last_line(self) -> str:
+        """The newest output line that was not taken yet; "" for none."""
+        with self._changed:
+            return self.lines[-1] if self.lines else ""
+
     def take_lines(self) -> list[str]:
         """The output lines since the last call. They are dropped here, so that a long run does not collect them."""
         with self._changed:

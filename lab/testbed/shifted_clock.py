@@ -1,16 +1,21 @@
 """``dehyst`` with a wall clock that another process can set back.
 
 ``python -m lab.testbed.shifted_clock FILE COMMAND ...`` adds the seconds in FILE (8 bytes, a double) to ``time.time``
-of this process. The system clock stays as it is: to set it needs rights that a test should not have.
+of this process. The system clock stays as it is: to set it needs rights that a test should not have. On SIGUSR2 the
+process writes the stacks of its threads beside FILE.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import mmap
+import os
+import signal
 import struct
 import sys
 import time
 from pathlib import Path
+from typing import TextIO
 
 _SECONDS = struct.Struct("<d")
 
@@ -37,8 +42,19 @@ def patch_clock(path: Path) -> None:
     time.time_ns = lambda: real_ns() + round(1e9 * offset())
 
 
+def write_stacks_on_signal(folder: Path) -> TextIO:
+    """Let this process append the stacks of all its threads to a file in ``folder`` on SIGUSR2; the open file.
+
+    It needs no interpreter lock, so that it shows who holds it.
+    """
+    file = (folder / f"stacks-{os.getpid()}.txt").open("a", encoding="utf-8")
+    faulthandler.register(signal.SIGUSR2, file=file, all_threads=True)
+    return file
+
+
 if __name__ == "__main__":
     patch_clock(Path(sys.argv[1]))
+    stacks = write_stacks_on_signal(Path(sys.argv[1]).parent)
     from lab.cli import main
 
     sys.exit(main(sys.argv[2:]))

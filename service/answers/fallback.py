@@ -22,6 +22,7 @@ from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
+from service.answers.model_errors import log_model_error
 from service.answers.slices import Pace, in_slices
 from service.protocol.model import StandIn
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
@@ -156,7 +157,8 @@ def _forward(model: InverseModel, points: tuple[FloatArray, FloatArray, FloatArr
     """What the model says; NaN where it raises, which no model may."""
     try:
         return model.feedforward(*points, memory)
-    except Exception:
+    except Exception as error:
+        log_model_error(model, error)
         nothing = np.full(points[0].size, math.nan)
         return Feedforward(nothing, nothing, np.zeros(points[0].size, dtype=np.bool_), memory)
 

@@ -206,10 +206,26 @@ def parse_config(text: str, where: str, folder: Path, insecure_beyond_loopback: 
     names = [axis.name for axis in config.axes]
     if len(set(names)) < len(names):
         raise FieldError(f"{where}: axis", ", ".join(names), "a different name for each axis")
+    _check_folders(where, config.axes)
     endpoints = (*config.listen, *config.standby_listen, *config.connect)
     if config.peer_secret is None and all(map(is_loopback, endpoints)):
         config = replace(config, peer_secret=folder / OWN_SECRET)
     return replace(config, axes=tuple(_with_reports_in(folder, axis) for axis in config.axes))
+
+
+def _check_folders(where: str, axes: tuple[AxisConfig, ...]) -> None:
+    """Refuse one folder for the checkpoints, or for the recordings, of two axes. Raises FieldError."""
+    for what in ("checkpoints", "recorder"):
+        seen: dict[Path, str] = {}
+        for axis in axes:
+            folder = axis.checkpoints if what == "checkpoints" else axis.recorder
+            other = None if folder is None else seen.setdefault(folder.resolve(), axis.name)
+            if other not in (None, axis.name):
+                raise FieldError(
+                    f"{where}: axis {axis.name}: {what}",
+                    f"{folder}, which is also that of axis {other}",
+                    "a folder of its own for each axis",
+                )
 
 
 def _with_reports_in(folder: Path, axis: AxisConfig) -> AxisConfig:

@@ -16,6 +16,8 @@ import zenoh
 from adaptive.errors import DehystError, ModelFileError
 from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
 from service.failover.state_transfer import MAX_PAUSE_S, NO_SECRET, PAUSE_S, fetch_state, gives_sign_of_life
+from service.operating.server import FREEZE, THAW, Switch
+from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
@@ -146,6 +148,8 @@ class Reachability:
 
 #: Events of the serving instance after which its model no longer follows from the samples alone.
 MODEL_EVENTS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
+#: Of these, those that must hold even if the one that serves dies before its state has come; by event, the verb.
+SWITCHES: Final = {"frozen": FREEZE, "thawed": THAW}
 #: Longest time for the transfer of the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
@@ -202,6 +206,8 @@ class RoleControl:
         #: Whether the state of the serving instance must be fetched, and whether that is going on.
         self._outdated = True
         self._fetching = False
+        #: The last *freeze* or *thaw* of the one that serves, and by whom, until a state from it includes it.
+        self._switch: tuple[str, str] | None = None
         self._token: Any = None
         self._epoch = 0
         self._rival_at: float | None = None
@@ -239,6 +245,9 @@ class RoleControl:
     def _on_event(self, sample: zenoh.Sample) -> None:
         event = fields_of(sample.payload.to_bytes())
         if event.get("instance") != self.server.instance and event.get("event") in MODEL_EVENTS:
+            highest = self.claims.highest()
+            if event["event"] in SWITCHES and highest is not None and event.get("instance") == highest.instance:
+                self._switch = SWITCHES[event["event"]], str(event.get("by", ""))[:MAX_WHO]
             self._refetch_state()
 
     def _on_status(self, sample: zenoh.Sample) -> None:
@@ -322,6 +331,7 @@ class RoleControl:
         """Note the first claims that prove nothing; the others are counted."""
         unproven, before = self.claims.unproven, self._unproven
         self._unproven = unproven
+        self.server.set_claims_refused(unproven)
         if unproven and not before:
             detail = "a claim without the signature of this service's instances is ignored; see peer_secret"
             self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
@@ -377,10 +387,18 @@ class RoleControl:
         self._outdated = True
         self._take_state()
 
+    def _apply_switch(self) -> None:
+        """Freeze or thaw as the one before did last, if that was not yet in a state from it: it was answered."""
+        switch, self._switch = self._switch, None
+        if switch is not None:
+            verb, by = switch
+            Switch(verb, by, 0, 0.0).apply(self.server.axis)
+
     def _leave_standby(self) -> None:
         axis = self.server.axis
         # The first instance takes over from nobody and continues from its own state.
         source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
+        self._apply_switch()
         self.server.loop.set_gate(None)
         if self._epoch > 1:
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"
@@ -426,6 +444,8 @@ class RoleControl:
                 # Another configuration: this instance stays without the served model, and records samples.
                 self.ready.set()
             return False
+        if not self._outdated:  # no verb came while it was sent
+            self._switch = None
         self._refusal, self._pause_s = "", PAUSE_S
         self.server.set_synced(True)
         self.ready.set()

@@ -23,6 +23,8 @@ from service.security.peers import SIGNATURE_DIGITS, PeerSecret, new_nonce
 _PART_BYTES: Final = 56 * 1024
 #: Most parts that are accepted, 256 MB together: a sender must not use up the memory of the receiver.
 _MAX_PARTS: Final = 4681
+#: Senders whose parts are joined at a time, at most.
+_MOST_SENDERS: Final = 4
 #: Attachment of each part: its index and the number of parts.
 _PLACE: Final = struct.Struct("<II")
 #: Pause between two parts, s: in the first transfer, and at most.
@@ -35,14 +37,18 @@ _LIFE_S, _LIFE_PAUSE_S = 0.5, 0.1
 NO_SECRET: Final = PeerSecret()
 
 
+class UnprovenError(ServiceError):
+    """Something came from somebody who does not prove to be an instance of this service."""
+
+
 def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any], secret: PeerSecret = NO_SECRET) -> None:
     """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s.
 
-    Raises ServiceError if it does not prove that an instance of the same service asks.
+    Raises UnprovenError if it does not prove that an instance of the same service asks.
     """
     nonce = str(query.parameters.get("nonce") or "")
     if not secret.proves(str(query.parameters.get("proof") or ""), "ask", key, nonce):
-        raise ServiceError("the state is for instances of this service only; see peer_secret in docs/operating.md")
+        raise UnprovenError("the state is for instances of this service only; see peer_secret in docs/operating.md")
     try:
         pause_s = float(query.parameters.get("pause_s") or PAUSE_S)
     except ValueError:
@@ -62,7 +68,7 @@ def fetch_state(
 ) -> bytes | None:
     """The bytes that `send_state` answers with; None if there is no reply or a part is lost.
 
-    Raises ServiceError if the sender does not prove that it is an instance of the same service.
+    Raises UnprovenError if a sender does not prove that it is an instance of the same service.
     """
     nonce = new_nonce()
     proof = f";nonce={nonce};proof={secret.sign('ask', key, nonce)}" if secret else ""
@@ -74,15 +80,20 @@ def fetch_state(
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    data = join_parts(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s))
-    if data is None or not secret:
-        return data
-    signature, state = data[:SIGNATURE_DIGITS].decode("ascii", "replace"), data[SIGNATURE_DIGITS:]
-    if not secret.proves(signature, "state", key, nonce, state):
-        raise ServiceError(
+    unproven = False
+    # Whoever else answers must not mix its parts with those of the instance that serves.
+    for data in joined_by_sender(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s)):
+        if not secret:
+            return data
+        signature, state = data[:SIGNATURE_DIGITS].decode("ascii", "replace"), data[SIGNATURE_DIGITS:]
+        if secret.proves(signature, "state", key, nonce, state):
+            return state
+        unproven = True
+    if unproven:
+        raise UnprovenError(
             f"{key}: a state came from somebody who does not know the secret of this service's instances"
         )
-    return state
+    return None
 
 
 # --- Whether an instance answers.
@@ -125,24 +136,51 @@ def gives_sign_of_life(
     return False
 
 
-def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
-    """The joined parts, given as (attachment, part), after the last one; None if one is missing or malformed."""
-    joined, taken, total = bytearray(), 0, 0
-    for place, part in parts:
-        if len(place) != _PLACE.size:
+class PartJoiner:
+    """Joins the parts of one sender."""
+
+    def __init__(self) -> None:
+        self._joined, self._taken, self._total = bytearray(), 0, 0
+        self._spoilt = False
+
+    def take(self, place: bytes, part: bytes) -> bytes | None:
+        """The whole after its last part, given with its attachment; else None, for good once one is missing or
+        malformed."""
+        if self._spoilt or len(place) != _PLACE.size:
+            self._spoilt = True
             return None
         i, n = _PLACE.unpack(place)
-        if i != taken or not taken < n <= _MAX_PARTS or (taken and n != total) or len(part) > _PART_BYTES:
+        taken = self._taken
+        if i != taken or not taken < n <= _MAX_PARTS or (taken and n != self._total) or len(part) > _PART_BYTES:
+            self._spoilt = True
+            self._joined.clear()
             return None
-        joined += part
-        taken, total = taken + 1, n
-        if taken == total:
-            return bytes(joined)
-    return None
+        self._joined += part
+        self._taken, self._total = taken + 1, n
+        if self._taken < n:
+            return None
+        self._spoilt = True
+        return bytes(self._joined)
 
 
-def _parts(replies: zenoh.Handler[zenoh.Reply], silence_s: float) -> Iterator[tuple[bytes, bytes]]:
-    """(attachment, part) of each reply, until the query ends or nothing arrives for ``silence_s``."""
+def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
+    """The joined parts of one sender, given as (attachment, part); None if one is missing or malformed."""
+    return next(joined_by_sender(("", place, part) for place, part in parts), None)
+
+
+def joined_by_sender(parts: Iterable[tuple[str, bytes, bytes]]) -> Iterator[bytes]:
+    """What each sender has sent, as soon as it is whole, from parts (sender, attachment, part) in any mixture."""
+    joiners: dict[str, PartJoiner] = {}
+    for sender, place, part in parts:
+        if sender not in joiners and len(joiners) >= _MOST_SENDERS:
+            continue
+        whole = joiners.setdefault(sender, PartJoiner()).take(place, part)
+        if whole is not None:
+            yield whole
+
+
+def _parts(replies: zenoh.Handler[zenoh.Reply], silence_s: float) -> Iterator[tuple[str, bytes, bytes]]:
+    """(sender, attachment, part) of each reply, until the query ends or nothing arrives for ``silence_s``."""
     last_s = time.monotonic()
     while time.monotonic() < last_s + silence_s:
         try:
@@ -153,5 +191,6 @@ def _parts(replies: zenoh.Handler[zenoh.Reply], silence_s: float) -> Iterator[tu
             time.sleep(_POLL_S)
             continue
         last_s = time.monotonic()
-        place = reply.ok.attachment if reply.ok is not None else None
-        yield (b"", b"") if reply.ok is None or place is None else (place.to_bytes(), reply.ok.payload.to_bytes())
+        sender, ok = str(reply.replier_id), reply.ok
+        place = None if ok is None else ok.attachment
+        yield (sender, b"", b"") if ok is None or place is None else (sender, place.to_bytes(), ok.payload.to_bytes())

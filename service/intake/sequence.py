@@ -110,6 +110,10 @@ class SequenceTracker:
         refuted, self.refuted = self.refuted, -1
         return refuted
 
+    def was_skipped(self, seq: int) -> bool:
+        """Whether ``seq`` is one of the lost numbers that are still remembered."""
+        return any(first <= seq <= last for first, last in self._gaps)
+
     def number(self, seq: int) -> int:
         """``seq``, a number of the present count, in the count that never decreases."""
         return seq + self._offset

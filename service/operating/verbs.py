@@ -125,14 +125,20 @@ class Verbs:
     ----------
     axis : the axis. between : runs work on it between two batches of samples.
     background : by verb, returns what starts the work; None if the configuration switches it off.
+    listed : is told the numbers of the checkpoints that an operator has been shown.
     """
 
     def __init__(
-        self, axis: OperableAxis, between: Between, background: Mapping[str, Callable[[], Background | None]]
+        self,
+        axis: OperableAxis,
+        between: Between,
+        background: Mapping[str, Callable[[], Background | None]],
+        listed: Callable[[list[int]], None] = lambda _: None,
     ) -> None:
         self._axis = axis
         self._between = between
         self._background = dict(background)
+        self._listed = listed
         self._verbs: dict[str, Callable[[Request], Outcome]] = {
             "freeze": self._freeze,
             "thaw": self._thaw,
@@ -182,7 +188,9 @@ class Verbs:
 
     def _checkpoints(self, request: Request) -> Outcome:
         take(request.arguments)
-        return self._axis.handled_seq, {"checkpoints": self._axis.checkpoints()}
+        entries = self._axis.checkpoints()
+        self._listed([int(entry["checkpoint"]) for entry in entries])
+        return self._axis.handled_seq, {"checkpoints": entries}
 
     def _start(self, request: Request) -> Outcome:
         start = self._background[request.verb]()

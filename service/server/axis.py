@@ -133,11 +133,18 @@ class Archive(Protocol):
 
 
 class SampleCounts(NamedTuple):
-    """Counts of one moment: number of the last sample handled, samples by order of arrival, samples by verdict."""
+    """Counts of one moment: number of the last sample handled, samples by order of arrival, samples by verdict; those
+    that were refused for their number, and of these the ones that contradict what came before."""
 
     seq: int
     samples: dict[str, int]
     gates: dict[str, int]
+    refused: int = 0
+    foreign: int = 0
+
+
+#: Samples whose readings are remembered, to tell a copy from another stage's: a power of two.
+_RECENT: Final = 1024
 
 
 class Axis:
@@ -196,6 +203,9 @@ class Axis:
         self._gates: dict[str, int] = {}
         # Newest last. A tuple, replaced at each snapshot, so that a query never waits for the learner.
         self._snapshots: tuple[Served, ...] = (self._first_snapshot(dict(models)),)
+        #: The last samples by number, (number, reading), and the counts of those refused for their number.
+        self._recent: list[tuple[int, float]] = [(-1, 0.0)] * _RECENT
+        self._refused = self._foreign = 0
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
         self.counts = SampleCounts(-1, self.sequence.counters(), {})
         self._age_s: float | None = None
@@ -310,6 +320,7 @@ class Axis:
                 self._note_refuted(self.sequence.take_refuted(), before)
             if order in REFUSED:
                 verdicts.append(self._counted(self._refusal(order, seq)))
+                self._count_refused(order, seq, y_um)
                 continue
             if order in NEW_COUNT:
                 self._begin_count(order, seq, before)
@@ -321,6 +332,7 @@ class Axis:
                 self.supervisor.adopt_due(number)
             self.supervisor.watch.take(u_V, y_um, verdict)
             self.tracker.add(seq, u_V, y_um)
+            self._recent[seq % _RECENT] = seq, y_um
             due = seq // every > self.newest.seq // every
             if due:
                 self._take_snapshot(seq, t_s, u_V)
@@ -340,7 +352,18 @@ class Axis:
         return verdict
 
     def _update_counts(self) -> None:
-        self.counts = SampleCounts(self.handled_seq, self.sequence.counters(), self.gates)
+        counts = self.sequence.counters()
+        self.counts = SampleCounts(self.handled_seq, counts, self.gates, self._refused, self._foreign)
+
+    def _count_refused(self, order: str, seq: int, y_um: float) -> None:
+        """Count a sample refused for its number: a copy of one before, one that was lost and comes late, or, where it
+        is neither, one of another sender."""
+        self._refused += 1
+        number, reading = self._recent[seq % _RECENT]
+        if number == seq:
+            self._foreign += reading != y_um and reading == reading and y_um == y_um
+        elif order == AHEAD or not self.sequence.was_skipped(seq):
+            self._foreign += 1
 
     def _refusal(self, order: str, seq: int) -> str:
         """The verdict on a sample that is refused for its number."""

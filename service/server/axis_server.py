@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -11,6 +12,7 @@ import zenoh
 from service.answers.answering import trust_by_age
 from service.background.retuning.retuner import Retuner
 from service.failover.state_transfer import NO_SECRET
+from service.intake.losses import Arrivals, SampleLosses
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
@@ -22,13 +24,15 @@ from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
-from service.server.status import Publications, axis_status
+from service.server.status import Publications, WriteRate, axis_status
 from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
+#: Longest time for which it waits for the thread that publishes, s.
+_TOLD_S: Final = 0.2
 
 
 class AxisServer:
@@ -70,6 +74,8 @@ class AxisServer:
         self.role = STANDBY
         self.synced = True
         self.epoch = 0
+        #: Claims of others that prove nothing.
+        self.claims_refused = 0
         #: Count of all samples when the last command was applied.
         self._operated_at = 0
         config = axis.config
@@ -93,6 +99,8 @@ class AxisServer:
         )
         self._session = session
         self._stale = False
+        self._losses = SampleLosses()
+        self._write_rate = WriteRate()
         self._inputs: list[Any] = []
         self._queryables: list[Any] = []
         self._token: Any = None
@@ -142,6 +150,10 @@ class AxisServer:
     def set_epoch(self, epoch: int) -> None:
         """The number of this instance's take-over."""
         self.epoch = epoch
+
+    def set_claims_refused(self, count: int) -> None:
+        """How many claims were ignored because they prove nothing."""
+        self.claims_refused = count
 
     def declare(self) -> None:
         """Take samples and serve."""
@@ -194,7 +206,8 @@ class AxisServer:
         def retune() -> Background | None:
             return None if self.loop.tuner is None else self.loop.tuner.request
 
-        verbs = Verbs(self.axis, self.operate, {"diagnose": diagnose, "retune": retune})
+        background = {"diagnose": diagnose, "retune": retune}
+        verbs = Verbs(self.axis, self.operate, background, self.checkpoints.keep_listed)
         return OperationsServer(
             self.keys,
             self.instance,
@@ -203,8 +216,18 @@ class AxisServer:
             self.axis.note,
             lambda: self.role,
             samples=lambda: self._operated_at,
-            settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
+            settle=self._settle,
         )
+
+    def _settle(self) -> bool:
+        """After a command: tell it to the standby before it is answered, and wait for its checkpoint."""
+        # With a time: whoever changes the role waits for the thread that calls this.
+        if self._changing.acquire(timeout=_TOLD_S):
+            try:
+                self._publications.publish_events()
+            finally:
+                self._changing.release()
+        return self.checkpoints.wait_written(_WRITTEN_S)
 
     # ---- the publishing thread
 
@@ -213,6 +236,7 @@ class AxisServer:
         if self.loop.watcher is not None:
             self.loop.watcher.tick(now_s)
         self._update_age(now_s)
+        self._look_for_losses(now_s)
         with self._changing:
             self._publications.tick(now_s)
 
@@ -234,6 +258,17 @@ class AxisServer:
         else:
             self.axis.note("fresh", "samples come and are learnt again")
 
+    def _look_for_losses(self, now_s: float) -> None:
+        """Note when samples come and are lost, and when that is over."""
+        queue, counts, before = self.loop.queue, self.axis.counts, self._losses.trouble
+        arrivals = Arrivals(counts.samples["received"], counts.refused, counts.foreign, queue.dropped, queue.malformed)
+        if not self._losses.look(now_s, arrivals):
+            return
+        if self._losses.trouble:
+            self.axis.note("trouble", f"{self._losses.trouble} ({self._losses.why})")
+        else:
+            self.axis.note("recovered", before)
+
     def status(self) -> dict[str, Any]:
         """The status as it is published."""
         return axis_status(
@@ -245,10 +280,22 @@ class AxisServer:
             epoch=self.epoch,
             synced=self.synced,
             stale=self._stale,
+            losses=self._losses.trouble,
             checkpoints=self.checkpoints.counters(),
             operations=self._operations.counters(),
             waiting_points=self._long_queries.waiting_points,
+            disk=self._disk(),
+            peers={"claims_refused": self.claims_refused, "states_refused": self._answers.states_refused},
         )
+
+    def _disk(self) -> dict[str, float | None] | None:
+        """What is written to the disk; None where neither samples nor checkpoints are kept."""
+        sink, kept = self.loop.sink, self.checkpoints
+        if sink is None and kept.folder is None:
+            return None
+        recorded = 0 if sink is None else int(sink.counters().get("bytes", 0))
+        with self._changing:
+            return self._write_rate.look(time.monotonic(), recorded + kept.bytes_in_all)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         try:

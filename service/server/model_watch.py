@@ -31,6 +31,7 @@ from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray, InverseModel
 from service.answers.guard import Limits
+from service.answers.model_errors import log_model_error
 
 SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"
@@ -229,5 +230,6 @@ def _at_rest(model: InverseModel, y_um: FloatArray) -> FloatArray:
     zero = np.zeros(y_um.size)
     try:
         return model.feedforward(y_um, zero, zero, model.rest_memory(float(y_um[0]))).u_V
-    except Exception:
+    except Exception as error:
+        log_model_error(model, error)
         return np.full(y_um.size, math.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
 import sys
@@ -20,7 +21,7 @@ from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
-from service.runtime.session import open_service
+from service.runtime.session import is_loopback, open_service
 from service.security.peers import read_secret
 from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
@@ -29,6 +30,7 @@ from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.long_queries import LongQueries
 from service.storage.checkpoint import learn_again, restore_newest
 
+_LOGGER: Final = logging.getLogger("dehyst.service")
 #: Longest time for which a Python thread keeps the interpreter's lock from another that waits, s. With the default of
 #: 5 ms a query that meets the learner would wait for that long.
 _SWITCH_S: Final = 1e-4
@@ -156,6 +158,11 @@ class Service:
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
         secret = read_secret(config.peer_secret)
+        if not secret and not all(map(is_loopback, (*config.listen, *config.connect))):
+            _LOGGER.warning(
+                "peer_secret: none, and an endpoint is beyond this machine: who may hold liveliness tokens there can "
+                "depose this service, and is given its state; see docs/access.md"
+            )
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh

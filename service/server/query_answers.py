@@ -14,7 +14,7 @@ import zenoh
 
 from adaptive.errors import DehystError
 from service.answers.slices import Pace
-from service.failover.state_transfer import NO_SECRET, send_sign_of_life, send_state
+from service.failover.state_transfer import NO_SECRET, UnprovenError, send_sign_of_life, send_state
 from service.protocol.container import JSON, to_json
 from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
@@ -114,6 +114,8 @@ class QueryAnswers:
         self._long = long_queries
         self._instance = instance
         self._secret = secret
+        #: Queries for the state from somebody who did not prove to be an instance of this service.
+        self.states_refused = 0
         self._sends = threading.BoundedSemaphore(_MOST_STATES)
 
     def declare(self, session: zenoh.Session) -> list[Any]:
@@ -215,6 +217,7 @@ class QueryAnswers:
                 try:
                     send_state(query, self._keys.state, self._state_buffers(), self._secret)
                 except Exception as error:
+                    self.states_refused += isinstance(error, UnprovenError)
                     query.reply_err(error_to_json(error), encoding=JSON)
                 finally:
                     self._sends.release()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -42,13 +43,18 @@ def axis_status(
     epoch: int = 0,
     synced: bool = True,
     stale: bool = False,
+    losses: str = "",
     checkpoints: dict[str, Any] | None = None,
     operations: dict[str, int] | None = None,
     waiting_points: int = 0,
+    peers: dict[str, int] | None = None,
+    disk: dict[str, float | None] | None = None,
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
-    ``checkpoints``, ``operations`` : their counters. ``waiting_points`` : of long queries that are not answered yet.
+    ``losses`` : name of the way in which samples are lost. ``checkpoints``, ``operations`` : their counters.
+    ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
+    ``disk`` : what is written, see `WriteRate`.
     """
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
@@ -98,14 +104,37 @@ def axis_status(
         "epoch": epoch,
         "synced": synced,
         "stale": stale,
-        "trouble": served.trouble,
+        "trouble": served.trouble or losses,
         "trust": served.trust,
         "stand_in": served.stand_in,
         "frozen": axis.frozen,
         "checkpoints": checkpoints,
         "operations": operations,
+        "peers": peers,
+        "disk": disk,
         "fingerprint": fingerprint(served.models[learn]) if learn else "",
     }
+
+
+#: Time over which the rate of writing is taken, s: some checkpoints.
+_RATE_S: Final = 60.0
+
+
+class WriteRate:
+    """Bytes that an axis writes to the disk, and how many a second."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque()
+
+    def look(self, now_s: float, total: int) -> dict[str, float | None]:
+        """``bytes`` in all, and ``bytes_per_s``, the mean of the last minute; null in the first second."""
+        marks = self._marks
+        if not marks or now_s - marks[-1][0] >= 1.0:
+            marks.append((now_s, total))
+        while len(marks) > 2 and now_s - marks[1][0] >= _RATE_S:
+            marks.popleft()
+        passed_s = now_s - marks[0][0]
+        return {"bytes": total, "bytes_per_s": round((total - marks[0][1]) / passed_s, 1) if passed_s >= 1.0 else None}
 
 
 # --- Publishes what changes on an axis: models, diagnostics, status and events.
@@ -172,7 +201,7 @@ class Publications:
 
     def stand_down(self) -> None:
         """Publish the events that wait, and then only the status of a standby."""
-        self._publish_events()
+        self.publish_events()
         self._deltas.close()
         publishers, self._publishers = self._publishers, {}
         for publisher in publishers.values():
@@ -196,7 +225,7 @@ class Publications:
             if due:
                 self._loop.figures.follow(is_followed(self._publishers["diagnostics"]))
                 self._publishers["status"].put(to_json(self._status()))
-            self._publish_events()
+            self.publish_events()
         elif due and self._standby is not None:
             self._standby.put(to_json(self._status()))
 
@@ -220,7 +249,8 @@ class Publications:
         extra = {"counters": figures.counters, "query_us": {"p50": latency["p50_us"], "p99": latency["p99_us"]}}
         self._publishers["diagnostics"].put(to_json({**diagnostics, **extra}))
 
-    def _publish_events(self) -> None:
+    def publish_events(self) -> None:
+        """Publish the events that wait."""
         # A standby keeps its events until it serves.
         publisher = self._publishers.get("event")
         if publisher is None:

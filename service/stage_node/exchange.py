@@ -5,6 +5,8 @@ A simulated stage (`service.stage_node.node`) and a real one (`service.adapters`
 
 from __future__ import annotations
 
+import contextlib
+import math
 import threading
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
@@ -102,11 +104,16 @@ class SampleRing:
     """Samples by number, written by one thread and sent by another.
 
     ``injector`` may change the messages. Samples that it leaves out count neither as published nor as lost; samples
-    that it sends twice count twice as published.
+    that it sends twice count twice as published. ``put_sound`` sends the samples without its faults.
     """
 
     def __init__(
-        self, dt_s: float, put: Callable[[bytes], None], injector: Injector | None = None, begin: int = 0
+        self,
+        dt_s: float,
+        put: Callable[[bytes], None],
+        injector: Injector | None = None,
+        begin: int = 0,
+        put_sound: Callable[[bytes], None] | None = None,
     ) -> None:
         self.dt_s = dt_s
         self.published = 0
@@ -115,14 +122,18 @@ class SampleRing:
         self._put = put
         self._u_V: FloatArray = np.zeros(RING_SIZE)
         self._y_um: FloatArray = np.zeros(RING_SIZE)
+        self._put_sound = put_sound
+        self._sound_um: FloatArray = np.zeros(RING_SIZE if put_sound is not None else 0)
         self._written = begin
         self._sent = begin
 
-    def write(self, k: int, u_V: float, y_um: float) -> None:
-        """Write sample k; samples come in order, without gaps, from ``begin`` on."""
+    def write(self, k: int, u_V: float, y_um: float, sound_um: float = math.nan) -> None:
+        """Write sample k; samples come in order, without gaps, from ``begin`` on. ``sound_um``: without a fault."""
         slot = k % RING_SIZE
         self._u_V[slot] = u_V
         self._y_um[slot] = y_um
+        if self._put_sound is not None:
+            self._sound_um[slot] = sound_um
         self._written = k + 1
 
     def send(self) -> bool:
@@ -139,6 +150,10 @@ class SampleRing:
         slots = seq % RING_SIZE
         rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
         self._sent += n
+        if self._put_sound is not None:
+            # Not counted: it is for tests, and one that is lost is judged by nobody.
+            with contextlib.suppress(zenoh.ZError):
+                self._put_sound(wire.encode_samples(*rows[:3], self._sound_um[slots]))
         for message in [rows] if self._injector is None else self._injector.deliver(rows):
             self._send(*message)
         return self._sent < end

@@ -20,6 +20,7 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
+from service.protocol.samples import MAX_SEQ
 
 #: Faults of a reading, and the meaning of ``value``.
 READING: Final = {
@@ -28,6 +29,10 @@ READING: Final = {
     "freeze": "not used: the last reading is repeated",
     "saturate": "µm beyond which the reading does not go",
     "offset": "µm added to every reading",
+    "stuck_noisy": "µm of noise, rms, about the last reading",
+    "sensor_gain": "factor of every motion, from the last reading on",
+    "sign": "not used: every motion from the last reading on has the other sign",
+    "other_stage": "µm: the readings are those of another stage that moves from 0 to there",
 }
 #: Faults of a message, and the meaning of ``value``.
 DELIVERY: Final = {
@@ -35,14 +40,27 @@ DELIVERY: Final = {
     "duplicate": "not used: every message is sent twice",
     "reorder": "not used: the messages come in pairs, the later one first",
     "clock": "s added to the time of every sample",
+    "seq_jump": "added to the number of one sample",
+    "losses": "share of the samples that are not sent, 0 to 1",
 }
 CHANGE: Final = "change"
+#: Faults in which the sensor goes on from its last reading.
+_ABOUT_LAST: Final = ("stuck_noisy", "sensor_gain", "sign")
 SPIKE_EVERY: Final = 25
+#: Motion of another stage: tones, Hz, their shares of its range, and its noise as a share.
+_OTHER_HZ: Final = (0.7, 1.9, 4.3)
+_OTHER_SHARES: Final = (0.28, 0.12, 0.06)
+_OTHER_NOISE: Final = 1e-4
 MAX_DURATION_S: Final = 3600.0
 _EXPECTED: Final = 'an object such as {"fault": "nan", "duration_s": 1}'
 
 #: (seq, t_s, u_V, y_um), each (n,).
 Rows = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+
+
+def sound_key(stage: str, axis: str) -> str:
+    """Key on which a stage started with ``--inject`` publishes its samples without any fault."""
+    return f"{Keys(stage, axis).base}/stage_sound"
 
 
 def fault_key(stage: str, axis: str) -> str:
@@ -117,8 +135,12 @@ class Injector:
         #: Always replaced as a whole, so that the sender reads it without the lock.
         self._active: tuple[_Active, ...] = ()
         self._frozen_um = math.nan
+        self._about_um = math.nan
         self._last_um = 0.0
         self._held: Rows | None = None
+        self._jumped: _Active | None = None
+        self._rng = np.random.default_rng(0)
+        self._loss_rng = np.random.default_rng(1)
 
     def receive(self, payload: bytes) -> None:
         """Take a message. A malformed one is counted, and the error text of the last one is kept."""
@@ -153,11 +175,31 @@ class Injector:
                 y_um = min(y_um, value)
             elif kind == "offset":
                 y_um += value
+            elif kind in _ABOUT_LAST:
+                if k == active.first:
+                    self._frozen_um, self._about_um = self._last_um, y_um
+                y_um = self._frozen_um + self._motion_um(kind, value, y_um - self._about_um)
+            elif kind == "other_stage":
+                y_um = self._other_um(k - active.first, value)
             else:
                 continue
             self.counts[kind] += 1
         self._last_um = y_um
         return y_um
+
+    def _motion_um(self, kind: str, value: float, moved_um: float) -> float:
+        """What a faulty sensor shows of a motion since the fault began, µm."""
+        if kind == "stuck_noisy":
+            return value * float(self._rng.standard_normal())
+        return value * moved_um if kind == "sensor_gain" else -moved_um
+
+    def _other_um(self, tick: int, range_um: float) -> float:
+        """The reading of another stage, µm, which moves in the middle of 0 to ``range_um``."""
+        t_s = tick * self._dt_s
+        share = 0.5 + _OTHER_NOISE * float(self._rng.standard_normal())
+        for hertz, part in zip(_OTHER_HZ, _OTHER_SHARES, strict=True):
+            share += part * math.sin(2.0 * math.pi * hertz * t_s + hertz)
+        return share * range_um
 
     def deliver(self, rows: Rows) -> list[Rows]:
         """The messages that are sent in place of one message ``rows``. Called by the sender, in order."""
@@ -176,6 +218,19 @@ class Injector:
                 sent = [*sent, *sent]
             elif kind == "clock":
                 sent = [(r[0], r[1] + active.fault.value * hit, r[2], r[3]) for r in sent]
+            elif kind == "losses":
+                kept = ~hit | (self._loss_rng.uniform(size=hit.size) >= active.fault.value)
+                self.counts[kind] -= int(np.count_nonzero(kept & hit))
+                left = rows[0][kept]
+                sent = [tuple(column[np.isin(r[0], left)] for column in r) for r in sent]  # type: ignore[misc]
+            elif kind == "seq_jump":
+                self.counts[kind] -= n
+                if self._jumped is not active:
+                    self._jumped = active
+                    self.counts[kind] += 1
+                    number = int(rows[0][hit][0])
+                    stray = min(number + int(active.fault.value), MAX_SEQ)
+                    sent = [(np.where(r[0] == number, stray, r[0]), *r[1:]) for r in sent]
             else:
                 reordering = True
         if self._held is not None:

@@ -27,7 +27,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
 from service.stage_node.exchange import CommandBuffer, SampleRing, Sender
-from service.stage_node.faults import Injector, fault_key
+from service.stage_node.faults import Injector, fault_key, sound_key
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 
@@ -108,7 +108,12 @@ class AxisPort:
         self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
         # Samples must not be lost: a full channel blocks the sender thread, not the loop, and drops nothing.
         self._publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
-        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first)
+        sound = None
+        if self.injector is not None:
+            sound = session.declare_publisher(sound_key(config.name, axis), express=True)
+        self._sound = sound
+        put_sound = None if sound is None else sound.put
+        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
         self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
         if self.injector is not None:
@@ -134,7 +139,10 @@ class AxisPort:
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""
-        self.ring.write(k, u_V, y_um if self.injector is None else self.injector.reading(k, y_um))
+        if self.injector is None:
+            self.ring.write(k, u_V, y_um)
+        else:
+            self.ring.write(k, u_V, self.injector.reading(k, y_um), y_um)
 
     def summary(self) -> dict[str, Any]:
         summary: dict[str, Any] = {
@@ -152,6 +160,8 @@ class AxisPort:
         for subscriber in self._subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        if self._sound is not None:
+            self._sound.undeclare()  # type: ignore[no-untyped-call]
         self.status.undeclare()  # type: ignore[no-untyped-call]
 
 

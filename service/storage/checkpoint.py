@@ -126,6 +126,12 @@ class CheckpointFolder:
         self.directory = directory
         self.kept = kept
         self._belongs = (stage, axis, dt_s)
+        self._pinned: tuple[frozenset[int], float] = frozenset(), 0.0
+
+    def pin(self, numbers: list[int], until_s: float) -> None:
+        """Keep these checkpoints until ``until_s`` (``time.monotonic``), beside the others; a full disk still takes
+        them."""
+        self._pinned = frozenset(numbers), until_s
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
         """Write a checkpoint under the next number, atomically and synced. Raises OSError."""
@@ -204,7 +210,10 @@ class CheckpointFolder:
         return sorted(path for path in self.directory.glob(f"checkpoint-*{SUFFIX}") if number_of(path) >= 0)
 
     def _remove_surplus(self, newest: int) -> None:
-        keep = [number for number in self.numbers() if is_kept(number, newest - number)][: self.kept]
+        keep = {*[number for number in self.numbers() if is_kept(number, newest - number)][: self.kept]}
+        pinned, until_s = self._pinned
+        if time.monotonic() < until_s:
+            keep |= pinned
         for path in self._paths():
             if number_of(path) not in keep:
                 path.unlink(missing_ok=True)
@@ -260,6 +269,8 @@ class Switch(Protocol):
 
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
+#: Time, s, for which checkpoints are kept after they were listed.
+LISTED_S: Final = 600.0
 _PORTION = 100
 
 
@@ -288,7 +299,7 @@ class CheckpointKeeper:
         self._due_at_s = 0.0
         self._written_at_s: float | None = None
         self._lock: IO[bytes] | None = None
-        self._bytes = 0
+        self._bytes = self._bytes_in_all = 0
         self._counts: dict[str, Any] = {"written": 0, "errors": 0, "degraded": False, "error": ""}
         self._thread = threading.Thread(target=self._run, name=f"checkpoints-{axis.config.name}", daemon=True)
         if folder is not None:
@@ -339,6 +350,11 @@ class CheckpointKeeper:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
             self._copy()
 
+    def keep_listed(self, numbers: list[int]) -> None:
+        """Keep these checkpoints for `LISTED_S`: an operator has been shown them, and may go back to one."""
+        if self.folder is not None:
+            self.folder.pin(numbers, self._clock() + LISTED_S)
+
     def copy_now(self) -> None:
         """Copy the present state, to be written. Call it in the thread that handles samples."""
         if self.folder is not None:
@@ -368,6 +384,11 @@ class CheckpointKeeper:
         a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
         age_s = None if at is None else time.monotonic() - at
         return {**self._counts, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
+
+    @property
+    def bytes_in_all(self) -> int:
+        """Bytes of all checkpoints that were written."""
+        return self._bytes_in_all
 
     def close(self) -> None:
         """Write the last state and end the thread. Call it after the thread that handles samples has ended."""
@@ -411,6 +432,7 @@ class CheckpointKeeper:
             try:
                 self._claim()
                 self._bytes = self.folder.write(meta, state).stat().st_size
+                self._bytes_in_all += self._bytes
                 self._counts.update(written=self._counts["written"] + 1, degraded=False, error="")
                 self._written_at_s = time.monotonic()
                 written = True

@@ -20,12 +20,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from service.protocol.errors import FieldError
-from service.storage.segments import Closer, Journal, Rows, Syncer, claim, journal_of, left_open, make_room, next_number
+from service.storage.segments import (
+    RECORD,
+    Closer,
+    Journal,
+    Rows,
+    Syncer,
+    claim,
+    journal_of,
+    left_open,
+    make_room,
+    next_number,
+    segments,
+)
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
 ASIDE: Final = "_aside"
 #: Time between two looks whether the folder is still there, s.
 _LOOK_S: Final = 0.2
+#: Fewest samples per segment: each costs a process that closes it.
+_LEAST_ROWS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +50,8 @@ class RecorderConfig:
     ----------
     directory : folder of the segments; created if missing. Each axis needs its own.
     segment_rows : samples per segment (600,000 are ten minutes at 1 kHz, about 15 MB).
-    max_bytes : size of all closed segments together; beyond it the oldest are removed. The journals of the newest two
-        segments, 40 bytes per sample, come on top.
+    max_bytes : size of all files together; beyond it the oldest closed segments are removed. The journals of the
+        newest two segments, 40 bytes per sample, count too; segments are shorter where they would take more than half.
     queue_samples : most samples that wait for the disk.
     flush_s : longest time that a sample waits in memory, s; about a millisecond if the disk keeps up, because `put`
         wakes the thread. Also the interval at which the recorder checks whether a segment has been closed.
@@ -62,6 +76,16 @@ class RecorderConfig:
             if not getattr(self, name) > 0.0:
                 raise FieldError(name, getattr(self, name), "a positive time in s")
 
+    @property
+    def rows(self) -> int:
+        """Samples per segment: two journals, and what is made of one, fit into ``max_bytes``."""
+        return min(self.segment_rows, max(_LEAST_ROWS, self.max_bytes // (4 * RECORD.itemsize)))
+
+    @property
+    def journal_bytes(self) -> int:
+        """Size of a full journal."""
+        return self.rows * RECORD.itemsize
+
     def aside(self) -> RecorderConfig:
         """Settings for samples that the axis does not handle: a folder inside this one, a tenth of its disk space."""
         return replace(self, directory=self.directory / ASIDE, max_bytes=max(1, self.max_bytes // 10))
@@ -83,6 +107,7 @@ class Recorder:
         self._wake = threading.Event()
         self._stop = False
         self._counts = {"offered": 0, "written": 0, "dropped": 0, "lost": 0, "errors": 0, "segments": 0, "removed": 0}
+        self._counts["bytes"] = 0
         self._salvaged = 0
         self._error = ""
         self._segment: Journal | None = None
@@ -141,7 +166,8 @@ class Recorder:
         """Counts for the status.
 
         Samples offered, written, dropped (queue full), lost (disk) and written ``aside``; segments closed and removed;
-        the last error. ``degraded`` is True from a failure of the disk until the next batch is written.
+        bytes written to journals and segments; the last error.
+        ``degraded`` is True from a failure of the disk until the next batch is written.
         """
         with self._lock:
             return {
@@ -213,7 +239,7 @@ class Recorder:
         directory.mkdir(parents=True, exist_ok=True)
         if self._claim is None:
             self._claim = claim(directory)
-        self._count(removed=make_room(directory, self.config.max_bytes))
+        self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
         return Journal(journal_of(directory, next_number(directory)))
 
     def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
@@ -227,11 +253,11 @@ class Recorder:
             while done < len(rows):
                 if self._segment is None:
                     self._segment = self._begin_segment()
-                stop = min(len(rows), done + self.config.segment_rows - self._segment.rows)
-                self._segment.write(rows.part(done, stop), index[done:stop])
-                self._count(written=stop - done)
+                stop = min(len(rows), done + self.config.rows - self._segment.rows)
+                written = self._segment.write(rows.part(done, stop), index[done:stop])
+                self._count(written=stop - done, bytes=written)
                 done = stop
-                if self._segment.rows >= self.config.segment_rows:
+                if self._segment.rows >= self.config.rows:
                     self._segment.close()
                     self._segment, self._left_open, self._own = None, True, True
             if self._segment is not None:
@@ -282,6 +308,8 @@ class Recorder:
     def _take_result(self, closer: Closer) -> None:
         try:
             made = closer.result()
+            newest = segments(self.config.directory)[-made:] if made else []
+            self._count(bytes=sum(path.stat().st_size for path in newest))
             if self._own:
                 self._count(segments=made)
             else:

@@ -104,8 +104,8 @@ class Journal:
             path.unlink(missing_ok=True)
             raise
 
-    def write(self, rows: Rows, index: NDArray[np.int64]) -> None:
-        """Append ``rows`` with the (n,) ``index`` of each: all of them or none.
+    def write(self, rows: Rows, index: NDArray[np.int64]) -> int:
+        """Append ``rows`` with the (n,) ``index`` of each: all of them or none. Returns the bytes that it wrote.
 
         The operating system has the rows when this returns, so a killed process does not lose them.
         """
@@ -125,6 +125,7 @@ class Journal:
         self._size += records.nbytes
         self._words = words
         self.rows += len(rows)
+        return int(records.nbytes)
 
     @property
     def vanished(self) -> bool:
@@ -398,14 +399,15 @@ def next_number(directory: Path) -> int:
     return max([0, *taken]) + 1
 
 
-def make_room(directory: Path, max_bytes: int) -> int:
-    """Remove the oldest closed segments until the rest fit into ``max_bytes``. Returns the number removed."""
-    sizes: list[tuple[Path, int]] = []
-    for path in segments(directory):
+def make_room(directory: Path, max_bytes: int, coming_bytes: int = 0) -> int:
+    """Remove the oldest closed segments until all files of the recording and ``coming_bytes`` more fit into
+    ``max_bytes``: journals count too, but are never removed. Returns the number removed."""
+    sizes: dict[Path, int] = {}
+    for path in directory.glob("*segment-*"):
         with contextlib.suppress(FileNotFoundError):
-            sizes.append((path, path.stat().st_size))
-    total, removed = sum(size for _, size in sizes), 0
-    for path, size in sizes:
+            sizes[path] = path.stat().st_size
+    total, removed = sum(sizes.values()) + coming_bytes, 0
+    for path, size in [(path, sizes[path]) for path in segments(directory) if path in sizes]:
         if total <= max_bytes:
             break
         path.unlink(missing_ok=True)

@@ -21,6 +21,7 @@ from lab.soak.verdict.invariants import (
     Invariant,
     answered_again,
     answers_safe,
+    faults_held,
     faults_told,
     mean_error,
     processes_alive,
@@ -48,7 +49,7 @@ _OVER_S: Final = 16.0
 #: A fault is compared with the statuses of this time before it, s. Faults older than the second number have no effect.
 _BEFORE_S, _PAST_S = 35.0, 120.0
 #: Invariants that count something, so that stretches are added.
-_COUNTED: Final = ("voltages_finite", "answers_safe", "faults_told")
+_COUNTED: Final = ("voltages_finite", "answers_safe", "faults_told", "faults_held")
 #: Seconds with ages before their 99 % is judged: in fewer, the first half second of a run has too much weight.
 _AGES_OF_S: Final = 60
 _AT_THE_END: Final = "known only at the end"
@@ -149,7 +150,9 @@ class InterimJudge:
         assess_recovery(replace(seen, faults=copies), last - first)
         part = replace(seen, faults=copies[: last - first])
         self._settled += part.faults
-        self._add({"recovers_by_itself": recovers(part), "faults_told": faults_told(part)})
+        self._add(
+            {"recovers_by_itself": recovers(part), "faults_told": faults_told(part), "faults_held": faults_held(part)}
+        )
         if part.mode != FAST:
             self._add({"answered_again": answered_again(part, MachineLoad(part.loop_delays, part.other_load))})
 

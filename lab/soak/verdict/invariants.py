@@ -386,6 +386,7 @@ def judge(observed: Observations, missing: int | None, tracking_pct: float = TRA
         int(bool(observed.planned) and not observed.faults), 0, "runs", "runs with a plan of which not one fault began"
     )
     found["faults_told"] = faults_told(observed)
+    found["faults_held"] = faults_held(observed)
     found["samples_accounted"] = samples_accounted(observed)
     found["processes_alive"] = processes_alive(observed)
     if missing is not None:
@@ -406,6 +407,21 @@ def faults_told(observed: Observations) -> Invariant:
     if early:
         text += f"; {early} of {len(observed.faults)} not judged: the run was over"
     return at_most(len(unreported) - early, 0, "faults", text)
+
+
+def faults_held(observed: Observations) -> Invariant:
+    """What must hold in a fault of its own kind: sensor faults are named and cost little, nobody is deposed, frozen
+    is frozen, a folder that vanishes is told of and made anew."""
+    broken = [fault for fault in observed.faults if fault.breaches]
+    text = "faults in which something did not hold that must in this kind"
+    if broken:
+        text += ": " + "; ".join(
+            f"{fault.kind} at {fault.begin_s:.0f} s: {', '.join(fault.breaches)}" for fault in broken[:5]
+        )
+    unjudged = sum(bool(fault.unjudged) for fault in observed.faults)
+    if unjudged:
+        text += f"; {unjudged} of {len(observed.faults)} not judged in every part"
+    return at_most(len(broken), 0, "faults", text)
 
 
 def processes_alive(observed: Observations) -> Invariant:

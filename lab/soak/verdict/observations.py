@@ -12,9 +12,10 @@ import threading
 import time
 from array import array
 from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -22,13 +23,16 @@ import zenoh
 from numpy.typing import NDArray
 
 from adaptive.errors import InputError
+from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray
-from lab.soak.controller import AXIS, STAGE, ControlTask
+from lab.soak.controller import AXIS, STAGE, STRAY, ControlTask
 from lab.soak.fault_plan import FAULT_KINDS
 from lab.soak.machine_load import MachineLoad
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
+from service.server.model_watch import SAMPLES_POISONED, SENSOR_FROZEN
+from service.stage_node.faults import sound_key
 from service.stage_node.node import status_key
 
 # --- Samples and voltages
@@ -131,6 +135,23 @@ class SampleSecond:
         return self.error_sum_um / self.judged if self.judged else math.nan
 
 
+#: Length of the parts in which the error is kept, s, and how many are kept: a few minutes.
+PART_S: Final = 0.25
+_MOST_PARTS: Final = 1200
+#: A reference moves if it changes by more than this share of its range per second.
+MOVES_PER_S: Final = 0.02
+
+
+@dataclass(slots=True)
+class ErrorPart:
+    """The error of a short time: when it began, the sum of |error|, µm, over so many samples, and held voltages."""
+
+    t_s: float
+    sum_um: float = 0.0
+    judged: int = 0
+    held: int = 0
+
+
 @dataclass
 class SampleTracker:
     """Collects references, commands and samples in the order of their arrival, second by second.
@@ -156,6 +177,8 @@ class SampleTracker:
         self.newest = -1
         self.received = 0
         self.repeated = 0
+        #: |error| of the last minutes in parts of `PART_S`.
+        self.parts: deque[ErrorPart] = deque(maxlen=_MOST_PARTS)
 
     def want(self, first: int, y_um: FloatArray) -> None:
         """Add the reference from sample ``first`` on, µm."""
@@ -195,16 +218,18 @@ class SampleTracker:
     def take(self, batch: wire.SampleBatch) -> None:
         """Add samples as they arrived."""
         second = self._second()
-        seq, u_V = batch.seq, batch.u_V
         self.received += len(batch)
+        self.seen.add_all(batch.seq)
+        second.samples += len(batch)
+        if self.newest >= 0:
+            batch = batch.where(batch.seq <= self.newest + STRAY)
+            if not len(batch):
+                return
+        seq, u_V = batch.seq, batch.u_V
         fresh = seq > self.newest if abs(int(seq[0]) - self.newest) < RESTART_GAP else np.ones(len(batch), dtype=bool)
         self.repeated += len(batch) - int(np.count_nonzero(fresh))
-        self.seen.add_all(seq)
-        second.samples += len(batch)
         second.seq = int(seq[-1])
-        slots = seq % _RING
-        in_time = (self._commanded_seq[slots] == seq) & (self._commanded_V[slots] == u_V)
-        second.held += len(batch) - int(np.count_nonzero(in_time))
+        second.held += self._held(seq, u_V)
         finite = np.isfinite(u_V)
         second.not_finite += int(np.count_nonzero(~finite))
         if finite.any():
@@ -219,12 +244,55 @@ class SampleTracker:
                 self._judge_resumed(second, seq, np.where(follows, before, np.nan))
             self._u_V, self._seq = float(u_V[-1]), int(seq[-1])
             self.newest = int(seq[-1])
+
+    def take_sound(self, batch: wire.SampleBatch) -> None:
+        """Add samples as a sound sensor reads them: these show where the stage is, whatever the service gets."""
+        second, seq = self._second(), batch.seq
         known = (self._wanted_seq[seq % _RING] == seq) & np.isfinite(batch.y_um)
-        if known.any():
-            error = np.abs(self._wanted[seq % _RING] - batch.y_um)[known]
-            second.judged += error.size
-            second.error_sum_um += float(error.sum())
-            second.error_max_um = max(second.error_max_um, float(error.max()))
+        if not known.any():
+            return
+        error = np.abs(self._wanted[seq % _RING] - batch.y_um)[known]
+        second.judged += error.size
+        second.error_sum_um += float(error.sum())
+        second.error_max_um = max(second.error_max_um, float(error.max()))
+        now = self.clock()
+        if not self.parts or now - self.parts[-1].t_s >= PART_S:
+            self.parts.append(ErrorPart(now))
+        part = self.parts[-1]
+        part.judged += error.size
+        part.sum_um += float(error.sum())
+        part.held += self._held(seq, batch.u_V)
+
+    def _held(self, seq: NDArray[np.int64], u_V: FloatArray) -> int:
+        """How many of these samples had no command in time."""
+        slots = seq % _RING
+        return int(np.count_nonzero((self._commanded_seq[slots] != seq) | (self._commanded_V[slots] != u_V)))
+
+    def moved_s(self, first: int, last: int) -> float:
+        """How long the reference moved between two samples, s: by more than `MOVES_PER_S` of its range per second.
+
+        NaN if it is no longer known.
+        """
+        seq = np.arange(first, last + 1)
+        if not 0 < seq.size <= _RING or (self._wanted_seq[seq % _RING] != seq).mean() > 0.1:
+            return math.nan
+        steps = np.abs(np.diff(self._wanted[seq % _RING]))
+        return self.control.dt_s * int(
+            np.count_nonzero(steps > MOVES_PER_S * self.control.range_um * self.control.dt_s)
+        )
+
+    def worst_half_second_pct(self, begin_s: float, end_s: float) -> float:
+        """The largest mean |error| over half a second in that time, percent of the range.
+
+        Parts in which the stage had no voltage in time say nothing about the model. NaN if there are no others.
+        """
+        parts = [part for part in self.parts if begin_s <= part.t_s and part.t_s + PART_S <= end_s]
+        worst = math.nan
+        for one, other in pairwise(parts):
+            judged = one.judged + other.judged
+            if judged and not (one.held or other.held):
+                worst = np.fmax(worst, 100.0 * (one.sum_um + other.sum_um) / judged / self.control.range_um)
+        return float(worst)
 
     def _second(self) -> SampleSecond:
         """The present second. A second without samples keeps the last sample number of the one before."""
@@ -288,6 +356,14 @@ class FaultRecord:
     #: What may have reported it was looked for until then, s.
     look_until_s: float = 0.0
     value: float = 0.0
+    #: Number of the stage's newest sample when it began.
+    begin_seq: int = -1
+    #: What had to hold in this fault and did not, in words; and what could not be judged.
+    breaches: list[str] = field(default_factory=list)
+    unjudged: list[str] = field(default_factory=list)
+    #: Of a sensor fault: the largest error, percent of the range, and the motion until it had a name, s.
+    error_pct: float = math.nan
+    named_s: float = math.nan
 
     def end(self, now_s: float) -> None:
         """It ends now."""
@@ -449,7 +525,7 @@ def flatten_status(status: dict[str, Any]) -> dict[str, float]:
         elif isinstance(value, (bool, int, float)):
             found[prefix] = float(value)
 
-    for part in ("samples", "learner", "recorder", "queries", "seq", "checkpoints", "fallback", "memory"):
+    for part in ("samples", "learner", "recorder", "queries", "seq", "checkpoints", "fallback", "memory", "peers"):
         walk(part, status.get(part))
     found["serves"] = float(status.get("role", "primary") == "primary")
     return found
@@ -486,6 +562,13 @@ INDICATORS: Final[dict[str, tuple[str, ...]]] = {
         "samples.gates.unexcited",
         "event",
     ),
+    **dict.fromkeys(("stuck_noisy", "sensor_gain", "sign", "other_stage"), ("trouble",)),
+    "seq_jump": ("samples.gates.ahead",),
+    "losses": ("samples.lost",),
+    "forged_state": ("peers.states_refused",),
+    "rogue_claim": ("peers.claims_refused",),
+    "folder_removed": ("recorder.errors",),
+    "freeze_restart": ("frozen event",),
     "stage_clock": ("samples.gates.timing", "samples.gates.out_of_order", "event"),
     "dwell": ("samples.gates.unexcited",),
 }
@@ -533,6 +616,13 @@ def _reported_by(observed: Observations, fault: FaultRecord, end: float) -> str:
             events = [e for e in observed.events_between(begin, end) if e.get("event") not in alive]
             if events:
                 return f"event {events[0].get('event')}"
+        elif indicator == "trouble":
+            troubles = [e for e in observed.events_between(begin, end) if e.get("event") == "trouble"]
+            if troubles:
+                return f"trouble {str(troubles[0].get('detail')).split(':')[0].split(' ')[0]}"
+        elif indicator == "frozen event":
+            if any(e.get("event") == "frozen" for e in observed.events_between(begin, end)):
+                return "event frozen"
         elif indicator == "instance":
             before = {name for t, name, _ in counters if begin - 5.0 <= t <= begin}
             new = {name for t, name, _ in counters if begin < t <= end} - before
@@ -552,6 +642,48 @@ def _grew(rows: list[tuple[float, str, Mapping[str, float]]], name: str, begin_s
     was = [row.get(name, 0.0) for t_s, _, row in rows if t_s <= begin_s]
     now = [row.get(name, 0.0) for t_s, _, row in rows if t_s > begin_s]
     return bool(now) and max(now) > (was[-1] if was else 0.0)
+
+
+def troubles_since(events: Sequence[Mapping[str, Any]], first: int) -> list[tuple[int, str]]:
+    """(sample number, name) of the troubles in ``events`` from sample ``first`` on, oldest first."""
+    found: list[tuple[int, str]] = []
+    for event in reversed(events):
+        if event.get("event") == "trouble":
+            if int(event.get("seq", -1)) < first:
+                break
+            found.append((int(event["seq"]), str(event.get("detail")).split(":")[0].split(" ")[0]))
+    return found[::-1]
+
+
+#: A sensor fault must have its name after so much motion, s, and the mean error over any half second must stay below
+#: this, percent of the range.
+NAMED_S: Final = 0.5
+SENSOR_PCT: Final = 1.0
+#: Troubles that name a sensor or its samples.
+_NAMES: Final = SENSOR_FAULTS | {SENSOR_FROZEN, SAMPLES_POISONED}
+
+
+def judge_sensor_fault(
+    fault: FaultRecord, track: SampleTracker, troubles: Sequence[tuple[int, str]], last_seq: int
+) -> None:
+    """Note in ``fault``, whose readings were wrong up to sample ``last_seq``, whether it was named in time and how
+    large the error became. ``troubles``: (sample number, name) since it began."""
+    dt_s = track.control.dt_s
+    moved_s = track.moved_s(fault.begin_seq, last_seq)
+    named = next((seq for seq, name in troubles if name in _NAMES and seq <= last_seq), None)
+    if named is not None:
+        fault.named_s = track.moved_s(fault.begin_seq, named) if named > fault.begin_seq else 0.0
+    if named is None and not moved_s >= NAMED_S:
+        fault.unjudged.append(f"named in time: the reference moved for {moved_s:.2f} s only")
+    elif named is None:
+        fault.breaches.append(f"not named within {moved_s:.2f} s of motion")
+    elif fault.named_s > NAMED_S + track.control.block * dt_s:
+        fault.breaches.append(f"named after {fault.named_s:.2f} s of motion, allowed {NAMED_S:g} s")
+    fault.error_pct = track.worst_half_second_pct(fault.begin_s, fault.end_s)
+    if math.isnan(fault.error_pct):
+        fault.unjudged.append("error: no half second in which every voltage came in time")
+    elif fault.error_pct > SENSOR_PCT:
+        fault.breaches.append(f"error {fault.error_pct:.2f} % of range over half a second, allowed {SENSOR_PCT:g} %")
 
 
 # --- Observes a soak from outside the service: samples, references, commands, events and statuses.
@@ -578,6 +710,7 @@ class Monitor:
             self._session.declare_subscriber(key, self._guarded(take))
             for key, take in (
                 (keys.sample, self._sample),
+                (sound_key(STAGE, AXIS), self._sound),
                 (keys.reference, self._reference),
                 (keys.command, self._command),
                 (keys.event, self._event),
@@ -621,6 +754,9 @@ class Monitor:
     def _sample(self, payload: bytes) -> None:
         self.track.take(wire.decode_samples(payload))
 
+    def _sound(self, payload: bytes) -> None:
+        self.track.take_sound(wire.decode_samples(payload))
+
     def _reference(self, payload: bytes) -> None:
         block = wire.decode_reference(payload)
         self.track.want(block.seq, block.values)
@@ -659,6 +795,16 @@ class Monitor:
     def put(self, key: str, value: dict[str, Any]) -> None:
         """Publish JSON, for the stage or the controller."""
         self._session.put(key, json.dumps(value), congestion_control=SURELY)
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of the monitor, for queries."""
+        return self._session
+
+    def named(self, first: int) -> list[tuple[int, str]]:
+        """(sample number, name) of the troubles that were reported from sample ``first`` on."""
+        with self._lock:
+            return troubles_since(self.events, first)
 
     def samples(self) -> dict[str, int]:
         """Number of distinct samples seen so far, and of samples received."""

@@ -73,6 +73,10 @@ def _of_kind(faults: list[FaultRecord]) -> dict[str, Any]:
         "worst_recovery_s": _most([value for value in took if math.isfinite(value)]),
         "worst_silence_s": _most([f.silent_s for f in faults]),
         "told_by": sorted({f.reported_by for f in faults if f.reported_by}),
+        "worst_error_pct": _most([f.error_pct for f in faults if math.isfinite(f.error_pct)]),
+        "worst_named_s": _most([f.named_s for f in faults if math.isfinite(f.named_s)]),
+        "breaches": [breach for f in faults for breach in f.breaches][:20],
+        "unjudged": [part for f in faults for part in f.unjudged][:20],
     }
 
 
@@ -194,8 +198,8 @@ def report(
         lines.append(f"| {name} | {held} | {worst} | {row['limit']:.4g} {row['unit']} | {row['text']} |")
     lines += ["", "## Faults", ""]
     lines += [
-        "| fault | | how often | well again after, s | allowed | silence, s | told by |",
-        "|---|---|---|---|---|---|---|",
+        "| fault | | how often | well again after, s | allowed | silence, s | error, % | named after, s | told by |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for kind, row in found["faults"].items():
         recovery = "never" if row["recovered"] < row["count"] else _two_digits(row["worst_recovery_s"])
@@ -206,8 +210,12 @@ def report(
         )
         lines.append(
             f"| {kind} | {FAULT_KINDS[kind].what} | {row['count']} | {recovery} | {FAULT_KINDS[kind].recover_s:g} | "
-            f"{_two_digits(row['worst_silence_s'])} | {told or '**nobody**'} |"
+            f"{_two_digits(row['worst_silence_s'])} | {_two_digits(row['worst_error_pct'])} | "
+            f"{_two_digits(row['worst_named_s'])} | {told or '**nobody**'} |"
         )
+    for kind, row in found["faults"].items():
+        lines += [f"- **{kind}: {breach}**" for breach in row["breaches"]]
+        lines += [f"- {kind}, not judged: {part}" for part in row["unjudged"]]
     for end_s, name in observed.ended:
         lines += ["", f"**{name} ended by itself at {end_s:.1f} s**; see `logs/`."]
     latency = found["latency"]

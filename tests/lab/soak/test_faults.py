@@ -47,6 +47,16 @@ PROMISED = {
     "bursts of bad queries": "bad_queries",
     "disk full": "disk_full",
     "CPU stolen": "cpu_stolen",
+    "a stuck sensor with any noise": "stuck_noisy",
+    "a sensor's gain": "sensor_gain",
+    "a flipped sign": "sign",
+    "another stage's data": "other_stage",
+    "one sample with a high number": "seq_jump",
+    "95 % loss": "losses",
+    "forged states": "forged_state",
+    "a stranger's claim": "rogue_claim",
+    "a folder removed while it is recorded into": "folder_removed",
+    "freeze over a restart": "freeze_restart",
 }
 
 

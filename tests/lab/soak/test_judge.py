@@ -49,13 +49,17 @@ def test_track_measures_errors_steps_and_holds() -> None:
     track = SampleTracker(CONTROL, lambda: now)
     track.want(0, np.array([1.0, 2.0, 3.0, 4.0]))
     track.command(0, np.array([0.0, 1.0, 1.5]))
-    track.take(batch(0, [0.0, 1.0], [1.5, 2.0]))
-    track.take(batch(2, [1.5, 1.5], [math.nan, 3.0]))
+    for samples in (
+        batch(0, [0.0, 1.0], [1.5, 2.0]),
+        batch(2, [1.5, 1.5], [math.nan, 3.0]),
+    ):
+        track.take(samples)
+        track.take_sound(samples)
     track.take(batch(2, [9.0], [3.0]))
     now = 1.5
     track.take(batch(6, [11.0, math.nan], [0.0, 0.0]))
     first, second = track.seconds
-    assert (first.samples, first.judged, first.held, track.repeated) == (5, 4, 2, 1)
+    assert (first.samples, first.judged, first.held, track.repeated) == (5, 3, 2, 1)
     assert first.error_sum_um == pytest.approx(0.5 + 0.0 + 1.0 + 0.0)
     assert first.step_max_V == pytest.approx(1.0), "neither the repeated sample nor the gap makes a step"
     assert second.beyond_V == pytest.approx(1.0)

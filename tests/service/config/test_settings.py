@@ -40,6 +40,18 @@ def test_a_short_configuration_has_safe_defaults(tmp_path: Path) -> None:
     assert (axis.served, axis.learn, axis.recorder) == ("auto", "lssvm_adaptive", None)
 
 
+@pytest.mark.parametrize("what", ["checkpoints", "recorder"])
+def test_one_folder_for_two_axes_is_refused_and_says_whose_it_is(what: str, tmp_path: Path) -> None:
+    axis = GOOD.split("[[axis]]")[1].split("[axis.learner]")[0]
+    other = axis.replace('"x"', '"y"', 1)
+    text = f'stage = "demo"\n[[axis]]{axis}{what} = "kept"\n[[axis]]{other}{what} = "./kept"\n'
+    with pytest.raises(
+        InputError, match=rf"axis y: {what}: got .*kept, which is also that of axis x, expected a folder"
+    ):
+        parse_config(text, "f", tmp_path)
+    parse_config(text.replace("./kept", "kept/y"), "f", tmp_path)
+
+
 def test_the_example_has_every_key_and_every_default(tmp_path: Path) -> None:
     shown = parse_config(example(), "example", tmp_path)
     assert shown.stage == "demo"

@@ -15,7 +15,9 @@ import zenoh
 from service.client.client import Client
 from service.operating.remote import operate
 from service.runtime.session import open_client
-from tests.service.living import eventually, samples
+from service.security.peers import OWN_SECRET
+from tests.service.conftest import unused_port, write_config
+from tests.service.living import Process, Stage, eventually, samples
 
 Serve = Callable[..., Any]
 
@@ -81,3 +83,36 @@ def test_with_both_it_starts_with_the_same_model_to_the_last_bit(serve: Serve, t
     assert prints[0] == prints[1]
     with Client.connect(serve(extra=extra).endpoint, axis="x", timeout_s=5.0) as client:
         assert client.status()["frozen"] is True
+
+
+@pytest.mark.e2e
+def test_a_standby_that_takes_over_within_20_ms_of_the_answer_is_frozen(tmp_path: Path) -> None:
+    """It has not fetched the state that includes the freeze, and its own files are elsewhere, as on another host."""
+    ports = [unused_port(), unused_port()]
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
+    first_config, second_config = tmp_path / "one", tmp_path / "two"
+    processes: list[Process] = []
+    try:
+        for folder, options in ((first_config, ()), (second_config, ("--standby",))):
+            folder.mkdir()
+            config = write_config(folder, ports[0], extra='recorder = "rec"\nserved = "lssvm_adaptive"\n')
+            secret = f'peer_secret = "{tmp_path / OWN_SECRET}"\n'
+            config.write_text(f'standby_listen = ["{endpoints[1]}"]\nlease_s = 0.6\n{secret}' + config.read_text())
+            processes.append(Process("serve", "--config", str(config), *options))
+        with (
+            open_client(endpoints, 20.0) as session,
+            Client.connect(endpoints, axis="x", timeout_s=0.5, wait_s=20.0, retry_s=10.0) as client,
+            Stage(endpoints),
+        ):
+            eventually(lambda: client.status()["samples"]["learnt"] > 300)
+            operate(session, client.keys, "freeze", "alice")
+            processes[0].kill()
+            status = eventually(lambda: (s := client.status())["instance"] == processes[1].ready["instance"] and s)
+            assert status["frozen"] is True
+            eventually(lambda: client.status()["seq"] > status["seq"] + 300)
+            assert client.status()["fingerprint"] == status["fingerprint"]
+            operate(session, client.keys, "thaw", "alice")
+            assert client.status()["frozen"] is False
+    finally:
+        for process in processes:
+            process.kill()

@@ -217,3 +217,29 @@ def test_only_loopback_is_listened_at(shared_service: Any) -> None:
 def _sockets(pid: int) -> set[str]:
     links = (path.readlink() for path in Path(f"/proc/{pid}/fd").iterdir())
     return {str(link)[8:-1] for link in links if str(link).startswith("socket:[")}
+
+
+@pytest.mark.e2e
+def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: Callable[..., Any]) -> None:
+    process = serve(extra="queue_samples = 60\n")
+    with Client.connect(process.endpoint, axis="x", timeout_s=2.0) as client, open_client(process.endpoint) as stage:
+
+        def trouble_of(first: int, n: int, step: int, payload: bytes = b"") -> str:
+            """The first trouble while messages of n samples from ``first`` on come for three seconds."""
+            until, at = time.monotonic() + 3.0, first
+            while time.monotonic() < until:
+                stage.put(client.keys.sample, payload or samples(at, n))
+                at += step
+                time.sleep(0.02)
+                if (name := client.status()["trouble"]) and time.monotonic() > until - 2.9:
+                    return str(name)
+            return ""
+
+        assert trouble_of(0, 20, 20) == ""
+        for name, lost in (
+            ("samples_dropped", lambda: trouble_of(10_000, 100, 100)),
+            ("samples_out_of_order", lambda: trouble_of(0, 20, 0)),
+            ("samples_malformed", lambda: trouble_of(0, 0, 0, b"rubbish")),
+        ):
+            assert lost() == name
+            eventually(lambda: client.status()["trouble"] == "", 5.0)

@@ -8,6 +8,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from adaptive.types import InverseModel
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sample_queue import SampleQueue
+from service.operating.verbs import Request, Verbs
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
@@ -162,6 +164,30 @@ def test_a_few_dozen_checkpoints_reach_back_for_months(tmp_path: Path) -> None:
     assert numbers[:4] == [40, 39, 38, 37]
     assert [entry["checkpoint"] for entry in few.entries()] == numbers
     assert not list(tmp_path.glob("*part"))
+
+
+def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back(tmp_path: Path) -> None:
+    axis, kept = make_axis(), folder(tmp_path)
+    axis.handle(recording(0, 100))
+    for _ in range(20):
+        kept.write(meta(axis), axis.state_dict())
+    keeper = CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", kept)
+    listed: list[dict[str, Any]] = []
+
+    def list_them() -> list[dict[str, Any]]:
+        listed[:] = kept.entries()
+        return listed
+
+    axis_with_list = SimpleNamespace(handled_seq=0, checkpoints=list_them)
+    verbs = Verbs(axis_with_list, lambda work: 0, {}, keeper.keep_listed)  # type: ignore[arg-type]
+    verbs.apply(Request("checkpoints", "alice"))
+    for _ in range(50):
+        kept.write(meta(axis), axis.state_dict())
+    assert {entry["checkpoint"] for entry in listed} <= set(kept.numbers())
+    kept.pin([], 0.0)
+    kept.write(meta(axis), axis.state_dict())
+    assert not {entry["checkpoint"] for entry in listed} <= set(kept.numbers())
+    keeper.close()
 
 
 def test_the_operator_freezes_selects_and_goes_back(tmp_path: Path) -> None:

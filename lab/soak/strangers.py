@@ -1,0 +1,137 @@
+"""Strangers to a service: processes on its network that do not know its secret, and try to move it.
+
+``python -m lab.soak.strangers forge ENDPOINT SEED MODEL.npz`` answers whoever asks for the state with forged ones, and
+makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve. Both ask for the state too. They print ``ready``, run
+until they are stopped, and print JSON: how often they ``tried``, and how many ``states`` they were given.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import zenoh
+
+from adaptive.types import StateDict
+from lab.soak.controller import AXIS, SERVED, STAGE
+from lab.testbed.processes import run_client_process
+from service.answers.guard import Limits
+from service.config.settings import AxisConfig
+from service.failover.state_transfer import fetch_state, send_state
+from service.protocol.keys import Keys
+from service.runtime.session import SURELY, open_client
+from service.runtime.stopping import StopSignal
+from service.server.axis_loading import load_axis
+from service.storage.checkpoint import CheckpointMeta, encode_checkpoint
+
+#: Pause between two attempts, s; longest wait for a state that is asked for, s.
+PAUSE_S: Final = 0.5
+_ASK_S: Final = 0.3
+#: An epoch above any that is known.
+EPOCH: Final = 900_000_000
+
+
+def forged_states(model: Path, seed: int) -> Any:
+    """States of an axis without end, (meta, state): each with one array emptied, cut or full of NaN."""
+    axis = load_axis(STAGE, AxisConfig(AXIS, model, Limits(0.0, 10.0, 1e4), served=SERVED))
+    whole = axis.state_dict()
+    arrays = [name for name, value in whole.items() if isinstance(value, np.ndarray) and value.size]
+    rng = np.random.default_rng(seed)
+    for number in itertools.count(1):
+        state: StateDict = dict(whole)
+        name = arrays[int(rng.integers(len(arrays)))]
+        value = whole[name]
+        state[name] = (value[:0], value.ravel()[:1], np.full(value.shape, np.nan))[number % 3]
+        yield CheckpointMeta(STAGE, AXIS, axis.dt_s, 2**40, 2**40, instance="i0-stranger"), state
+
+
+class Stranger:
+    """What both have: they ask for the state, and count what they get."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.counts = {"tried": 0, "states": 0}
+        self.session = session
+        self.keys = Keys(STAGE, AXIS)
+
+    def ask_for_state(self) -> None:
+        """Ask for the state without a proof, as a standby asks where there is no secret."""
+        self.counts["tried"] += 1
+        self.counts["states"] += fetch_state(self.session, self.keys.state, _ASK_S) is not None
+
+
+def forge(endpoint: str, seed: int, model: Path) -> int:
+    """Answer for the state with forged ones, and tell standbys that the model has changed, so that they ask."""
+    stop = StopSignal()
+    states = forged_states(model, seed)
+    next(states)
+    with open_client(endpoint, 20.0) as session, ExitStack() as stack:
+        # Asks through a session of its own, which does not get its own answers.
+        stranger = Stranger(stack.enter_context(open_client(endpoint, 20.0)))
+        keys = stranger.keys
+        mine = [False]
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                if not mine[0]:
+                    send_state(query, keys.state, encode_checkpoint(*next(states)))
+
+        queryable = session.declare_queryable(keys.state, answer)
+        print("ready", flush=True)
+        while not stop.reason:
+            # A standby believes an event at most as far as to ask who serves for the state.
+            event = json.dumps({"event": "selected", "instance": "i0-stranger"})
+            session.put(keys.event, event, congestion_control=SURELY)
+            stop.wait(PAUSE_S)
+            mine[0] = True
+            stranger.ask_for_state()
+            mine[0] = False
+        queryable.undeclare()  # type: ignore[no-untyped-call]
+    print(json.dumps(stranger.counts), flush=True)
+    return 0
+
+
+def claim(endpoint: str, seed: int) -> int:
+    """Claim to serve, by one name after the other, unsigned and with signatures of nobody, and say to be alive."""
+    stop = StopSignal()
+    rng = np.random.default_rng(seed)
+    with open_client(endpoint, 20.0) as session, ExitStack() as stack:
+        stranger = Stranger(stack.enter_context(open_client(endpoint, 20.0)))
+        keys = stranger.keys
+
+        def alive(query: zenoh.Query) -> None:
+            with query:
+                name = query.parameters.get("alive")
+                if name is not None:
+                    query.reply(keys.state, str(name).encode())
+
+        queryable = session.declare_queryable(keys.state, alive)
+        tokens: list[Any] = []
+        print("ready", flush=True)
+        while not stop.reason:
+            signature = "" if len(tokens) % 2 else rng.bytes(16).hex()
+            key = keys.claim(EPOCH + len(tokens), f"i{len(tokens)}-rogue", signature)
+            tokens.append(session.liveliness().declare_token(key))
+            stranger.ask_for_state()
+            time.sleep(PAUSE_S)
+        for entity in (queryable, *tokens):
+            entity.undeclare()
+    print(json.dumps(stranger.counts), flush=True)
+    return 0
+
+
+def main(argv: list[str]) -> int:
+    """Entry of the process. Returns its exit status."""
+    what, endpoint, seed = argv[:3]
+    if what == "claim":
+        return claim(endpoint, int(seed))
+    return forge(endpoint, int(seed), Path(argv[3]))
+
+
+if __name__ == "__main__":
+    sys.exit(run_client_process(lambda: main(sys.argv[1:])))

@@ -1,0 +1,116 @@
+"""Samples that come and are lost have a name within two seconds; what is usual has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from service.intake.losses import (
+    SAMPLES_DROPPED,
+    SAMPLES_MALFORMED,
+    SAMPLES_OUT_OF_ORDER,
+    TWO_STAGES,
+    Arrivals,
+    SampleLosses,
+)
+from service.protocol.samples import SampleBatch
+from service.server.axis import Axis
+from tests.service.storage.test_stored_files import make_axis, recording
+
+#: Pause between two looks of the publishing thread, s, and samples in it at 1 kHz.
+LOOK_S, EACH = 0.02, 20
+
+
+def judged(come: Callable[[float], Arrivals], duration_s: float) -> list[tuple[float, str]]:
+    """(time, name) of each change, where ``come`` gives the arrivals of the look at a time."""
+    losses, total, changes = SampleLosses(), Arrivals(), []
+    for k in range(round(duration_s / LOOK_S)):
+        t_s = k * LOOK_S
+        total = Arrivals(*(a + b for a, b in zip(total, come(t_s), strict=True)))
+        if losses.look(100.0 + t_s, total):
+            changes.append((t_s, losses.trouble))
+    return changes
+
+
+@pytest.mark.parametrize(
+    ("bad", "name"),
+    [
+        (Arrivals(dropped=EACH), SAMPLES_DROPPED),
+        (Arrivals(received=EACH - 6, dropped=6), SAMPLES_DROPPED),
+        (Arrivals(received=EACH, refused=EACH), SAMPLES_OUT_OF_ORDER),
+        (Arrivals(received=2 * EACH, refused=EACH, foreign=EACH), TWO_STAGES),
+        (Arrivals(malformed=1), SAMPLES_MALFORMED),
+    ],
+)
+def test_each_way_of_losing_samples_has_a_name_within_two_seconds_and_loses_it(bad: Arrivals, name: str) -> None:
+    good = Arrivals(received=EACH)
+    changes = judged(lambda t_s: bad if 3.0 <= t_s < 8.0 else good, 12.0)
+    assert [changed for _, changed in changes] == [name, ""]
+    assert 3.0 < changes[0][0] <= 5.0
+    assert 8.0 < changes[1][0] <= 10.0
+
+
+@pytest.mark.parametrize(
+    "usual",
+    [
+        Arrivals(received=EACH),
+        Arrivals(received=2 * EACH, refused=EACH),  # every message twice
+        Arrivals(received=EACH, dropped=1),
+        Arrivals(),
+        Arrivals(received=EACH, malformed=5),
+    ],
+)
+def test_what_is_usual_has_no_name(usual: Arrivals) -> None:
+    assert judged(lambda _: usual, 10.0) == []
+
+
+def test_a_stage_that_restarts_its_count_has_no_name() -> None:
+    restart = Arrivals(received=EACH, refused=EACH, foreign=EACH)
+    assert judged(lambda t_s: restart if 3.0 <= t_s < 3.2 else Arrivals(received=EACH), 8.0) == []
+    # Also where nothing came for a second before.
+    quiet = {True: Arrivals(), False: Arrivals(received=EACH)}
+    assert judged(lambda t_s: restart if 4.0 <= t_s < 4.2 else quiet[2.0 <= t_s < 4.0], 8.0) == []
+
+
+def test_an_axis_tells_a_copy_and_a_late_sample_from_another_senders() -> None:
+    axis = make_axis()
+
+    def refused(batch: SampleBatch) -> tuple[int, int]:
+        before = axis.counts
+        axis.handle(batch)
+        return axis.counts.refused - before.refused, axis.counts.foreign - before.foreign
+
+    first = recording(0, 200)
+    axis.handle(first)
+    assert refused(recording(150, 20)) == (20, 0)
+    other = SampleBatch(first.seq, first.t_s, first.u_V, first.y_um + 0.5)
+    assert refused(SampleBatch(*(column[180:190] for column in columns(other)))) == (10, 10)
+    axis.handle(recording(210, 50))
+    assert refused(recording(200, 10)) == (10, 0), "lost, and late"
+    behind = recording(0, 10)
+    assert refused(SampleBatch(behind.seq + 10**6, behind.t_s, behind.u_V, behind.y_um))[1] > 0
+
+
+def columns(batch: SampleBatch) -> tuple[object, ...]:
+    return batch.seq, batch.t_s, batch.u_V, batch.y_um
+
+
+def test_two_stages_with_the_same_numbers_on_one_key_are_told() -> None:
+    axis, losses = make_axis(), SampleLosses()
+    told = ""
+    for first in range(0, 3000, EACH):
+        one = recording(first, EACH)
+        axis.handle(one)
+        if first >= 1000:
+            axis.handle(SampleBatch(one.seq, one.t_s, one.u_V, one.y_um[::-1] + 3.0))
+        told = arrived(axis, losses, first) or told
+        assert (told == "") or first > 1000
+    assert told == TWO_STAGES
+    assert "two stages send on one key" in losses.why
+
+
+def arrived(axis: Axis, losses: SampleLosses, tick: int) -> str:
+    counts = axis.counts
+    losses.look(tick * 1e-3, Arrivals(counts.samples["received"], counts.refused, counts.foreign))
+    return losses.trouble
