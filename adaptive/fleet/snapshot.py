@@ -103,6 +103,11 @@ class FleetSnapshot:
         u, std, inside = (torch.stack(part, 1).cpu().numpy() for part in zip(*out, strict=True))
         return Answers(u, std, inside, kept.cpu().numpy())
 
+    def linear(self) -> FloatArray:
+        """(B, 2 + p) gain and offset (µm) of each axis' frame, and its linear part, V. A copy."""
+        parts = (self.gain[:, None], self.offset_um[:, None], self.beta)
+        return np.asarray(torch.cat(parts, 1).cpu().numpy(), dtype=np.float64)
+
     def model(self, axis: int) -> dict[str, FloatArray]:
         """The arrays of one axis' model, by name: what those that follow it need."""
         names = ("beta", "scaled", "alpha", "inverse_widths", "domain")
