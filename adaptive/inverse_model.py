@@ -172,7 +172,7 @@ def voltage_of(
     advance(y, scratch, m)
     basis, kernel = np.empty(beta.shape[0]), np.empty(inverse_widths.shape[0])
     fill(y, v, a, scratch, m, basis, kernel)
-    return _mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
+    return mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
 
 
 @compiled
@@ -194,7 +194,7 @@ def track_memory(y: FloatArray, memory: FloatArray, m: FeatureArrays) -> None:  
 
 
 @compiled
-def _mean_of(
+def mean_of(
     basis: FloatArray,
     kernel: FloatArray,
     beta: FloatArray,
@@ -384,7 +384,7 @@ class LssvmInverse:
 
     def mean(self, basis: FloatArray, kernel: FloatArray) -> float:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
-        return float(_mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
+        return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
 
     def at_bound(self, y_um: FloatArray, u_V: FloatArray) -> BoolArray:
         """(n,) whether the voltages, (n,) V, that it gave for (n,) places at rest are held by ``allowed_V``."""

@@ -242,6 +242,11 @@ class DriftFilter:
         """(p, p) of the estimate, V²; a copy."""
         return self._P.copy()
 
+    @property
+    def variances(self) -> tuple[FloatArray, FloatArray]:
+        """(p,) variances that each coefficient gains with a step, and with a sudden change, V²."""
+        return self._walk.copy(), self._burst.copy()
+
     def update(self, basis: FloatArray, target_V: float, moving: bool, weight: float = 1.0) -> str:
         """Update with one measurement ``target_V`` of ``basis' beta``; ``basis`` (p,).
 
@@ -344,12 +349,12 @@ class DriftFilter:
 # --- Creep at rest.
 
 #: Updates of the filter between two moves of the frame: a new feature map takes as long as an update.
-_FRAME_EVERY = 10
+FRAME_EVERY = 10
 #: Fastest move of the frame, as a share of the range per second: creep is slow.
-_FASTEST_PER_S = 0.02
+FASTEST_PER_S = 0.02
 #: Fastest change of a voltage that holds a stage in place, as a share of the span per second. With a stuck sensor the
 #: stage seems to rest too, but the voltage changes faster.
-_STILL_PER_S = 0.1
+STILL_PER_S = 0.1
 
 
 @dataclass(slots=True)
@@ -385,15 +390,15 @@ class RestCreep:
         if isnan(self.constant_V):
             self.constant_V, self.u_V = constant_V, u_V
         self.steps += 1
-        if creep_s <= 0.0 or self.steps % _FRAME_EVERY:
+        if creep_s <= 0.0 or self.steps % FRAME_EVERY:
             return 0.0
         change_V, self.u_V = abs(u_V - self.u_V), u_V
-        if change_V > _STILL_PER_S * span_V * _FRAME_EVERY * step_s:
+        if change_V > STILL_PER_S * span_V * FRAME_EVERY * step_s:
             self.leave()
             return 0.0
         gained_um = (constant_V - self.constant_V) * range_um / span_V
-        most_um = _FASTEST_PER_S * range_um * _FRAME_EVERY * step_s
-        return -min(max(gained_um * min(1.0, _FRAME_EVERY * step_s / creep_s), -most_um), most_um)
+        most_um = FASTEST_PER_S * range_um * FRAME_EVERY * step_s
+        return -min(max(gained_um * min(1.0, FRAME_EVERY * step_s / creep_s), -most_um), most_um)
 
     def state_dict(self) -> StateDict:
         return {"constant_V": self.constant_V, "steps": self.steps, "u_V": self.u_V}

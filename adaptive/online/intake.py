@@ -559,6 +559,28 @@ class Intake:
             return self.served.memory_in(self.base.features, memory) if frozen else memory.copy()
         return self.track.memory_now(frozen)
 
+    @property
+    def controls(self) -> bool:
+        """Whether a control trial of the model is under way."""
+        return self._control is not None
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether nothing is under way: readings are smoothed and trusted, and no jump is open."""
+        track = self.track
+        return not (
+            track is None
+            or self._lost
+            or track.motion is None
+            or track.features != track.served
+            or self.holds
+            or self._control is not None
+            or self._proven is not None
+            or self._proven_past is not None
+            or self.on_probation
+            or self._voltages.array().size
+        )
+
     # ---- what it teaches
 
     def advance(self, step: Step) -> tuple[Pair | None, bool]:

@@ -13,7 +13,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, prefixed, under
 from adaptive.window import arrays as ws
-from adaptive.window.arrays import Status
+from adaptive.window.arrays import Status, WindowArrays
 from adaptive.window.healing import Healing
 from adaptive.window.window import SolverConfig, Window, WindowConfig
 
@@ -106,8 +106,35 @@ class ResidualWindow:
             made._healing = Healing(made._window)
         return made
 
+    @classmethod
+    def over(
+        cls, arrays: WindowArrays, model: LssvmInverse, eviction: Eviction, solver: SolverConfig
+    ) -> ResidualWindow:
+        """A window whose state is in arrays that another owns, with the hyper-parameters of ``model``.
+
+        `restore` with ``arrays=False`` sets what is not in them.
+        """
+        made = cls(arrays.S.size, model, eviction, solver)
+        made._window = Window(made._config, arrays)
+        made._healing = Healing(made._window)
+        return made
+
     def __len__(self) -> int:
         return len(self._window)
+
+    @property
+    def window_arrays(self) -> WindowArrays:
+        """The state of the solver; written in place by each step."""
+        return self._window.arrays
+
+    @property
+    def heals(self) -> bool:
+        """Whether a new factorisation is on its way."""
+        return self._healing.open
+
+    def begin_healing(self) -> None:
+        """A step was refused for numerics: make a new factorisation."""
+        self._healing.begin()
 
     @property
     def reach_V(self) -> float:
@@ -247,8 +274,8 @@ class ResidualWindow:
 
     # ---- keeping
 
-    def state_dict(self) -> StateDict:
-        """All arrays under flat names, and their hyper-parameters."""
+    def state_dict(self, arrays: bool = True) -> StateDict:
+        """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
         own = {
             "born": self._born.copy(),
             "own_weights": self._own.copy(),
@@ -259,14 +286,18 @@ class ResidualWindow:
         }
         hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
         healing = prefixed("healing.", self._healing.state_dict())
-        return {**self._window.state_dict(), **own, **hyper, **healing}
+        return {**(self._window.state_dict() if arrays else {}), **own, **hyper, **healing}
 
-    def restore(self, values: StateDict) -> None:
-        """Continue from a ``state_dict``. Raises InputError where its capacity or number of inputs differs."""
+    def restore(self, values: StateDict, arrays: bool = True) -> None:
+        """Continue from a ``state_dict``. Raises InputError where its capacity or number of inputs differs.
+
+        ``arrays=False`` : the solver's arrays stay.
+        """
         c = self._config
         widths = tuple(float(w) for w in values["widths"])
         self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.form, c.accuracy)
-        self._window = Window.from_state(self._config, values)
+        kept = self._window.arrays
+        self._window = Window.from_state(self._config, values) if arrays else Window(self._config, kept)
         self._healing = Healing.from_state(self._window, under("healing.", values))
         self._born = np.array(values["born"], dtype=np.int64)
         self._own = np.array(values["own_weights"], dtype=np.float64)

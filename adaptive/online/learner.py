@@ -152,6 +152,7 @@ class Delay:
     """The last ``steps`` + 1 coefficient vectors: errors are those of the model as it was ``steps`` ago."""
 
     def __init__(self, steps: int) -> None:
+        self.steps = steps
         self._past: deque[FloatArray] = deque(maxlen=steps + 1)
 
     def push(self, vector: FloatArray) -> FloatArray:
@@ -238,7 +239,13 @@ class Parts:
     counters : samples by outcome. events : by name.
     """
 
-    def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
+    def __init__(
+        self,
+        base: LssvmInverse,
+        config: LearnerConfig,
+        window: ResidualWindow | None = None,
+        allowed_V: float | None = None,
+    ) -> None:
         self.config = config
         self.intake = Intake(base, config)
         p = base.features.basis_size
@@ -246,7 +253,7 @@ class Parts:
         step_s = config.filter_every * base.dt_s
         self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
         self.first = self.filter.mark()
-        self.window = ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
+        self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
         self.mark: Mark = self.filter.mark()
         self.next_mark: Mark = self.mark
         self.jump_mark: Mark = self.mark
@@ -262,7 +269,9 @@ class Parts:
         steps = max(1, round(CHECK_S / self.filter.step_s))
         self.check_every, self.check_s = steps * config.filter_every, steps * self.filter.step_s
         # Without a linear part there is nothing to bound the kernel by. The identified kernel part is allowed on top.
-        self.allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
+        if allowed_V is None:
+            allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
+        self.allowed_V = allowed_V
         self.rail_s = 0.0
         self.railed = False
         self.left_s = 0.0
@@ -480,14 +489,19 @@ class Parts:
         self.shift_constant(shift_V)
         return ""
 
+    @property
+    def ordinary(self) -> bool:
+        """Whether samples are learnt in the ordinary way: nothing is in doubt, and nothing is being repaired."""
+        return self.intake.ordinary and not (self.window.heals or self.railed or self.left or self.alone)
+
     # ---- keeping
 
-    def state_dict(self) -> StateDict:
-        """The whole changing state under flat names."""
+    def state_dict(self, arrays: bool = True) -> StateDict:
+        """The whole changing state under flat names; ``arrays=False``: without the arrays of the window's solver."""
         groups = {
             "front": self.intake.state_dict(),
             "filter": self.filter.state_dict(),
-            "window": self.window.state_dict(),
+            "window": self.window.state_dict(arrays),
             "rest": self.rest.state_dict(),
             "judgement": self.judgement.state_dict(),
             "counters": dict(self.counters),
@@ -512,12 +526,12 @@ class Parts:
             "confirmed_ages": np.array(self.confirmed_ages),
         }
 
-    def restore(self, state: StateDict) -> None:
+    def restore(self, state: StateDict, arrays: bool = True) -> None:
         """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
         self.intake.restore(under("front.", state))
         kept_filter = under("filter.", state)
         self.filter = DriftFilter.from_state(self.config.drift, self.filter.step_s, self.filter.span_V, kept_filter)
-        self.window.restore(under("window.", state))
+        self.window.restore(under("window.", state), arrays)
         self.rest = RestCreep.from_state(under("rest.", state))
         self.judgement = Judgement.from_state(under("judgement.", state))
         self.counters |= {key: int(value) for key, value in under("counters.", state).items()}
@@ -528,6 +542,7 @@ class Parts:
         self.left_s, self.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
         self.alone = bool(state.get("alone", False))
         self.mark_ages, self.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
+        self.delay = Delay(self.delay.steps)
         self.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
         self.mark, self.next_mark, self.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
@@ -569,10 +584,16 @@ class Learner:
     def __init__(self, model: LssvmInverse, config: LearnerConfig | None = None) -> None:
         self._begin(model, config or LearnerConfig())
 
-    def _begin(self, model: LssvmInverse, config: LearnerConfig) -> None:
+    def _begin(
+        self,
+        model: LssvmInverse,
+        config: LearnerConfig,
+        window: ResidualWindow | None = None,
+        allowed_V: float | None = None,
+    ) -> None:
         self.config = config
         self.base = model
-        self.parts = Parts(model, config)
+        self.parts = Parts(model, config, window, allowed_V)
         features = model.features
         self._basis = np.empty(features.basis_size)
         self._frozen_basis, self._frozen_kernel = self._basis.copy(), np.empty(features.kernel_size)
@@ -583,6 +604,16 @@ class Learner:
     def from_model(cls, model: LssvmInverse, config: LearnerConfig | None = None) -> Learner:
         """A learner that starts from an identified model."""
         return cls(model, config)
+
+    @classmethod
+    def around(cls, model: LssvmInverse, config: LearnerConfig, window: ResidualWindow, allowed_V: float) -> Learner:
+        """A learner that steps a window which another owns, with the bound of a learner of the same model, V.
+
+        `resume` gives it a state.
+        """
+        made = cls.__new__(cls)
+        made._begin(model, config, window, allowed_V)
+        return made
 
     # ---- samples in
 
@@ -891,6 +922,12 @@ class Learner:
         """The whole state; ``from_state`` continues from it with the same result to the last bit."""
         made_from = joined({"base": self.base.state_dict(), "config": self.config.state_dict()})
         return {**made_from, **self.parts.state_dict(), "frozen": self._frozen}
+
+    def resume(self, state: StateDict, arrays: bool = True) -> None:
+        """Continue from the changing part of a state; ``arrays=False``: the solver's arrays hold theirs already."""
+        self.parts.restore(state, arrays)
+        self._frozen = bool(state["frozen"])
+        self._cache = None
 
     def restored(self, state: StateDict) -> Learner:
         """A learner with ``state``. Raises ModelFileError where entries are missing or do not fit together."""

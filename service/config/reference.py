@@ -19,6 +19,7 @@ from service.background.diagnosing.settings import WatchConfig
 from service.background.retuning.settings import RetuningConfig
 from service.config.schema import Key, inline_keys, keys_of
 from service.config.settings import AxisConfig, ServeConfig
+from service.fleet.settings import FleetSettings
 
 _HEAD = "# Configuration of 'dehyst serve --config FILE'. Displacement in µm, voltage in V, time in s.\n"
 _WIDTH = 36
@@ -53,6 +54,7 @@ def tables() -> tuple[tuple[str, type], ...]:
         ("`[axis.competition]`: comparison and exchange of models", CompetitionConfig),
         ("`[axis.retuning]`: background tuning of hyper-parameters", RetuningConfig),
         ("`[axis.diagnosis]`: background diagnosis", WatchConfig),
+        ("`[fleet]`: many axes as one batch", FleetSettings),
     )
 
 
@@ -67,7 +69,7 @@ def page() -> str:
 def _example_of(kind: type) -> list[str]:
     lines = []
     for key in _flat(kind):
-        if _is_table(key) or key.name == "axis":
+        if _is_table(key) or key.name in ("axis", "fleet"):
             continue
         shown = key.required or key.setting.shown
         left = f"{'' if shown else '# '}{key.name} = {_toml(key)}"

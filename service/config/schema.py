@@ -175,6 +175,9 @@ def _value(kind: Any, value: Any, field: str, setting: Setting, folder: Path | N
     if get_origin(kind) is tuple:
         return _tuple(get_args(kind), value, field, setting, folder)
     kinds = get_args(kind) if isinstance(kind, types.UnionType) or get_origin(kind) is Union else (kind,)
+    table = next((one for one in kinds if is_dataclass(one)), None)
+    if table is not None and isinstance(value, dict):
+        return build_settings(cast(type[Any], table), value, field, folder)
     if Path in kinds and isinstance(value, str):
         return (folder or Path()) / value if value else _empty_path(kinds, field, setting)
     value = float(value) if float in kinds and isinstance(value, int) and not isinstance(value, bool) else value
@@ -219,6 +222,8 @@ def _expected(kind: Any, setting: Setting) -> str:
         return "one of " + ", ".join(repr(choice) for choice in get_args(kind))
     kinds = [one for one in (get_args(kind) or (kind,)) if one is not type(None)]
     kind = get_origin(kind) if get_origin(kind) is dict else kinds[0]
+    if is_dataclass(kind):
+        return "a table"
     if not setting.bounded:
         return _NAMES[kind]
     return f"{'an integer, ' if kind is int else ''}{setting.range()}"

@@ -11,6 +11,7 @@ from service.answers.guard import Limits
 from service.background.diagnosing.settings import WatchConfig
 from service.background.retuning.settings import RetuningConfig
 from service.config.schema import Setting, build_settings, parse_toml, read_text
+from service.fleet.settings import FleetSettings
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO, check_name
 from service.protocol.samples import MAX_COUNT
@@ -140,7 +141,10 @@ class ServeConfig:
         str,
         Setting(help="name of the stage on the wire: a-z, 0-9, _ and -", check=check_name, example="demo", shown=True),
     ]
-    axes: Annotated[tuple[AxisConfig, ...], Setting(key="axis", help="one such table for each axis", shown=True)]
+    axes: Annotated[tuple[AxisConfig, ...], Setting(key="axis", help="one such table for each axis", shown=True)] = ()
+    fleet: Annotated[
+        FleetSettings | None, Setting(help="many axes as one batch, in place of [[axis]] tables; see docs/fleet.md")
+    ] = None
     listen: Annotated[
         tuple[str, ...],
         Setting(help="where controllers, stage and viewer connect", check=check_endpoint, shown=True),
@@ -201,8 +205,10 @@ def parse_config(text: str, where: str, folder: Path, insecure_beyond_loopback: 
     check_reach(where, (*config.listen, *config.standby_listen), config.connect, config.zenoh_config, insecure)
     if not config.listen and not config.connect:
         raise FieldError(f"{where}: listen", "nothing", "an endpoint to listen at, or one to connect to")
-    if not config.axes:
-        raise FieldError(f"{where}: axis", "none", "one or more [[axis]] tables")
+    if config.fleet is not None and config.axes:
+        raise FieldError(f"{where}: fleet", "[[axis]] tables too", "one of the two", "serve them by two processes")
+    if not config.axes and config.fleet is None:
+        raise FieldError(f"{where}: axis", "none", "one or more [[axis]] tables, or a [fleet] table")
     names = [axis.name for axis in config.axes]
     if len(set(names)) < len(names):
         raise FieldError(f"{where}: axis", ", ".join(names), "a different name for each axis")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,8 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints an example")
     with starting() as started:
         config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
+        if config.fleet is not None:
+            return _run_fleet(config, args, started)
         from service.runtime.stopping import StopSignal
         from service.server.process import Service, tune_process
 
@@ -72,6 +75,29 @@ def run(args: argparse.Namespace) -> int:
                 f"in transit, {samples['dropped']} dropped; {queries['count']} queries, {queries['errors']} refused"
             )
         print(f"stopped: {reason}", flush=True)
+    return 0
+
+
+def _run_fleet(config: ServeConfig, args: argparse.Namespace, started: Callable[[], None]) -> int:
+    """Serve a fleet until interrupted. Only here torch is imported."""
+    if args.standby:
+        raise FieldError("--standby", "a fleet", "[[axis]] tables", "a fleet has no standby")
+    from service.fleet.serving import FleetService
+    from service.runtime.stopping import StopSignal
+    from service.server.process import tune_process
+
+    tune_process()
+    stop = StopSignal()
+    with FleetService(config) as service:
+        started()
+        _print_ready(service.ready(), args.json)
+        reason = stop.wait(args.duration)
+    status = service.status()
+    if args.json:
+        print(json.dumps({"stopped": reason, "fleet": status}, default=str), flush=True)
+    else:
+        samples = status["samples"]
+        print(f"{samples['received']} samples of all axes received, {samples['dropped']} dropped; stopped: {reason}")
     return 0
 
 

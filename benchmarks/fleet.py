@@ -1,0 +1,140 @@
+"""A fleet beside a loop of single learners and beside naive batched ``torch.linalg.solve``, in one run.
+
+``python -m benchmarks.fleet [--axes 64 256 1024] [--window 100] [--learn-every 10] [--device cuda] [--steps 200]``
+
+For each number of axes: time of a step of all axes (median, p99), the same of as many single learners one after the
+other (measured on at most 64 of them, times the number of axes), and of solving all kernel matrices anew with
+``torch.linalg.solve``, which a step of all windows replaces; evaluation of all axes at one point; start-up; memory; and
+the bytes of the inverses that a step of all windows must read and write (one triangle each), over the bandwidth that a
+copy of a large array reaches here. All axes have the same model, each with a gain of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import Fleet
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
+from adaptive.online.learner import Learner
+from adaptive.types import FloatArray, Sample
+from adaptive.window.window import SolverConfig
+from sim.signals.voltages import training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT_S = 1e-3
+#: Largest number of single learners that are measured.
+MOST_SINGLE = 64
+
+
+def identified(window: int) -> tuple[LssvmInverse, Stage]:
+    """A model with ``window`` support vectors, and its stage."""
+    stage = Stage(preset("rich", seed=1))
+    _, u = training_input(DT_S, 10.0)
+    y, _ = stage.run(stage.initial_state(), u)
+    return identify_lssvm(u, y, DT_S, config=IdentifyConfig(n=window, tune=False, gamma=1e3))[0], stage
+
+
+def recording(stage: Stage, n: int) -> tuple[FloatArray, FloatArray]:
+    """(n,) voltages, V, and readings, µm, of a moving stage."""
+    t_s = np.arange(n) * DT_S
+    tones = ((1.6, 0.7), (1.0, 1.9), (0.6, 4.3), (0.3, 7.7))
+    u = np.minimum(t_s / 0.1, 1.0) * (4.0 + sum(size * np.sin(2.0 * np.pi * hz * t_s + hz) for size, hz in tones))
+    return np.asarray(u), stage.run(stage.initial_state(), u)[0]
+
+
+def bandwidth(device: str) -> float:
+    """Bytes a second that a copy of 256 MB reads and writes."""
+    source = torch.zeros(2**25, dtype=torch.float64, device=device)
+    target = torch.empty_like(source)
+    times = [timed(lambda: target.copy_(source), device) for _ in range(7)]
+    return 2.0 * source.numel() * 8 / float(np.median(times))
+
+
+def timed(work: Callable[[], object], device: str) -> float:
+    """Seconds of one call, the device's work included."""
+    begin = time.perf_counter()
+    work()
+    if device != "cpu":
+        torch.cuda.synchronize()
+    return time.perf_counter() - begin
+
+
+def naive_s(axes: int, window: int, device: str) -> float:
+    """Seconds to solve for all axes anew; measured on as many as fit into 512 MB."""
+    some = max(1, min(axes, 2**29 // (8 * window * window)))
+    points = torch.rand((some, window, 3), dtype=torch.float64, device=device)
+    R = torch.exp(-(torch.cdist(points, points) ** 2)) + 1e-3 * torch.eye(window, dtype=torch.float64, device=device)
+    right = torch.rand((some, window, 2), dtype=torch.float64, device=device)
+    return timed(lambda: torch.linalg.solve(R, right), device) * axes / some
+
+
+def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
+    """Print the lines of one number of axes."""
+    form = "inverse" if args.device != "cpu" or args.backend == "torch" else args.form
+    config = LearnerConfig(window=args.window, learn_every=args.learn_every, solver=SolverConfig(form=form))
+    model, stage = identified(args.window)
+    gains = 1.0 + 0.1 * np.linspace(-1.0, 1.0, axes)
+    models = [replace(model, features=replace(model.features, gain=float(gain))) for gain in gains]
+    begin = time.perf_counter()
+    fleet = Fleet(models, FleetConfig(config, args.device, args.backend, args.threads))
+    start_s = time.perf_counter() - begin
+    u, y = recording(stage, args.before + args.steps)
+    singles = [Learner(one, config) for one in models[: min(axes, MOST_SINGLE)]]
+    together, alone, apart = [], [], 0
+    for k in range(args.before + args.steps):
+        together.append(timed(lambda k=k: fleet.step(k, k * DT_S, u[k], gains * y[k]), args.device))  # type: ignore[misc]
+        apart += len(fleet.apart) if k >= args.before else 0
+        begin = time.perf_counter()
+        for gain, single in zip(gains, singles, strict=False):
+            single.handle(Sample(k, k * DT_S, float(u[k]), float(gain * y[k])))
+        alone.append((time.perf_counter() - begin) * axes / len(singles))
+    steps, loops = np.array(together[args.before :]), np.array(alone[args.before :])
+    snapshot, memory = fleet.snapshot(), fleet.memory()
+    at_um, still = np.full((axes, 1), 20.0), np.zeros((axes, 1))
+    answers = [timed(lambda: snapshot.feedforward(at_um, still, still, memory), args.device) for _ in range(20)]
+    triangles = axes * args.window * (args.window + 1) / 2 * 8 * 2 / args.learn_every
+    solved = naive_s(axes, args.window, args.device) / args.learn_every
+    print(f"B = {axes}, N = {args.window}, a window step every {args.learn_every} samples, {args.device}, {form}")
+    print(f"  start-up {start_s:.2f} s; window matrices {2 * axes * args.window**2 * 8 / 2**20:.0f} MiB")
+    ms = 1e3
+    print(f"  fleet         mean {steps.mean() * ms:8.2f} ms a sample of all axes, median {np.median(steps) * ms:.2f}, "
+          f"p99 {np.percentile(steps, 99) * ms:.2f}; {apart / args.steps:.1f} axes apart on average")  # fmt: skip
+    print(f"  single x B    mean {loops.mean() * ms:8.2f} ms, {loops.mean() / steps.mean():.2f} times the fleet's")
+    print(f"  solve x B     mean {solved * ms:8.2f} ms for the windows alone, {solved / steps.mean():.1f} times")
+    share = triangles / moved_bytes_s / steps.mean()
+    print(f"  inverses      {triangles / 1e6:.1f} MB a sample, {triangles / moved_bytes_s * ms:.2f} ms at a copy's "
+          f"{moved_bytes_s / 1e9:.1f} GB/s: {100 * share:.0f} % of the fleet's time")  # fmt: skip
+    print(f"  evaluation    median {np.median(answers) * ms:.2f} ms for one point of all axes", flush=True)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--axes", type=int, nargs="+", default=[64, 256, 1024], help="numbers of axes")
+    parser.add_argument("--window", type=int, default=100, help="samples in each window")
+    parser.add_argument("--learn-every", type=int, default=10, help="samples between two steps of the windows")
+    parser.add_argument("--device", default="cpu", help="device of torch: cpu or cuda")
+    parser.add_argument("--backend", default="auto", choices=["auto", "compiled", "torch"], help="see docs/fleet.md")
+    parser.add_argument("--form", default="auto", choices=["auto", "inverse", "cholesky"], help="of the windows")
+    parser.add_argument("--threads", type=int, default=2, help="that share the axes of a compiled step")
+    parser.add_argument("--before", type=int, default=150, help="samples before the measured ones")
+    parser.add_argument("--steps", type=int, default=200, help="measured samples")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    moved = bandwidth(args.device)
+    for axes in args.axes:
+        measure(axes, args, moved)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,347 @@
+"""The serving process of a fleet: one session, one thread that learns, replies from the newest snapshot."""
+
+from __future__ import annotations
+
+import os
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from adaptive.errors import DehystError
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
+from adaptive.types import BoolArray, FloatArray
+from service.answers.guard import Limits
+from service.config.schema import build_settings
+from service.config.settings import LEARN, ServeConfig
+from service.fleet.settings import FleetSettings
+from service.fleet.wire import (
+    REFUSED,
+    FleetChanges,
+    FleetQuery,
+    FleetReply,
+    FleetSamples,
+    decode_fleet_query,
+    decode_fleet_samples,
+    encode_fleet_changes,
+    encode_fleet_reply,
+)
+from service.protocol.container import JSON, fields_of, to_json
+from service.protocol.errors import FieldError, error_to_json
+from service.protocol.keys import Keys
+from service.protocol.model import encode_model
+from service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
+from service.runtime.session import open_service
+from service.storage.model_file import read_bundle
+
+try:
+    from adaptive.fleet.config import FleetConfig
+    from adaptive.fleet.fleet import Fleet
+    from adaptive.fleet.snapshot import FleetSnapshot
+    from adaptive.fleet.state import OUTCOMES
+except ImportError as error:
+    raise FieldError(
+        "[fleet]", f"a fleet, without torch ({error})", "torch, which fleets need", "pip install 'dehyst[torch]'"
+    ) from error
+
+#: Name of a fleet in the keys, in place of an axis.
+NAME: Final = "fleet"
+#: Axes that the summary lists, worst first; time between two statuses, s.
+_WORST, _STATUS_S = 10, 1.0
+
+
+def load_fleet(settings: FleetSettings) -> Fleet:
+    """The fleet that ``settings`` describe. Raises ModelFileError or InputError saying what does not fit."""
+    models: list[LssvmInverse] = []
+    for path in settings.models:
+        model = read_bundle(path).models.get(LEARN)
+        if not isinstance(model, LssvmInverse):
+            raise FieldError("fleet.models", str(path), f"a model file with {LEARN!r}", "identify with --inputs memory")
+        models.append(model)
+    if len(models) == 1:
+        f = models[0].features
+        gains = settings.gains or (1.0,) * settings.axes
+        models = [replace(models[0], features=replace(f, gain=gain * f.gain)) for gain in gains]
+    limits, given = settings.limits, settings.learner.get("admission", {})
+    if isinstance(given, dict):
+        given = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **given}
+    learner = build_settings(LearnerConfig, {**settings.learner, "admission": given}, "fleet.learner")
+    config = FleetConfig(learner, settings.device, settings.backend, settings.threads, settings.checks)
+    return Fleet(models, config)
+
+
+def answer(
+    snapshot: FleetSnapshot, tracked: FloatArray, limits: Limits, query: FleetQuery, seq: int
+) -> tuple[FleetReply, int]:
+    """The reply to a query, and the number of its points that were refused. Pure."""
+    axes, dt_s = len(tracked), snapshot.constants.dt_s
+    k, asked = query.y_um.shape
+    here = slice(query.first, min(query.first + asked, axes))
+    known = max(here.stop - here.start, 0)
+    if query.memory is not None and query.memory.shape[1] != snapshot.memory_size:
+        raise FieldError("columns", query.memory.shape[1], f"{snapshot.memory_size}, the size of a memory")
+    given = np.stack((query.y_um, query.v_um_per_s, query.a_um_per_s2))[:, :, :known]
+    refused = ~np.isfinite(given).all(0) | ~((given[0] >= limits.y_min_um) & (given[0] <= limits.y_max_um))
+    memory = tracked.copy()
+    if query.memory is not None and known:
+        sound = np.isfinite(query.memory[:known]).all(1)
+        refused |= ~sound
+        memory[here][sound] = query.memory[:known][sound]
+    # From its first refused point on, an axis' memory would be unknown.
+    refused = np.logical_or.accumulate(refused, axis=0)
+    motion = np.zeros((3, axes, k))
+    motion[:, here] = np.where(refused, 0.0, given).transpose(0, 2, 1)
+    said = snapshot.feedforward(motion[0], motion[1], motion[2], memory)
+    u, std = np.full((k, asked), np.nan), np.full((k, asked), np.nan)
+    flags = np.full((k, asked), REFUSED, dtype=np.uint8)
+    before = np.full(known, np.nan) if query.u_before_V is None else query.u_before_V[:known]
+    safe, bits = _limited(said.u_V[here].T, said.inside[here].T, before, limits, dt_s)
+    u[:, :known], flags[:, :known] = np.where(refused, np.nan, safe), np.where(refused, REFUSED, bits)
+    std[:, :known] = np.where(refused, np.nan, said.std_V[here].T)
+    after = np.full((asked, snapshot.memory_size), np.nan)
+    after[:known] = np.where(refused[-1][:, None], memory[here], said.memory[here])
+    count = int(refused.sum()) + k * (asked - known)
+    return FleetReply(query.first, seq, u, std, flags, after), count
+
+
+def _limited(
+    u_V: FloatArray, inside: BoolArray, before: FloatArray, limits: Limits, dt_s: float
+) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """`service.answers.guard.limit_voltage` for (k, B) points of all axes at once."""
+    out, flags = np.empty_like(u_V), np.where(inside, 0, OUTSIDE_DOMAIN).astype(np.uint8)
+    low, high, step = limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * dt_s
+    previous = np.clip(np.where(np.isfinite(before), before, np.nan), low, high)
+    for i, row in enumerate(u_V):
+        known, sound = np.isfinite(previous), np.isfinite(row)
+        wanted = np.where(sound, row, np.where(known, previous, 0.5 * (low + high)))
+        kept = np.clip(wanted, low, high)
+        slow = np.where(known, np.clip(kept, previous - step, previous + step), kept)
+        flags[i] |= np.where(sound, 0, NOT_FINITE_REPLACED).astype(np.uint8)
+        flags[i] |= np.where(kept != wanted, LIMITED_VOLTAGE, 0).astype(np.uint8)
+        flags[i] |= np.where(slow != kept, LIMITED_SLEW, 0).astype(np.uint8)
+        out[i] = previous = slow
+    return out, flags
+
+
+class FleetService:
+    """A running fleet; use as a context manager. The thread ``learn-fleet`` owns the fleet."""
+
+    def __init__(self, config: ServeConfig) -> None:
+        assert config.fleet is not None
+        self.config, self.settings = config, config.fleet
+        self.keys = Keys(config.stage, NAME)
+        self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
+        self._fleet = load_fleet(self.settings)
+        self._newest = self._fleet.snapshot(), self._fleet.memory(), -1
+        self._published = self._newest[0].linear()
+        self._queue: queue.Queue[FleetSamples | Callable[[], None]] = queue.Queue()
+        self._waiting = 0
+        self._counts = dict.fromkeys(
+            (
+                "received",
+                "dropped",
+                "malformed",
+                "missing",
+                "unknown_axes",
+                "queries",
+                "query_errors",
+                "points_refused",
+            ),
+            0,
+        )
+        self._counting = threading.Lock()
+        self._stopping = threading.Event()
+        self._session: zenoh.Session | None = None
+        self._entities: list[Any] = []
+        self._publisher: Any = None
+        self._thread = threading.Thread(target=self._run, name="learn-fleet")
+
+    def __enter__(self) -> FleetService:
+        config = self.config
+        self._session = session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
+        keys = self.keys
+        self._publisher = session.declare_publisher(keys.model)
+        self._thread.start()
+        self._entities = [
+            session.declare_subscriber(keys.sample, self._on_samples),
+            session.declare_queryable(keys.feedforward, self._guarded(keys.feedforward, self._feedforward)),
+            session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
+            session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
+            # Last, because alive means callable.
+            session.liveliness().declare_token(keys.alive(self.instance)),
+        ]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for entity in reversed(self._entities):
+            entity.undeclare()
+        self._stopping.set()
+        self._queue.put(lambda: None)
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._publisher is not None:
+            self._publisher.undeclare()
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def ready(self) -> dict[str, Any]:
+        """Fields of the line that `dehyst serve` prints when it is ready."""
+        return {
+            "ready": True, "instance": self.instance, "role": "primary", "synced": True, "stage": self.config.stage,
+            "listen": list(self.config.listen), "connect": list(self.config.connect), "key": self.keys.base,
+            "axes": {NAME: [f"{self.settings.axes} axes", self.settings.device]},
+        }  # fmt: skip
+
+    # ---- zenoh's threads
+
+    def _count(self, **more: int) -> None:
+        with self._counting:
+            for name, value in more.items():
+                self._counts[name] += value
+
+    def _on_samples(self, sample: zenoh.Sample) -> None:
+        try:
+            batch = decode_fleet_samples(sample.payload.to_bytes())
+        except DehystError:
+            self._count(malformed=1)
+            return
+        with self._counting:
+            room = self._waiting + batch.seq.size <= self.settings.queue_samples
+            self._counts["received" if room else "dropped"] += batch.seq.size
+            self._waiting += batch.seq.size if room else 0
+        if room:
+            self._queue.put(batch)
+
+    def _guarded(self, key: str, reply: Callable[[bytes], tuple[bytes, str]]) -> Callable[[zenoh.Query], None]:
+        """A callback that answers or refuses, and never raises."""
+
+        def on_query(query: zenoh.Query) -> None:
+            with query:
+                self._count(queries=1)
+                try:
+                    payload, encoding = reply(query.payload.to_bytes() if query.payload is not None else b"")
+                    query.reply(key, payload, encoding=encoding)
+                except Exception as error:
+                    self._count(query_errors=1)
+                    query.reply_err(error_to_json(error), encoding=JSON)
+
+        return on_query
+
+    def _in_turn(self, key: str, reply: Callable[[bytes], tuple[bytes, str]]) -> Callable[[zenoh.Query], None]:
+        """The same in the thread that learns, because it reads the learners."""
+        guarded = self._guarded(key, reply)
+        return lambda query: self._queue.put(lambda: guarded(query))
+
+    def _feedforward(self, payload: bytes) -> tuple[bytes, str]:
+        snapshot, memory, seq = self._newest
+        reply, refused = answer(snapshot, memory, self.settings.limits, decode_fleet_query(payload), seq)
+        if refused:
+            self._count(points_refused=refused)
+        return encode_fleet_reply(reply), "application/octet-stream"
+
+    # ---- the thread that learns
+
+    def _run(self) -> None:
+        handled, told_s, changed_s = 0, 0.0, 0.0
+        while not self._stopping.is_set():
+            try:
+                item = self._queue.get(timeout=0.1)
+            except queue.Empty:
+                item = None
+            if isinstance(item, FleetSamples):
+                before, handled = handled // self.settings.snapshot_every, handled + self._learn(item)
+                if handled // self.settings.snapshot_every > before:
+                    self._newest = self._fleet.snapshot(), self._fleet.memory(), int(item.seq.max())
+            elif item is not None:
+                item()
+            now_s = time.monotonic()
+            if self._session is not None and now_s - told_s >= _STATUS_S:
+                told_s = now_s
+                self._session.put(self.keys.status, to_json(self.status()), encoding=JSON)
+            if self._publisher is not None and now_s - changed_s >= 1.0 / self.settings.model_hz:
+                changed_s = now_s
+                self._publish_changes()
+
+    def _learn(self, batch: FleetSamples) -> int:
+        """Take all samples of a message; returns their number."""
+        axes = self.settings.axes
+        k, given = batch.u_V.shape
+        here = slice(batch.first, min(batch.first + given, axes))
+        known = max(here.stop - here.start, 0)
+        u, y = np.full((k, axes), np.nan), np.full((k, axes), np.nan)
+        u[:, here], y[:, here] = batch.u_V[:, :known], batch.y_um[:, :known]
+        present = ~(np.isnan(u) & np.isnan(y))
+        self._count(missing=int((~present).sum()), unknown_axes=k * (given - known))
+        for i in range(k):
+            self._fleet.step(int(batch.seq[i]), float(batch.t_s[i]), u[i], y[i], present[i])
+        with self._counting:
+            self._waiting -= k
+        return k
+
+    def _publish_changes(self) -> None:
+        """Send the linear parts and frames that have changed since the last time, to those that follow."""
+        if not self._publisher.matching_status.matching:
+            return
+        snapshot, _, seq = self._newest
+        now = snapshot.linear()
+        axes = np.flatnonzero(np.any(now != self._published, axis=1))
+        self._published = now
+        if axes.size:
+            changes = FleetChanges(seq, axes, now[axes, :2], now[axes, 2:])
+            self._publisher.put(encode_fleet_changes(changes))
+
+    def _axis_of(self, payload: bytes) -> int | None:
+        """The axis that a request names; None for none. Raises InputError."""
+        if not payload:
+            return None
+        axis: object = fields_of(payload).get("axis")
+        if isinstance(axis, bool) or not isinstance(axis, int) or not 0 <= axis < self.settings.axes:
+            raise FieldError("axis", repr(axis), f"an axis from 0 to {self.settings.axes - 1}")
+        return axis
+
+    def _model(self, payload: bytes) -> tuple[bytes, str]:
+        axis = self._axis_of(payload)
+        if axis is None:
+            raise FieldError("axis", "nothing", 'JSON with the number of one axis, {"axis": 0}')
+        learner = self._fleet.learner_of(axis)
+        model = learner.snapshot()
+        return encode_model(LEARN, model, model.seq, learner.memory()), "application/octet-stream"
+
+    def _status_reply(self, payload: bytes) -> tuple[bytes, str]:
+        axis = self._axis_of(payload)
+        return to_json(self.status() if axis is None else self.axis_status(axis)), JSON
+
+    def status(self) -> dict[str, Any]:
+        """The summary: counts, and the worst axes first."""
+        fleet = self._fleet
+        errors, troubles, outcomes = fleet.rms_error_pct(), fleet.troubles(), fleet.outcomes()
+        # An axis in trouble is worse than any that learns.
+        order = sorted(range(fleet.axes), key=lambda axis: (axis not in troubles, -errors[axis]))
+        with self._counting:
+            counts = {**self._counts, "waiting": self._waiting}
+        return {
+            "role": "primary", "instance": self.instance, "stage": self.config.stage, "axes": fleet.axes,
+            "seq": self._newest[2], "samples": counts,
+            "gates": {name: int(n) for name, n in zip(OUTCOMES, outcomes.sum(0), strict=True)},
+            "rms_error_pct": {"median": float(np.median(errors)), "max": float(errors.max())},
+            "apart": len(fleet.apart), "in_trouble": len(troubles),
+            "worst": [{"axis": axis, "rms_error_pct": float(errors[axis]), "trouble": troubles.get(axis, "")}
+                      for axis in order[:_WORST]],
+        }  # fmt: skip
+
+    def axis_status(self, axis: int) -> dict[str, Any]:
+        """The status of one axis: counters and figures of its learner."""
+        learner = self._fleet.learner_of(axis)
+        figures = {name: value for name, value in learner.diagnostics().items() if not isinstance(value, list)}
+        return {
+            "axis": axis, "seq": learner.seq, "trouble": learner.trouble, "why": learner.why,
+            "apart": axis in self._fleet.apart, "gates": learner.counters(), "figures": figures,
+        }  # fmt: skip

@@ -1,0 +1,70 @@
+"""The ``[fleet]`` table of a configuration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from service.answers.guard import Limits
+from service.config.schema import Setting
+from service.protocol.errors import FieldError
+
+#: Most axes of a fleet: what a message for all may hold.
+MOST_AXES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class FleetSettings:
+    """One stage with many axes that are alike. ``limits`` are those of every axis."""
+
+    axes: Annotated[int, Setting(help="number of axes", low=1, high=MOST_AXES, shown=True)]
+    models: Annotated[
+        tuple[Path, ...],
+        Setting(help="model files from 'dehyst identify': one for all axes, or one for each; relative to this file"),
+    ]
+    limits: Annotated[
+        Limits,
+        Setting(
+            help="limits of what the service sends to each axis",
+            inline={
+                "u_min_V": Setting(help="lowest voltage that the service sends", unit="V", example=0.0),
+                "u_max_V": Setting(help="highest voltage that the service sends", unit="V", example=10.0),
+                "slew_V_per_s": Setting(help="fastest change of the voltage", unit="V/s", example=2000.0),
+                "y_min_um": Setting(help="lowest displacement that is answered", unit="µm"),
+                "y_max_um": Setting(help="highest displacement that is answered", unit="µm"),
+            },
+        ),
+    ]
+    gains: Annotated[
+        tuple[float, ...],
+        Setting(help="gain of each axis over the model's, where one model file is for all; [] for 1"),
+    ] = ()
+    device: Annotated[str, Setting(help="device of torch: 'cpu', 'cuda'")] = "cpu"
+    backend: Annotated[
+        Literal["auto", "compiled", "torch"], Setting(help="what steps the matrices, see docs/fleet.md")
+    ] = "auto"
+    threads: Annotated[int, Setting(help="threads that share the axes of a step", low=1, high=256)] = 2
+    checks: Annotated[int, Setting(help="axes whose model is checked at a time", low=1, high=MOST_AXES)] = 16
+    snapshot_every: Annotated[
+        int, Setting(help="samples between two snapshots, which answer the queries", low=1, high=100_000)
+    ] = 20
+    queue_samples: Annotated[
+        int, Setting(help="samples of all axes that may wait; more are counted and dropped", low=1, high=1_000_000)
+    ] = 2000
+    model_hz: Annotated[
+        float, Setting(help="highest rate at which changes of models are published", unit="1/s", low=0, above=True)
+    ] = 5.0
+    learner: Annotated[dict[str, Any], Setting(help="settings of the learner of each axis, see docs/learner.md")] = (
+        field(default_factory=dict)
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.models) not in (1, self.axes):
+            raise FieldError("models", f"{len(self.models)} files", f"1 for all axes, or {self.axes}, one for each")
+        if self.gains and (len(self.models) != 1 or len(self.gains) != self.axes):
+            raise FieldError("gains", f"{len(self.gains)} gains", f"{self.axes} with one model file, or none")
+        for i, gain in enumerate(self.gains):
+            if not (math.isfinite(gain) and gain > 0.0):
+                raise FieldError(f"gains[{i}]", gain, "a positive finite number")

@@ -1,0 +1,178 @@
+"""Each axis of a fleet equals a single learner on the same samples, and its state is a single learner's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import NO_SAMPLE, Fleet
+from adaptive.fleet.state import OUTCOMES
+from adaptive.identification import IdentifyConfig, identify_lssvm
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
+from adaptive.online.learner import Learner
+from adaptive.types import Sample
+from adaptive.window.window import SolverConfig
+from sim.signals.voltages import training_input
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+DT = 1e-3
+ALIKE = 1e-9
+
+
+def drive(n: int, seed: int) -> np.ndarray:
+    """(n,) voltages, V: eight tones up to 12 Hz."""
+    rng, t_s = np.random.default_rng(seed), np.arange(n) * DT
+    hz = rng.uniform(0.3, 12.0, 8)
+    tones = np.sin(2.0 * np.pi * hz[:, None] * t_s + rng.uniform(0.0, 6.28, (8, 1))) / np.sqrt(hz)[:, None]
+    wave = tones.sum(0) / np.abs(tones.sum(0)).max()
+    return (4.0 + 3.5 * wave) * np.minimum(1.0, t_s / 0.2)
+
+
+@pytest.fixture(scope="module")
+def models() -> list[LssvmInverse]:
+    """Of both presets, in turn, each axis with a gain of its own."""
+    made = []
+    for name in ("rich", "bouc_wen"):
+        stage = Stage(preset(name, seed=1))
+        _, u = training_input(DT, 10.0)
+        y, _ = stage.run(stage.initial_state(), u)
+        config = IdentifyConfig(tune=False, n=60, gamma=1e3)
+        made.append(identify_lssvm(u, y, DT, config=config)[0])
+    two = [made[axis % 2] for axis in range(4)]
+    return [replace(m, features=replace(m.features, gain=1.0 + 0.01 * axis)) for axis, m in enumerate(two)]
+
+
+def samples(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """(4, n) voltages and readings: glitches and NaN everywhere, jumps, a change of gain, a rest, a stuck sensor."""
+    u, y = np.empty((4, n)), np.empty((4, n))
+    for axis in range(4):
+        stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
+        u[axis] = drive(n, 5 + axis)
+        if axis == 2:
+            u[axis, n // 2 : n // 2 + 800] = u[axis, n // 2]
+        y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+        rng = np.random.default_rng(axis)
+        y[axis, rng.integers(400, n, 8)] += rng.normal(0.0, 8.0, 8)
+        y[axis, rng.integers(400, n, 5)] = np.nan
+    y[1, n // 3 :] += 1.5
+    y[3, 2 * n // 3 :] *= 0.93
+    y[0, n // 4 : n // 4 + 250] = y[0, n // 4]
+    return u, y
+
+
+def compare(fleet: Fleet, singles: list[Learner], first: int, u: np.ndarray, y: np.ndarray, every: int) -> None:
+    """Feed both with samples (4, n) from number ``first`` on, with gaps and repeats; assert that they stay alike."""
+    n = u.shape[1]
+    rng = np.random.default_rng(first)
+    present = rng.random((4, n)) > 0.001
+    seq = first + np.arange(n)[None].repeat(4, 0)
+    seq[rng.integers(0, 4, 6), rng.integers(10, n, 6)] -= 1
+    t_s = seq * DT
+    at_um = np.linspace(12.0, 50.0, 3)[None].repeat(4, 0)
+    speed, still = np.full_like(at_um, 40.0), np.zeros_like(at_um)
+    for k in range(n):
+        said = fleet.step(seq[:, k], t_s[:, k], u[:, k], y[:, k], present[:, k])
+        for axis, single in enumerate(singles):
+            if not present[axis, k]:
+                assert said[axis] == NO_SAMPLE
+                continue
+            sample = Sample(int(seq[axis, k]), float(t_s[axis, k]), float(u[axis, k]), float(y[axis, k]))
+            assert OUTCOMES[said[axis]] == single.handle(sample), (axis, k)
+        if k % every == every - 1:
+            snapshot, memory = fleet.snapshot(), fleet.memory()
+            answers = snapshot.feedforward(at_um, speed, still, memory)
+            for axis, single in enumerate(singles):
+                model = single.snapshot()
+                kept = single.memory_for(model)
+                assert kept is not None
+                expected = model.feedforward(at_um[axis], speed[axis], still[axis], kept)
+                np.testing.assert_allclose(answers.u_V[axis], expected.u_V, atol=ALIKE, rtol=0, err_msg=f"{axis} {k}")
+                np.testing.assert_allclose(answers.std_V[axis], expected.std_V, atol=1e-7, rtol=0)
+                np.testing.assert_array_equal(answers.inside[axis], expected.inside)
+                assert snapshot.valid[axis] == model.valid
+                # A single learner keeps its snapshot while nothing is learnt, with the number it had then.
+                assert snapshot.seq[axis] >= model.seq
+            troubles = fleet.troubles()
+            assert [troubles.get(axis, "") for axis in range(4)] == [single.trouble for single in singles]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_each_axis_equals_the_single_learner(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60)
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    u, y = samples(10_000)
+    compare(fleet, singles, 0, u, y, 250)
+    for axis, single in enumerate(singles):
+        got, expected = fleet.counters(axis), single.counters()
+        # When a step is refined depends on the last bits.
+        rounding = ("window_residuals_exceeded", "window_refinements")
+        assert {n: v for n, v in got.items() if n not in rounding} == {
+            n: v for n, v in expected.items() if n not in rounding
+        }
+    # The comparison has seen what it is for.
+    total = {name: sum(single.counters()[name] for single in singles) for name in singles[0].counters()}
+    assert all(total[name] > 0 for name in ("glitch", "jumps", "trials", "bursts", "unexcited", "not_finite", "gap"))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInverse], backend: str) -> None:
+    config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
+    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    singles = [Learner(model, config) for model in models]
+    u, y = samples(1500)
+    compare(fleet, singles, 0, u[:, :700], y[:, :700], 100)
+    # Out of the fleet, and into it: the axes change places with the single learners.
+    out = [Learner.from_state(fleet.export_axis(axis)) for axis in range(4)]
+    for axis, single in enumerate(singles):
+        fleet.load_axis(axis, single.state_dict())
+    compare(fleet, out, 700, u[:, 700:], y[:, 700:], 100)
+
+
+def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:
+    fleet = Fleet(models, FleetConfig(LearnerConfig(window=60)))
+    u, y = samples(500)
+    for k in range(300):
+        fleet.step(k, k * DT, u[:, k], y[:, k])
+    before = fleet.outcomes()
+    said = fleet.step([299, 300, 250, 300], [0.299, np.inf, 0.25, 0.3], u[:, 300], y[:, 300])
+    assert [OUTCOMES[code] for code in said[:3]] == ["duplicate", "not_finite", "out_of_order"]
+    assert OUTCOMES[said[3]] in ("learnt", "passed")
+    assert (fleet.outcomes() - before).sum() == 4
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_a_frozen_axis_learns_nothing(models: list[LssvmInverse], backend: str) -> None:
+    config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
+    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    u, y = samples(1200)
+    for k in range(600):
+        fleet.step(k, k * DT, u[:, k], y[:, k])
+    fleet.freeze([2])
+    before = fleet.snapshot()
+    for k in range(600, 700):
+        fleet.step(k, k * DT, u[:, k], y[:, k])
+    after = fleet.snapshot()
+    changed = [not np.array_equal(before.model(axis)["beta"], after.model(axis)["beta"]) for axis in range(4)]
+    assert changed == [True, True, False, True]
+    assert fleet.counters(2)["frozen"] > 0
+
+
+def test_what_does_not_fit_is_refused_by_name(models: list[LssvmInverse]) -> None:
+    config = FleetConfig(LearnerConfig(window=60))
+    fleet = Fleet(models, config)
+    with pytest.raises(InputError, match=r"u_V: got shape \(3,\), expected \(4,\)"):
+        fleet.step(0, 0.0, [1.0, 2.0, 3.0], 0.0)
+    with pytest.raises(ModelFileError, match="axis 1: the state is of another model"):
+        fleet.load_axis(1, fleet.export_axis(0))
+    other = replace(models[1], features=replace(models[1].features, dt_s=2e-3))
+    with pytest.raises(InputError, match=r"models\[1\].dt_s: got 0.002, expected 0.001"):
+        Fleet([models[0], other], config)
+    with pytest.raises(InputError, match="'inverse', which backend 'torch' has"):
+        FleetConfig(LearnerConfig(window=60), backend="torch")

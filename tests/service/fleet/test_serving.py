@@ -1,0 +1,202 @@
+"""A fleet of 64 axes as a real process over loopback, and its payloads."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from adaptive.errors import InputError
+from service.config.settings import parse_config
+from service.fleet import wire
+from service.protocol.keys import Keys
+from service.protocol.model import decode_model
+from service.protocol.query import LIMITED_VOLTAGE
+from service.runtime.session import open_client
+from service.storage.model_file import BundleMeta, write_bundle
+from tests.service.conftest import ServeProcess, make_models, unused_port
+
+DT_S, AXES = 1e-3, 64
+GAINS = 1.0 + 0.002 * np.arange(AXES)
+KEYS = Keys("mirror", "fleet")
+
+
+def configuration(port: int, more: str = "") -> str:
+    return (
+        f'stage = "mirror"\nlisten = ["tcp/127.0.0.1:{port}"]\n[fleet]\naxes = {AXES}\nmodels = ["x.npz"]\n'
+        f"u_min_V = 0.0\nu_max_V = 10.0\nslew_V_per_s = 2000.0\ny_min_um = -5.0\ny_max_um = 110.0\n"
+        f"gains = {GAINS.tolist()}\nsnapshot_every = 10\n{more}"
+    )
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServeProcess]:
+    folder, port = tmp_path_factory.mktemp("fleet"), unused_port()
+    write_bundle(folder / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    path = folder / "serve.toml"
+    path.write_text(configuration(port), encoding="utf-8")
+    process = ServeProcess(path, port)
+    yield process
+    process.kill()
+
+
+def motion(first: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """seq, t_s (n,), voltages and readings (n, 64) of stages of 11 µm/V and a gain of their own."""
+    k = np.arange(first, first + n)
+    stage_um = 45.0 + 30.0 * np.sin(2.0 * np.pi * 3.0 * k * DT_S)[:, None]
+    return k, k * DT_S, np.repeat((stage_um - 1.0) / 11.0, AXES, 1), stage_um * GAINS
+
+
+def ask(session: zenoh.Session, key: str, payload: bytes = b"") -> Any:
+    """The reply to a query: its bytes, or what a refusal says as a dictionary."""
+    reply = next(iter(session.get(key, payload=payload, timeout=5.0)))
+    return reply.ok.payload.to_bytes() if reply.ok is not None else json.loads(reply.err.payload.to_bytes())
+
+
+def status(session: zenoh.Session, **of: int) -> dict[str, Any]:
+    said: dict[str, Any] = json.loads(ask(session, KEYS.status, json.dumps(of).encode() if of else b""))
+    return said
+
+
+def eventually(condition: Callable[[], Any]) -> Any:
+    until = time.monotonic() + 30.0
+    while not (value := condition()):
+        assert time.monotonic() < until, "did not come true in time"
+        time.sleep(0.05)
+    return value
+
+
+@pytest.mark.e2e
+def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) -> None:
+    changes: list[wire.FleetChanges] = []
+    with open_client(service.endpoint) as session:
+        session.declare_subscriber(
+            KEYS.model, lambda s: changes.append(wire.decode_fleet_changes(s.payload.to_bytes()))
+        )
+        for first in range(0, 600, 20):
+            session.put(KEYS.sample, wire.encode_fleet_samples(*motion(first, 20)))
+        eventually(lambda: status(session)["seq"] == 599)
+        before = status(session)
+        assert before["gates"]["learnt"] > 50 * AXES
+        assert len(before["worst"]) == 10
+        assert before["worst"][0]["rms_error_pct"] == before["rms_error_pct"]["max"]
+        # Axis 3 is missing, 5 has no reading, the message holds two axes too many; then it comes once more, late.
+        seq, t_s, u, y = motion(600, 1)
+        u, y = np.pad(u, ((0, 0), (0, 2))), np.pad(y, ((0, 0), (0, 2)))
+        u[0, 3] = y[0, 3] = y[0, 5] = np.nan
+        bad = wire.encode_fleet_samples(seq, t_s, u, y)
+        for payload in (bad, bad, b"\x01\x07", b"\x01\x07" + bytes(40)):
+            session.put(KEYS.sample, payload)
+        eventually(lambda: status(session)["samples"]["malformed"] == 2)
+        after = eventually(lambda: (now := status(session))["samples"]["received"] == 602 and now)
+        assert after["samples"]["missing"] == 2
+        assert after["samples"]["unknown_axes"] == 4
+        assert after["gates"]["duplicate"] == AXES - 2
+        assert after["gates"]["not_finite"] == 2
+        # What is refused of one axis costs the others nothing.
+        for first in range(601, 901, 20):
+            session.put(KEYS.sample, wire.encode_fleet_samples(*motion(first, 20)))
+        eventually(lambda: status(session)["seq"] >= 899)
+        one, other = status(session, axis=5), status(session, axis=6)
+        assert one["gates"]["not_finite"] == 2
+        assert other["gates"]["not_finite"] == 0
+        assert one["trouble"] == other["trouble"] == ""
+        assert ask(session, KEYS.status, b'{"axis": 64}')["field"] == "axis"
+        # One query for all axes: the same place of the stages is another reading of each axis.
+        at = np.full((2, AXES), 40.0) * GAINS
+        at[1, 7], at[0, 8] = np.nan, 1e4
+        still = np.zeros_like(at)
+        reply = wire.decode_fleet_reply(ask(session, KEYS.feedforward, wire.encode_fleet_query(at, still, still)))
+        refused = np.zeros((2, AXES), dtype=np.bool_)
+        refused[1, 7] = refused[:, 8] = True
+        np.testing.assert_array_equal(reply.flags == wire.REFUSED, refused)
+        np.testing.assert_array_equal(np.isnan(reply.u_V), refused)
+        np.testing.assert_allclose(reply.u_V[~refused], 39.0 / 11.0, atol=0.1)
+        # Its own memory gives the same answer again.
+        whole = np.full((1, AXES), 41.0) * GAINS
+        first_reply = wire.encode_fleet_query(whole, 0 * whole, 0 * whole, reply.memory, np.full(AXES, 3.0))
+        again = [wire.decode_fleet_reply(ask(session, KEYS.feedforward, first_reply)) for _ in range(2)]
+        np.testing.assert_array_equal(again[0].u_V, again[1].u_V)
+        assert again[0].u_V.max() <= 5.0
+        wrong = ask(
+            session, KEYS.feedforward, wire.encode_fleet_query(whole, 0 * whole, 0 * whole, reply.memory[:, :3])
+        )
+        assert wrong["field"] == "columns"
+        # Changes are small, and a whole model comes on demand.
+        eventually(lambda: bool(changes))
+        assert changes[-1].beta.shape[1] == make_models()["lssvm_adaptive"].state_dict()["beta"].size
+        model = decode_model(ask(session, KEYS.model, b'{"axis": 9}')).model
+        assert model.features.gain == pytest.approx(GAINS[9], rel=0.05)  # type: ignore[attr-defined]
+        assert len(list(session.liveliness().get(KEYS.alive_any))) == 1
+    code, last, complaints = service.stop()
+    assert (code, complaints) == (0, "")
+    assert last["fleet"]["samples"]["points_refused"] == 3
+
+
+def test_payloads_survive_the_way_and_damage_is_named() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(2, 3, 5))
+    got = wire.decode_fleet_samples(wire.encode_fleet_samples([7, 8, 9], [0.1, 0.2, 0.3], u, y, first=2))
+    assert (got.first, got.seq.tolist()) == (2, [7, 8, 9])
+    np.testing.assert_array_equal(got.y_um, y)
+    reply = wire.FleetReply(1, 42, u, y, np.full((3, 5), LIMITED_VOLTAGE, dtype=np.uint8), rng.normal(size=(5, 4)))
+    back = wire.decode_fleet_reply(wire.encode_fleet_reply(reply))
+    for name, value in reply._asdict().items():
+        np.testing.assert_array_equal(getattr(back, name), value)
+    query = wire.encode_fleet_query(u, y, y, rng.normal(size=(5, 4)), np.zeros(5))
+    assert wire.decode_fleet_query(query).memory is not None
+    for data, field in (
+        (query[:-1], "payload"), (b"\x02" + query[1:], "version"), (query[:2] + b"\xff" + query[3:], "options"),
+        (query[:4] + bytes(4) + query[8:], "axes"), (query[:12] + bytes(4) + query[16:], "rows"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=f"^{field}: got"):
+            wire.decode_fleet_query(data)
+
+
+def test_damaged_payloads_never_raise_anything_else() -> None:
+    rng = np.random.default_rng(1)
+    whole = wire.encode_fleet_query(*rng.normal(size=(3, 2, 4)))
+    for _ in range(2000):
+        data = bytearray(whole[: rng.integers(0, len(whole) + 1)])
+        for place in rng.integers(0, max(len(data), 1), 3) if data else ():
+            data[place] = rng.integers(0, 256)
+        for decode in (wire.decode_fleet_query, wire.decode_fleet_samples, wire.decode_fleet_reply):
+            try:
+                decode(bytes(data))
+            except InputError:
+                continue
+
+
+def test_a_configuration_names_what_does_not_fit(tmp_path: Path) -> None:
+    good = configuration(7447)
+    assert parse_config(good, "f", tmp_path).fleet is not None
+    for text, message in (
+        (good.replace(f"axes = {AXES}", "axes = 3"), r"f: fleet.gains: got 64 gains, expected 3"),
+        (good.replace('["x.npz"]', '["x.npz", "y.npz"]'), r"f: fleet.models: got 2 files, expected 1"),
+        (good.replace(f"axes = {AXES}", "axes = 0"), r"f: fleet.axes: got 0, expected an integer, 1 to 4096"),
+        (good + "colour = 1\n", r"f: fleet.colour: got 1, expected one of the known keys"),
+        ('stage = "a"\nfleet = 3\n', r"f: fleet: got 3, expected a table"),
+        ('stage = "a"\n', r"f: axis: got none, expected one or more \[\[axis\]\] tables, or a \[fleet\] table"),
+    ):
+        with pytest.raises(InputError, match=message):
+            parse_config(text, "f", tmp_path)
+
+
+def test_without_torch_the_extra_is_named(tmp_path: Path) -> None:
+    (tmp_path / "serve.toml").write_text(configuration(unused_port()), encoding="utf-8")
+    code = (
+        "import sys; sys.modules['torch'] = None\nfrom lab.cli import main\n"
+        f"sys.exit(main(['serve', '--config', {str(tmp_path / 'serve.toml')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode != 0
+    assert "[fleet]: got a fleet, without torch" in done.stderr
+    assert "pip install 'dehyst[torch]'" in done.stderr
