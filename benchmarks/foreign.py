@@ -5,19 +5,25 @@ each seed (``tests/foreign/plants.py``), rehearses it (``lab.rehearsal``), write
 tables: the goals with the results, and one row for each class of events. ``--table FILE`` prints the tables of
 finished runs. ``--line`` runs twelve fixed stages and prints one line. Errors are mean absolute errors in percent of
 the commanded range.
+
+``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, with the learning loop alone, until
+the file holds that many hours of simulated time, and prints each trouble that was reported. Further calls go on where
+the file ends.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -44,6 +50,11 @@ LINE = (
     ("zero_at_once", 900_018), ("spikes", 900_019), ("gap", 900_021), ("losses", 900_022),
     ("number_stray", 900_023), ("stuck_noise", 900_024), ("sensor_gain", 900_027), ("sign", 900_028),
 )  # fmt: skip
+
+#: Class of healthy runs in the files. Length of such a run: as many samples as this, within these limits, s.
+HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
+#: Healthy runs end when so many have failed.
+MOST_FAILED = 10
 
 Record = dict[str, Any]
 
@@ -75,18 +86,37 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
     return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
 
 
+def run_healthy_stage(seed: int, block: int) -> Record:
+    """A run of the learning loop alone, in which nothing happens, as JSON values. If it raises, the record holds the
+    traceback."""
+    from lab.rehearsal import RehearsalConfig, identify, run_healthy
+    from tests.foreign.plants import random_plant
+
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    record: Record = {"seed": seed, "class": HEALTHY, "block": block}
+    try:
+        factory = random_plant(seed)
+        record["stage"] = factory.traits.summary()
+        low_V, high_V = factory.traits.excite_V
+        config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=block, snapshot_every=block)
+        duration_s = float(np.clip(HEALTHY_SAMPLES * factory.traits.dt_s, *HEALTHY_S))
+        record |= run_healthy(factory, identify(factory, config), config, duration_s, seed).as_dict()
+    except Exception:
+        record["failed"] = traceback.format_exc()
+    return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
+
+
 def run_all(
     plan: Sequence[tuple[str, int]], jobs: int, preset: str = "random", after_s: float = AFTER_S
 ) -> Iterator[Record]:
     """The runs of ``plan``, (class, seed) each, in the order in which they end. If a process dies, its run
     has failed."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    _one_blas_thread()
     if jobs == 1:
         for name, seed in plan:
             yield run_one(name, seed, preset, after_s)
         return
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with _pool(jobs) as pool:
         waiting = {pool.submit(run_one, name, seed, preset, after_s): (name, seed) for name, seed in plan}
         for done in as_completed(waiting):
             try:
@@ -94,6 +124,50 @@ def run_all(
             except BrokenProcessPool:
                 name, seed = waiting[done]
                 yield {"seed": seed, "preset": preset, "class": name, "failed": "the process ended"}
+
+
+def run_healthy_hours(
+    hours: float, first_seed: int, jobs: int, block: int, done: Sequence[Record] = ()
+) -> Iterator[Record]:
+    """Healthy runs of the seeds from ``first_seed`` on that are not in ``done``, in the order in which they end, until
+    all together, with ``done``, are at least ``hours`` of simulated time, or ``MOST_FAILED`` have failed."""
+    _one_blas_thread()
+    known = {record["seed"] for record in done}
+    seeds = (seed for seed in itertools.count(first_seed) if seed not in known)
+    simulated_h, failed = _hours(done), 0
+    with _pool(jobs) as pool:
+        running: dict[Future[Record], int] = {}
+        while True:
+            # How long a run will be is not known before; so all processes work until the hours are reached.
+            while simulated_h < hours and failed < MOST_FAILED and len(running) < jobs:
+                seed = next(seeds)
+                running[pool.submit(run_healthy_stage, seed, block)] = seed
+            if not running:
+                return
+            for ended in wait(running, return_when=FIRST_COMPLETED).done:
+                seed = running.pop(ended)
+                try:
+                    record = ended.result()
+                except BrokenProcessPool:
+                    yield {"seed": seed, "class": HEALTHY, "block": block, "failed": "the process ended"}
+                    return
+                simulated_h += _hours([record])
+                failed += "failed" in record
+                yield record
+
+
+def _pool(jobs: int) -> Executor:
+    return ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
+
+
+def _one_blas_thread() -> None:
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def _hours(records: Iterable[Record]) -> float:
+    """Simulated time of healthy runs, h."""
+    return float(sum(record.get("simulated_s", 0.0) for record in records)) / 3600.0
 
 
 # ---- what a run came to
@@ -264,6 +338,69 @@ def line(records: Sequence[Record]) -> str:
     return "foreign stages: " + ", ".join(told)
 
 
+HEALTHY_HEAD = (
+    "sample rate, Hz", "stages", "failed", "hours", "false `trouble`", "per hour", "above 5 % for longer than 0.1 s",
+    "error after the start, median / 95 %",
+)  # fmt: skip
+
+
+def healthy_table(records: Sequence[Record]) -> str:
+    """Markdown: healthy runs by sample rate, and below it each run with a trouble or a large error."""
+    rates = sorted({_rate_Hz(record) for record in records if "stage" in record})
+    groups = [(f"{rate}", [r for r in records if "stage" in r and _rate_Hz(r) == rate]) for rate in rates]
+    rows = []
+    for name, part in (*groups, ("**all**", list(records))):
+        ended = [record for record in part if "failed" not in record]
+        false, hours = sum(len(record["troubles"]) for record in ended), _hours(ended)
+        rows.append(
+            (
+                name,
+                str(len(part)),
+                str(len(part) - len(ended)),
+                f"{hours:.2f}",
+                str(false),
+                f"{false / hours:.2f}" if hours else "-",
+                str(sum(record["figures"]["large_s"] > LARGE_S for record in ended)),
+                _percentiles(_numbers(record["mean_pct"] for record in ended), 50, 95) if ended else "-",
+            )
+        )
+    names = Counter(trouble["name"] for record in records for trouble in record.get("troubles", ()))
+    total = ", ".join(f"{name} {count}" for name, count in sorted(names.items())) or "none"
+    notable = [told_healthy(record) for record in sorted(records, key=lambda r: int(r["seed"])) if _notable(record)]
+    blocks = ", ".join(str(block) for block in sorted({record["block"] for record in records}))
+    return "\n".join(
+        [
+            _markdown(HEALTHY_HEAD, rows),
+            "",
+            f"false troubles by name: {total}; answers know all samples but the last {blocks}",
+            *notable,
+        ]
+    )
+
+
+def _rate_Hz(record: Record) -> int:
+    return round(1.0 / record["stage"]["dt_s"])
+
+
+def _notable(record: Record) -> bool:
+    return "failed" in record or bool(record["troubles"]) or record["figures"]["large_s"] > LARGE_S
+
+
+def told_healthy(record: Record) -> str:
+    """A healthy run in one line."""
+    if "failed" in record:
+        return f"seed {record['seed']}: FAILED: {record['failed'].strip().splitlines()[-1]}"
+    figures, stage = record["figures"], record["stage"]
+    marks = [
+        *(f"TROUBLE {t['name']} at {t['named_s']:.2f} s" for t in record["troubles"]),
+        *([f"LARGE for {figures['large_s']:.2f} s"] if figures["large_s"] > LARGE_S else []),
+    ]
+    return (
+        f"seed {record['seed']} {stage['hysteresis']} {_rate_Hz(record)} Hz, {record['simulated_s']:.0f} s: "
+        f"error {record['mean_pct']:.3f}, {record['cpu_s']:.1f} s {', '.join(marks)}".rstrip()
+    )
+
+
 def told(record: Record) -> str:
     """A run in one line."""
     if "failed" in record:
@@ -330,7 +467,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--after", type=float, default=AFTER_S, metavar="S", help=f"closed loop after the event, s ({AFTER_S:g})"
     )
+    parser.add_argument(
+        "--block", type=int, default=5, metavar="N",
+        help="samples per query and snapshot of --healthy (5): fewer queries cost less, and answers are older",
+    )  # fmt: skip
     only = parser.add_mutually_exclusive_group()
+    only.add_argument(
+        "--healthy", type=float, metavar="HOURS",
+        help="run stages on which nothing happens until --json holds so many hours of simulated time; it is continued",
+    )  # fmt: skip
     only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
     only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
     given = parser.parse_args(arguments)
@@ -341,12 +486,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
     if given.after < 4.0:
         parser.error(f"--after: got {given.after:g} s, expected 4 s or more")
-    if given.line:
+    if given.healthy is not None:
+        if not 0.0 < given.healthy <= 1e4:
+            parser.error(f"--healthy: got {given.healthy:g}, expected hours above 0 and up to 10000")
+        if not 1 <= given.block <= 512:
+            parser.error(f"--block: got {given.block}, expected 1 to 512")
+        records = _run_healthy(given, jobs)
+        print(healthy_table(records))
+    elif given.line:
         records = run_line(jobs)
         print(line(records))
     elif given.table:
         records = read(given.table)
-        print(table(records))
+        healthy = [record for record in records if record.get("class") == HEALTHY]
+        others = [record for record in records if record.get("class") != HEALTHY]
+        print(
+            "\n\n".join(
+                [*([table(others)] if others or not healthy else []), *([healthy_table(healthy)] if healthy else [])]
+            )
+        )
     else:
         records = _run(given, jobs)
         print(table(records))
@@ -364,6 +522,25 @@ def _run(given: argparse.Namespace, jobs: int) -> list[Record]:
     for record in run_all(plan, jobs, given.preset, given.after):
         records.append(record)
         print(f"[{len(records)}/{given.runs}] {told(record)}", file=sys.stderr, flush=True)
+        if given.json:
+            with given.json.open("a") as file:
+                file.write(json.dumps(record) + "\n")
+    return records
+
+
+def _run_healthy(given: argparse.Namespace, jobs: int) -> list[Record]:
+    records: list[Record] = []
+    if given.json and given.json.exists():
+        records = [record for record in read([given.json]) if record.get("class") == HEALTHY]
+        if (text := given.json.read_text()) and not text.endswith("\n"):
+            given.json.write_text(f"{text}\n")  # after a line that was cut off
+        if records:
+            print(f"{given.json}: {len(records)} runs, {_hours(records):.2f} h", file=sys.stderr)
+    elif given.json:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+    for record in run_healthy_hours(given.healthy, given.first_seed, jobs, given.block, records):
+        records.append(record)
+        print(f"[{_hours(records):.2f} of {given.healthy:g} h] {told_healthy(record)}", file=sys.stderr, flush=True)
         if given.json:
             with given.json.open("a") as file:
                 file.write(json.dumps(record) + "\n")

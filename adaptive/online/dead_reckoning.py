@@ -10,7 +10,7 @@ Why the place cannot diverge, for any model:
   difference of the displacement: an implicit Euler step, which is stable. Where voltage falls with velocity, that
   recursion would be unstable; there the velocity follows from the change of the voltage itself, which is no recursion.
 - A change of the voltage moves the stage by a slope within ``SLOPES`` times the mean one. Summed from the start this
-  gives a band that limits the place.
+  gives a band that limits the place. In one sample it moves the stage one way only, apart from the motion under way.
 - The place stays within ``OFF_LINE`` ranges of a straight line through the start, of the model's mean slope.
 
 The uncertainty grows with the way gone and with what the band and the line cut off. Beyond ``LOST_SHARE`` of the range
@@ -31,10 +31,13 @@ from adaptive.types import FloatArray, IntArray, StateDict, prefixed, under
 
 #: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
 STEPS, SLOPE_SHARE = 2, 1e-5
-#: Slopes, as shares of the mean one, that a stage can have. A slope beyond is the model's error.
-SLOPES = (0.4, 2.5)
+#: Slopes of the voltage over the displacement, as shares of the mean one, that a stage can have. Some stages stand
+#: nearly still while the voltage turns back over a tenth of the drive.
+SLOPES = (0.4, 25.0)
 #: Distance from the straight line through the start, in ranges, that hysteresis, creep and bend explain together.
 OFF_LINE = 0.35
+#: Most motion that a constant voltage causes (creep, drift), ranges per second.
+CREEP_PER_S = 0.1
 #: Readings before the doubtful one from which the model's error is taken.
 ANCHORS = 5
 #: Time constant with which the acceleration at the start is forgotten, s; time for which the stage's own motion at the
@@ -84,7 +87,8 @@ class Reckoning:
         made.numbers[:_WAY] = (y, v, a, u_before_V, y - slack, y + slack)
         slope = mean_slope(model)
         made.numbers[[_SLOPE, _LINE]] = slope, u_before_V - slope * y
-        off = np.array([made.advance(float(u)) for u in u_V[: y_um.size]])
+        # The first step is the model's way from the measured place to its own.
+        off = np.array([made.advance(float(u), anew=i == 0) for i, u in enumerate(u_V[: y_um.size])])
         for u in u_V[y_um.size :]:
             made.advance(float(u))
         if off.size:
@@ -151,14 +155,17 @@ class Reckoning:
     def by_model(self, model: LssvmInverse) -> Reckoning:
         """Continue with another model of the same frame; the expected reading stays the same."""
         made = Reckoning(model, self.memory.copy(), self.numbers.copy())
-        made.numbers[_OFF] += self.y_um - made.advance(float(self.numbers[_U]))
+        made.numbers[_OFF] += self.y_um - made.advance(float(self.numbers[_U]), anew=True)
         return made
 
-    def advance(self, u_V: float) -> float:
-        """Advance by one sample with the voltage ``u_V``; returns the expected reading, µm."""
+    def advance(self, u_V: float, anew: bool = False) -> float:
+        """Advance by one sample with the voltage ``u_V``; returns the expected reading, µm.
+
+        ``anew`` : the place is not yet the model's own, and may move to it at once.
+        """
         f = self.model.features
         constants, counts = self.model.packed
-        _step(u_V, f.dt_s, self.range_um, self.memory, self.numbers, constants, counts)
+        _step(u_V, f.dt_s, self.range_um, anew, self.memory, self.numbers, constants, counts)
         return self.y_um
 
     def state_dict(self) -> StateDict:
@@ -209,15 +216,17 @@ def _step(
     u: float,
     dt: float,
     span: float,
+    anew: bool,
     memory: FloatArray,
     n: FloatArray,
     constants: FloatArray,
     counts: IntArray,
 ) -> None:  # pragma: no cover - compiled
-    """One sample: place, velocity, band and memory in place."""
+    """One sample: place, velocity, band and memory in place. ``anew`` : the model has not reckoned the place before."""
     m, beta, inverse_widths, alpha, scaled, _ = unpacked(constants, counts)
     scratch = np.empty(memory.shape[0])
     before, v, k = n[_Y], n[_V], n[_SLOPE]
+    under_way = v * dt
     sign, least, most = math.copysign(1.0, k), SLOPES[0] * abs(k), SLOPES[1] * abs(k)
     dv = 1e-3 / (m.scale[2] * m.frame[1])
     # How the voltage depends on velocity here decides where the velocity comes from.
@@ -251,6 +260,11 @@ def _step(
     held = min(max(y, low), high) if math.isfinite(y) else before
     # What is cut off stays the same error while the stage stands still: the largest of it, not the sum.
     n[_CUT] = max(n[_CUT], abs(held - y) if math.isfinite(y) else span)
+    if not anew:
+        # A voltage that rises moves the stage one way only, apart from the motion under way and from creep.
+        creep = CREEP_PER_S * span * dt
+        down, up = falls / least + min(under_way, -creep), rises / least + max(under_way, creep)
+        held = min(max(held, before + down), before + up)
     n[_V] = (held - before) / dt
     n[_A] *= math.exp(-dt / FORGET_S)
     n[_WAY] += abs(held - before)

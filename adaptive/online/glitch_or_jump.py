@@ -377,7 +377,7 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         return Verdict.WAIT if waited * now.dt_s < RINGING_S else Verdict.MOTION
     if waited < max(UNDECIDED_SAMPLES, UNDECIDED_S / now.dt_s):
         return Verdict.WAIT
-    small = hold.seen_um <= now.config.glitch_share * now.range_um
+    small = hold.seen_um <= now.config.glitch_share * now.range_um or _no_further(hold, waited, now, stride)
     return Verdict.MOTION if small and not hold.taken and _follow(hold, n, now) else Verdict.LOST
 
 
@@ -415,6 +415,18 @@ def _level(hold: Hold, now: Circumstances, stride: int) -> Verdict | None:
             hold.away_um, hold.level = level.at, y.size - count
             return Verdict.JUMP
     return None
+
+
+def _no_further(hold: Hold, count: int, now: Circumstances, stride: int) -> bool:
+    """Whether the level of the last ``count`` readings is known and no further than the model may be wrong.
+
+    The ringing about it may be larger: it is motion.
+    """
+    part = slice(-(count - count % stride), None)
+    away = np.array(hold.y_um[part]) - hold.slope * np.array(hold.old_um[part]) - hold.shift_um
+    level = level_of(_spaced(away[-VALUES * stride :], stride), now.noise_um / math.sqrt(stride))
+    usual_um = tolerance_um(now, hold.reckoning)
+    return _known(level, usual_um) and abs(level.at) - usual_um <= SIGMA * level.std
 
 
 def _spaced(x: FloatArray, stride: int) -> FloatArray:

@@ -637,7 +637,8 @@ class Intake:
             # Motion from before and after a jump cannot be compared.
             self._forget()
             return False
-        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s)
+        fastest_V_per_s = self._envelope.drift_per_s * self._drive_V
+        fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s, fastest_V_per_s)
         self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
         if self.confirmed:
             if self.following.good >= CONFIRMED:

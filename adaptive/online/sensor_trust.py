@@ -52,6 +52,9 @@ CREEP_PER_S = 0.05
 ENOUGH_SLOPE = 6.0
 #: Slopes p/u that a stage can have, with hysteresis and a wrong model allowed for; smallest squared correlation.
 FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
+#: The stage itself drifts if p - u changes at a rate whose standard deviation is below this share of its mean; a step
+#: follows if p differs from u by no more than this share. Forgetting factor of the rate for each step.
+STEADY, FORGET_DRIFT = 0.35, 0.5
 #: A reading stands still if p moves by less than this share of the step of u; number of such steps for a fault.
 STEP_STILL, STILL_STEPS = 0.2, 4
 #: Good steps in a row after which all readings so far count as confirmed.
@@ -70,6 +73,7 @@ class Following:
     uu, pp, up : sums of the products over the steps; with forgetting.
     good, still : number of steps in a row in which the readings followed, and stood still.
     last_V, noise2 : last p - u, V, and its mean square change between two pairs, V².
+    drift_V_per_s, drift2 : mean rate of p - u over the last steps, V/s, and its mean square; with forgetting.
     """
 
     u_V: float = math.nan
@@ -84,6 +88,8 @@ class Following:
     still: int = 0
     last_V: float = math.nan
     noise2: float = 0.0
+    drift_V_per_s: float = 0.0
+    drift2: float = 0.0
 
     def forget(self) -> None:
         """Discard all steps so far."""
@@ -91,16 +97,17 @@ class Following:
         self.last_V = math.nan
         self.steps = self.good = self.still = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
+        self.drift_V_per_s = self.drift2 = 0.0
 
     def count_again(self) -> None:
         """Count the steps in which the readings followed from zero again."""
         self.good = 0
 
-    def take(self, u_V: float, p_V: float, span_V: float, dt_s: float) -> bool:
+    def take(self, u_V: float, p_V: float, span_V: float, dt_s: float, drift_V_per_s: float = 0.0) -> bool:
         """Process one pair (u, p). Returns True if the last steps show a fault.
 
         ``u_V`` : applied voltage. ``p_V`` : the model's voltage for the reading. ``span_V`` : range of the drive, V.
-        ``dt_s`` : time between two pairs, s.
+        ``dt_s`` : time between two pairs, s. ``drift_V_per_s`` : fastest drift of the stage, as a voltage, V/s.
         """
         self.steps += 1
         change_V, self.last_V = p_V - u_V - self.last_V, p_V - u_V
@@ -116,11 +123,15 @@ class Following:
         size = max(abs(du), abs(dp))
         if size < step_V or self.steps * dt_s < STEP_S:
             return False
-        slow = size < CREEP_PER_S * span_V * self.steps * dt_s
+        step_s = self.steps * dt_s
+        slow = size < CREEP_PER_S * span_V * step_s
         self.u_V, self.p_V, self.steps = u_V, p_V, 0
         if slow:
             return False
         u, p = du / size, dp / size
+        rate = (dp - du) / step_s
+        self.drift_V_per_s += (1.0 - FORGET_DRIFT) * (rate - self.drift_V_per_s)
+        self.drift2 += (1.0 - FORGET_DRIFT) * (rate * rate - self.drift2)
         self.still = self.still + 1 if abs(p) <= STEP_STILL * abs(u) else 0
         self.count = FORGET * self.count + 1.0
         self.uu = FORGET * self.uu + u * u
@@ -130,13 +141,19 @@ class Following:
         self.driven = FORGET * self.driven + (abs(u) >= STEP_STILL)
         if self.count < ENOUGH or self.driven < OF_VOLTAGE * self.count:
             return False
-        fault = self._fault()
+        fault = self._fault(abs(p - u) <= STEADY, drift_V_per_s)
         self.good = 0 if fault else self.good + 1
         return fault or self.still >= STILL_STEPS
 
-    def _fault(self) -> bool:
+    def _fault(self, follows: bool, fastest_V_per_s: float) -> bool:
+        """Whether the sums show a fault. ``follows`` : whether p went with u in the last step."""
         slope, straight = self.up / self.uu, self.up * self.up / (self.uu * self.pp) if self.pp > 0.0 else 0.0
         if straight < FOLLOWING_STRAIGHT:
+            mean2 = self.drift_V_per_s**2
+            drifts = self.drift2 - mean2 <= STEADY**2 * mean2 and mean2 <= fastest_V_per_s**2 and not self.still
+            if follows or drifts:
+                # A steady drift beside the voltage, or the first steps after one: the stage changes, not the sensor.
+                return False
             # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
             return self.pp <= FOLLOWING_SLOPES[1] ** 2 * self.uu
         return self.count >= ENOUGH_SLOPE and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
@@ -149,6 +166,8 @@ class Following:
         """Inverse of ``state_dict``; older states have no entries and give an empty check."""
         if not values:
             return cls()
+        # States of before there was a drift have no entries for it.
+        values = {"drift_V_per_s": 0.0, "drift2": 0.0} | values
         return cls(**{name: type(value)(values[name]) for name, value in asdict(cls()).items()})
 
 

@@ -11,7 +11,7 @@ See docs/rehearse.md.
 from lab.rehearsal.config import RehearsalConfig
 from lab.rehearsal.disturbance import CLASSES, EVENT_KINDS, INTACT, SENSOR, STANDARD, Event, draw
 from lab.rehearsal.loop import LoopRecord
-from lab.rehearsal.outcome import ErrorFigures, Outcome, Trouble
+from lab.rehearsal.outcome import ErrorFigures, HealthyOutcome, Outcome, Trouble
 from lab.rehearsal.plant import (
     Change,
     Changeable,
@@ -23,7 +23,7 @@ from lab.rehearsal.plant import (
     identify,
 )
 from lab.rehearsal.reference import Motion, RandomReference, Reference, ReferenceRequest
-from lab.rehearsal.rehearsal import EventRun, Rehearsal, rehearse, run_event, standard_events
+from lab.rehearsal.rehearsal import EventRun, Rehearsal, rehearse, run_event, run_healthy, standard_events
 
 __all__ = [
     "CLASSES",
@@ -37,6 +37,7 @@ __all__ = [
     "Event",
     "EventRun",
     "FunctionPlant",
+    "HealthyOutcome",
     "IdentifiedPlant",
     "LoopRecord",
     "Motion",
@@ -54,5 +55,6 @@ __all__ = [
     "identify",
     "rehearse",
     "run_event",
+    "run_healthy",
     "standard_events",
 ]

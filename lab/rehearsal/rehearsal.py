@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,18 +27,29 @@ from lab.rehearsal.disturbance import (
     draw,
 )
 from lab.rehearsal.loop import LoopRecord, idle_samples, run_adaptive, run_frozen, times
-from lab.rehearsal.outcome import LARGE_PCT, SENSOR_FACTOR, SENSOR_PCT, Outcome, outcome
+from lab.rehearsal.outcome import (
+    LARGE_PCT,
+    SENSOR_FACTOR,
+    SENSOR_PCT,
+    HealthyOutcome,
+    Outcome,
+    healthy_outcome,
+    outcome,
+)
 from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range, go_to_lowest, identify
 from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
 from service.config.settings import LEARN, AxisConfig
 from service.protocol.errors import FieldError
 from service.reports.plot_style import figure, legend, line, save
+from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
 from service.viewer.colours import ADAPTIVE, EVENT, FROZEN, TROUBLE
 
 #: Stage and axis name of the rehearsed axis.
 STAGE, AXIS = "rehearsal", "x"
+#: From here on the errors of a healthy run count, s: what comes before is the start.
+HEALTHY_AT_S: Final = 4.0
 #: Called with the present step and its progress, 0 to 1.
 Progress = Callable[[str, float], None]
 
@@ -126,46 +137,94 @@ def run_event(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> EventRun:
-    """The closed loop with one event. Raises as `rehearse` does."""
-    dt_s, block = known.dt_s, config.block
-    stage_span = known.high_um - known.low_um
-    # With numbers from 1 on, a snapshot falls on the last sample of a block and knows all samples so far.
-    first_number = idle_samples(dt_s, block) + 1
-    axis = load_axis(STAGE, _axis_config(known, config), bundle=_bundle(known))
-    duration_s = event.end_s + config.after_s
-    n = math.ceil(duration_s / dt_s / block) * block
-    wish = ReferenceRequest(
-        known.rest_um, known.low_um + config.band[0] * stage_span, known.low_um + config.band[1] * stage_span,
-        n * dt_s, seed,
-    )  # fmt: skip
-    reference: Reference = (config.reference or RandomReference)(wish)
-    t_s = times(n, dt_s)
-    base = reference(t_s)
-    range_um = float(np.ptp(base.y_um[round(2.0 / dt_s) :]))
-    if not range_um > 0.0:
-        raise FieldError("reference", "a constant", "a motion: errors are measured by its range")
-    wanted = base
-    if event.where == REFERENCE:
-        level_um = axis.limits.y_max_um if event.seed % 2 else axis.limits.y_min_um
-        wanted = Excursion(reference, level_um, event.at_s, event.end_s)(t_s)
-    wanted = Motion(np.clip(wanted.y_um, axis.limits.y_min_um, axis.limits.y_max_um), wanted[1], wanted[2])
-    scale = EventScale(range_um, float(0.5 * (wish.low_um + wish.high_um)), known.rest_um)
-    low_V, _ = excitation_range(plant_factory(), config)
-
-    def new_plant() -> DisturbedPlant:
-        plant = plant_factory()
-        go_to_lowest(plant, low_V)
-        return DisturbedPlant(plant, event, scale)
-
-    learning = new_plant()
-    adaptive = run_adaptive(
-        axis, learning, DisturbedSensor(event, scale, dt_s, n), MessageLine(event, dt_s, first_number), wanted, low_V,
-        block, first_number, lambda done: progress(done / n) if done % (100 * block) == 0 else None,
-    )  # fmt: skip
-    frozen = run_frozen(known.models[LEARN], new_plant(), wanted, low_V, axis.limits, block)
+    """The closed loop with one event, learning and frozen. Raises as `rehearse` does."""
+    course = _Course.prepared(plant_factory, known, config, event, event.end_s + config.after_s, seed)
+    learning = course.new_plant()
+    adaptive = course.run_adaptive(learning, progress)
+    frozen = run_frozen(
+        known.models[LEARN], course.new_plant(), course.wanted, course.low_V, course.axis.limits, config.block
+    )
     progress(1.0)
-    result = outcome(event, adaptive, frozen, range_um, axis.limits, dt_s, learning.left_out)
-    return EventRun(event, range_um, adaptive, frozen, result)
+    result = outcome(event, adaptive, frozen, course.range_um, course.axis.limits, known.dt_s, learning.left_out)
+    return EventRun(event, course.range_um, adaptive, frozen, result)
+
+
+def run_healthy(
+    plant_factory: PlantFactory, known: IdentifiedPlant, config: RehearsalConfig, duration_s: float, seed: int
+) -> HealthyOutcome:
+    """The learning loop alone, for ``duration_s`` (at least 4 s), in which nothing happens. Raises as `rehearse`
+    does."""
+    event = Event("none", "none", HEALTHY_AT_S)
+    course = _Course.prepared(plant_factory, known, config, event, duration_s, seed)
+    record = course.run_adaptive(course.new_plant())
+    return healthy_outcome(event, record, course.range_um, course.axis.limits, known.dt_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """An axis and the motion that it is to make, ready to run.
+
+    Attributes
+    ----------
+    wanted : the motion. range_um : what errors refer to. scale : what the size of the event refers to. first_number :
+    of sample 0 in the stage's count. low_V : voltage at rest before the first command.
+    """
+
+    axis: Axis
+    plant_factory: PlantFactory
+    event: Event
+    wanted: Motion
+    range_um: float
+    scale: EventScale
+    block: int
+    first_number: int
+    low_V: float
+
+    @classmethod
+    def prepared(
+        cls, plant_factory: PlantFactory, known: IdentifiedPlant, config: RehearsalConfig, event: Event,
+        duration_s: float, seed: int,
+    ) -> _Course:  # fmt: skip
+        """A new axis and its motion for ``duration_s``. Raises FieldError if the reference does not move."""
+        dt_s, block = known.dt_s, config.block
+        stage_span = known.high_um - known.low_um
+        # With numbers from 1 on, a snapshot falls on the last sample of a block and knows all samples so far.
+        first_number = idle_samples(dt_s, block) + 1
+        axis = load_axis(STAGE, _axis_config(known, config), bundle=_bundle(known))
+        n = math.ceil(duration_s / dt_s / block) * block
+        wish = ReferenceRequest(
+            known.rest_um, known.low_um + config.band[0] * stage_span, known.low_um + config.band[1] * stage_span,
+            n * dt_s, seed,
+        )  # fmt: skip
+        reference: Reference = (config.reference or RandomReference)(wish)
+        t_s = times(n, dt_s)
+        base = reference(t_s)
+        range_um = float(np.ptp(base.y_um[round(2.0 / dt_s) :]))
+        if not range_um > 0.0:
+            raise FieldError("reference", "a constant", "a motion: errors are measured by its range")
+        wanted = base
+        if event.where == REFERENCE:
+            level_um = axis.limits.y_max_um if event.seed % 2 else axis.limits.y_min_um
+            wanted = Excursion(reference, level_um, event.at_s, event.end_s)(t_s)
+        wanted = Motion(np.clip(wanted.y_um, axis.limits.y_min_um, axis.limits.y_max_um), wanted[1], wanted[2])
+        scale = EventScale(range_um, float(0.5 * (wish.low_um + wish.high_um)), known.rest_um)
+        low_V, _ = excitation_range(plant_factory(), config)
+        return cls(axis, plant_factory, event, wanted, range_um, scale, block, first_number, low_V)
+
+    def new_plant(self) -> DisturbedPlant:
+        """A plant at the lowest voltage of the excitation."""
+        plant = self.plant_factory()
+        go_to_lowest(plant, self.low_V)
+        return DisturbedPlant(plant, self.event, self.scale)
+
+    def run_adaptive(self, plant: DisturbedPlant, progress: Callable[[float], None] = lambda _: None) -> LoopRecord:
+        """Close the loop over ``plant``; once only, for the axis learns."""
+        n, dt_s, event = self.wanted.y_um.size, self.axis.dt_s, self.event
+        return run_adaptive(
+            self.axis, plant, DisturbedSensor(event, self.scale, dt_s, n), MessageLine(event, dt_s, self.first_number),
+            self.wanted, self.low_V, self.block, self.first_number,
+            lambda done: progress(done / n) if done % (100 * self.block) == 0 else None,
+        )  # fmt: skip
 
 
 def _axis_config(known: IdentifiedPlant, config: RehearsalConfig) -> AxisConfig:

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.foreign import HEAD, LINE, by_class, goals, line, main, read, table, told
+from benchmarks import foreign
+from benchmarks.foreign import (
+    HEAD,
+    LINE,
+    by_class,
+    goals,
+    healthy_table,
+    line,
+    main,
+    read,
+    run_healthy_hours,
+    table,
+    told,
+)
 from lab.rehearsal.disturbance import EVENT_KINDS, SENSOR, draw
 from tests.foreign.plants import random_plant
 
@@ -137,3 +151,61 @@ def test_what_cannot_be_asked_for_is_refused(
     with pytest.raises(SystemExit):
         main(arguments)
     assert words in capsys.readouterr().err
+
+
+def healthy_run(seed: int, **given: Any) -> dict[str, Any]:
+    """Half an hour on a stage with 1 kHz in which nothing was wrong, but for what is given."""
+    record = {
+        "seed": seed, "class": "healthy", "block": 5, "stage": {"hysteresis": "plays", "dt_s": 1e-3},
+        "simulated_s": 1800.0, "mean_pct": 0.05, "figures": {"large_s": 0.0}, "troubles": [], "cpu_s": 1.0,
+    }  # fmt: skip
+    return record | given
+
+
+def test_healthy_runs_are_counted_by_rate_and_the_notable_ones_are_named() -> None:
+    records = [
+        healthy_run(3),
+        healthy_run(4, troubles=[{"name": "sensor_gain", "named_s": 7.0}]),
+        healthy_run(5, stage={"hysteresis": "duhem", "dt_s": 2e-3}, figures={"large_s": 0.3}),
+        {"seed": 6, "class": "healthy", "block": 5, "failed": "Traceback\nValueError: no"},
+    ]
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in healthy_table(records).splitlines()[2:5]]
+    assert rows == [
+        ["500", "1", "0", "0.50", "0", "0.00", "1", "0.050 / 0.050"],
+        ["1000", "2", "0", "1.00", "1", "1.00", "0", "0.050 / 0.050"],
+        ["**all**", "4", "1", "1.50", "1", "0.67", "1", "0.050 / 0.050"],
+    ]
+    told_runs = healthy_table(records).splitlines()[6:]
+    assert told_runs[0].startswith("false troubles by name: sensor_gain 1;")
+    assert "seed 4 " in told_runs[1]
+    assert "TROUBLE sensor_gain at 7.00 s" in told_runs[1]
+    assert "LARGE for 0.30 s" in told_runs[2]
+    assert told_runs[3] == "seed 6: FAILED: ValueError: no"
+
+
+def test_healthy_runs_go_on_where_the_file_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreign, "HEALTHY_S", (6.0, 6.0))
+    monkeypatch.setattr(foreign, "_pool", ThreadPoolExecutor)
+    file = tmp_path / "healthy.jsonl"
+    file.write_text(json.dumps(healthy_run(900_001, simulated_s=10.0)) + "\n{cut off")
+    hours = 14.0 / 3600.0
+    assert main(["--healthy", f"{hours}", "--first-seed", "900001", "--json", str(file), "--block", "20"]) == 0
+    records = read([file])
+    assert [record["seed"] for record in records] == [900_001, 900_002]
+    new = records[1]
+    assert new["class"] == "healthy"
+    assert new["block"] == 20
+    assert new["simulated_s"] == pytest.approx(6.0, abs=0.05)
+    assert new["mean_pct"] < 1.0
+    assert "frozen" not in new
+    # The hours are reached: nothing is run.
+    assert main(["--healthy", f"{hours}", "--first-seed", "900001", "--json", str(file)]) == 0
+    assert len(read([file])) == 2
+
+
+def test_healthy_runs_end_when_many_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foreign, "_pool", ThreadPoolExecutor)
+    monkeypatch.setattr(
+        foreign, "run_healthy_stage", lambda seed, block: {"seed": seed, "block": block, "failed": "no"}
+    )
+    assert len(list(run_healthy_hours(1.0, 0, 1, 5))) == foreign.MOST_FAILED

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online.dead_reckoning import LOST_SHARE, OFF_LINE, SLOPES, Reckoning, answers, mean_slope
+from adaptive.online.dead_reckoning import CREEP_PER_S, LOST_SHARE, OFF_LINE, SLOPES, Reckoning, answers, mean_slope
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, Sample
 from sim.stage.presets import preset
@@ -74,9 +74,14 @@ def test_no_model_makes_it_run_off(model: LssvmInverse, seed: int, steps: list[f
     u = np.clip(4.0 + np.cumsum(steps), 0.0, 10.0)
     reckoning = Reckoning.begin(wrong, REST, 4.0, np.empty(0), np.empty(0), model.rest_memory(40.0))
     slope = mean_slope(wrong)
-    before, way_V = 4.0, 0.0
+    before, way_V, last, creep = 4.0, 0.0, 0.0, CREEP_PER_S * reckoning.range_um * DT
     for u_V in u:
+        held = reckoning.y_um
         place = reckoning.advance(float(u_V))
+        # In one sample: by the largest slope, by the motion under way, by creep.
+        caused = np.sign(slope) * (u_V - before) / (SLOPES[0] * abs(slope))
+        assert min(caused, 0.0) + min(last, -creep) - 1e-9 <= place - held <= max(caused, 0.0) + max(last, creep) + 1e-9
+        last = place - held
         way_V += abs(u_V - before)
         before = u_V
         assert abs(place - REST[0]) <= way_V / (SLOPES[0] * abs(slope)) + 1e-3 * reckoning.range_um + 1e-9

@@ -139,6 +139,23 @@ def test_a_jump_is_found_by_its_level_and_soon(model: LssvmInverse, dt_s: float,
     assert latest_s <= (0.06 if ringing else max(0.02, 17.0 * dt_s))
 
 
+@pytest.mark.parametrize(("level_um", "verdict"), [(3.6, Verdict.MOTION), (6.0, Verdict.LOST)])
+def test_ringing_about_a_level_at_the_edge_of_the_doubt_is_motion(
+    model: LssvmInverse, level_um: float, verdict: Verdict
+) -> None:
+    """The model may be wrong by 3.6 µm: a level there is neither the old one nor a jump, and the sensor is sound."""
+    rng, hold = np.random.default_rng(9), hold_at(model)
+    # The reading never moved as far as the distance says: no jump either.
+    hold.last_um = PLACE_UM + level_um
+    now, mode = circumstances()._replace(usual_um=3.6, high_um=PLACE_UM - 1.0), Mode(rng, DT_S, 4.5)
+    said = []
+    while len(said) < 60 and (not said or said[-1] in (Verdict.WAIT, Verdict.BACK)):
+        off_um = level_um + mode(len(said) * DT_S) + 0.3 * circumstances().noise_um * rng.standard_normal()
+        put(hold, PLACE_UM, PLACE_UM + off_um)
+        said.append(judge(hold, now))
+    assert said[-1] is verdict
+
+
 def test_no_jump_claims_more_than_the_readings_have_moved(model: LssvmInverse) -> None:
     """The reckoning goes 8 µm away at once, the readings stay: that is no jump of theirs."""
     rng, now = np.random.default_rng(5), circumstances()

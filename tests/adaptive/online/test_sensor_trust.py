@@ -237,6 +237,25 @@ def test_what_is_no_number_is_no_answer_and_begins_anew() -> None:
     assert math.isfinite(following.noise2)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_stage_whose_zero_drifts_beside_a_slow_voltage_is_no_fault(sign: float) -> None:
+    """For 0.2 s the stage moves by half its range per second, several times as fast as the voltage moves it."""
+    n, seconds = round(0.2 / EVERY_S), EVERY_S * np.arange(750)
+    speed_V_per_s = np.full(seconds.size, 0.3 * SPAN_V)
+    speed_V_per_s[250 : 250 + n] = -sign * 0.12 * SPAN_V
+    drift_V_per_s = np.where((seconds >= 1.0) & (seconds < 1.2), sign * 0.5 * SPAN_V, 0.0)
+    u = np.cumsum(speed_V_per_s) * EVERY_S
+    p = u + np.cumsum(drift_V_per_s) * EVERY_S
+
+    def faults(fastest_V_per_s: float) -> list[bool]:
+        following = Following()
+        return [following.take(a, b, SPAN_V, EVERY_S, fastest_V_per_s) for a, b in zip(u, p, strict=True)]
+
+    assert not any(faults(0.8 * SPAN_V))
+    # Faster than the envelope allows, it is a fault; not after the drift is over.
+    assert 250 < first(faults(0.4 * SPAN_V)) <= 250 + n
+
+
 def test_to_forget_is_to_begin_anew_but_for_the_noise() -> None:
     following, fresh = Following(), Following()
     u = strokes(3.0)
