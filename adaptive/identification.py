@@ -67,7 +67,7 @@ class IdentifyConfig:
 
 
 # --- Fit: first the linear part with its Gaussian prior, then the kernel on the residual of a subset of the samples.
-# Gamma and the widths maximise the evidence.
+# Gamma and the widths maximise the evidence; beside a linear part gamma is limited.
 
 
 #: Prior standard deviations of the linear part, as shares of the voltage range.
@@ -76,6 +76,11 @@ PRIOR_FREE, PRIOR_MOTION, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRI
 )  # fmt: skip
 #: Correlation time of the model error, s: samples within this time count as one measurement.
 CORRELATION_S = 0.02
+#: Largest gamma for the residual of a linear part. The evidence takes the rows for independent, but the residual of one
+#: pass is smooth in time even where the next pass has another one. Left alone it fits each pass with narrow kernels and
+#: a large gamma, and the kernel part is then wrong on other motion. Below 6, stated deviations outside the learnt range
+#: become too small.
+GAMMA_MAX = 8.0
 #: Smallest model error assumed for the linear part, as a share of the voltage range.
 ERROR_FLOOR = 5e-4
 #: Number of rows for the evidence, and the search ranges. A gamma above 1e5 only loses precision; with a width below
@@ -159,13 +164,17 @@ def tune(
     dt_s: float,
     config: IdentifyConfig,
 ) -> tuple[float, FloatArray]:
-    """(gamma, widths (d,)) that maximise the evidence of the kernel part: basis (n, p), inputs (n, d), u_V (n,)."""
+    """(gamma, widths (d,)) by the evidence of the kernel part: basis (n, p), inputs (n, d), u_V (n,).
+
+    Beside a linear part gamma is at most ``GAMMA_MAX``.
+    """
     target = u_V
     if features.linear:
         beta, _ = _linear(features, basis, u_V, float(np.ptp(u_V)), dt_s)
         target = u_V - basis @ beta
     rows = select(kernel, np.ones(kernel.shape[1]), config.n)
-    return evidence_search(kernel[rows], target[rows])
+    gamma, widths = evidence_search(kernel[rows], target[rows])
+    return min(gamma, GAMMA_MAX) if features.linear else gamma, widths
 
 
 def fit_model(

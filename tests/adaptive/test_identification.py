@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adaptive import identification
 from adaptive.errors import InputError
 from adaptive.identification import IdentifyConfig, identify_lssvm, select
 from adaptive.inverse_model import LssvmInverse
+from adaptive.online.learner import Learner
+from adaptive.types import FloatArray, Sample
+from sim.signals.voltages import training_input
+from tests.foreign.plants import random_plant
 
 DT = 1e-3
 QUICK = IdentifyConfig(tune=False, n=200)
@@ -36,6 +41,52 @@ def test_evidence_finds_widths_that_fit_better_than_a_guess(recording: tuple[np.
     _, guessed = identify_lssvm(*recording, DT, "two", IdentifyConfig(tune=False, n=200))
     _, tuned = identify_lssvm(*recording, DT, "two", IdentifyConfig(n=200))
     assert tuned.heldout_rmse_um < 0.7 * guessed.heldout_rmse_um
+
+
+def answered(model: LssvmInverse, u_V: FloatArray, y_um: FloatArray) -> FloatArray:
+    """(n,) errors of what a learner answers, V: blocks of 20 samples, each from before its own samples are learnt."""
+    learner, memory, error_V = Learner.from_model(model), model.rest_memory(float(y_um[0])), np.empty(u_V.size)
+    v_um_per_s = np.gradient(y_um, model.dt_s)
+    motion = np.column_stack([y_um, v_um_per_s, np.gradient(v_um_per_s, model.dt_s)])
+    for start in range(0, u_V.size, 20):
+        part = slice(start, start + 20)
+        y, v, a = np.ascontiguousarray(motion[part].T)
+        answer = learner.snapshot().feedforward(y, v, a, memory)
+        memory, error_V[part] = answer.memory, answer.u_V - u_V[part]
+        for k in range(start, min(start + 20, u_V.size)):
+            learner.handle(Sample(k, k * model.dt_s, float(u_V[k]), float(y_um[k])))
+    return error_V
+
+
+def test_the_kernel_does_not_fit_single_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage whose residual is smooth in time but does not repeat: with the gamma of the evidence alone the kernel
+    part makes the answers on another motion worse."""
+    factory = random_plant(61_000_009)
+    low_V, high_V = factory.traits.excite_V
+    wave = training_input(factory.traits.dt_s, 10.0)[1]
+    t = np.arange(0.0, 6.0, factory.traits.dt_s)
+    other = 0.45 * np.minimum(1.0, t / 0.5) - 0.3 * np.cos(4.4 * t) - 0.15 * np.cos(14.5 * t) * np.minimum(1.0, t / 0.5)
+    motions = []
+    for share in (wave / wave.max(), other - other[0]):
+        plant, u_V = factory(), low_V + (high_V - low_V) * share
+        plant.run(np.full(1000, low_V))
+        true_um, read_um = plant.run(u_V)
+        motions.append((u_V, true_um, read_um))
+    (u_V, _, read_um), (other_V, other_um, _) = motions
+    limited, _ = identify_lssvm(u_V, read_um, factory.traits.dt_s)
+    assert limited.gamma == identification.GAMMA_MAX
+    monkeypatch.setattr(identification, "GAMMA_MAX", np.inf)
+    free, _ = identify_lssvm(u_V, read_um, factory.traits.dt_s)
+    assert free.gamma > limited.gamma
+    settled = slice(other_V.size // 2, None)
+    errors = [float(np.abs(answered(model, other_V, other_um)[settled]).mean()) for model in (limited, free)]
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_the_gamma_of_a_model_without_a_linear_part_is_that_of_the_evidence(
+    recording: tuple[np.ndarray, np.ndarray],
+) -> None:
+    assert identify_lssvm(*recording, DT, "two", IdentifyConfig(n=200))[0].gamma > identification.GAMMA_MAX
 
 
 def test_deterministic(recording: tuple[np.ndarray, np.ndarray]) -> None:
