@@ -25,8 +25,8 @@ class WindowArrays(NamedTuple):
     """State of a window. R is the kernel matrix of (2.27) with the noise variances, P its inverse.
 
     P : (N, N). Inverse form: the lower triangle is R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS
-        and PLUS of V). Cholesky form: the upper triangle is L' with R = L L', in the order of ``order``; the strictly
-        lower one keeps L as it was before the last replacement, with its diagonal in row PK of V.
+        and PLUS of V). Cholesky form: L with R = L L', in the order of ``order``, in the upper or the lower triangle
+        (LOWER); the other one keeps L as it was before the last replacement, with its diagonal in row PK of V.
     R : (N, N) Omega + diag(1/(gamma w)), both triangles.
     X : (d, N) features.  scaled : (d, N) features divided by their widths.  inverse_widths : (d,).
     S : (N,) P 1; in the Cholesky form L^-1 1, by position.
@@ -83,6 +83,8 @@ FLOATS = 9
     CARRIED,
 ) = range(16)
 COUNTERS = 16
+#: In the Cholesky form, which has no pending term: 1 where the factor is in the lower triangle of P.
+LOWER = PENDING
 
 #: The counters that add up over a window's life.
 EVENTS = slice(STEPS, UNDO_PLACE)

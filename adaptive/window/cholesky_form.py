@@ -4,9 +4,14 @@ The sample that leaves is a rank-1 *update* of the factor behind it, a chain of 
 sample goes to the end of the factor, by one forward solve. T = L^-1 [1 y] (S and SY) goes through the same rotations.
 The error of alpha grows with cond(R), not with its square as in the inverse form, for about twice the time.
 
-Column j of L is row j of ``P`` (contiguous). *Positions* are the order of the factor; ``order`` holds the slot at each
-position. The slot of a sample does not influence the numerics. Rotations cannot be reversed to the last bit, so a step
-first copies the factor into the free triangle of P.
+*Positions* are the order of the factor; ``order`` holds the slot at each position. The slot of a sample does not
+influence the numerics.
+
+Rotations cannot be reversed to the last bit, so a refused step needs the factor from before it. A replacement therefore
+reads the factor from one triangle of P and writes the new one into the other, in one pass: to take it back is to go
+back to the first triangle. Column j of L is contiguous in both: behind the diagonal in row j of P, or, in the lower
+triangle (C[LOWER] is 1), from the beginning of row N - 1 - j. Its diagonal element is P[j, j] in both, and the one from
+before is in row PK of V.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from adaptive.window.arrays import (
     COUNT,
     CURSOR,
     DIAGONAL,
+    LOWER,
     MINUS,
     PK,
     PLUS,
@@ -36,16 +42,24 @@ from adaptive.window.arrays import (
 
 
 @compiled_reassociating
-def _forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
-    """b <- L^-1 b in place, L' in the upper triangle of P[:n, :n]; two columns at a time."""
+def _place(N: int, lower: bool, k: int) -> int:
+    """Where in the flat P, of N rows, element 0 of column ``k`` of L would be: element i > k is i further on."""
+    return (N - 1 - k) * N - k - 1 if lower else k * N
+
+
+@compiled_reassociating
+def _forward_columns(A: WindowArrays, n: int, b: FloatArray) -> None:
+    """b <- L^-1 b in place; two columns at a time."""
+    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
+    flat = P.reshape(N * N)
     k = 0
     while k + 1 < n:
-        r0, r1 = P[k], P[k + 1]
-        t0 = b[k] / r0[k]
-        t1 = (b[k + 1] - r0[k + 1] * t0) / r1[k + 1]
+        c0, c1 = _place(N, lower, k), _place(N, lower, k + 1)
+        t0 = b[k] / P[k, k]
+        t1 = (b[k + 1] - flat[c0 + k + 1] * t0) / P[k + 1, k + 1]
         b[k] = t0
         b[k + 1] = t1
-        a0, a1, rest = r0[k + 2 : n], r1[k + 2 : n], b[k + 2 : n]
+        a0, a1, rest = flat[c0 + k + 2 : c0 + n], flat[c1 + k + 2 : c1 + n], b[k + 2 : n]
         for i in range(rest.shape[0]):
             rest[i] -= a0[i] * t0 + a1[i] * t1
         k += 2
@@ -54,54 +68,116 @@ def _forward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
 
 
 @compiled_reassociating
-def _backward_columns(P: FloatArray, n: int, b: FloatArray) -> None:
-    """b <- L'^-1 b in place, L' in the upper triangle of P[:n, :n]; two rows at a time."""
+def _backward_columns(A: WindowArrays, n: int, b: FloatArray) -> None:
+    """b <- L'^-1 b in place; four columns of L at a time."""
+    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
+    flat = P.reshape(N * N)
     k = n - 1
-    while k >= 1:
-        r0, r1 = P[k - 1], P[k]
-        s0, s1 = 0.0, 0.0
-        a0, a1, rest = r0[k + 1 : n], r1[k + 1 : n], b[k + 1 : n]
+    while k >= 3:
+        c0, c1 = _place(N, lower, k - 3), _place(N, lower, k - 2)
+        c2, c3 = _place(N, lower, k - 1), _place(N, lower, k)
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        a0, a1 = flat[c0 + k + 1 : c0 + n], flat[c1 + k + 1 : c1 + n]
+        a2, a3, rest = flat[c2 + k + 1 : c2 + n], flat[c3 + k + 1 : c3 + n], b[k + 1 : n]
         for i in range(rest.shape[0]):
-            s0 += a0[i] * rest[i]
-            s1 += a1[i] * rest[i]
-        b[k] = (b[k] - s1) / r1[k]
-        b[k - 1] = (b[k - 1] - s0 - r0[k] * b[k]) / r0[k - 1]
-        k -= 2
-    if k == 0:
-        r0, s0 = P[0], 0.0
-        for i in range(1, n):
-            s0 += r0[i] * b[i]
-        b[0] = (b[0] - s0) / r0[0]
+            x = rest[i]
+            s0 += a0[i] * x
+            s1 += a1[i] * x
+            s2 += a2[i] * x
+            s3 += a3[i] * x
+        x3 = (b[k] - s3) / P[k, k]
+        x2 = (b[k - 1] - s2 - flat[c2 + k] * x3) / P[k - 1, k - 1]
+        x1 = (b[k - 2] - s1 - flat[c1 + k - 1] * x2 - flat[c1 + k] * x3) / P[k - 2, k - 2]
+        x0 = b[k - 3] - s0 - flat[c0 + k - 2] * x1 - flat[c0 + k - 1] * x2 - flat[c0 + k] * x3
+        b[k], b[k - 1], b[k - 2], b[k - 3] = x3, x2, x1, x0 / P[k - 3, k - 3]
+        k -= 4
+    while k >= 0:
+        c0, s0 = _place(N, lower, k), 0.0
+        for i in range(k + 1, n):
+            s0 += flat[c0 + i] * b[i]
+        b[k] = (b[k] - s0) / P[k, k]
+        k -= 1
 
 
 @compiled_reassociating
-def _shift_columns(P: FloatArray, n: int, position: int, b: FloatArray) -> None:
-    """The columns of L before ``position`` lose that row, and take their part in b <- L^-1 b."""
+def _shift_columns(A: WindowArrays, n: int, position: int, b: FloatArray) -> None:
+    """The columns before ``position`` go to the other triangle without that row, and take part in b <- L^-1 b."""
+    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
+    flat = P.reshape(N * N)
     for k in range(position):
-        row = P[k]
-        t = b[k] / row[k]
+        c, to = _place(N, lower, k), _place(N, not lower, k)
+        t = b[k] / P[k, k]
         b[k] = t
-        a, rest = row[k + 1 : position], b[k + 1 : position]
+        old, new, rest = flat[c + k + 1 : c + position], flat[to + k + 1 : to + position], b[k + 1 : position]
         for i in range(rest.shape[0]):
-            rest[i] -= a[i] * t
-        to, rest = row[position : n - 1], b[position : n - 1]
+            value = old[i]
+            new[i] = value
+            rest[i] -= value * t
+        old, new, rest = flat[c + position + 1 : c + n], flat[to + position : to + n - 1], b[position : n - 1]
         for i in range(rest.shape[0]):
-            to[i] = row[position + 1 + i]
-        for i in range(rest.shape[0]):
-            rest[i] -= to[i] * t
+            value = old[i]
+            new[i] = value
+            rest[i] -= value * t
 
 
 @compiled_reassociating
-def _rotate_column(
-    old: FloatArray, new: FloatArray, x: FloatArray, b: FloatArray, cosine: float, sine: float, t: float
-) -> None:
-    """One rotation of the rank-1 update over the rest of a column, and that column's part in b <- L^-1 b."""
-    for i in range(x.shape[0]):
-        before, other = old[i], x[i]
-        after = cosine * before + sine * other
-        x[i] = cosine * other - sine * before
-        new[i] = after
-        b[i] -= after * t
+def _rotate_columns(A: WindowArrays, n: int, position: int, x: FloatArray, b: FloatArray) -> None:
+    """The columns behind ``position`` take in the rank-1 term x x' by rotations, which T goes through too.
+
+    The new columns go to the other triangle, one place further to the front, and take part in b <- L^-1 b. Two columns
+    at a time. ``x`` is used up.
+    """
+    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
+    flat, S, sy = P.reshape(N * N), A.S, A.V[SY]
+    tau, tau_y = S[position], sy[position]
+    k = position + 1
+    while k < n:
+        c0, to0 = _place(N, lower, k), _place(N, not lower, k - 1)
+        diagonal0 = P[k, k]
+        r0 = np.sqrt(diagonal0 * diagonal0 + x[k] * x[k])
+        cosine0, sine0 = diagonal0 / r0, x[k] / r0
+        P[k - 1, k - 1] = r0
+        t0 = b[k - 1] / r0
+        b[k - 1] = t0
+        value = S[k]
+        S[k - 1] = cosine0 * value + sine0 * tau
+        tau = cosine0 * tau - sine0 * value
+        value = sy[k]
+        sy[k - 1] = cosine0 * value + sine0 * tau_y
+        tau_y = cosine0 * tau_y - sine0 * value
+        if k + 1 == n:
+            return
+        c1, to1 = _place(N, lower, k + 1), _place(N, not lower, k)
+        before, other = flat[c0 + k + 1], x[k + 1]
+        after = cosine0 * before + sine0 * other
+        other = cosine0 * other - sine0 * before
+        flat[to0 + k] = after
+        diagonal1 = P[k + 1, k + 1]
+        r1 = np.sqrt(diagonal1 * diagonal1 + other * other)
+        cosine1, sine1 = diagonal1 / r1, other / r1
+        P[k, k] = r1
+        t1 = (b[k] - after * t0) / r1
+        b[k] = t1
+        value = S[k + 1]
+        S[k] = cosine1 * value + sine1 * tau
+        tau = cosine1 * tau - sine1 * value
+        value = sy[k + 1]
+        sy[k] = cosine1 * value + sine1 * tau_y
+        tau_y = cosine1 * tau_y - sine1 * value
+        old0, old1 = flat[c0 + k + 2 : c0 + n], flat[c1 + k + 2 : c1 + n]
+        new0, new1 = flat[to0 + k + 1 : to0 + n - 1], flat[to1 + k + 1 : to1 + n - 1]
+        xs, rest = x[k + 2 : n], b[k + 1 : n - 1]
+        for i in range(rest.shape[0]):
+            before, other = old0[i], xs[i]
+            first = cosine0 * before + sine0 * other
+            other = cosine0 * other - sine0 * before
+            before = old1[i]
+            second = cosine1 * before + sine1 * other
+            xs[i] = cosine1 * other - sine1 * before
+            new0[i] = first
+            new1[i] = second
+            rest[i] -= first * t0 + second * t1
+        k += 2
 
 
 # --- The factor.
@@ -126,51 +202,42 @@ def gather(A: WindowArrays, by_slot: FloatArray, by_position: FloatArray) -> Non
 @compiled_reassociating
 def forward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L^-1 b in place, by position."""
-    _forward_columns(A.P, A.C[COUNT], b)
+    _forward_columns(A, A.C[COUNT], b)
 
 
 @compiled_reassociating
 def backward(A: WindowArrays, b: FloatArray) -> None:
     """b <- L'^-1 b in place, by position."""
-    _backward_columns(A.P, A.C[COUNT], b)
+    _backward_columns(A, A.C[COUNT], b)
 
 
 @compiled_reassociating
 def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
     """Take the sample at ``position`` out of the factor, and b <- L^-1 b with the new factor in the same pass.
 
-    ``b`` is by position without the one that leaves. COUNT is one less afterwards.
+    ``b`` is by position without the one that leaves. COUNT is one less afterwards; `restore_factor` takes it back.
     """
-    n, x = A.C[COUNT], A.V[PLUS]
-    row = A.P[position]
+    n, N, x = A.C[COUNT], A.P.shape[0], A.V[PLUS]
+    flat, column = A.P.reshape(N * N), _place(N, A.C[LOWER] != 0, position)
     for i in range(position + 1, n):
-        x[i] = row[i]
-    _shift_columns(A.P, n, position, b)
-    tau, tau_y = A.S[position], A.V[SY, position]
+        x[i] = flat[column + i]
+    for i in range(n):
+        A.V[PK, i] = A.P[i, i]
+    _shift_columns(A, n, position, b)
+    _rotate_columns(A, n, position, x, b)
     for k in range(position + 1, n):
-        old, new = A.P[k], A.P[k - 1]
-        r = np.sqrt(old[k] * old[k] + x[k] * x[k])
-        cosine, sine = old[k] / r, x[k] / r
-        new[k - 1] = r
-        t = b[k - 1] / r
-        b[k - 1] = t
-        _rotate_column(old[k + 1 : n], new[k : n - 1], x[k + 1 : n], b[k : n - 1], cosine, sine, t)
-        value = A.S[k]
-        A.S[k - 1] = cosine * value + sine * tau
-        tau = cosine * tau - sine * value
-        value = A.V[SY, k]
-        A.V[SY, k - 1] = cosine * value + sine * tau_y
-        tau_y = cosine * tau_y - sine * value
         A.order[k - 1] = A.order[k]
+    A.C[LOWER] = 1 - A.C[LOWER]
     A.C[COUNT] = n - 1
 
 
 @compiled_reassociating
 def add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
     """Put the sample of ``slot``, already written, at the end; ``half`` is L^-1 of its column. COUNT is one more."""
-    n = A.C[COUNT]
+    n, N, lower = A.C[COUNT], A.P.shape[0], A.C[LOWER] != 0
+    flat = A.P.reshape(N * N)
     for k in range(n):
-        A.P[k, n] = half[k]
+        flat[_place(N, lower, k) + n] = half[k]
     A.P[n, n] = diagonal
     A.S[n] = (1.0 - dot(half, A.S, n)) / diagonal
     A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
@@ -179,24 +246,10 @@ def add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
 
 
 @compiled_reassociating
-def keep_factor(A: WindowArrays) -> None:
-    """Copy the factor into the strictly lower triangle of P, last row first, and its diagonal into PK."""
-    n = A.C[COUNT]
-    for i in range(n):
-        A.V[PK, i] = A.P[i, i]
-        source, target = A.P[i, i + 1 : n], A.P[n - 1 - i]
-        for j in range(source.shape[0]):
-            target[j] = source[j]
-
-
-@compiled_reassociating
 def restore_factor(A: WindowArrays) -> None:
-    """The factor and its order as `keep_factor` found them, to the last bit. COUNT is what it was then."""
+    """The factor and its order as `delete` found them, to the last bit. COUNT is what it was then."""
     n, place = A.C[COUNT], A.C[UNDO_PLACE]
-    for i in range(n):
-        source, target = A.P[n - 1 - i], A.P[i, i + 1 : n]
-        for j in range(target.shape[0]):
-            target[j] = source[j]
+    A.C[LOWER] = 1 - A.C[LOWER]
     for i in range(n):
         A.P[i, i] = A.V[PK, i]
     for r in range(n - 1 - place):
@@ -217,16 +270,17 @@ def restore_factor(A: WindowArrays) -> None:
 @compiled_reassociating
 def _half_column(A: WindowArrays, place: int, t: FloatArray) -> float:
     """t <- L^-1 e_place, by position: zero above ``place``. Returns its square, the diagonal element of R^-1."""
-    n, total = A.C[COUNT], 0.0
+    n, N, lower, total = A.C[COUNT], A.P.shape[0], A.C[LOWER] != 0, 0.0
+    flat = A.P.reshape(N * N)
     for i in range(n):
         t[i] = 0.0
     t[place] = 1.0
     for k in range(place, n):
-        row = A.P[k]
-        half = t[k] / row[k]
+        column = _place(N, lower, k)
+        half = t[k] / A.P[k, k]
         t[k] = half
         total += half * half
-        a, rest = row[k + 1 : n], t[k + 1 : n]
+        a, rest = flat[column + k + 1 : column + n], t[k + 1 : n]
         for i in range(rest.shape[0]):
             rest[i] -= a[i] * half
     return total
@@ -237,7 +291,7 @@ def _column(A: WindowArrays, place: int, out: FloatArray) -> None:
     """out <- R^-1 e, by slot, of the sample at ``place``."""
     t = A.V[MINUS]
     _half_column(A, place, t)
-    _backward_columns(A.P, A.C[COUNT], t)
+    _backward_columns(A, A.C[COUNT], t)
     for i in range(A.C[COUNT]):
         out[A.order[i]] = t[i]
 

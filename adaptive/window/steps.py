@@ -373,7 +373,6 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
     place = cholesky.position_of(A, slot)
     _keep_for_undo(A, slot, UNDO_REPLACE)
     A.C[UNDO_PLACE] = place
-    cholesky.keep_factor(A)
     cholesky.before_leaving(A, place)
     for i in range(place):
         half[i] = column[A.order[i]]
