@@ -5,6 +5,9 @@ that replays samples at 1 kHz in batches of five, and a follower (this process) 
 second the age is the time since the stage had the last sample that the model in use has seen. The stage's clock is read
 from the samples: the earliest arrival of all counts as one without delay. ``nobody`` follows in the third part of a
 turn: the processor time of a sample is compared with it.
+
+``--cost``: processor time alone, in one process and one thread, without the wire: learning and making the messages, for
+the three ways in turns of one second of samples. Other work on the machine matters less there.
 """
 
 from __future__ import annotations
@@ -23,10 +26,15 @@ import zenoh
 
 from benchmarks.latency_setup import CONNECT_S, prepare
 from benchmarks.sample_feed import AXIS, STAGE
+from benchmarks.sample_feed import sent as sent_batch
 from lab.testbed.identified_stage import Rig
 from lab.testbed.processes import Child
 from service.client.client import Client
+from service.config.settings import read_config
+from service.protocol.model import encode_model
 from service.protocol.samples import decode_samples
+from service.server.axis_loading import load_axis
+from service.server.deltas import DeltaStreams
 
 RATE_HZ: Final = 1000.0
 BATCH: Final = 5
@@ -138,6 +146,38 @@ def _cost(client: Client, service: Child, work: Any) -> dict[str, Any]:
     return {"cpu_us": 1e6 * (after - before) / max(1, last - first)}
 
 
+def cost(seconds: float, model: str) -> dict[str, Any]:
+    """Processor time by way in µs a sample: median over turns of a second of samples, and ratios turn by turn."""
+    with tempfile.TemporaryDirectory() as folder, Rig(Path(folder)) as rig:
+        setup = prepare(rig, Path(folder), RATE_HZ, BATCH, every_sample=False)
+        config = read_config(setup.config).axes[0]
+        axes = {way: load_axis(STAGE, config) for way in WAYS}
+        with np.load(setup.samples) as kept:
+            u_V, y_um = kept["u_V"], kept["y_um"]
+    sent: list[bytes] = []
+    streams = DeltaStreams(axes["changes"])
+    streams.publish(model, sent.append, lambda: True)
+    second = round(RATE_HZ)
+    taken: dict[str, list[float]] = {way: [] for way in WAYS}
+    for turn in range(round(seconds)):
+        for way in WAYS:
+            axis, begin = axes[way], time.thread_time()
+            for first in range(turn * second, (turn + 1) * second, BATCH):
+                before = axis.newest
+                axis.handle(sent_batch(u_V, y_um, RATE_HZ, BATCH, first // BATCH))
+                if way == "changes":
+                    streams.tick(first / RATE_HZ)
+                elif way == "whole" and axis.newest is not before:
+                    found, seq, memory = axis.model(model)
+                    sent.append(encode_model(model, found, seq, memory, axis.safety(model)))
+            sent.clear()
+            taken[way].append(1e6 * (time.thread_time() - begin) / second)
+    columns = {way: np.array(values[2:]) for way, values in taken.items()}  # the first seconds load and compile
+    ratios = {way: float(np.median(columns["changes"] / columns[way])) for way in ("whole", "nobody")}
+    us = {way: round(float(np.median(values)), 1) for way, values in columns.items()}
+    return {"model": model, "cpu_us": us, "changes_over": {way: round(ratio, 3) for way, ratio in ratios.items()}}
+
+
 def page(report: dict[str, Any]) -> str:
     """The report as a table."""
     nobody_us = report["nobody"]["cpu_us"]
@@ -171,8 +211,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each part, s (%(default)s)")
     parser.add_argument("--turns", type=int, default=2, help="turns of the three parts (%(default)s)")
     parser.add_argument("--model", default="lssvm_adaptive", help="lssvm_adaptive or auto (%(default)s)")
+    parser.add_argument("--cost", action="store_true", help="processor time alone, in one process")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args()
+    if args.cost:
+        print(json.dumps(cost(args.seconds, args.model)))
+        return
     report = followed(args.seconds, args.turns, args.model)
     print(json.dumps(report) if args.json else page(report))
 

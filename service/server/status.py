@@ -195,7 +195,10 @@ class Publications:
         if self._axis.config.delta_hz > 0.0 and self._axis.config.learn:
             for key, name in ((keys.model_delta, self._axis.config.learn), (keys.champion_delta, AUTO)):
                 if name in self._axis.newest.models:
-                    publisher = session.declare_publisher(key, congestion_control=drop, express=True)
+                    # A class of its own: in that of the samples, which pass through here, two waiting messages fill
+                    # the queue, and a change would be dropped.
+                    urgent = zenoh.Priority.INTERACTIVE_HIGH
+                    publisher = session.declare_publisher(key, congestion_control=drop, express=True, priority=urgent)
                     self._publishers[key] = publisher
                     self._deltas.publish(name, publisher.put, partial(is_followed, publisher))
 

@@ -107,7 +107,7 @@ pub fn open(options: &Options) -> Result<Live> {
                     Some(publisher) => {
                         // What is refused is counted there. A whole model is complete again; changes are not.
                         if !matches!(publisher.update(&payload), Ok(Update::Taken | Update::Known | Update::Waits)) {
-                            drop(repair.try_send(()));
+                            let _ = repair.try_send(()); // one that waits already is enough
                         }
                     }
                     None => drop(early.try_send(payload.into_owned())),
@@ -125,7 +125,7 @@ pub fn open(options: &Options) -> Result<Live> {
     }
     drop(publisher.set(own));
     if missing {
-        drop(repair.try_send(()));
+        let _ = repair.try_send(()); // one that waits already is enough
     }
     Ok(Live { follower, feed })
 }
