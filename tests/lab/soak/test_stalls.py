@@ -38,10 +38,11 @@ def test_a_thread_that_was_ready_and_got_no_processor_blames_the_machine() -> No
         now = {7: ThreadTimes("learn", "R", "", 1.0 + ran_s, 2.0 + ready_s)}
         return since({7: ThreadTimes("learn", "S", "futex", 1.0, 2.0)}, now)
 
-    assert cause(0.3, row(0.2)) == "machine"
-    assert cause(0.3, row(0.02)) == "service"
-    assert cause(0.3, row(0.02, ran_s=0.25)) == "service"
-    assert cause(0.3, []) == "service"
+    assert cause(0.3, 0.4, row(0.2)) == "machine"
+    assert cause(0.3, 1.0, row(0.2)) == "service", "a fifth of a second is usual for a busy thread"
+    assert cause(0.3, 0.4, row(0.02)) == "service"
+    assert cause(0.3, 0.4, row(0.02, ran_s=0.25)) == "service"
+    assert cause(0.3, 0.4, []) == "service"
 
 
 def test_a_silence_is_written_with_the_stacks_of_the_service(tmp_path: Path) -> None:
