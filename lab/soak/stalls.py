@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from lab.testbed.shifted_clock import stacks_file
+
 #: Signal on which a service writes its stacks.
 DUMP: Final = signal.SIGUSR2
 #: Pause between two looks at the prober, s; between two of the counts; least between two that are written; most of
@@ -101,7 +103,7 @@ class StallWatch:
         processes: Callable[[], Mapping[str, int]],
         now_s: Callable[[], float],
     ) -> None:
-        self._path = folder / "stalls.jsonl"
+        self._folder, self._path = folder, folder / "stalls.jsonl"
         self._silence, self._processes, self._now_s = silence, processes, now_s
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="soak-stalls", daemon=True)
@@ -142,10 +144,11 @@ class StallWatch:
 
     def _write(self, silent_s: float, over_s: float, before: Mapping[str, Mapping[int, ThreadTimes]]) -> None:
         processes = self._processes()
-        for name in ("a", "b"):
-            if name in processes:
-                with contextlib.suppress(OSError):
-                    os.kill(processes[name], DUMP)
+        for pid in processes.values():
+            # Who writes no stacks, or not yet, would be ended by the signal.
+            with contextlib.suppress(OSError):
+                if stacks_file(self._folder, pid).stat().st_size:
+                    os.kill(pid, DUMP)
         found = {name: since(before.get(name, {}), threads_of(pid)) for name, pid in processes.items()}
         why = cause(silent_s, over_s, [row for rows in found.values() for row in rows])
         self.machine += why == "machine"
