@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from benchmarks.latency_setup import CONNECT_S, prepare
 from benchmarks.sample_feed import AXIS, STAGE
@@ -33,12 +34,14 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
 
     Returns
     -------
-    ``ready_s``: from the start until the service is ready; ``answered_s``: from the kill until a client that keeps
+    ``ready_s``: from the start until the service is ready; ``ready_cpu_s``: the processor time that it has taken until
+    then, which on a machine with idle cores is about as long; ``answered_s``: from the kill until a client that keeps
     asking has an answer; ``libraries_s``; ``ready_over_libraries``; each as a list. ``unlearnt_ms``: milliseconds of
     samples that the last status counted as handled and that the restarted learner does not know. ``records_lost``: of
     those, how many are in no recording.
     """
     rows: dict[str, list[float]] = {"ready_s": [], "answered_s": [], "libraries_s": [], "unlearnt_ms": []}
+    rows["ready_cpu_s"] = []
     told: list[tuple[int, int]] = []
     keeps = {"recorder": "rec", "checkpoints": "kept"}
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder)) as rig:
@@ -57,6 +60,7 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
                 begun = time.monotonic()
                 service = setup.start_service()
                 rows["ready_s"].append(time.monotonic() - begun)
+                rows["ready_cpu_s"].append(sum(psutil.Process(service.pid).cpu_times()[:2]))
                 client.point(40.0)
                 rows["answered_s"].append(time.monotonic() - killed)
                 after = int(client.status()["seq"])
@@ -83,6 +87,7 @@ def page(report: dict[str, Any]) -> str:
     lines = [f"A service killed and started again {report['rounds']} times, samples at {RATE_HZ:g} Hz", ""]
     for name, text in (
         ("ready_s", "from the start until it is ready, s"),
+        ("ready_cpu_s", "its processor time until then, s"),
         ("libraries_s", "the libraries alone, s"),
         ("ready_over_libraries", "the first over the second"),
         ("answered_s", "from the kill until a client is answered, s"),

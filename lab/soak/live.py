@@ -338,7 +338,7 @@ class FaultActions:
         return lambda: write_offset(self._soak.wall_clock, 0.0)
 
     def _take_folders_away(self, fault: PlannedFault) -> Undo:
-        """Rename the folders of who serves, so that what they hold still counts: it must be told, and made anew."""
+        """Take the folders of who serves away: it must be told, and they must be made anew."""
         name = self.primary
         taken = self._soak.take_folders_away(name, self._monitor.now())
 

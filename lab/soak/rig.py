@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -161,13 +162,18 @@ class SoakRig:
         return self.rig.start(f"stranger{self._strangers}", program)
 
     def take_folders_away(self, name: str, now_s: float) -> list[Path]:
-        """Rename the folders of recordings and checkpoints of a service; returns where they were."""
+        """Rename the folders of recordings of a service and remove those of its checkpoints; returns where they were.
+
+        What was recorded must still be counted at the end; checkpoints of hours would fill the disk.
+        """
         away = self._out / name / f"taken-{now_s:.0f}"
         away.mkdir()
-        taken = [path for what in FOLDERS for path in sorted((self._out / name).glob(f"{what}*"))]
-        for path in taken:
+        recordings, checkpoints = (sorted((self._out / name).glob(f"{what}*")) for what in FOLDERS)
+        for path in recordings:
             path.rename(away / path.name)
-        return taken
+        for path in checkpoints:
+            shutil.rmtree(path, ignore_errors=True)
+        return [*recordings, *checkpoints]
 
     def service_of(self, instance: str) -> str:
         """Name of the service with this instance id, which contains its process id; "" if there is none."""

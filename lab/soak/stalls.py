@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from lab.testbed.shifted_clock import stacks_file
+
 #: Signal on which a service writes its stacks.
 DUMP: Final = signal.SIGUSR2
 #: Pause between two looks at the prober, s; between two of the counts; least between two that are written; most of
@@ -30,8 +32,10 @@ _LOOK_S: Final = 0.03
 _COUNT_S: Final = 1.0
 _APART_S: Final = 5.0
 _MOST: Final = 100
-#: A thread that waited for a processor for this share of a silence waited for the machine.
+#: A thread waited for the machine if it was ready without a processor for so much of the silence, and of the time in
+#: which it was counted.
 _MACHINE_SHARE: Final = 0.5
+_READY_SHARE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +79,11 @@ def since(before: Mapping[int, ThreadTimes], now: Mapping[int, ThreadTimes]) -> 
     return sorted(rows, key=lambda row: -float(row["ready_ms"]))
 
 
-def cause(silent_s: float, threads: list[dict[str, Any]]) -> str:
-    """ "machine" if a thread was ready for most of the silence and got no processor, else "service"."""
+def cause(silent_s: float, over_s: float, threads: list[dict[str, Any]]) -> str:
+    """Whose a silence is: "machine" if a thread was ready without a processor for half as long as the silence, and for
+    a good share of the time ``over_s`` in which it was counted; else "service"."""
     longest_s = max((1e-3 * float(row["ready_ms"]) for row in threads), default=0.0)
-    return "machine" if longest_s >= _MACHINE_SHARE * silent_s else "service"
+    return "machine" if longest_s >= max(_MACHINE_SHARE * silent_s, _READY_SHARE * over_s) else "service"
 
 
 class StallWatch:
@@ -98,7 +103,7 @@ class StallWatch:
         processes: Callable[[], Mapping[str, int]],
         now_s: Callable[[], float],
     ) -> None:
-        self._path = folder / "stalls.jsonl"
+        self._folder, self._path = folder, folder / "stalls.jsonl"
         self._silence, self._processes, self._now_s = silence, processes, now_s
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="soak-stalls", daemon=True)
@@ -139,12 +144,13 @@ class StallWatch:
 
     def _write(self, silent_s: float, over_s: float, before: Mapping[str, Mapping[int, ThreadTimes]]) -> None:
         processes = self._processes()
-        for name in ("a", "b"):
-            if name in processes:
-                with contextlib.suppress(OSError):
-                    os.kill(processes[name], DUMP)
+        for pid in processes.values():
+            # Who writes no stacks, or not yet, would be ended by the signal.
+            with contextlib.suppress(OSError):
+                if stacks_file(self._folder, pid).stat().st_size:
+                    os.kill(pid, DUMP)
         found = {name: since(before.get(name, {}), threads_of(pid)) for name, pid in processes.items()}
-        why = cause(silent_s, [row for rows in found.values() for row in rows])
+        why = cause(silent_s, over_s, [row for rows in found.values() for row in rows])
         self.machine += why == "machine"
         self.service += why == "service"
         self._written += 1

@@ -45,11 +45,19 @@ def patch_clock(path: Path) -> None:
 def write_stacks_on_signal(folder: Path) -> TextIO:
     """Let this process append the stacks of all its threads to a file in ``folder`` on SIGUSR2; the open file.
 
-    It needs no interpreter lock, so that it shows who holds it.
+    It needs no interpreter lock, so that it shows who holds it. The file has a first line as soon as the signal may be
+    sent: before that it would end the process.
     """
-    file = (folder / f"stacks-{os.getpid()}.txt").open("a", encoding="utf-8")
+    file = stacks_file(folder, os.getpid()).open("a", encoding="utf-8")
     faulthandler.register(signal.SIGUSR2, file=file, all_threads=True)
+    file.write("Stacks of all threads, one after the other, each time that nobody was answered.\n")
+    file.flush()
     return file
+
+
+def stacks_file(folder: Path, pid: int) -> Path:
+    """The file to which the process ``pid`` writes its stacks."""
+    return folder / f"stacks-{pid}.txt"
 
 
 if __name__ == "__main__":

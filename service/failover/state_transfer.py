@@ -8,6 +8,7 @@ asks again with longer pauses.
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Iterable, Iterator
@@ -25,6 +26,8 @@ _PART_BYTES: Final = 56 * 1024
 _MAX_PARTS: Final = 4681
 #: Senders whose parts are joined at a time, at most.
 _MOST_SENDERS: Final = 4
+#: Time from the first part until those of other senders must have begun, s.
+_OTHERS_S: Final = 0.2
 #: Attachment of each part: its index and the number of parts.
 _PLACE: Final = struct.Struct("<II")
 #: Pause between two parts, s: in the first transfer, and at most.
@@ -137,41 +140,54 @@ def gives_sign_of_life(
 
 
 class PartJoiner:
-    """Joins the parts of one sender."""
+    """Joins the parts of one sender.
+
+    Attributes
+    ----------
+    spoilt : whether a part is missing or malformed. done : whether the whole has come.
+    """
 
     def __init__(self) -> None:
+        self.spoilt = self.done = False
         self._joined, self._taken, self._total = bytearray(), 0, 0
-        self._spoilt = False
 
     def take(self, place: bytes, part: bytes) -> bytes | None:
-        """The whole after its last part, given with its attachment; else None, for good once one is missing or
-        malformed."""
-        if self._spoilt or len(place) != _PLACE.size:
-            self._spoilt = True
+        """The whole after its last part, given with its attachment; else None."""
+        if self.spoilt or self.done:
             return None
-        i, n = _PLACE.unpack(place)
+        i, n = _PLACE.unpack(place) if len(place) == _PLACE.size else (-1, 0)
         taken = self._taken
         if i != taken or not taken < n <= _MAX_PARTS or (taken and n != self._total) or len(part) > _PART_BYTES:
-            self._spoilt = True
+            self.spoilt = True
             self._joined.clear()
             return None
         self._joined += part
         self._taken, self._total = taken + 1, n
-        if self._taken < n:
-            return None
-        self._spoilt = True
-        return bytes(self._joined)
+        self.done = self._taken == n
+        return bytes(self._joined) if self.done else None
 
 
 def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
     """The joined parts of one sender, given as (attachment, part); None if one is missing or malformed."""
-    return next(joined_by_sender(("", place, part) for place, part in parts), None)
+    joiner = PartJoiner()
+    for place, part in parts:
+        whole = joiner.take(place, part)
+        if joiner.done or joiner.spoilt:
+            return whole
+    return None
 
 
 def joined_by_sender(parts: Iterable[tuple[str, bytes, bytes]]) -> Iterator[bytes]:
-    """What each sender has sent, as soon as it is whole, from parts (sender, attachment, part) in any mixture."""
+    """What each sender has sent, as soon as it is whole, from parts (sender, attachment, part) in any mixture.
+
+    Ends `_OTHERS_S` after the first part where no sender is left whose parts fit together.
+    """
     joiners: dict[str, PartJoiner] = {}
+    others_until_s = math.inf
     for sender, place, part in parts:
+        others_until_s = min(others_until_s, time.monotonic() + _OTHERS_S)
+        if joiners and all(joiner.spoilt for joiner in joiners.values()) and time.monotonic() > others_until_s:
+            return
         if sender not in joiners and len(joiners) >= _MOST_SENDERS:
             continue
         whole = joiners.setdefault(sender, PartJoiner()).take(place, part)

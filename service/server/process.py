@@ -22,7 +22,7 @@ from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import is_loopback, open_service
-from service.security.peers import read_secret
+from service.security.peers import PeerSecret, read_secret
 from service.server.axis import Axis
 from service.server.axis_loading import LearnerFactory, load_axis, make_learner
 from service.server.axis_loop import SampleSink, SampleWatcher
@@ -65,6 +65,17 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     from service.background.diagnosing.watcher import Watcher
 
     return Watcher(axis, axis.config.diagnosis)
+
+
+def warn_without_secret(config: ServeConfig, secret: PeerSecret) -> None:
+    """Log a warning where others than this machine's processes are believed without a proof."""
+    beyond = [endpoint for endpoint in (*config.listen, *config.connect) if not is_loopback(endpoint)]
+    if beyond and not secret:
+        _LOGGER.warning(
+            "peer_secret: none, and %s is beyond this machine: who may hold liveliness tokens there can depose this "
+            "service, and is given its state; see docs/access.md",
+            ", ".join(beyond),
+        )
 
 
 def as_standby(config: ServeConfig) -> ServeConfig:
@@ -158,11 +169,7 @@ class Service:
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
         secret = read_secret(config.peer_secret)
-        if not secret and not all(map(is_loopback, (*config.listen, *config.connect))):
-            _LOGGER.warning(
-                "peer_secret: none, and an endpoint is beyond this machine: who may hold liveliness tokens there can "
-                "depose this service, and is given its state; see docs/access.md"
-            )
+        warn_without_secret(config, secret)
         loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh

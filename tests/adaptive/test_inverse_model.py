@@ -159,6 +159,10 @@ def test_bad_shapes_are_named(model: LssvmInverse) -> None:
         model.feedforward(y, v, a, np.zeros(3))
     with pytest.raises(InputError, match="alpha"):
         replace(model, alpha=np.full(model.alpha.shape, np.nan))
+    p = model.features.basis_size
+    for value in (np.nan, np.inf):
+        with pytest.raises(InputError, match="beta_covariance: got"):
+            replace(model, beta_covariance=np.full((p, p), value))
 
 
 @pytest.mark.parametrize("field", ["noise_variance", "kernel_variance", "gamma", "span_V"])

@@ -109,6 +109,23 @@ def test_after_every_lie_of_the_sensor_the_error_is_soon_what_it_was(tmp_path: P
 
 
 @pytest.mark.e2e
+def test_every_sensor_that_lies_plausibly_is_named_and_costs_little(tmp_path: Path) -> None:
+    """A stuck one with noise, one with another gain or sign, one of another stage; and numbers and losses."""
+    lies = ("stuck_noisy", "sensor_gain", "sign", "other_stage", "seq_jump", "losses")
+    done = subprocess.run(
+        command(tmp_path, "--duration", "50s", "--fast", "--faults", ",".join(lies)),
+        capture_output=True, text=True, timeout=170, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    faults = read(tmp_path)["faults"]
+    assert set(faults) == set(lies)
+    for kind in lies[:4]:
+        assert faults[kind]["worst_error_pct"] < 1.0
+        assert faults[kind]["worst_named_s"] < 0.6
+        assert faults[kind]["told_by"][0].startswith("trouble sensor_")
+
+
+@pytest.mark.e2e
 def test_ctrl_c_leaves_a_report_of_what_ran(tmp_path: Path) -> None:
     process = subprocess.Popen(
         command(tmp_path, "--duration", "2h", "--fast", "--faults", "gap"),

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, join_parts, send_state
+from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, join_parts, joined_by_sender, send_state
 from service.runtime.session import open_client, open_router
 from tests.service.conftest import unused_port
 
@@ -85,6 +85,26 @@ def test_nobody_fills_the_memory_of_the_one_that_asks() -> None:
 
     assert join_parts(without_end()) is None
     assert taken == 1
+
+
+def test_what_a_stranger_sends_between_spoils_nothing_for_the_one_that_serves() -> None:
+    honest = [("a", *part) for part in placed((0, 3), (1, 3), (2, 3))]
+    other = [("b", *part) for part in placed((0, 2), (1, 2))]
+    rubbish = [("c", b"", b"x"), ("d", struct.pack("<II", 0, 2**32 - 1), b"x")]
+    mixed = [*rubbish, other[0], honest[0], honest[1], other[1], honest[2]]
+    assert list(joined_by_sender(mixed)) == [b"xx", b"xxx"]
+    crowd = [(str(k), *placed((0, 2))[0]) for k in range(50)]
+    assert list(joined_by_sender([honest[0], *crowd, *honest[1:]])) == [b"xxx"]
+
+
+def test_senders_of_nothing_but_rubbish_are_not_heard_for_ever() -> None:
+    def without_end() -> Iterator[tuple[str, bytes, bytes]]:
+        while True:
+            yield "c", b"", b"x"
+
+    begin = time.monotonic()
+    assert list(joined_by_sender(without_end())) == []
+    assert time.monotonic() - begin < 5.0
 
 
 def in_a_thread(query: zenoh.Query) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import time
@@ -13,12 +14,14 @@ import zenoh
 
 from adaptive.errors import InputError
 from service.client.client import Client
+from service.config.settings import ServeConfig
 from service.failover.role_control import MAX_EPOCH, Claim, Claims, claim_parts, parse_claim
 from service.failover.state_transfer import fetch_state, gives_sign_of_life, send_sign_of_life, send_state
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_router
 from service.security.peers import OWN_SECRET, PeerSecret, read_secret
+from service.server.process import warn_without_secret
 from tests.service.conftest import unused_port
 from tests.service.failover.test_standby import pair_config
 from tests.service.living import Process, Stage, eventually
@@ -97,6 +100,22 @@ def test_a_claim_without_proof_or_with_an_absurd_epoch_is_none() -> None:
     assert claims.highest() is None
     for epoch in ("²", "١", "-1", str(MAX_EPOCH + 1), "9" * 400, "1.5", ""):
         assert parse_claim(f"{KEYS.base}/claim/{epoch}/i-a") is None
+
+
+@pytest.mark.parametrize(
+    ("listen", "secret", "warned"),
+    [
+        ("tls/192.0.2.10:7447", PeerSecret(), True),
+        ("tls/192.0.2.10:7447", OURS, False),
+        ("tcp/127.0.0.1:7447", PeerSecret(), False),
+    ],
+)
+def test_who_believes_anybody_beyond_this_machine_says_so(
+    listen: str, secret: PeerSecret, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "dehyst.service"):
+        warn_without_secret(ServeConfig("demo", (), listen=(listen,)), secret)
+    assert ["192.0.2.10" in record.getMessage() for record in caplog.records] == [True] * warned
 
 
 def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> None:
