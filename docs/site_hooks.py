@@ -18,7 +18,10 @@ _LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 def programs() -> str:
     """The page that holds the programs of examples/, as they are."""
-    text = "# Programs\n\nComplete programs of the folder `examples/` of the checkout. `examples/notebooks/` holds two notebooks: *identify and diagnose*, and *learn online*.\n"
+    text = (
+        "# Programs\n\nComplete programs of the folder `examples/` of the checkout. `examples/notebooks/` holds two "
+        "notebooks: *identify and diagnose*, and *learn online*.\n"
+    )
     for path in sorted((ROOT / "examples").glob("*.py")):
         text += f"\n## {path.name} {{: #{path.stem} }}\n\n```python\n{path.read_text()}```\n"
     return text
