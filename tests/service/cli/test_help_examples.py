@@ -70,7 +70,7 @@ def test_a_mistyped_command_is_answered_with_the_nearest(
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files that examples name: recordings of a play operator, in the forms that they say."""
     folder = tmp_path_factory.mktemp("examples")
-    t_s, u_V = training_input(0.005, 40.0)
+    t_s, u_V = training_input(0.005, 12.0)
     y_um = np.empty(u_V.size)
     play = 0.0
     for k, u in enumerate(u_V):

@@ -1,0 +1,14 @@
+"""Run the stage for a controller in another process: publish samples, apply what it commands. Ctrl-C ends it."""
+
+import contextlib
+
+from my_stage import open_stage
+
+from service.adapters import StageLoop
+from service.client import Client
+
+with open_stage() as stage, Client.connect("tcp/127.0.0.1:7447", stage="demo", axis="x", wait_s=10.0) as client:
+    loop = StageLoop(stage, client)
+    print(f"ready: samples from number {loop.first} on", flush=True)  # the controller commands from there on
+    with contextlib.suppress(KeyboardInterrupt):
+        loop.run()
