@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Any, Final
@@ -19,12 +20,15 @@ from service.protocol.samples import decode_samples
 from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
+from service.server.health import Health
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, axis_status
 from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
+#: Period at which the rates of the state are taken, s.
+HEALTH_S: Final = 1.0
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
 
@@ -83,6 +87,8 @@ class AxisServer:
         self._publications = Publications(session, keys, instance, self.loop, self._latency, self._answers, self.status)
         self._session = session
         self._stale = False
+        self._health = Health()
+        self._health_at_s = -math.inf
         self._inputs: list[Any] = []
         self._queryables: list[Any] = []
         self._token: Any = None
@@ -203,6 +209,10 @@ class AxisServer:
         if self.loop.watcher is not None:
             self.loop.watcher.tick(now_s)
         self._update_age(now_s)
+        if now_s - self._health_at_s >= HEALTH_S:
+            self._health_at_s = now_s
+            samples = self.status()["samples"]
+            self._health.update(now_s, samples["received"], samples["dropped"], samples["gates"])
         with self._changing:
             self._publications.tick(now_s)
 
@@ -236,6 +246,7 @@ class AxisServer:
             stale=self._stale,
             checkpoints=self.checkpoints.counters(),
             operations=self._operations.counters(),
+            health=self._health,
         )
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
