@@ -64,6 +64,8 @@ class Health:
             return "frozen", "an operator has stopped the learning"
         if not status["learning"]:
             return "not learning", "no model of this axis learns"
+        if not status["samples"]["received"]:
+            return "no samples", "none has come since the start"
         if self._dropped:
             return "dropping", f"{self._dropped} samples were dropped in the last {WINDOW_S:g} s: too many waited"
         if factor > 1:

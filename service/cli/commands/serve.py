@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--standby", action="store_true", help="run as hot standby: learn the same, and take over when the service dies"
     )
     add_shared(parser, "insecure-beyond-loopback", "duration")
-    add_shared(parser, quiet={"help": "print no warnings and no line a minute"})
+    add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
     add_epilog(parser, "All keys of the configuration: docs/configuration.md.")
 
@@ -62,8 +61,6 @@ def run(args: argparse.Namespace) -> int:
             started()
             _print_ready(service.ready(), args.json)
             quiet = args.quiet or args.json
-            if not quiet:
-                _print_warnings(service)
             reason = _wait(stop, args.duration, lambda: None if quiet else print(summary(service), flush=True))
             statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
@@ -112,12 +109,6 @@ def summary(service: Service) -> str:
         words.append(f"{status['queries']['count']} queries")
         parts.append(", ".join(words))
     return f"{time.strftime('%H:%M:%S')} {'; '.join(parts)}"
-
-
-def _print_warnings(service: Service) -> None:
-    for axis in service.axes:
-        for warning in axis.axis.warnings.values():
-            print(f"warning: {axis.keys.axis}: {warning}", file=sys.stderr, flush=True)
 
 
 def _print_ready(ready: dict[str, Any], as_json: bool) -> None:

@@ -115,6 +115,10 @@ def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.
 
 def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     loop = axis_loop(META)
+    assert status_of(loop)["state"] == "no samples"
+    loop.offer(batches(0, 25)[0])
+    loop.start()
+    loop.close()
     base = status_of(loop)
     good = health_after({"learnt": 100, "passed": 900})
     assert good.per_s == pytest.approx(1000)
@@ -132,7 +136,11 @@ def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
 
 
 def test_ok_comes_back_when_the_drops_are_over(axis_loop: Make) -> None:
-    health, base = Health(), status_of(axis_loop(META))
+    loop = axis_loop(META)
+    loop.offer(batches(0, 25)[0])
+    loop.start()
+    loop.close()
+    health, base = Health(), status_of(loop)
     states = []
     for k in range(30):
         health.update(float(k), 1000 * k, 50 if k >= 5 else 0, {"learnt": 1000 * k})
