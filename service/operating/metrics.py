@@ -142,7 +142,6 @@ def serve_page(address: str, port: int, collect: Callable[[], bytes]) -> Iterato
         raise InputError(
             f"--port {port}: cannot listen at {address} ({error.strerror}): choose another port, or 0 for a free one"
         ) from error
-    server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, name="metrics")
     thread.start()
     try:
