@@ -12,8 +12,8 @@ PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/base
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
           protocol/test_payloads.py runtime/test_logging_setup.py \
-          server/test_axis.py server/test_competing.py server/test_deltas.py server/test_long_queries.py \
-          server/test_model_watch.py \
+          server/test_axis.py server/test_competing.py server/test_deltas.py server/test_health.py \
+          server/test_long_queries.py server/test_model_watch.py \
           storage/test_stored_files.py viewer/test_scene.py)
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
 PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \

@@ -50,6 +50,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "router": _command("router", SERVING, "forward messages between stages, services and clients on several hosts"),
     "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file", VIEWER),
     "status": _command("status", OPERATING, "show a live table of all axes and instances that serve"),
+    "metrics": _command("metrics", OPERATING, "serve the status of all axes as metrics for Prometheus"),
     "freeze": _command("operate", OPERATING, "stop an axis from learning, until it is thawed"),
     "thaw": _command("operate", OPERATING, "let a frozen axis learn again"),
     "rollback": _command("operate", OPERATING, "set the model of an axis back to a checkpoint"),
@@ -64,6 +65,7 @@ COMMANDS: Final[dict[str, Command]] = {
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),
     "identify": _command("identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE),
+    "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
     "replay": _command(
         "replay", IDENTIFICATION, "run the learner over a recording offline, with its decisions and errors", SERVE
     ),

@@ -145,7 +145,9 @@ def _age(seconds: Any) -> str:
 
 
 def _state(status: dict[str, Any]) -> str:
-    """The state of the axis in a word: the first condition that holds."""
+    """The state of the axis in a word, as the service says; of an older service the first condition that holds."""
+    if isinstance(status.get("state"), str):
+        return str(status["state"])
     if status.get("trouble"):
         return str(status["trouble"])
     if status.get("stale"):
@@ -164,6 +166,11 @@ def _gates(status: dict[str, Any]) -> str:
     return " ".join(f"{name}:{n}" for n, name in refused[:2]) or "-"
 
 
+def _not_handled(status: dict[str, Any]) -> int:
+    """Samples that were lost on the way, dropped, or left out by thinning."""
+    return sum(_get(status, "samples", name) or 0 for name in ("lost", "dropped", "thinned"))
+
+
 COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
     ("stage/axis", 16, lambda s: f"{s.get('stage')}/{s.get('axis')}"),
     ("instance", 18, lambda s: str(s.get("instance"))),
@@ -175,7 +182,7 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
     ("sample", 10, lambda s: str(s.get("seq"))),
     ("age", 7, lambda s: _age(s.get("sample_age_s"))),
     ("learnt", 9, lambda s: str(_get(s, "samples", "learnt"))),
-    ("lost", 6, lambda s: str((_get(s, "samples", "lost") or 0) + (_get(s, "samples", "dropped") or 0))),
+    ("lost", 6, lambda s: str(_not_handled(s))),
     ("ckpt", 7, lambda s: _age(_get(s, "checkpoints", "age_s"))),
     ("queries", 9, lambda s: str(_get(s, "queries", "count"))),
     ("p50 us", 7, lambda s: _number(_get(s, "queries", "p50_us"), ".0f")),
@@ -188,7 +195,7 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
 
 def is_healthy(status: dict[str, Any]) -> bool:
     """Whether a status needs no attention of an operator."""
-    return _state(status) in ("ok", "not learning") and not _get(status, "samples", "dropped")
+    return _state(status) in ("ok", "not learning")
 
 
 def table(statuses: Sequence[dict[str, Any]], width: int = 0, colour: bool = False) -> str:

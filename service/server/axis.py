@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -51,6 +51,10 @@ LEVELS: Final = {
     "trouble": logging.WARNING,
     "stale": logging.WARNING,
     "samples_dropped": logging.WARNING,
+    "thinned": logging.WARNING,
+    "limits_narrow": logging.WARNING,
+    "model_clipped": logging.WARNING,
+    "rate_too_high": logging.WARNING,
     "malformed_samples": logging.WARNING,
     "contestant_failed": logging.WARNING,
     "checkpoint_failed": logging.WARNING,
@@ -160,6 +164,7 @@ class Axis:
     stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
     template : state of a learner like ``learner`` that has learnt some samples: what a state to restore must look like.
         By default that of ``learner`` itself.
+    warnings : what the operator should know from the start on, by the name of its event.
 
     Raises InputError if ``config`` names a model that is missing, or if the sample times differ.
     """
@@ -175,6 +180,7 @@ class Axis:
         stage: str = "",
         archive: Archive | None = None,
         template: StateDict | None = None,
+        warnings: Mapping[str, str] | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
             config = replace(config, served=config.learn or LEARN)  # without a competition
@@ -213,6 +219,9 @@ class Axis:
             template = {} if learner is None else learner.state_dict()
         sizes = {name: memory.size for name, memory in self.newest.memories.items()}
         self._schema = StateSchema(template, sizes)
+        self.warnings = dict(warnings or {})
+        for event, detail in self.warnings.items():
+            self.note(event, detail)
 
     # ---- what other threads read
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
@@ -86,9 +87,72 @@ def load_axis(
     archive = None
     if config.checkpoints is not None:
         archive = CheckpointFolder(config.checkpoints, stage, config.name, bundle.meta.dt_s, config.checkpoints_kept)
-    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive, template=template)
+    warnings = _warnings(limits, bundle.meta)
+    if config.learn and 1.0 / bundle.meta.dt_s > _CERTAIN_HZ:
+        warnings |= _rate_warning(warmed, limits)
+    axis = Axis(
+        config, models, learner, limits, begin, stage=stage, archive=archive, template=template, warnings=warnings
+    )
     _warm_models(axis)
     return axis
+
+
+#: Share of the model's voltages by which the limits may be narrower without a warning.
+_NARROWER: Final = 0.05
+#: Rate, Hz, that one thread sustains everywhere; above it the learner's speed is measured at the start.
+_CERTAIN_HZ: Final = 4000.0
+#: Share of the measured speed up to which a rate is sustained: other threads need the processor too.
+_SUSTAINED: Final = 0.8
+
+
+def _warnings(limits: Limits, meta: BundleMeta) -> dict[str, str]:
+    """What does not fit between limits and model, and what was wrong with its recording; by name of the event."""
+    found = {}
+    low, high = meta.u_min_V, meta.u_max_V
+    if low is not None and high is not None:
+        margin = _NARROWER * (high - low)
+        if limits.u_min_V > low + margin or limits.u_max_V < high - margin:
+            found["limits_narrow"] = (
+                f"the limits of {limits.u_min_V:g} to {limits.u_max_V:g} V are narrower than the {low:g} to {high:g} V "
+                "of the model's recording: positions that need more are answered with a voltage at the limit"
+            )
+    clipped = meta.notes.get("clipped")
+    if isinstance(clipped, list) and clipped:
+        found["model_clipped"] = (
+            f"the model was identified from a clipped recording ({'; '.join(map(str, clipped))[:200]}): it is wrong "
+            "where the sensor or the amplifier was at its end; record again within their range"
+        )
+    return found
+
+
+def _rate_warning(learner: OnlineModel, limits: Limits) -> dict[str, str]:
+    """A warning where one thread cannot learn as many samples as the stage sends, by a trial of 400 samples."""
+    learner.resync()
+    model = learner.snapshot()
+    dt_s = model.dt_s
+    low, high = limits.y_min_um, limits.y_max_um
+    if not math.isfinite(high - low):
+        return {}
+    t_s = np.arange(_WARM_SAMPLES + 200) * dt_s
+    phase = 2.0 * np.pi * 5.0 * t_s
+    half = 0.3 * (high - low)
+    y, v, a = 0.5 * (low + high) - half * np.cos(phase), half * 31.4 * np.sin(phase), half * 987.0 * np.cos(phase)
+    u_V = model.feedforward(y, v, a, model.rest_memory(float(y[0]))).u_V
+    samples = [Sample(k, float(t_s[k]), float(u_V[k]), float(y[k])) for k in range(len(t_s))]
+    for sample in samples[:200]:
+        learner.handle(sample)
+    begun = time.perf_counter()
+    for sample in samples[200:]:
+        learner.handle(sample)
+    per_s = (len(samples) - 200) / (time.perf_counter() - begun)
+    if per_s * _SUSTAINED >= 1.0 / dt_s:
+        return {}
+    return {
+        "rate_too_high": (
+            f"the stage sends {1.0 / dt_s:.0f} samples/s and one thread learns about {per_s:.0f} here: they will be "
+            "thinned, as the status then says; send fewer, or raise learner.learn_every and learner.filter_every"
+        )
+    }
 
 
 def _with_domain(limits: Limits, meta: BundleMeta) -> Limits:

@@ -8,6 +8,7 @@ the thread of the process. docs/architecture.md lists all threads.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Final, Protocol
 
@@ -16,12 +17,15 @@ from numpy.typing import ArrayLike
 from service.background.retuning.retuner import Retuner
 from service.intake.sample_queue import Job, SampleQueue
 from service.intake.sequence import AHEAD
+from service.intake.thinning import Thinner
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.competing import standing_of
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"
+#: Verdict, in a recording, on samples that were left out because the learner cannot keep up.
+THINNED: Final = "thinned"
 #: Longest time for which the samples that wait are handled at the end, s.
 DRAIN_S: Final = 2.0
 
@@ -154,6 +158,7 @@ class AxisLoop:
         self.watcher = watcher
         self.retuner = retuner
         self.figures = LearnerFigures(axis)
+        self.thinner = Thinner(axis.dt_s, queue.capacity)
         self._announce = announce
         self._on_snapshot = on_snapshot
         self._gate: Gate | None = None
@@ -204,7 +209,26 @@ class AxisLoop:
     # ---- from other threads
 
     def offer(self, batch: SampleBatch) -> bool:
-        """Queue samples for the axis; False if they were dropped because it is too far behind."""
+        """Queue samples for the axis; False if they were dropped because it is too far behind.
+
+        Where the queue fills faster than it is emptied, samples are thinned by a factor that an event states.
+        """
+        if self.thinner.watch(self.queue.waiting, time.monotonic()):
+            self._note_thinning()
+        kept, left_out = self.thinner.split(batch)
+        if left_out is not None and self.sink is not None:
+            self.sink.put_aside(left_out.seq, left_out.t_s, left_out.u_V, left_out.y_um, THINNED)
+        return kept is None or self._queue(kept)
+
+    def _note_thinning(self) -> None:
+        factor = self.thinner.factor
+        if factor == 1:
+            self.axis.note("thinning_ended", "the learner keeps up: all samples are learnt again", factor=1)
+            return
+        detail = f"the learner cannot keep up: it takes one stretch in {factor}, the others are recorded aside"
+        self.axis.note("thinned", detail, factor=factor)
+
+    def _queue(self, batch: SampleBatch) -> bool:
         dropped_before = self.queue.dropped
         if self.queue.put(batch):
             return True

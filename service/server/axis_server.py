@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
+from service.server.health import Health
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, WriteRate, axis_status
@@ -29,6 +31,8 @@ from service.storage.checkpoint import CheckpointFolder, CheckpointKeeper
 
 PRIMARY: Final = "primary"
 STANDBY: Final = "standby"
+#: Period at which the rates of the state are taken, s.
+HEALTH_S: Final = 1.0
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
 #: Longest time for which it waits for the thread that publishes, s.
@@ -101,6 +105,8 @@ class AxisServer:
         self._stale = False
         self._losses = SampleLosses()
         self._write_rate = WriteRate()
+        self._health = Health()
+        self._health_at_s = -math.inf
         self._inputs: list[Any] = []
         self._queryables: list[Any] = []
         self._token: Any = None
@@ -237,6 +243,10 @@ class AxisServer:
             self.loop.watcher.tick(now_s)
         self._update_age(now_s)
         self._look_for_losses(now_s)
+        if now_s - self._health_at_s >= HEALTH_S:
+            self._health_at_s = now_s
+            samples = self.status()["samples"]
+            self._health.update(now_s, samples["received"], samples["dropped"], samples["gates"])
         with self._changing:
             self._publications.tick(now_s)
 
@@ -286,6 +296,7 @@ class AxisServer:
             waiting_points=self._long_queries.waiting_points,
             disk=self._disk(),
             peers={"claims_refused": self.claims_refused, "states_refused": self._answers.states_refused},
+            health=self._health,
         )
 
     def _disk(self) -> dict[str, float | None] | None:

@@ -18,8 +18,10 @@ from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed
 from service.security.refusals import refusal_counters
+from service.server.axis import SampleCounts
 from service.server.axis_loop import AxisLoop
 from service.server.deltas import DeltaStreams
+from service.server.health import Health
 from service.server.learner_supervisor import fingerprint
 from service.server.query_answers import LatencyMeter, QueryAnswers
 
@@ -49,6 +51,7 @@ def axis_status(
     waiting_points: int = 0,
     peers: dict[str, int] | None = None,
     disk: dict[str, float | None] | None = None,
+    health: Health | None = None,
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
@@ -59,7 +62,8 @@ def axis_status(
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
     served, counts, learn = axis.newest, axis.counts, axis.config.learn
-    return {
+    queue_dropped, thinned = queue.dropped, loop.thinner.thinned
+    status = {
         "schema": SCHEMA,
         "wire": VERSION,
         "stage": keys.stage,
@@ -80,8 +84,9 @@ def axis_status(
         "delta_hz": axis.config.delta_hz,
         "sample_age_s": queue.age_s(time.monotonic()),
         "samples": {
-            **counts.samples,
-            "dropped": queue.dropped,
+            **_samples(counts, queue_dropped + thinned),
+            "thinned": thinned,
+            "dropped": queue_dropped,
             "malformed": queue.malformed,
             "waiting": queue.waiting,
             "learnt": counts.gates.get("learnt", 0),
@@ -114,6 +119,23 @@ def axis_status(
         "disk": disk,
         "fingerprint": fingerprint(served.models[learn]) if learn else "",
     }
+    health = health or Health()
+    state, reason = health.state(status, loop.thinner.factor)
+    return {
+        **status,
+        "state": state,
+        "state_reason": reason,
+        "warnings": list(axis.warnings.values()),
+        "rate_per_s": None if health.per_s is None else round(health.per_s, 1),
+        "thinning": loop.thinner.factor,
+    }
+
+
+def _samples(counts: SampleCounts, not_handled: int) -> dict[str, int]:
+    """The counters by order of arrival. Samples that came and were not handled are received, and none of the lost."""
+    samples = counts.samples
+    received, lost = samples["received"] + not_handled, max(0, samples["lost"] - not_handled)
+    return {**samples, "received": received, "lost": lost}
 
 
 #: Time over which the rate of writing is taken, s: some checkpoints.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 from service.cli.options import add_epilog, add_shared
 from service.config.settings import ServeConfig, read_config
@@ -16,6 +18,10 @@ from service.runtime.memory import starting
 from service.runtime.session import check_endpoint, is_loopback
 from service.security.check import has_access_control
 from service.security.refusals import count_refusals
+
+if TYPE_CHECKING:
+    from service.runtime.stopping import StopSignal
+    from service.server.process import Service
 
 EPILOG = """\
 All keys of the configuration: docs/configuration.md.
@@ -36,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--standby", action="store_true", help="run as hot standby: learn the same, and take over when the service dies"
     )
     add_shared(parser, "insecure-beyond-loopback", "duration")
+    add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
     add_epilog(parser, EPILOG)
 
@@ -63,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
         with Service(config, standby=args.standby, stopped=lambda: bool(stop.reason)) as service:
             started()
             _print_ready(service.ready(), args.json)
-            reason = stop.wait(args.duration)
+            quiet = args.quiet or args.json
+            reason = _wait(stop, args.duration, lambda: None if quiet else print(summary(service), flush=True))
             statuses = {axis.keys.axis: axis.status() for axis in service.axes}
     if args.json:
         print(json.dumps({"stopped": reason, "axes": statuses}, default=str), flush=True)
@@ -72,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
             samples, queries = status["samples"], status["queries"]
             print(
                 f"{name}: {samples['received']} samples received, {samples['learnt']} learnt, {samples['lost']} lost "
-                f"in transit, {samples['dropped']} dropped; {queries['count']} queries, {queries['errors']} refused"
+                f"in transit, {samples['thinned']} left out, {samples['dropped']} dropped; {queries['count']} queries, "
+                f"{queries['errors']} refused"
             )
         print(f"stopped: {reason}", flush=True)
     return 0
@@ -99,6 +108,40 @@ def _run_fleet(config: ServeConfig, args: argparse.Namespace, started: Callable[
         samples = status["samples"]
         print(f"{samples['received']} samples of all axes received, {samples['dropped']} dropped; stopped: {reason}")
     return 0
+
+
+#: Period of the line that says how it goes, s.
+SUMMARY_S: Final = 60.0
+
+
+def _wait(stop: StopSignal, duration_s: float | None, say: Callable[[], None]) -> str:
+    """Wait for a signal or for ``duration_s``, with ``say`` every minute; returns the reason."""
+    until = math.inf if duration_s is None else time.monotonic() + duration_s
+    while True:
+        rest_s = until - time.monotonic()
+        reason = stop.wait(min(SUMMARY_S, rest_s))
+        if stop.reason or rest_s <= SUMMARY_S:
+            return reason
+        say()
+
+
+def summary(service: Service) -> str:
+    """One line on all axes: state, rates, errors."""
+    parts = []
+    for axis in service.axes:
+        status = axis.status()
+        samples, quality = status["samples"], status["quality"]
+        error = quality.get("recent_rms_error_pct")
+        words = [
+            f"{axis.keys.axis}: {status['state']}" + (f" ({status['state_reason']})" if status["state_reason"] else ""),
+            f"{status['rate_per_s'] or 0:.0f} samples/s",
+            f"{samples['learnt']} learnt",
+        ]
+        words += [f"{samples[name]} {name}" for name in ("thinned", "dropped", "lost") if samples[name]]
+        words += [f"error {error:.3g} %"] if isinstance(error, float) else []
+        words.append(f"{status['queries']['count']} queries")
+        parts.append(", ".join(words))
+    return f"{time.strftime('%H:%M:%S')} {'; '.join(parts)}"
 
 
 def _print_ready(ready: dict[str, Any], as_json: bool) -> None:

@@ -28,6 +28,12 @@ EPILOG = """\
 """
 
 
+CHECK = """\
+Exit status of --check: 0 every axis is ok; 1 an axis is not ok but answers as before (frozen, thinned, refusing,
+unsure, not learning); 2 usage error; 3 an axis is in trouble, stale or drops samples; 4 no service answers.
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
     add_epilog(parser, EPILOG)
@@ -35,8 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_connection(parser)
     add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
     add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+    add("--check", action="store_true", help="print what needs attention, and exit: a health check, see below")
     add("--once", action="store_true", help="print the table once, and exit")
     add("--period", type=float, default=1.0, metavar="S", help="period of the live table, s (%(default)s)")
+    add_epilog(parser, CHECK)
     add_shared(parser, "duration", json={"help": "print JSON: once an object, live one a line"})
 
 
@@ -51,8 +59,10 @@ def run(args: argparse.Namespace) -> int:
     try:
         standbys = Standbys(session, args.stage, args.axis)
         try:
-            if not args.once:
+            if not args.once and not args.check:
                 return _live(session, standbys, args)
+            if args.check:
+                return _check(_settled(session, args))
             all_answered = time.monotonic() + _STANDBY_PERIOD_S
             found = _settled(session, args)
             time.sleep(max(0.0, all_answered - time.monotonic()))
@@ -63,6 +73,25 @@ def run(args: argparse.Namespace) -> int:
             standbys.undeclare()
     finally:
         session.close()  # type: ignore[no-untyped-call]
+
+
+def _check(found: list[dict[str, Any]]) -> int:
+    """Print what needs attention and return the exit status of `CHECK`."""
+    if not found:
+        print("no service answers")
+        return 4
+    worst = 0
+    for status in found:
+        name = f"{status['stage']}/{status['axis']}"
+        state, reason = str(status.get("state", "unknown")), str(status.get("state_reason", ""))
+        if state == "ok":
+            print(f"{name}: ok")
+            continue
+        # It still answers, safely: a human should look. A wrong sensor or model is more urgent.
+        urgent = bool(status.get("trouble")) or state in ("stale", "dropping")
+        worst = max(worst, 3 if urgent else 1)
+        print(f"{name}: {state}: {reason}")
+    return worst
 
 
 def _live(session: zenoh.Session, standbys: Standbys, args: argparse.Namespace) -> int:

@@ -1,0 +1,60 @@
+"""``dehyst metrics``: the status of all axes for Prometheus."""
+
+from __future__ import annotations
+
+import argparse
+
+from service.cli.options import add_connection, add_epilog, add_shared
+from service.protocol.errors import FieldError
+from service.protocol.keys import check_name
+
+EPILOG = """\
+Grafana: import deploy/grafana-dashboard.json. Names and alarms: docs/monitoring.md.
+
+  dehyst metrics --port 9464
+  curl http://127.0.0.1:9464/metrics
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command, with units in the help."""
+    add_epilog(parser, EPILOG)
+    add = parser.add_argument
+    add_connection(parser)
+    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
+    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+    add("--port", type=int, default=9464, metavar="N", help="port of the page, 0 for a free one (%(default)s)")
+    add("--address", default="127.0.0.1", metavar="IP", help="address to listen at (%(default)s, this machine only)")
+    add("--once", action="store_true", help="print the page once, and exit")
+    add_shared(parser, "duration")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until interrupted. Returns 0. Raises InputError where the package or the port is missing."""
+    for name, given in (("--stage", args.stage), ("--axis", args.axis)):
+        if given != "*":
+            check_name(name, given)
+    if not 0 <= args.port <= 65535:
+        raise FieldError("--port", args.port, "0 to 65535")
+    from service.operating.metrics import page, serve_page
+    from service.operating.remote import statuses
+    from service.runtime.session import open_client
+    from service.runtime.stopping import StopSignal
+
+    stop = StopSignal()
+    session = open_client(args.endpoint, args.wait, args.zenoh_config)
+    try:
+
+        def collect() -> bytes:
+            return page(statuses(session, args.stage, args.axis, args.timeout))
+
+        if args.once:
+            stop.wait(0.5)  # a new session does not know the services at once
+            print(collect().decode(), end="")
+            return 0
+        with serve_page(args.address, args.port, collect) as port:
+            print(f"metrics at http://{args.address}:{port}/metrics", flush=True)
+            print(f"stopped: {stop.wait(args.duration)}", flush=True)
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    return 0

@@ -1,0 +1,149 @@
+"""The state of an axis is ok only while it learns what it is sent; its counters add up under faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adaptive.types import InverseModel
+from service.answers.guard import Limits
+from service.config.settings import AxisConfig
+from service.intake.sample_queue import Arrived
+from service.protocol.keys import Keys
+from service.protocol.samples import SampleBatch
+from service.server.axis_loading import load_axis, make_learner
+from service.server.axis_loop import AxisLoop
+from service.server.health import Health
+from service.server.query_answers import LatencyMeter
+from service.server.status import axis_status
+from service.storage.model_file import Bundle, BundleMeta
+from tests.service.axes import loop_of
+
+DT_S = 1e-3
+
+
+Make = Callable[..., AxisLoop]
+
+
+@pytest.fixture
+def axis_loop(models: dict[str, InverseModel]) -> Make:
+    def make(meta: BundleMeta, **changes: Any) -> AxisLoop:
+        config = replace(AxisConfig("x", Path("x.npz"), Limits(0.0, 9.0, 2000.0), compete=()), **changes)
+        return loop_of(load_axis("demo", config, make_learner, Bundle(models, meta)))
+
+    return make
+
+
+def status_of(loop: AxisLoop, health: Health | None = None) -> dict[str, Any]:
+    return axis_status(Keys("demo", "x"), "i1", loop, LatencyMeter(), health=health)
+
+
+META = BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0, u_min_V=0.0, u_max_V=8.0)
+
+
+def test_limits_narrower_than_the_model_and_a_clipped_recording_are_warned_of_at_the_start(axis_loop: Make) -> None:
+    assert status_of(axis_loop(META))["warnings"] == []
+    wide = replace(META, u_min_V=5.0, u_max_V=120.0, notes={"clipped": ["y_um: flat top at 90"]})
+    loop = axis_loop(wide)
+    narrow, clipped = status_of(loop)["warnings"]
+    assert "limits of 0 to 9 V are narrower than the 5 to 120 V" in narrow
+    assert "flat top at 90" in clipped
+    assert [event["event"] for event in loop.axis.take_events()] == ["limits_narrow", "model_clipped"]
+
+
+def batches(seed: int, n: int) -> list[SampleBatch]:
+    """Messages with doubles, swaps, gaps, NaN and numbers far ahead."""
+    rng = np.random.default_rng(seed)
+    seq = np.arange(n)
+    seq = seq[rng.random(n) > 0.02]
+    y_um = 45.0 + 30.0 * np.sin(2 * np.pi * 3.0 * seq * DT_S)
+    u_V = (y_um - 1.0) / 11.0
+    y_um[rng.random(seq.size) < 0.01] = np.nan
+    order = np.arange(seq.size)
+    order[rng.integers(0, seq.size, 20)] = rng.integers(0, seq.size, 20)
+    seq, y_um, u_V = seq[order], y_um[order], u_V[order]
+    seq[rng.integers(0, seq.size, 3)] += 10**7
+    return [
+        SampleBatch(seq[k : k + 25], seq[k : k + 25] * DT_S, u_V[k : k + 25], y_um[k : k + 25])
+        for k in range(0, seq.size, 25)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_received_is_what_was_learnt_refused_thinned_and_dropped(
+    axis_loop: Make, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = axis_loop(META, queue_samples=300)
+    sent = 0
+    monkeypatch.setattr("service.intake.sample_queue.MOST_TOGETHER", 50)
+    now_s = iter(0.1 * k for k in range(10_000))
+    monkeypatch.setattr("service.server.axis_loop.time", SimpleNamespace(monotonic=lambda: next(now_s)))
+    for number, batch in enumerate(batches(seed, 4000)):
+        # The stage is faster than the learner, which takes some samples now and then.
+        loop.offer(batch)
+        sent += len(batch)
+        if number % 4 == 3 and loop.queue.waiting and isinstance(item := loop.queue.take(), Arrived):
+            loop.handle(item.batch)
+            loop.queue.finish(item, handled=True)
+    # A message longer than the queue is dropped whole.
+    k = np.arange(5000, 15_000)
+    loop.offer(SampleBatch(k, k * DT_S, np.full(k.size, 4.0), np.full(k.size, 45.0)))
+    sent += k.size
+    loop.start()
+    loop.close()
+    samples = status_of(loop)["samples"]
+    assert samples["received"] == sent
+    assert samples["thinned"] > 0
+    assert samples["dropped"] > 0
+    assert sum(samples["gates"].values()) + samples["thinned"] + samples["dropped"] == sent
+    assert samples["lost"] >= 0
+
+
+def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.0) -> Health:
+    health = Health()
+    for k in range(seconds):
+        gates = {name: int(rate * k) for name, rate in per_s.items()}
+        health.update(float(k), sum(gates.values()), int(dropped * k), gates)
+    return health
+
+
+def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
+    loop = axis_loop(META)
+    assert status_of(loop)["state"] == "no samples"
+    loop.offer(batches(0, 25)[0])
+    loop.start()
+    loop.close()
+    base = status_of(loop)
+    good = health_after({"learnt": 100, "passed": 900})
+    assert good.per_s == pytest.approx(1000)
+    assert good.state(base, 1) == ("ok", "")
+    assert good.state(base, 3)[0] == "thinned 1/3"
+    assert "1000 samples/s" in good.state(base, 3)[1]
+    assert health_after({"unexcited": 1000}).state(base, 1)[0] == "ok"
+    refusing = health_after({"learnt": 100, "glitch": 600, "timing": 300})
+    assert refusing.state(base, 1) == ("refusing", "most samples of the last 10 s are not learnt: glitch")
+    assert health_after({"learnt": 1000}, dropped=5.0).state(base, 1)[0] == "dropping"
+    assert good.state({**base, "stale": True}, 1)[0] == "stale"
+    assert good.state({**base, "trouble": "rail"}, 1)[0] == "rail"
+    assert good.state({**base, "learning": None}, 1)[0] == "not learning"
+    assert good.state({**base, "quality": {"valid": 0.0}}, 1)[0] == "unsure"
+
+
+def test_ok_comes_back_when_the_drops_are_over(axis_loop: Make) -> None:
+    loop = axis_loop(META)
+    loop.offer(batches(0, 25)[0])
+    loop.start()
+    loop.close()
+    health, base = Health(), status_of(loop)
+    states = []
+    for k in range(30):
+        health.update(float(k), 1000 * k, 50 if k >= 5 else 0, {"learnt": 1000 * k})
+        states.append(health.state(base, 1)[0])
+    assert states[6] == "dropping"
+    assert states[-1] == "ok"
