@@ -72,7 +72,7 @@ def run(out: Path, config: MirrorConfig, duration_s: float, say: Callable[[str],
     fleet = Fleet([model] * config.actuators, FleetConfig(LearnerConfig(window=WINDOW)))
     start_s = time.perf_counter() - begin
     say(f"identified one actuator; a fleet of {config.actuators} axes started in {start_s:.1f} s")
-    t_s = np.arange(n + 2) * dt
+    t_s: FloatArray = dt * np.arange(n + 2, dtype=np.float64)
     ramp = np.minimum(1.0, t_s / _RAMP_S)[:, None]
     middle_um = _MIDDLE_V * config.stroke_um_per_V
     wave = mirror.strokes(Wavefront(config.side, seed=config.seed + 1).at(t_s))
