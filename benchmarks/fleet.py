@@ -70,12 +70,16 @@ def timed(work: Callable[[], object], device: str) -> float:
 
 
 def naive_s(axes: int, window: int, device: str) -> float:
-    """Seconds to solve for all axes anew; measured on as many as fit into 512 MB."""
-    some = max(1, min(axes, 2**29 // (8 * window * window)))
+    """Seconds to solve for all axes anew; on the processor by one thread, measured on 16 of them."""
+    # With two threads some builds of MKL fail in batched factorisations of 500 rows, and do not return.
+    threads, some = torch.get_num_threads(), min(axes, 16 if device == "cpu" else 128)
+    torch.set_num_threads(1)
     points = torch.rand((some, window, 3), dtype=torch.float64, device=device)
     R = torch.exp(-(torch.cdist(points, points) ** 2)) + 1e-3 * torch.eye(window, dtype=torch.float64, device=device)
     right = torch.rand((some, window, 2), dtype=torch.float64, device=device)
-    return timed(lambda: torch.linalg.solve(R, right), device) * axes / some
+    seconds = min(timed(lambda: torch.linalg.solve(R, right), device) for _ in range(3)) * axes / some
+    torch.set_num_threads(threads)
+    return seconds
 
 
 def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:

@@ -27,6 +27,7 @@ Displacements in µm, errors in percent of the commanded range.
   dehyst demo
   dehyst demo --fast --out out/fast
   dehyst demo --view                 # and watch it in the Rerun viewer
+  dehyst demo --mirror --duration 4  # a mirror of 1024 actuators, learnt as one batch (needs torch; docs/fleet.md)
 """
 
 
@@ -38,6 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--real-time", action="store_true", help="processes over zenoh at 1 kHz (default)")
     how.add_argument("--fast", action="store_true", help="one process, as fast as possible, the same numbers")
+    how.add_argument("--mirror", action="store_true", help="a mirror of many actuators flattens a moving wavefront")
+    add("--side", type=int, default=32, help="actuators along each side of the mirror (%(default)s)")
     add_shared(
         parser,
         duration={"default": 60.0, "help": "length of the run after identification, s (%(default)s)"},
@@ -52,6 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify, run, score, draw. Returns 0, or 1 where samples were lost or nothing was measured."""
+    if args.mirror:
+        return _run_mirror(args)
     from lab.demo import session
 
     if not (math.isfinite(args.duration) and 8.0 <= args.duration <= 86_400.0):
@@ -101,6 +106,36 @@ def _controlled(summary: dict[str, Any]) -> str:
         f"{found['lost']} changes lost and {found['repairs']} repaired; "
         f"{found['extrapolated']} voltages from the reserve of an earlier block"
     )
+
+
+def _run_mirror(args: argparse.Namespace) -> int:
+    """Run the mirror. Returns 0."""
+    if not (math.isfinite(args.duration) and 1.5 <= args.duration <= 3600.0):
+        raise InputError(f"--duration: got {args.duration:g} s, expected 1.5 to 3600 s with --mirror")
+    check_seed(args.seed)
+    from lab.demo import mirror
+    from sim.mirror import MirrorConfig
+
+    stop, show = StopSignal(raising=True), progress_printer(args.quiet)
+
+    def say(text: str) -> None:
+        stop.look()
+        show(text)
+
+    config = MirrorConfig(side=args.side, seed=args.seed)
+    summary = mirror.run(args.out, config, args.duration, say)
+    if args.json:
+        print(json.dumps(summary))
+        return 0
+    for name, said in summary["surface_error"].items():
+        print(
+            f"{name:<11} {said['learnt_rms_nm']:6.1f} nm rms, worst actuator {said['worst_learnt_rms_nm']:.1f} nm; "
+            f"with actuator {summary['dead_actuator']} dead {said['dead_rms_nm']:.1f} nm, far from it "
+            f"{said['far_from_dead_rms_nm']:.1f} nm, at its place {said['at_dead_rms_nm']:.1f} nm"
+        )
+    print(f"troubles: {summary['troubles'] or 'none'}; a step of all axes takes {summary['step_ms']['median']:.1f} ms")
+    print(f"in {args.out}/: mirror.png (maps of the error), worst.png (errors over time), mirror.json")
+    return 0
 
 
 def _result(summary: dict[str, Any], out: Path, seconds: float) -> str:

@@ -284,7 +284,7 @@ class FleetService:
             self._fleet.step(int(batch.seq[i]), float(batch.t_s[i]), u[i], y[i], present[i])
         with self._counting:
             self._waiting -= k
-        return k
+        return int(k)
 
     def _publish_changes(self) -> None:
         """Send the linear parts and frames that have changed since the last time, to those that follow."""
@@ -313,7 +313,7 @@ class FleetService:
             raise FieldError("axis", "nothing", 'JSON with the number of one axis, {"axis": 0}')
         learner = self._fleet.learner_of(axis)
         model = learner.snapshot()
-        return encode_model(LEARN, model, model.seq, learner.memory()), "application/octet-stream"
+        return encode_model(LEARN, model, model.seq, self._fleet.memory()[axis]), "application/octet-stream"
 
     def _status_reply(self, payload: bytes) -> tuple[bytes, str]:
         axis = self._axis_of(payload)
