@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -43,7 +44,9 @@ def ask_long(endpoint: str, go: Path, end: Path, points: int) -> int:
     with Client.connect(endpoint, STAGE, AXIS, timeout_s=_TIMEOUT_S, wait_s=CONNECT_S, retry_s=_TIMEOUT_S) as client:
         client.trajectory(y[:1000], v[:1000], a[:1000])
         print(json.dumps({"ready": True}), flush=True)
-        while not end.exists():
+        # Also where the measurement was killed and cannot say so.
+        parent = os.getppid()
+        while not end.exists() and os.getppid() == parent:
             if not go.exists():
                 time.sleep(_IDLE_S)
                 continue
