@@ -5,7 +5,8 @@ ours. Or it was ready and got no processor: that is the machine. The kernel coun
 (``/proc/PID/task/TID/schedstat``: time on a processor, time ready and waiting for one). `StallWatch` keeps the counts
 of the last second, and when the prober reports a silence it writes what has happened since, the state of each thread
 and the kernel function in which it waits, and lets the services write the Python stacks of all their threads
-(``logs/stacks-PID.txt``, see `lab.testbed.shifted_clock`). Linux only.
+(``logs/stacks-PID.txt``, see `lab.testbed.shifted_clock`), as soon as its main thread gets the interpreter lock. Linux
+only.
 """
 
 from __future__ import annotations

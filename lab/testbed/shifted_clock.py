@@ -7,15 +7,16 @@ process writes the stacks of its threads beside FILE.
 
 from __future__ import annotations
 
-import faulthandler
+import contextlib
 import mmap
 import os
 import signal
 import struct
 import sys
+import threading
 import time
+import traceback
 from pathlib import Path
-from typing import TextIO
 
 _SECONDS = struct.Struct("<d")
 
@@ -42,17 +43,25 @@ def patch_clock(path: Path) -> None:
     time.time_ns = lambda: real_ns() + round(1e9 * offset())
 
 
-def write_stacks_on_signal(folder: Path) -> TextIO:
-    """Let this process append the stacks of all its threads to a file in ``folder`` on SIGUSR2; the open file.
+def write_stacks_on_signal(folder: Path) -> None:
+    """Let this process append the stacks of all its threads to a file in ``folder`` on SIGUSR2.
 
-    It needs no interpreter lock, so that it shows who holds it. The file has a first line as soon as the signal may be
-    sent: before that it would end the process.
+    Not by `faulthandler`: it walks the frames of threads that run meanwhile, and ended a service that way. The file has
+    a first line as soon as the signal may be sent; before that it would end the process.
     """
-    file = stacks_file(folder, os.getpid()).open("a", encoding="utf-8")
-    faulthandler.register(signal.SIGUSR2, file=file, all_threads=True)
-    file.write("Stacks of all threads, one after the other, each time that nobody was answered.\n")
-    file.flush()
-    return file
+    path = stacks_file(folder, os.getpid())
+
+    def write(*_: object) -> None:
+        names = {thread.ident: thread.name for thread in threading.enumerate()}
+        parts = [
+            f"{names.get(number, number)}:\n{''.join(traceback.format_stack(frame))}"
+            for number, frame in sys._current_frames().items()
+        ]
+        with contextlib.suppress(OSError), path.open("a", encoding="utf-8") as file:
+            file.write("\n".join([f"--- {time.monotonic():.3f} s", *parts, ""]))
+
+    signal.signal(signal.SIGUSR2, write)
+    path.write_text("Stacks of all threads, the innermost call last, each time that nobody was answered.\n")
 
 
 def stacks_file(folder: Path, pid: int) -> Path:
@@ -62,7 +71,7 @@ def stacks_file(folder: Path, pid: int) -> Path:
 
 if __name__ == "__main__":
     patch_clock(Path(sys.argv[1]))
-    stacks = write_stacks_on_signal(Path(sys.argv[1]).parent)
+    write_stacks_on_signal(Path(sys.argv[1]).parent)
     from lab.cli import main
 
     sys.exit(main(sys.argv[2:]))
