@@ -8,6 +8,7 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import quote
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -174,21 +175,33 @@ def _part(part: Part, ranges: rrb.VisibleTimeRange) -> rrb.Container | rrb.View:
     return rrb.TextLogView(name=part.name, origin=f"/{part.path}", columns=columns)
 
 
-def viewer_command(port: int, *, headless: bool = False) -> list[str]:
-    """The command that starts a viewer on the loopback interface (Rerun's default is all interfaces)."""
+def viewer_command(port: int, *, headless: bool = False, web_port: int | None = None) -> list[str]:
+    """The command that starts a viewer on the loopback interface (Rerun's default is all interfaces).
+
+    ``web_port`` : serve the viewer as a page for a browser at this port, in place of a window.
+    """
     # The program itself: its Python wrapper would leave a child process behind.
     binary = Path(rr.__file__).parents[1] / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
     command = [
         str(binary), "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen",
         "--memory-limit", VIEWER_MEMORY, "--server-memory-limit", SERVER_MEMORY,
     ]  # fmt: skip
+    if web_port is not None:
+        return [*command, "--serve-web", "--web-viewer-port", str(web_port)]
     return [*command, "--headless"] if headless else command
 
 
-def spawn_viewer(port: int = DEFAULT_PORT, *, headless: bool = False) -> tuple[subprocess.Popen[bytes], str]:
-    """Start a viewer; returns its process and the URL to connect to. It keeps running until it is ended."""
-    process = subprocess.Popen(viewer_command(port, headless=headless), start_new_session=True)
-    return process, f"rerun+http://127.0.0.1:{port}/proxy"
+def spawn_viewer(
+    port: int = DEFAULT_PORT, *, headless: bool = False, web_port: int | None = None
+) -> tuple[subprocess.Popen[bytes], str]:
+    """Start a viewer; returns its process and the URL to stream to. It keeps running until it is ended."""
+    command = viewer_command(port, headless=headless, web_port=web_port)
+    return subprocess.Popen(command, start_new_session=True), f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def page_of(url: str, web_port: int) -> str:
+    """Address of the page that shows what is streamed to ``url``, for a browser on this machine."""
+    return f"http://127.0.0.1:{web_port}/?url={quote(url, safe='')}"
 
 
 # --- Draws a run that was computed: the same scene as live, from arrays.

@@ -27,6 +27,7 @@ LIVE_HISTORY_S = 30.0
 
 EPILOG = """\
   dehyst view --spawn                           # a viewer on this machine
+  dehyst view --web                             # a page for a browser on this machine, without a display here
   dehyst view --rrd run.rrd --duration 5        # a file, for later: rerun run.rrd
 """
 
@@ -62,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"stream to a viewer that already runs (at {DEFAULT_URL} without URL)",
     )
     add("--spawn", action="store_true", help="start a viewer on this machine and stream to it; it stays open")
-    add("--port", type=int, default=9876, help="port of the spawned viewer, loopback only (%(default)s)")
+    add("--web", action="store_true", help="serve Rerun's web viewer and stream to it; ends with this command")
+    add("--port", type=int, default=9876, help="port of the started viewer, loopback only (%(default)s)")
+    add("--web-port", type=int, default=9090, help="port of the page of --web, loopback only (%(default)s)")
     add("--range-um", type=float, metavar="UM", help="range for percentages, µm (span of the reference so far)")
     add(
         "--history",
@@ -76,10 +79,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Stream until a signal, the end of the viewer or of the duration. Returns 0, or 1 if the file is incomplete."""
-    if not (args.rrd or args.connect or args.spawn):
-        raise InputError("rrd, connect, spawn: got none of them, expected at least one; --rrd FILE writes a file")
-    if args.connect and args.spawn:
-        raise InputError("connect, spawn: got both, expected one: --spawn starts the viewer that it streams to")
+    live = [name for name in ("connect", "spawn", "web") if getattr(args, name)]
+    if not (args.rrd or live):
+        raise InputError("rrd, connect, spawn, web: got none of them, expected at least one; --rrd FILE writes a file")
+    if len(live) > 1:
+        raise InputError(
+            f"{', '.join(live)}: got {len(live)} of them, expected one: --spawn and --web start what they stream to"
+        )
     config = ConsumerConfig(
         args.stage, args.axis, args.model, twins(args.twin), changes_s=tuple(args.change_at), batch_s=args.batch
     )
@@ -90,10 +96,12 @@ def run(args: argparse.Namespace) -> int:
     try:
         with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
             url = args.connect
-            if args.spawn:
-                from service.viewer.rerun_sink import spawn_viewer
+            if args.spawn or args.web:
+                from service.viewer.rerun_sink import page_of, spawn_viewer
 
-                viewer, url = spawn_viewer(args.port)
+                viewer, url = spawn_viewer(args.port, web_port=args.web_port if args.web else None)
+                if args.web:
+                    print(f"open in a browser: {page_of(url, args.web_port)}", flush=True)
             name = str(uuid.uuid4())
             if args.rrd:
                 outputs.append(Output(OutputConfig(_scene(args, config, None), rrd=args.rrd, recording_id=name)))
@@ -111,6 +119,9 @@ def run(args: argparse.Namespace) -> int:
     finally:
         # A file gets all the time that a slow disk may need; a viewer may be gone.
         finished = [(output.config, output.close(60.0 if output.config.rrd else 5.0)) for output in outputs]
+        if args.web and viewer is not None:
+            viewer.terminate()
+            viewer.wait(5.0)
     lost_file = any(c.rrd and not ok for c, ok in finished)
     drawn = all(ok for _, ok in finished)
     if args.json:
@@ -151,8 +162,8 @@ def _wait(stop: StopSignal, duration_s: float | None, viewer: subprocess.Popen[b
         if viewer is not None and viewer.poll() is not None:
             if viewer.returncode != 0:
                 raise ServiceError(
-                    f"the viewer ended with status {viewer.returncode}: is there a display and a graphics driver? "
-                    "--rrd FILE needs neither"
+                    f"the viewer ended with status {viewer.returncode}: is there a display and a graphics driver, and "
+                    "is its port free? --web needs no display, --rrd FILE needs neither"
                 )
             if alone:
                 return

@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import time
+import urllib.request
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from adaptive.types import FloatArray
 from service.viewer.output import Output, OutputConfig
 from service.viewer.records import Diagnostics, Event, Record, SceneConfig, Status, Tracking
 from service.viewer.rerun_sink import write_recording
+from tests.service.conftest import unused_port
 
 MODELS = ("lssvm_adaptive", "linear")
 
@@ -194,3 +196,27 @@ def test_a_spawned_viewer_is_there_and_bound_to_this_machine() -> None:
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     said = subprocess.run([command[0], "--version"], capture_output=True, text=True, timeout=30)
     assert said.stdout.startswith("rerun-cli 0.41")
+
+
+def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:
+    from service.viewer.rerun_sink import page_of, spawn_viewer, viewer_command
+
+    port, web_port = unused_port(), unused_port()
+    command = viewer_command(port, web_port=web_port)
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
+    viewer, url = spawn_viewer(port, web_port=web_port)
+    try:
+        until = time.monotonic() + 30.0
+        while True:
+            try:
+                with urllib.request.urlopen(page_of(url, web_port), timeout=5.0) as page:
+                    text = page.read().decode()
+                break
+            except OSError:
+                assert viewer.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.1)
+    finally:
+        viewer.terminate()
+        viewer.wait(10.0)
+    assert "rerun" in text.lower()
