@@ -156,7 +156,8 @@ def identify_one(
     if name == "linear":
         return fit_linear(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     if name == "bouc_wen":
-        return fit_bouc_wen(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
+        # Its fit simulates the stage many times, from rest on: of a recording of many minutes the beginning must do.
+        return fit_bouc_wen(u_thin[:most], y_thin[:most], dt_thin, serve_dt_s=dt_s)[0]
     if name == "mpi":
         return fit_mpi(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     inputs = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
