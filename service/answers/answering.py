@@ -219,7 +219,7 @@ def answer(
     if query.pending is not None:
         check_domain(query.pending.y_um, limits, "pending.y_um")
         check_voltages(query.pending.u_V, limits, "pending.u_V")
-        check_near(query.pending, None if age_s is None else handled + math.ceil(age_s / model.dt_s), model.dt_s)
+        check_count(query.pending)
     memory, y_um, v_um_per_s, a_um_per_s2 = query.memory, query.y_um, query.v_um_per_s, query.a_um_per_s2
     resumes_V = math.nan
     if memory is None:
@@ -279,24 +279,15 @@ def under_way(
     return way, (y_um, v_um_per_s, a_um_per_s2, float(pending.u_V[-1]))
 
 
-def check_near(pending: Pending, now: int | None, dt_s: float) -> None:
-    """Raise InputError where what is under way begins far ahead of sample ``now``, where the stage is by the clock.
-
-    ``now`` None: no sample has come since the start, so that the end of all counts alone bounds it.
-    """
-    last = pending.first + pending.y_um.size - 1
-    if last > MAX_SEQ:
+def check_count(pending: Pending) -> None:
+    """Raise InputError where what is under way would go beyond the largest number of a sample."""
+    if pending.first + pending.y_um.size - 1 > MAX_SEQ:
         raise FieldError("pending.first", pending.first, f"at most 2**62 - {pending.y_um.size - 1}")
-    if now is None:
-        return
-    most = now + 1 + math.ceil(AHEAD_S / dt_s) + MAX_PENDING
-    if pending.first > most:
-        raise FieldError(
-            "pending.first",
-            pending.first,
-            f"at most {most}: the stage is at sample {now}",
-            "count as the stage does, and begin at snapshot_seq + 1",
-        )
+
+
+def most_ahead(handled: int, age_s: float, dt_s: float) -> int:
+    """The largest number at which what is under way plausibly begins, when sample ``handled`` came ``age_s`` s ago."""
+    return handled + math.ceil(age_s / dt_s) + 1 + math.ceil(AHEAD_S / dt_s) + MAX_PENDING
 
 
 def carried(model: InverseModel, memory: FloatArray, way: Pending | None) -> FloatArray:

@@ -21,7 +21,7 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
-from service.answers.answering import MemoryTracker, Served, answer, blends, learns
+from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
 from service.answers.guard import Limits
 from service.answers.slices import Pace
 from service.background.retuning.adoption import Retuned
@@ -64,6 +64,7 @@ LEVELS: Final = {
     "standby_refused": logging.WARNING,
     "standby_differed": logging.WARNING,
     "claim_ignored": logging.WARNING,
+    "under_way_ahead": logging.WARNING,
 }
 #: Events that wait for the publisher; of a flood only the newest are kept.
 _KEPT: Final = 256
@@ -215,6 +216,9 @@ class Axis:
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
         self.counts = SampleCounts(-1, self.sequence.counters(), {})
         self._age_s: float | None = None
+        #: Queries whose samples under way began far ahead of the stage; and whether the last one did.
+        self.far_ahead = 0
+        self._far_ahead = False
         if template is None:
             template = {} if learner is None else learner.state_dict()
         sizes = {name: memory.size for name, memory in self.newest.memories.items()}
@@ -278,7 +282,21 @@ class Axis:
         ``pace`` : evaluate in slices, all from one snapshot, with this between them (`service.answers.slices`).
         """
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
-        return answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
+        got = answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
+        if query.pending is not None and self._age_s is not None:
+            self._look_ahead(query.pending.first, most_ahead(handled, self._age_s, self.dt_s))
+        return got
+
+    def _look_ahead(self, first: int, most: int) -> None:
+        """Tell of a controller whose count is far ahead of the stage's. It gets its answer: the stage's counter may
+        have jumped, which samples will show later."""
+        if first <= most:
+            self._far_ahead = False
+            return
+        self.far_ahead += 1
+        if not self._far_ahead:
+            self._far_ahead = True
+            self.note("under_way_ahead", f"a controller's voltages begin at sample {first}, the stage is before {most}")
 
     def model(self, name: str, served: Served | None = None) -> tuple[InverseModel, int, FloatArray]:
         """(model, snapshot_seq, tracked memory) of a snapshot, or the newest. Raises InputError on an unknown name."""

@@ -101,6 +101,7 @@ def axis_status(
             **latency.summary(),
             "max_points": axis.config.query_points,
             "waiting_points": waiting_points,
+            "far_ahead": axis.far_ahead,
         },
         "diagnosis": None if loop.watcher is None else loop.watcher.status(),
         "refused": refusal_counters(),

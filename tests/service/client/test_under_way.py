@@ -203,22 +203,28 @@ def test_a_client_that_says_when_its_points_are_due(shared_service: Any) -> None
             client.point(40.0, begin=first, memory=one.memory)
 
 
-def test_what_begins_far_ahead_of_the_stage_is_refused(models: dict[str, InverseModel]) -> None:
+def test_what_begins_far_ahead_of_the_stage_is_answered_and_told(models: dict[str, InverseModel]) -> None:
+    """The stage's counter may have jumped; the answer goes on from the snapshot, and nobody can miss it."""
     axis = make_axis(models)
     for part in parts(recording(1001), 20):
         axis.handle(part)
 
-    def ask(first: int) -> None:
-        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(first, np.array([40.0]), np.array([4.0]))))
+    def ask(first: int) -> FloatArray:
+        query = FeedforwardQuery(*motion(0, 1), pending=Pending(first, np.array([40.0]), np.array([4.0])))
+        return axis.answer(query).u_V
 
     ask(100_000)  # nothing has come since the start: the stage may be anywhere
     axis.update_age(0.0)
-    ask(1001 + 1000 + 4096)
-    for first in (1001 + 1000 + 4097, 100_000, 2**62):
-        with pytest.raises(FieldError) as refused:
-            ask(first)
-        assert refused.value.field == "pending.first"
+    near = ask(1001 + 1000 + 4096)
+    assert axis.far_ahead == 0
+    axis.take_events()
+    for first in (1001 + 1000 + 4097, 100_000, 2**61):
+        assert np.array_equal(ask(first), near)
+    assert axis.far_ahead == 3
+    assert [event["event"] for event in axis.take_events()] == ["under_way_ahead"]
     axis.update_age(60.0)  # while no samples come, the controller goes on commanding
     ask(61_000)
-    with pytest.raises(FieldError):
-        ask(100_000)
+    assert axis.far_ahead == 3
+    with pytest.raises(FieldError) as refused:
+        ask(2**62 + 1)
+    assert refused.value.field == "pending.first"
