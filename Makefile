@@ -8,6 +8,7 @@ SEED   ?= 0
 PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
           tests/hidden tests/lab/reproduce tests/lab/test_scenarios.py tests/lab/rehearsal \
           tests/benchmarks/test_house_bench.py \
+          tests/lab/demo/test_mirror.py \
           $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_sensor_faults.py test_voltages.py) \
           $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
           background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
@@ -16,10 +17,10 @@ PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/base
           server/test_long_queries.py server/test_model_watch.py \
           storage/test_stored_files.py viewer/test_scene.py)
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
-PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py) \
+PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py) \
           $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
           viewer/test_sink.py viewer/test_live.py operating security server/test_process.py storage/test_recorder.py \
-          stage_node)
+          stage_node fleet adapters client/test_fair.py client/test_thin.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
 
