@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -59,6 +59,8 @@ class FleetSnapshot:
     kernel_V2: Tensor
     domain: Tensor
     bounded: Tensor
+    #: (p, p) covariance of the linear part, V², by axis: of the identified models that are served.
+    covariances: dict[int, Tensor] = field(default_factory=dict)
 
     @property
     def memory_size(self) -> int:
@@ -98,6 +100,8 @@ class FleetSnapshot:
             held = torch.minimum(torch.maximum(mean, known - c.allowed_V), known + c.allowed_V)
             nearest = column.amax(1)
             variance = self.noise_V2 + self.kernel_V2 * (1.0 - shrink * nearest * nearest)
+            for axis, covariance in self.covariances.items():
+                variance[axis] += basis[axis] @ covariance @ basis[axis]
             within = ((now >= low - margin) & (now <= high + margin)).all(1)
             out.append((torch.where(self.bounded, held, mean), variance.clamp(min=0.0).sqrt(), within))
         u, std, inside = (torch.stack(part, 1).cpu().numpy() for part in zip(*out, strict=True))
@@ -163,5 +167,7 @@ def _fill(made: FleetSnapshot, axis: int, model: LssvmInverse, keep_noise: bool 
     made.inverse_widths[axis] = torch.as_tensor(1.0 / model.widths)
     made.gamma[axis], made.kernel_V2[axis] = model.gamma, model.kernel_variance
     made.gain[axis], made.offset_um[axis] = model.features.gain, model.features.offset_um
+    if model.beta_covariance.size:
+        made.covariances[axis] = torch.as_tensor(model.beta_covariance.copy()).to(made.beta.device)
     if not keep_noise:
         made.noise_V2[axis] = model.noise_variance

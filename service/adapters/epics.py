@@ -142,7 +142,8 @@ class EpicsAxis:
         variable = self._variables[name]
         if value is None:
             value = variable.current().raw.value
-        variable.post(value, timestamp=time.time(), severity=severity, message=message[:80])
+        stamp_unix_s = time.time()
+        variable.post(value, timestamp=stamp_unix_s, severity=severity, message=message[:80])
 
     def _freeze(self, on: bool) -> None:
         operate(self._session, self._keys, "freeze" if on else "thaw", "epics", timeout_s=self._timeout_s)

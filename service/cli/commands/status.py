@@ -25,10 +25,8 @@ _STANDBY_PERIOD_S = 1.2
 EPILOG = """\
   dehyst status                   # a live table; Ctrl-C ends it
   dehyst status --once --json
-"""
+  dehyst status --check           # for a watchdog: see the exit status
 
-
-CHECK = """\
 Exit status of --check: 0 every axis is ok; 1 an axis is not ok but answers as before (frozen, thinned, refusing,
 unsure, not learning); 2 usage error; 3 an axis is in trouble, stale or drops samples; 4 no service answers.
 """
@@ -44,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--check", action="store_true", help="print what needs attention, and exit: a health check, see below")
     add("--once", action="store_true", help="print the table once, and exit")
     add("--period", type=float, default=1.0, metavar="S", help="period of the live table, s (%(default)s)")
-    add_epilog(parser, CHECK)
     add_shared(parser, "duration", json={"help": "print JSON: once an object, live one a line"})
 
 

@@ -57,7 +57,7 @@ def motion(first: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 
 def ask(session: zenoh.Session, key: str, payload: bytes = b"") -> Any:
     """The reply to a query: its bytes, or what a refusal says as a dictionary."""
-    reply = next(iter(session.get(key, payload=payload, timeout=5.0)))
+    reply = next(iter(session.get(key, payload=payload, timeout=60.0)))  # the first one compiles
     return reply.ok.payload.to_bytes() if reply.ok is not None else json.loads(reply.err.payload.to_bytes())
 
 

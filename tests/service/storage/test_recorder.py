@@ -162,9 +162,9 @@ def test_a_full_queue_drops_and_counts_and_never_blocks(tmp_path: Path, monkeypa
     hold = threading.Event()
     write = Journal.write
 
-    def slow(self: Journal, rows: Rows, index: np.ndarray) -> None:
+    def slow(self: Journal, rows: Rows, index: np.ndarray) -> int:
         hold.wait(10.0)
-        write(self, rows, index)
+        return write(self, rows, index)
 
     monkeypatch.setattr(Journal, "write", slow)
     recorder = Recorder(config(tmp_path, queue_samples=500))
