@@ -47,12 +47,12 @@ def test_faults_follow_one_another_with_time_to_recover(seed: int, duration_s: f
 
 
 def test_what_ends_a_service_comes_early_in_a_long_run() -> None:
-    plan = make_plan(1800.0, 1, tuple(FAULT_KINDS))
+    plan = make_plan(2400.0, 1, tuple(FAULT_KINDS))
     assert not plan.left_out
     ends = [fault.at_s for fault in plan.faults if FAULT_KINDS[fault.kind].ends_service]
     assert len(ends) >= 4
-    assert max(ends) <= 0.4 * 1800.0
-    assert make_plan(1800.0, 2, tuple(FAULT_KINDS)).faults != plan.faults
+    assert max(ends) <= 0.4 * 2400.0
+    assert make_plan(2400.0, 2, tuple(FAULT_KINDS)).faults != plan.faults
     gains = [fault.value for fault in plan.faults if fault.kind == "gain"]
     assert gains[0] < 0.0 == gains[1], "there and back again"
 
