@@ -136,7 +136,9 @@ def main() -> None:
     parser.add_argument("--backend", default="auto", choices=["auto", "compiled", "torch"], help="see docs/fleet.md")
     parser.add_argument("--form", default="auto", choices=["auto", "inverse", "cholesky"], help="of the windows")
     parser.add_argument("--threads", type=int, default=2, help="that share the axes of a compiled step")
-    parser.add_argument("--before", type=int, default=150, help="samples before the measured ones")
+    parser.add_argument(
+        "--before", type=int, default=700, help="samples before the measured; windows learn from 600 on"
+    )
     parser.add_argument("--steps", type=int, default=200, help="measured samples")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

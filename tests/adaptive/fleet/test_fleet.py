@@ -119,7 +119,7 @@ def test_each_axis_equals_the_single_learner(models: list[LssvmInverse]) -> None
         }
     # The comparison has seen what it is for.
     total = {name: sum(single.counters()[name] for single in singles) for name in singles[0].counters()}
-    wanted = ("glitch", "jumps", "trials", "bursts", "unexcited", "not_finite", "gap")
+    wanted = ("glitch", "jumps", "trials", "bursts", "unexcited", "not_finite", "gap", "duplicate")
     assert [name for name in wanted if not total[name]] == []
 
 
