@@ -78,8 +78,8 @@ PRIOR_FREE, PRIOR_MOTION, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRI
 CORRELATION_S = 0.02
 #: Largest gamma for the residual of a linear part. The evidence takes the rows for independent, but the residual of one
 #: pass is smooth in time even where the next pass has another one. Left alone it fits each pass with narrow kernels and
-#: a large gamma, and the kernel part is then wrong on other motion. Below 6, stated deviations outside the learnt range
-#: become too small.
+#: a large gamma, and the kernel part is then wrong on other motion. At 6 and below, stated deviations
+#: outside the learnt range become too small.
 GAMMA_MAX = 8.0
 #: Smallest model error assumed for the linear part, as a share of the voltage range.
 ERROR_FLOOR = 5e-4

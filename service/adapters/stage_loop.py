@@ -16,7 +16,7 @@ from adaptive.types import FloatArray
 from service.adapters.adapter import AdapterError, StageAdapter, Ticks, asked, check_range
 from service.client.client import Client
 from service.protocol.errors import FieldError
-from service.stage_node.exchange import MAX_MESSAGE, RING_SIZE, CommandBuffer, Sender
+from service.stage_node.exchange import RING_SIZE, CommandBuffer, Sender, next_message
 
 #: (sample number, reading at that instant, µm) -> voltage from that instant on, V.
 Control = Callable[[int, float], float]
@@ -77,12 +77,8 @@ class SampleLog:
     def send(self) -> bool:
         """Send what waits, at most `MAX_MESSAGE` samples in one message. Returns whether more is left."""
         end = self.written
-        # The slots that the loop writes next are left alone.
-        oldest = end - KEPT + MAX_MESSAGE
-        if self._sent < oldest:
-            self.lost += oldest - self._sent
-            self._sent = oldest
-        n = min(end - self._sent, MAX_MESSAGE)
+        self._sent, n, lost = next_message(self._sent, end, KEPT)
+        self.lost += lost
         if n <= 0:
             return False
         slots = np.arange(self._sent, self._sent + n) % KEPT

@@ -100,6 +100,13 @@ RING_SIZE: Final = 32_768
 MAX_MESSAGE: Final = 4096
 
 
+def next_message(sent: int, written: int, size: int) -> tuple[int, int, int]:
+    """(first, n, lost) of the next message from a ring of ``size`` slots: its first sample, its length, and how many
+    samples before it were overwritten. The slots that the loop writes next are left alone."""
+    lost = max(0, written - size + MAX_MESSAGE - sent)
+    return sent + lost, min(written - sent - lost, MAX_MESSAGE), lost
+
+
 class SampleRing:
     """Samples by number, written by one thread and sent by another.
 
@@ -139,11 +146,8 @@ class SampleRing:
     def send(self) -> bool:
         """Send what waits, at most ``MAX_MESSAGE`` samples in one message. Returns whether more is left."""
         end = self._written
-        oldest = end - RING_SIZE + MAX_MESSAGE
-        if self._sent < oldest:
-            self.lost += oldest - self._sent
-            self._sent = oldest
-        n = min(end - self._sent, MAX_MESSAGE)
+        self._sent, n, lost = next_message(self._sent, end, RING_SIZE)
+        self.lost += lost
         if n <= 0:
             return False
         seq = np.arange(self._sent, self._sent + n, dtype=np.int64)
