@@ -163,6 +163,15 @@ def slope_of(x: FloatArray, y: FloatArray) -> Slope:
     return Slope(slope, float(y.mean() - slope * x.mean()), std, math.sqrt(left / n), share, math.sqrt(xx / n))
 
 
+def correlated(left: FloatArray) -> float:
+    """Factor of the deviation of a slope whose (n,) residuals are smooth, as from ringing or a drift; at least 1.
+
+    Values of an autoregression of first order count for fewer than they are.
+    """
+    alike = min(max(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300), 0.0), 0.99)
+    return math.sqrt((1.0 + alike) / (1.0 - alike))
+
+
 #: Fewest readings in a row at the expected level that end a hold.
 BACK_AGAIN = 2
 #: Most samples without a reading, or with a repeated one, that dead reckoning bridges.
@@ -184,8 +193,9 @@ SPAN_S = 0.008
 WINDOWS = (28, 16)
 #: A reading that repeats for this time, s, while the stage moves is a fault and not a lost sample.
 STUCK_S = 0.1
-#: Time for which readings must be at the expected level, s.
-CALM_S = 0.005
+#: Time for which readings must be at the expected level, s, and the same within ``UNDECIDED_S`` of ringing: one half
+#: swing lies within the tolerance.
+CALM_S, CALM_RINGING_S = 0.005, 0.01
 #: A drift may begin at no more than this share of its present level. A larger first reading is still allowed if the
 #: drift is at most this many times faster than a change of gain would be from the motion of the stage.
 BEGUN, WITH_STAGE = 0.6, 2.0
@@ -353,7 +363,8 @@ def judge(hold: Hold, now: Circumstances) -> Verdict:
         hold.good += 1
         # Two samples or fewer: the voltage explains the motion, or a single reading was wrong; no need to wait. Later,
         # readings must stay for CALM_S, because a ringing stage passes the expected level again and again.
-        enough = max(BACK_AGAIN, round(CALM_S / now.dt_s))
+        rings = hold.rang and (n - hold.rang) * now.dt_s <= UNDECIDED_S
+        enough = max(BACK_AGAIN, round((CALM_RINGING_S if rings else CALM_S) / now.dt_s))
         return Verdict.BACK if hold.good >= enough or n <= 2 else Verdict.WAIT
     hold.good = 0
     hold.seen_um = max(hold.seen_um, abs(away_um))
@@ -482,8 +493,9 @@ def _follow(hold: Hold, count: int, now: Circumstances, share: float = MOTION_SH
     if x.size < 6 or np.ptp(x) < max(share * now.range_um, 8.0 * now.noise_um):
         return True
     s = slope_of(x, y)
+    std = s.std * correlated(y - s.slope * x - s.constant)
     low, high = FOLLOWING
-    return not (s.slope + 4.0 * s.std < low or s.slope - 4.0 * s.std > high)
+    return not (s.slope + 4.0 * std < low or s.slope - 4.0 * std > high)
 
 
 def jump_after(frame: FeatureMap, at_um: float, away_um: float) -> tuple[float, float]:

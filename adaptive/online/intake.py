@@ -13,12 +13,9 @@ the hysteresis memory.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from math import nan
-
-import numpy as np
 
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
@@ -71,46 +68,6 @@ def _parts_of(
     )
 
 
-# --- Voltages of samples without a good reading, and an estimate for missing samples.
-
-
-#: Most samples without a good reading whose voltages are kept.
-MOST_LOGGED = MOST_BRIDGED
-
-
-class _VoltageLog:
-    """Pairs (seq, voltage in V) of the samples without a good reading since the last one taken."""
-
-    def __init__(self) -> None:
-        self._kept: deque[tuple[int, float]] = deque(maxlen=MOST_LOGGED)
-
-    def put(self, sample: Sample) -> None:
-        """Keep the voltage of a sample whose reading is not used: the stage moves all the same."""
-        self._kept.append((sample.seq, sample.u_V))
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._kept.clear()
-
-    def missed(self, gates: AdmissionState, sample: Sample, max_gap: int) -> tuple[list[float], bool]:
-        """Voltages, V, of the samples without a reading before ``sample``, and whether too many are missing."""
-        first, missing = gates.seq + 1, sample.seq - gates.seq - 1
-        heard = {seq: u for seq, u in self._kept if seq < sample.seq}
-        # The voltages of missing samples are unknown: interpolate.
-        slope_V = (sample.u_V - gates.u_V) / (missing + 1)
-        between = [heard.get(first + i, gates.u_V + slope_V * (i + 1)) for i in range(min(missing, MOST_LOGGED))]
-        return between, missing > MOST_LOGGED or missing - len(heard) > max_gap
-
-    def array(self) -> FloatArray:
-        """(n, 2) pairs, for a file."""
-        return np.array(self._kept, dtype=np.float64).reshape(-1, 2)
-
-    def restore(self, pairs: Iterable[Iterable[float]]) -> None:
-        """Inverse of ``array``."""
-        self._kept.clear()
-        self._kept.extend((int(seq), float(u)) for seq, u in pairs)
-
-
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
 #: A reading further from the middle of the range than this many ranges is out of range.
@@ -126,9 +83,10 @@ KNOWN = 0.05
 PAST_SHARE = 0.02
 #: Age of a place that is certainly from before a fault that is detected now, s.
 CLEAN_S = 0.06
-#: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with;
-#: time from one to the next while it has full credit, and while not, s; windows after which one has shown nothing.
-CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 2, 5.0, 0.3, 4
+#: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with,
+#: so that a model that was never right judges none; time from one to the next while it has full credit, and while not,
+#: s; windows after which one has shown nothing.
+CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 5.0, 0.3, 4
 
 Model = Callable[[], LssvmInverse]
 
@@ -161,7 +119,6 @@ class Intake:
         self._hold: Hold | None = None
         self._trial: Trial | None = None
         self._lost = True  # The smoother has to start again.
-        self._voltages = _VoltageLog()
         self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
@@ -175,6 +132,7 @@ class Intake:
         # credit: without credit the model may not judge the sensor. Samples until the next control trial.
         self._control: Trial | None = None
         self._credit, self._until_control = FIRST_CREDIT, 0
+        self._reckoned_seq = -1  # The last sample that has advanced the place, with a reading or without.
         self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
         # Places from before the last steps in which the readings followed the drive, the older one first.
         self._pasts: list[Past] = []
@@ -197,9 +155,9 @@ class Intake:
     def resync(self) -> None:
         """Forget the sequence: the next sample is taken whatever its number."""
         self.gates = admission.AdmissionState()
+        self._reckoned_seq = -1
         self._hold, self._trial, self._lost = None, None, True
         self._proven = self._proven_past = None
-        self._voltages.clear()
         self._forget()
 
     def _forget(self) -> None:
@@ -232,28 +190,30 @@ class Intake:
         """
         self._doubt_V = doubt_V
         c, gates, track = self._admission, self.gates, self.track
-        refused = admission.check_sample(c, gates, sample, self.dt_s)
-        if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
-            refused = admission.OUT_OF_RANGE
+        refused = self._refusal(sample)
         if refused:
-            if gates.seq >= 0 and not admission.check_sample(c, gates, replace(sample, y_um=0.0), self.dt_s):
-                self._voltages.put(sample)
-            return Taken(refused)
-        missing = sample.seq - gates.seq - 1 if gates.seq >= 0 else 0
-        between, gone = self._voltages.missed(gates, sample, c.max_gap) if missing else ([], False)
-        self._voltages.clear()
+            if gates.seq < 0 or self._refusal(replace(sample, y_um=self._middle_um)):
+                return Taken(refused)
+            # Only the reading is wrong. The stage moves all the same: the sample is one without a reading.
+            sample = replace(sample, y_um=nan)
+        missing = sample.seq - self._reckoned_seq - 1 if gates.seq >= 0 else 0
+        between = self._missed_V(sample.u_V, missing)
         for u in (*between, sample.u_V):
             admission.watch_voltage(c, gates, u, self.base.span_V)
-        gates.take(sample, 1 + missing)
+        if not refused:
+            gates.take(sample, sample.seq - gates.seq if gates.seq >= 0 else 1)
+        self._reckoned_seq = sample.seq
         if self._trial is not None:
-            # Missing samples count as no motion; the readings correct the reckoning later.
-            for u in between:
-                self._trial.put(u, nan, self._circumstances(0.0))
-            return self._try(self._trial, sample)
-        if track is None or self._lost or gone or (missing and track.motion is None):
+            return self._try(self._trial, sample, between, refused)
+        if track is None or self._lost or missing > c.max_gap or ((missing or refused) and track.motion is None):
+            if refused:
+                self._lost = True
+                return Taken(refused)
             return self._restart(sample, admission.GAP if missing else admission.SETTLING)
         for u in between:
             self._keep(track, model, u, nan)
+        if refused:
+            return self._without_reading(self._keep(track, model, sample.u_V, nan), refused)
         stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
         known = track.motion is not None and gates.since_start > c.settle
@@ -270,6 +230,31 @@ class Intake:
         # Dead reckoning knows the motion that a kink of the voltage causes; only the smoother does not.
         limit -= admission.KINK_SHARE * gates.kink_V / self.base.span_V
         return self._decide(sample, track, self._keep(track, model, sample.u_V, sample.y_um), limit)
+
+    def _refusal(self, sample: Sample) -> str:
+        """The gate that refuses a sample for what it is, or ""."""
+        refused = admission.check_sample(self._admission, self.gates, sample, self.dt_s)
+        if not refused and sample.seq <= self._reckoned_seq:
+            # A sample without a reading has come in its place already, or in that of a later one.
+            return admission.DUPLICATE if sample.seq == self._reckoned_seq else admission.OUT_OF_ORDER
+        if not refused and abs(sample.y_um - self._middle_um) > FAR_OUT * self.range_um:
+            return admission.OUT_OF_RANGE
+        return refused
+
+    def _missed_V(self, u_V: float, missing: int) -> list[float]:
+        """Voltages of ``missing`` samples before one with ``u_V``, V: interpolated, as they are unknown."""
+        before_V = self.gates.u_V
+        slope_V = (u_V - before_V) / (missing + 1)
+        return [before_V + slope_V * (i + 1) for i in range(min(missing, MOST_BRIDGED))]
+
+    def _without_reading(self, hold: Hold, refused: str) -> Taken:
+        """A held sample whose reading was refused; after too many, the next reading begins anew."""
+        if len(hold.y_um) < MOST_BRIDGED:
+            return Taken(refused)
+        if self._judges:
+            return self._begin_trial(hold.reckoning)
+        self._hold, self._lost = None, True
+        return Taken(refused)
 
     def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
@@ -479,8 +464,12 @@ class Intake:
             return None
         if self._hold is not None:
             reckoning = self._hold.reckoning
+        elif self._pasts:
+            reckoning = self._from_past(track, model())
+            # What was learnt since is about to be taken back: the place is reckoned once more then.
+            self._proven_past = self._proven_past or self._clean_past()
         else:
-            reckoning = self._from_past(track, model()) if self._pasts else self._begin_hold(track, model()).reckoning
+            reckoning = self._begin_hold(track, model()).reckoning
         return self._begin_trial(reckoning)
 
     def _begin_trial(self, reckoning: Reckoning) -> Taken:
@@ -503,9 +492,17 @@ class Intake:
         self._forget()
         return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
 
-    def _try(self, trial: Trial, sample: Sample) -> Taken:
-        """One sample of a sensor on trial."""
+    def _try(self, trial: Trial, sample: Sample, between: list[float], refused: str) -> Taken:
+        """One sample of a sensor on trial, after missing ones with the voltages ``between``, V.
+
+        ``refused`` : the gate that refused its reading, or "".
+        """
         fault = trial.fault
+        # Samples without a reading advance the reckoning alone.
+        for u in between if not refused else (*between, sample.u_V):
+            trial.put(u, nan, self._circumstances(0.0))
+        if refused:
+            return Taken(refused)
         decision = trial.put(sample.u_V, sample.y_um, self._circumstances(0.0))
         if decision.outcome is Outcome.OPEN:
             return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
@@ -530,7 +527,7 @@ class Intake:
     def reckon_by(self, model: LssvmInverse) -> None:
         """``model`` is served while readings are on trial: reckon the place with the same model.
 
-        After jumps that were taken back the place is reckoned again from before the first of them.
+        The place is reckoned again from one at which the readings followed, or from before jumps that were taken back.
         """
         past, self._proven_past = self._proven_past, None
         if self._trial is None or self.track is None:
@@ -578,7 +575,6 @@ class Intake:
             or self._proven is not None
             or self._proven_past is not None
             or self.on_probation
-            or self._voltages.array().size
         )
 
     # ---- what it teaches
@@ -664,7 +660,6 @@ class Intake:
         if self._proven_past is not None:
             state |= prefixed("proven_past.", self._proven_past.state_dict())
         state |= {
-            "heard": self._voltages.array(),
             "lost": self._lost,
             "jump_um": self._jump_um,
             "calm": self._calm,
@@ -672,6 +667,7 @@ class Intake:
             "credit": self._credit,
             "until_control": self._until_control,
             "look_from": self._look_from,
+            "reckoned_seq": self._reckoned_seq,
         }
         if self._control is not None:
             state |= prefixed("control.", self._control.state_dict())
@@ -688,11 +684,11 @@ class Intake:
         self._credit = int(state.get("credit", FIRST_CREDIT))
         self._until_control = int(state.get("until_control", 0))
         self._look_from = int(state.get("look_from", 0))
+        self._reckoned_seq = int(state.get("reckoned_seq", self.gates.seq))
         proven = under("proven.", state)
         self._proven = FeatureMap.from_state(proven) if proven else None
         past = under("proven_past.", state)
         self._proven_past = Past.from_state(past) if past else None
-        self._voltages.restore(state["heard"])
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
         self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))

@@ -33,7 +33,7 @@ import numpy as np
 
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
-from adaptive.online.glitch_or_jump import Circumstances, Slope, slope_of, tolerance_um
+from adaptive.online.glitch_or_jump import Circumstances, Slope, correlated, slope_of, tolerance_um
 from adaptive.types import FloatArray, StateDict, prefixed, under
 
 # --- The check that always runs.
@@ -156,7 +156,7 @@ class Following:
                 return False
             # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
             return self.pp <= FOLLOWING_SLOPES[1] ** 2 * self.uu
-        return self.count >= ENOUGH_SLOPE and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
+        return self.count >= ENOUGH_SLOPE and not follows and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
 
     def state_dict(self) -> StateDict:
         return asdict(self)
@@ -205,6 +205,9 @@ OPEN_SLOPE = 0.15
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
 ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
+#: A drift of the zero beside the motion is accepted after half a window, if position and voltages explain this share of
+#: what is left beside the drift, both slopes are known with this standard deviation, and lie within this factor of 1.
+BESIDE, BESIDE_STD, BESIDE_SLOPE = 0.9, 0.1, 1.4
 #: The model is wrong if the readings follow for this many windows without two windows that agree on slope and shift.
 UNCLEAR = 6
 #: Number of windows in which p must follow u; smallest share of the variance and largest slope (or its inverse) for
@@ -324,7 +327,7 @@ class Trial:
         )
         straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
         follows = straight and allowed
-        if self.open_slope and self._confirms_reverted_jumps(s, x, y, now):
+        if self.open_slope and not self.fault and self._confirms_reverted_jumps(s, x, y, now):
             return Decision(Outcome.CHANGED, self.open_slope, self.open_shift_um)
         off_um = float(np.mean(y - x))
         by_model_um = off_V / self.reckoning.mean_slope_V_per_um
@@ -336,6 +339,9 @@ class Trial:
         if usual and min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE:
             # A clear shift of usual size, without a fault so far, needs only half a window.
             return Decision(Outcome.CHANGED, 1.0, off_um)
+        drifted_um = 0.0 if self.fault or follows else self._drifted_um(u, y, x, p, now)
+        if drifted_um:
+            return Decision(Outcome.CHANGED, 1.0, drifted_um)
         fault = _fault(s, float(np.std(y)))
         if s.swing < TELLS * self.reckoning.std_um:
             # The dead-reckoned position is less certain than the motion is large: only the voltages can decide.
@@ -357,6 +363,15 @@ class Trial:
         if not obeyed:
             self._suspect(*fault)
         return OPEN
+
+    def _drifted_um(self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, now: Circumstances) -> float:
+        """Shift of the readings by a drift of the zero that has gone on over the window, µm; 0 if there is none."""
+        rate_um, off_um = beside_drift(x, y, now.noise_um)
+        rate_V, off_V = beside_drift(u, p, now.noise_um * abs(self.reckoning.mean_slope_V_per_um))
+        by_model_um = off_V / self.reckoning.mean_slope_V_per_um
+        alike = off_um != 0.0 and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
+        usual = tolerance_um(now, self.reckoning) < abs(off_um) <= now.envelope.jump * now.range_um
+        return off_um if alike and usual and rate_um * rate_V * self.reckoning.mean_slope_V_per_um > 0.0 else 0.0
 
     def _confirms_reverted_jumps(self, s: Slope, x: FloatArray, y: FloatArray, now: Circumstances) -> bool:
         """Whether the readings follow in the frame of the jumps that were reverted when the trial began."""
@@ -439,6 +454,24 @@ _NUMBERS = {
     "obeyed": int, "followed": int, "agreed": int, "slope": float, "shift_um": float,
     "open_slope": float, "open_shift_um": float,
 }  # fmt: skip
+
+
+def beside_drift(x: FloatArray, y: FloatArray, noise: float) -> tuple[float, float]:
+    """(change over the window, y - x at its end) of a steady drift of (n,) values ``y`` beside a motion ``x``.
+
+    Zeros if the motion does not explain the rest, with a slope near 1. ``noise`` : standard deviation of a value y.
+    """
+    n = x.size
+    t = np.linspace(-1.0, 0.0, n)
+    over_x, over_y = slope_of(t, x), slope_of(t, y)
+    dx, dy = x - over_x.slope * t - over_x.constant, y - over_y.slope * t - over_y.constant
+    s = slope_of(dx, dy)
+    left = dy - s.slope * dx
+    known = s.std * correlated(left) <= BESIDE_STD and s.swing > SWING_SIGMA * noise
+    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
+        return 0.0, 0.0
+    off = slope_of(t, y - x)
+    return off.slope, off.constant
 
 
 def _fault(s: Slope, spread: float, unit: str = "um") -> tuple[str, str]:

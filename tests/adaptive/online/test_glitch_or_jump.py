@@ -588,6 +588,19 @@ def test_readings_that_are_none_are_bridged_by_their_voltages(
     np.testing.assert_allclose(learner.memory(), twin.memory(), atol=0.05)
 
 
+def test_the_place_goes_on_while_readings_are_none(before_glitch: dict[str, object], recording: Recording) -> None:
+    """And not only from the next reading on: what is served meanwhile begins at the place of the stage."""
+    u, clean = recording
+    y = np.where(np.arange(clean.size) % 2, math.nan, 1e6)
+    learner, twin = Learner.from_state(before_glitch), Learner.from_state(before_glitch)
+    before = learner.parts.intake.memory_now()
+    feed_readings(learner, u, y, AT, AT + 100)
+    feed_readings(twin, u, clean, AT, AT + 100)
+    after = twin.parts.intake.memory_now()
+    assert np.max(np.abs(after - before)) > 1.0
+    np.testing.assert_allclose(learner.parts.intake.memory_now(), after, atol=0.1)
+
+
 @pytest.mark.parametrize("kind", ["gain", "offset", "small offset"])
 def test_a_real_jump_is_believed_within_20_ms(
     before_glitch: dict[str, object], recording: Recording, kind: str

@@ -32,6 +32,7 @@ from adaptive.online.sensor_trust import (
     Following,
     Outcome,
     Trial,
+    beside_drift,
 )
 from adaptive.types import FloatArray, Sample, StateDict
 from sim.signals.voltages import training_input
@@ -254,6 +255,26 @@ def test_a_stage_whose_zero_drifts_beside_a_slow_voltage_is_no_fault(sign: float
     assert not any(faults(0.8 * SPAN_V))
     # Faster than the envelope allows, it is a fault; not after the drift is over.
     assert 250 < first(faults(0.4 * SPAN_V)) <= 250 + n
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, -1.0, 2.0])
+@pytest.mark.parametrize("rate", [-40.0, 40.0])
+def test_a_drift_beside_a_motion_is_told_from_another_slope(slope: float, rate: float) -> None:
+    """(n,) readings of a stage that turns; the drift is as fast as the motion."""
+    t_s = np.linspace(0.0, 0.15, 128)
+    x = 2.0 * np.sin(2.0 * math.pi * 4.0 * t_s)
+    noise = 0.01 * np.random.default_rng(5).normal(size=x.size)
+    change, off = beside_drift(x, x + rate * t_s + noise, 0.01)
+    assert change == pytest.approx(rate * 0.15, abs=0.05)
+    assert off == pytest.approx(rate * 0.15, abs=0.05)
+    assert beside_drift(x, slope * x + rate * t_s + noise, 0.01) == (0.0, 0.0)
+
+
+def test_a_steady_motion_does_not_show_a_drift_beside_it() -> None:
+    x = np.linspace(0.0, 5.0, 128)
+    noise = 0.01 * np.random.default_rng(6).normal(size=x.size)
+    assert beside_drift(x, 0.4 * x + noise, 0.01) == (0.0, 0.0)
+    assert beside_drift(x, x + noise, 0.01) == (0.0, 0.0)
 
 
 def test_to_forget_is_to_begin_anew_but_for_the_noise() -> None:
