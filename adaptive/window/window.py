@@ -92,7 +92,7 @@ class WindowConfig:
 INVERSE_ERROR_SHARE = 3e-18
 
 #: Arrays whose entry in a state is the array itself.
-_SAVED = ("P", "R", "X", "scaled", "inverse_widths", "V", "U", "C", "order")
+_SAVED = ("X", "scaled", "inverse_widths", "V", "U", "C", "order")
 
 
 class Window:
@@ -339,6 +339,7 @@ class Window:
         # A window once had further linear coefficients beside the bias. Its file format, with a row for each of them
         # and entries without content, stays readable both ways.
         return {
+            **_matrices(A),
             **{name: getattr(A, name).copy() for name in _SAVED},
             "F": A.F[: ws.GRAM].copy(),
             "S": A.S[None].copy(),
@@ -354,19 +355,46 @@ class Window:
         """Raises InputError where an entry is missing or its shape is not that of ``config``."""
         window = cls(config)
         A = window.arrays
-        for name, own in window.state_dict().items():
+        expected, whole = window.state_dict(), "P" in state
+        if whole:
+            expected.pop("PR", None)  # a window whose form is given begins in it
+            expected |= {"P": A.P, "R": A.R}
+        for name, own in expected.items():
             given = np.shape(state[name]) if name in state else ()
             # States of older versions lack the last rows of V and C, which are zero where nothing is known yet.
             older = name in ("V", "C") and len(given) == own.ndim and given[1:] == own.shape[1:]
             if name not in state or not (given == own.shape or (older and given[0] < own.shape[0])):
                 got = given if name in state else "nothing"
                 raise InputError(f"{name}: got {got}, expected an array {own.shape}; the state is of another window")
+        if whole:
+            A.P[:], A.R[:] = state["P"], state["R"]
+        else:
+            below = np.tri(config.capacity, dtype=np.bool_)
+            A.P[:] = np.where(below, state["PR"][:, :-1], 0.0)
+            A.R[:] = np.where(below, state["PR"][:, 1:].T, state["PR"][:, 1:])
         for name in _SAVED:
             getattr(A, name)[: len(state[name])] = state[name]
         A.F[: ws.BETA] = state["F"][: ws.BETA]
         A.S[:], A.F[ws.BETA], A.F[ws.GRAM] = state["S"][0], state["beta"][0], state["G"][0, 0]
         A.C[ws.UNDO] = ws.UNDO_NOTHING
         return window
+
+
+def _matrices(A: ws.WindowArrays) -> StateDict:
+    """P and R of a state.
+
+    In the inverse form the lower triangle of P holds all of it, and R is symmetric: ``PR`` (N, N + 1) is the lower
+    triangle of P, and beside it the upper one of R. The Cholesky form needs all of P. States of older versions hold
+    both matrices in either form.
+    """
+    if A.C[ws.FORM] == ws.CHOLESKY_FORM:
+        return {"P": A.P.copy(), "R": A.R.copy()}
+    n = A.P.shape[0]
+    packed = np.empty((n, n + 1))
+    below = np.tri(n, dtype=np.bool_)
+    np.copyto(packed[:, :-1], A.P, where=below)
+    np.copyto(packed[:, 1:], A.R, where=below.T)
+    return {"PR": packed}
 
 
 def _largest_eigenvalue(R: FloatArray, iterations: int = 12) -> float:

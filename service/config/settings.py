@@ -98,7 +98,7 @@ class AxisConfig:
     ] = None
     checkpoint_s: Annotated[
         float, Setting(help="time of samples between two checkpoints", unit="s", low=0.05, high=86400)
-    ] = 10.0
+    ] = 7.0
     checkpoints_kept: Annotated[
         int, Setting(help="checkpoints kept: the newest, and older ones ever further apart", low=2, high=10_000)
     ] = 32

@@ -116,6 +116,8 @@ RULES: Final = (
     Rule(r"window\.(gamma|kernel_variance)", "", low=0.0),
     Rule(r"window\.(inverse_widths|widths)", "d", low=1e-100),
     Rule(r"window\.V", "vectors,N"),
+    Rule(r"window\.(P|R)", "N,N"),
+    Rule(r"window\.PR", "N,*"),
     Rule(r"window\.healing\.(X|scaled)", "d,N"),
     Rule(r"window\.healing\.(R|P)", "N,N"),
     Rule(r"window\.healing\.(y|w)", "N"),
@@ -318,7 +320,7 @@ def _sizes_of(template: StateDict) -> dict[str, int]:
         sizes["kernel_plays"] = len(base["features.kernel_plays"])
         sizes["p"], sizes["d"] = base["beta"].size, base["widths"].size
         sizes["m"] = sizes["plays"] + sizes["arcs"] + sizes["slow"] + (sizes["arcs"] > 0)
-        sizes["N"] = template[f"{head}window.P"].shape[0]
+        sizes["N"] = template[f"{head}window.order"].size
     out = template.get("out")
     if isinstance(out, np.ndarray):
         sizes["contestants"] = out.size

@@ -178,7 +178,7 @@ def test_state_goes_on_to_the_last_bit(model: LssvmInverse, quiet: Run) -> None:
 
 def test_a_damaged_state_is_refused(quiet: Run) -> None:
     state = quiet.learner.state_dict()
-    del state["window.P"]
+    del state["window.PR"]
     with pytest.raises(ModelFileError, match="learner state"):
         Learner.from_state(state)
 

@@ -156,6 +156,16 @@ def test_state_goes_on_to_the_last_bit(form: Form) -> None:
     assert again.counters() == window.counters()
 
 
+def test_both_matrices_share_one_in_the_inverse_form() -> None:
+    """Only what is used: the lower triangle of P, and one triangle of R, which is symmetric to the last bit."""
+    window = filled("inverse")
+    state = window.state_dict()
+    assert sum(state[name].size for name in ("P", "R", "PR") if name in state) == CAPACITY * (CAPACITY + 1)
+    again = Window.from_state(window.config, state)
+    np.testing.assert_array_equal(again.arrays.R, window.arrays.R)
+    np.testing.assert_array_equal(np.tril(again.arrays.P), np.tril(window.arrays.P))
+
+
 def test_a_copy_is_independent() -> None:
     window = filled("inverse")
     alpha, twin = window.alpha, window.copy()
@@ -167,8 +177,8 @@ def test_foreign_state_is_refused() -> None:
     state = filled("inverse").state_dict()
     with pytest.raises(InputError, match="expected an array"):
         Window.from_state(WindowConfig(CAPACITY + 1, WIDTHS, GAMMA), state)
-    del state["R"]
-    with pytest.raises(InputError, match="R: got nothing"):
+    del state["PR"]
+    with pytest.raises(InputError, match="PR: got nothing"):
         Window.from_state(WindowConfig(CAPACITY, WIDTHS, GAMMA), state)
 
 
@@ -238,11 +248,13 @@ def test_singular_samples_leave_the_window_as_it_was() -> None:
 
 
 @forms
-def test_a_state_without_what_was_added_since_goes_on(form: Form) -> None:
-    """As an older version wrote it: without the diagonal and the position of the sample that was replaced."""
+def test_a_state_of_an_older_version_goes_on(form: Form) -> None:
+    """Without the diagonal and the position of the sample that was replaced, and with both matrices whole."""
     window, rng = filled(form), np.random.default_rng(6)
     window.replace(1, *sample(rng))
     state = window.state_dict()
+    state.pop("PR", None)
+    state |= {"P": window.arrays.P.copy(), "R": window.arrays.R.copy()}
     state |= {"V": state["V"][: ws.DIAGONAL], "C": state["C"][: ws.UNDO_PLACE]}
     again = Window.from_state(window.config, state)
     point = sample(rng)

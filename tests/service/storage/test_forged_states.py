@@ -59,7 +59,7 @@ def test_the_refusal_names_the_entry_what_it_is_and_what_is_expected() -> None:
         (
             f"{window}.P",
             np.zeros((0, 0)),
-            rf"{window}.P: got float64 \(0, 0\), expected an array of float64 \(60, 60\)",
+            rf"{window}.P: got float64 \(0, 0\), expected a shape of \(60, 60\)",
         ),
         (f"{window}.order", np.zeros(60, np.int64), "expected each of 0 to 59 once"),
         (f"{window}.C", state[f"{window}.C"] + 1000, "expected at most the window's 60 samples"),
