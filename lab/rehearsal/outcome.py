@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from adaptive.online.gates import GLITCH, RINGING, UNTRUSTED
 from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
@@ -28,6 +29,10 @@ END_S: Final = 0.1
 BREAK_S: Final = 0.01
 #: A reference that moves by less than this share of the range per second is at rest.
 REST_PER_S: Final = 0.02
+#: Verdicts on samples that are held back or on trial. A change that is not held back within this time, s, is followed
+#: without a decision.
+HELD: Final = frozenset({GLITCH, RINGING, UNTRUSTED})
+NOTICED_S: Final = 0.05
 #: Error allowed during a sensor fault: percent of the range, or this multiple of the frozen model's error.
 SENSOR_PCT, SENSOR_FACTOR = 1.0, 1.5
 
@@ -93,6 +98,8 @@ class Outcome:
     happened.
     healthy_s : how long nothing had happened, s.
     named_s : motion, s, from the event to its first report; NaN if it was not reported, or is no sensor fault.
+    believed_samples : from the event to the first sample that is not held back any more; NaN if none was, or they were
+    to the end.
     noted : names of the axis' events from the event on, with their counts.
     simulated_s : length of the run, s.
     """
@@ -109,6 +116,7 @@ class Outcome:
     false_troubles: tuple[str, ...]
     healthy_s: float
     named_s: float
+    believed_samples: float
     noted: dict[str, int]
     simulated_s: float
 
@@ -193,6 +201,7 @@ def outcome(
         false_troubles=tuple(t.name for t in troubles if t.named_s + event.at_s < healthy_s),
         healthy_s=healthy_s,
         named_s=true[0].motion_s if true else float("nan"),
+        believed_samples=_believed_samples(adaptive, event, dt_s),
         noted=_noted(adaptive, event.at_s),
         simulated_s=adaptive.t_s.size * dt_s,
     )
@@ -209,6 +218,16 @@ def healthy_outcome(event: Event, course: LoopRecord, range_um: float, limits: L
         troubles=tuple(replace(t, named_s=t.named_s + event.at_s, until_s=t.until_s + event.at_s) for t in troubles),
         noted=_noted(course, 0.0),
     )
+
+
+def _believed_samples(course: LoopRecord, event: Event, dt_s: float) -> float:
+    at, soon = round(event.at_s / dt_s), round(NOTICED_S / dt_s)
+    held = np.isin(course.verdict[at:], [i for i, name in enumerate(course.verdicts) if name in HELD])
+    if not held[: soon + 1].any():
+        return float("nan")
+    first = int(np.argmax(held))
+    free = ~held[first:]
+    return float(first + np.argmax(free)) if free.any() else float("nan")
 
 
 def _noted(course: LoopRecord, from_s: float) -> dict[str, int]:

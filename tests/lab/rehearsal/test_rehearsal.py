@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -346,6 +347,23 @@ def test_trouble_is_timed_by_motion_and_false_where_nothing_happened() -> None:
     nothing = outcome(Event("none", "none", 4.0), course(calm, u_V, said), course(calm, u_V), 100.0, limits, DT_S, "")
     assert nothing.false_troubles == ("sensor_frozen", "sensor_frozen")
     assert np.isnan(nothing.named_s)
+
+
+def test_a_change_is_believed_with_the_first_sample_that_is_not_held_back() -> None:
+    n = 9000
+    still = course(np.zeros(n), np.full(n, 5.0))
+    event, limits = Event("gain_at_once", "gain", 4.0, 0.06), Limits(0.0, 10.0, 1e4)
+
+    def believed(*held: tuple[int, int]) -> float:
+        verdict = np.zeros(n, dtype=np.int16)
+        for first, end in held:
+            verdict[first:end] = 1
+        record = replace(still, verdict=verdict, verdicts=("learnt", "glitch"))
+        return outcome(event, record, still, 100.0, limits, DT_S, "").believed_samples
+
+    assert believed((4002, 4014), (4100, 4200)) == 14.0
+    assert np.isnan(believed((3000, 3100), (4200, 4300)))
+    assert np.isnan(believed((4002, n)))
 
 
 def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() -> None:
