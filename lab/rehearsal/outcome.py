@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.online.gates import GLITCH, RINGING, UNTRUSTED
+from adaptive.online.gates import GLITCH, UNTRUSTED
 from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
@@ -29,9 +29,9 @@ END_S: Final = 0.1
 BREAK_S: Final = 0.01
 #: A reference that moves by less than this share of the range per second is at rest.
 REST_PER_S: Final = 0.02
-#: Verdicts on samples that are held back or on trial. A change that is not held back within this time, s, is followed
-#: without a decision.
-HELD: Final = frozenset({GLITCH, RINGING, UNTRUSTED})
+#: Verdicts on samples of which it is open what they mean; those that ring about a new level are held back too, but the
+#: change is believed. A change that is not held back within this time, s, is followed without a decision.
+UNDECIDED: Final = frozenset({GLITCH, UNTRUSTED})
 NOTICED_S: Final = 0.05
 #: Error allowed during a sensor fault: percent of the range, or this multiple of the frozen model's error.
 SENSOR_PCT, SENSOR_FACTOR = 1.0, 1.5
@@ -98,8 +98,8 @@ class Outcome:
     happened.
     healthy_s : how long nothing had happened, s.
     named_s : motion, s, from the event to its first report; NaN if it was not reported, or is no sensor fault.
-    believed_samples : from the event to the first sample that is not held back any more; NaN if none was, or they were
-    to the end.
+    believed_samples : from the event to the first sample of which it is known what it means, after others of which it
+    was not; NaN if there were none, or they went on to the end.
     noted : names of the axis' events from the event on, with their counts.
     simulated_s : length of the run, s.
     """
@@ -222,7 +222,7 @@ def healthy_outcome(event: Event, course: LoopRecord, range_um: float, limits: L
 
 def _believed_samples(course: LoopRecord, event: Event, dt_s: float) -> float:
     at, soon = round(event.at_s / dt_s), round(NOTICED_S / dt_s)
-    held = np.isin(course.verdict[at:], [i for i, name in enumerate(course.verdicts) if name in HELD])
+    held = np.isin(course.verdict[at:], [i for i, name in enumerate(course.verdicts) if name in UNDECIDED])
     if not held[: soon + 1].any():
         return float("nan")
     first = int(np.argmax(held))
