@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.intake.clock import SampleClock
     from service.intake.sample_queue import SampleQueue
-    from service.intake.sequence import SequenceTracker
+    from service.intake.sequence import SampleClock, SequenceTracker
 
 _MODULES = {
-    "SampleClock": "clock",
+    "SampleClock": "sequence",
     "SampleQueue": "sample_queue",
     "SequenceTracker": "sequence",
 }

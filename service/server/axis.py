@@ -26,8 +26,7 @@ from service.answers.guard import Limits
 from service.answers.slices import Pace
 from service.background.retuning.adoption import Retuned
 from service.config.settings import LEARN, AxisConfig
-from service.intake.clock import SampleClock
-from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SequenceTracker
+from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety

@@ -15,9 +15,8 @@ from typing import Any, Final, Protocol
 from numpy.typing import ArrayLike
 
 from service.background.retuning.retuner import Retuner
-from service.intake.sample_queue import Job, SampleQueue
+from service.intake.sample_queue import Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
-from service.intake.thinning import Thinner
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.competing import standing_of

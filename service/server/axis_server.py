@@ -13,7 +13,6 @@ import zenoh
 from service.answers.answering import trust_by_age
 from service.background.retuning.retuner import Retuner
 from service.failover.state_transfer import NO_SECRET
-from service.intake.losses import Arrivals, SampleLosses
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
@@ -23,7 +22,7 @@ from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
-from service.server.health import Health
+from service.server.health import Arrivals, Health, SampleLosses
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, WriteRate, axis_status
