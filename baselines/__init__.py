@@ -34,36 +34,4 @@ if TYPE_CHECKING:
     from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
     from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
-_MODULES = {
-    "BoucWenInverse": "bouc_wen.model",
-    "BoucWenOnline": "bouc_wen.online",
-    "ChampionInverse": "competition.champion",
-    "Competition": "competition.competition",
-    "CompetitionConfig": "competition.config",
-    "FitReport": "fit_report",
-    "LinearInverse": "linear",
-    "LinearOnline": "linear",
-    "MpiInverse": "prandtl_ishlinskii.model",
-    "MpiOnline": "prandtl_ishlinskii.online",
-    "fit_bouc_wen": "fit",
-    "fit_linear": "fit",
-    "fit_mpi": "fit",
-}
-
-__all__ = [
-    "BoucWenInverse",
-    "BoucWenOnline",
-    "ChampionInverse",
-    "Competition",
-    "CompetitionConfig",
-    "FitReport",
-    "LinearInverse",
-    "LinearOnline",
-    "MpiInverse",
-    "MpiOnline",
-    "fit_bouc_wen",
-    "fit_linear",
-    "fit_mpi",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

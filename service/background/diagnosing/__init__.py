@@ -11,22 +11,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.background.diagnosing.alarm import Alarm
-    from service.background.diagnosing.buffer import SampleBuffer
-    from service.background.diagnosing.settings import WatchConfig
-    from service.background.diagnosing.watcher import Watcher
+    from service.background.diagnosing.alarm import Alarm as Alarm
+    from service.background.diagnosing.buffer import SampleBuffer as SampleBuffer
+    from service.background.diagnosing.settings import WatchConfig as WatchConfig
+    from service.background.diagnosing.watcher import Watcher as Watcher
 
-_MODULES = {
-    "Alarm": "alarm",
-    "SampleBuffer": "buffer",
-    "WatchConfig": "settings",
-    "Watcher": "watcher",
-}
-__all__ = [
-    "Alarm",
-    "SampleBuffer",
-    "WatchConfig",
-    "Watcher",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

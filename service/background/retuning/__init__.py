@@ -12,21 +12,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.background.retuning.adoption import Adoptions, Retuned
-    from service.background.retuning.retuner import Retuner
-    from service.background.retuning.settings import RetuningConfig
+    from service.background.retuning.adoption import Adoptions as Adoptions
+    from service.background.retuning.adoption import Retuned as Retuned
+    from service.background.retuning.retuner import Retuner as Retuner
+    from service.background.retuning.settings import RetuningConfig as RetuningConfig
 
-_MODULES = {
-    "Adoptions": "adoption",
-    "Retuned": "adoption",
-    "Retuner": "retuner",
-    "RetuningConfig": "settings",
-}
-__all__ = [
-    "Adoptions",
-    "Retuned",
-    "Retuner",
-    "RetuningConfig",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)
