@@ -33,8 +33,14 @@ from service.protocol.model import Safety
 from service.protocol.model_classes import build_model, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
-from service.server.competing import champion_of
-from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, check_same_learner, fingerprint
+from service.server.learner_supervisor import (
+    NOT_LEARNING,
+    LearnerSupervisor,
+    Revive,
+    champion_of,
+    check_same_learner,
+    fingerprint,
+)
 from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
 from service.server.moves import Moves
 from service.server.state_schema import StateSchema

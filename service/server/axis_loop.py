@@ -19,7 +19,7 @@ from service.intake.sample_queue import Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.competing import standing_of
+from service.server.learner_supervisor import standing_of
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"

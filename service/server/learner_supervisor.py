@@ -18,11 +18,11 @@ from adaptive.errors import DehystError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from baselines.competition.champion import ChampionInverse
+from baselines.competition.competition import Competition
 from service.answers.answering import Served
 from service.background.retuning.adoption import Adoptions, Retuned
 from service.protocol.keys import AUTO
 from service.protocol.model_classes import build_model, stored_kind
-from service.server.competing import champion_of
 from service.server.model_watch import BEGUN_AGAIN, LEARNER_FAILED, POISON, ROLES, ModelWatch
 
 # --- Stored states of a learner: whether one fits the learner of an axis, and the fingerprint of a model.
@@ -89,6 +89,20 @@ def _same_frame(model: InverseModel, learner: OnlineModel) -> bool:
     except (DehystError, ValueError, ArithmeticError):
         return False
     return isinstance(now, LssvmInverse) and isinstance(model, LssvmInverse) and now.features == model.features
+
+
+# --- The competition of an axis. The favourite's own model is served under its name, as without a competition, and the
+# champion as ``auto``: the model that answers where a query names none.
+
+
+def champion_of(learner: OnlineModel | None) -> dict[str, InverseModel]:
+    """The champion under its name; empty without a competition."""
+    return {AUTO: learner.champion_model()} if isinstance(learner, Competition) else {}
+
+
+def standing_of(learner: OnlineModel | None) -> dict[str, Any] | None:
+    """Champion, changes, and the rms error of each contestant; None without a competition."""
+    return learner.standing() if isinstance(learner, Competition) else None
 
 
 # --- Supervision.

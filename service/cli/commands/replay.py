@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from service.config.learner import read_learner_settings
     from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from service.server.axis_loading import load_axis
-    from service.server.competing import standing_of
+    from service.server.learner_supervisor import standing_of
     from service.storage.model_file import read_bundle, write_bundle
 
     say = progress_printer(args.quiet)

@@ -28,9 +28,9 @@ from service.config.settings import AxisConfig, parse_config
 from service.protocol.errors import FieldError
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
-from service.server import competing
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
+from service.server.learner_supervisor import champion_of
 from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.voltages import training_input
 from sim.stage.presets import preset
@@ -96,7 +96,7 @@ def ask(axis: Axis, name: str = "") -> Any:
 def degrade(axis: Axis, by_V: float) -> None:
     """Poison the learner: what its linear part gives is off by ``by_V``, whatever it learns."""
     learner: Any = axis.learner
-    favourite = learner.competition.favourite
+    favourite = learner.favourite
     inner = favourite.snapshot
 
     def snapshot() -> InverseModel:
@@ -132,16 +132,16 @@ def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
     axis = axis_of(bundle)
     give(axis, recorded, 0, 3000)
     learner: Any = axis.learner
-    inner = learner.competition.favourite.snapshot
+    inner = learner.favourite.snapshot
     degrade(axis, 0.6)
     give(axis, recorded, 3000, 5000)
-    assert learner.competition.champion == "mpi"
+    assert learner.champion == "mpi"
     assert [event["event"] for event in axis.take_events()].count("champion_changed") == 1
     bad, served, baseline = (ask(axis, name).u_V[-1] for name in ("lssvm_adaptive", "", "mpi"))
     assert abs(served - baseline) < 0.15 < 0.4 < abs(bad - served)
-    learner.competition.favourite.snapshot = inner
+    learner.favourite.snapshot = inner
     give(axis, recorded, 5000, 9000)
-    assert learner.competition.champion == "lssvm_adaptive"
+    assert learner.champion == "lssvm_adaptive"
     np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
 
 
@@ -448,4 +448,4 @@ def test_settings_come_from_the_configuration(tmp_path: Path) -> None:
     for bad in ("margin = 1.5\n", 'compete = ["mpi"]'):
         with pytest.raises(InputError):
             parse_config(text.replace(bad, bad.replace("1.5", "0.5").replace('"mpi"', "3")), "serve.toml", tmp_path)
-    assert competing.champion_of(None) == {}
+    assert champion_of(None) == {}
