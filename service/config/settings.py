@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 from baselines.competition.config import CompetitionConfig
 from service.answers.guard import Limits
-from service.background.diagnosing.settings import WatchConfig
-from service.background.retuning.settings import RetuningConfig
+from service.background.settings import RetuningConfig, WatchConfig
 from service.config.schema import Setting, build_settings, parse_toml, read_text
 from service.fleet.settings import FleetSettings
 from service.protocol.errors import FieldError

@@ -24,7 +24,7 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateD
 from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
 from service.answers.guard import Limits
 from service.answers.slices import Pace
-from service.background.retuning.adoption import Retuned
+from service.background.retuner import Retuned
 from service.config.settings import LEARN, AxisConfig
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError

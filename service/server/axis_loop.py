@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 
 from numpy.typing import ArrayLike
 
-from service.background.retuning.retuner import Retuner
+from service.background.retuner import Retuner
 from service.intake.sample_queue import Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
 from service.protocol.samples import SampleBatch

@@ -11,7 +11,7 @@ from typing import Any, Final
 import zenoh
 
 from service.answers.answering import trust_by_age
-from service.background.retuning.retuner import Retuner
+from service.background.retuner import Retuner
 from service.failover.state_transfer import NO_SECRET
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer

@@ -20,7 +20,7 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateD
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
 from service.answers.answering import Served
-from service.background.retuning.adoption import Adoptions, Retuned
+from service.background.retuner import Adoptions, Retuned
 from service.protocol.keys import AUTO
 from service.protocol.model_classes import build_model, stored_kind
 from service.server.model_watch import BEGUN_AGAIN, LEARNER_FAILED, POISON, ROLES, ModelWatch

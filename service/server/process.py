@@ -62,7 +62,7 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     """The background diagnosis of an axis, or None if the configuration switches it off."""
     if not axis.config.diagnosis.enabled:
         return None
-    from service.background.diagnosing.watcher import Watcher
+    from service.background.watcher import Watcher
 
     return Watcher(axis, axis.config.diagnosis)
 

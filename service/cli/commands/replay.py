@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
     from adaptive.inverse_model import LssvmInverse
-    from service.background.retuning.adoption import read as read_adoptions
+    from service.background.retuner import read_adoptions
     from service.config.learner import read_learner_settings
     from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from service.server.axis_loading import load_axis
