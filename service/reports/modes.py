@@ -14,7 +14,7 @@ from adaptive.types import FloatArray
 from service.reports.plot_style import figure, label, legend, line, save
 from service.viewer.colours import AFTER, BEFORE, MEASURED, NOISE_BAND, SERIES
 from sim.modal import ModalStudy
-from sim.modal.response import smoothed
+from sim.modal.periods import smoothed
 from sim.modal.study import RAYLEIGH_RATIO, Level, Mode
 
 

@@ -29,8 +29,7 @@ from service.config.settings import LEARN, AxisConfig
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
-from service.protocol.model import Safety
-from service.protocol.model_classes import build_model, stored_kind
+from service.protocol.model import Safety, build_model, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (

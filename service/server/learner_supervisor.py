@@ -22,7 +22,7 @@ from baselines.competition.competition import Competition
 from service.answers.answering import Served
 from service.background.retuner import Adoptions, Retuned
 from service.protocol.keys import AUTO
-from service.protocol.model_classes import build_model, stored_kind
+from service.protocol.model import build_model, stored_kind
 from service.server.model_watch import BEGUN_AGAIN, LEARNER_FAILED, POISON, ROLES, ModelWatch
 
 # --- Stored states of a learner: whether one fits the learner of an axis, and the fingerprint of a model.

@@ -30,8 +30,8 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import SENSOR_FAULTS
 from adaptive.types import FloatArray, InverseModel
+from service.answers.fallback import log_model_error
 from service.answers.guard import Limits
-from service.answers.model_errors import log_model_error
 
 SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"

@@ -21,10 +21,8 @@ from scipy.linalg import solve_triangular
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, IntArray
-from sim.modal.model import ModalModel, poles_at, powers_of
-from sim.modal.periods import ComplexArray
-from sim.modal.poles import basis, stacked, vector_fit
-from sim.modal.response import FrequencyResponse
+from sim.modal.model import ModalModel, basis, poles_at, powers_of, stacked, vector_fit
+from sim.modal.periods import ComplexArray, FrequencyResponse
 
 #: Powers of 1/z beside the modes: the direct term and what the anti-alias filter adds beyond the band.
 DIRECT: Final = 4
