@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from baselines.bouc_wen.identify import identify_bouc_wen
 from baselines.bouc_wen.model import BoucWenInverse
-from baselines.fit_report import FitReport
+from baselines.common import FitReport
 from baselines.linear import LinearInverse, identify_linear
 from baselines.prandtl_ishlinskii.identify import identify_mpi
 from baselines.prandtl_ishlinskii.model import MpiInverse

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, StateDict, prefixed, under
 from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.fit_report import Domain, FitReport
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
-from baselines.validation import (
+from baselines.common import (
+    Domain,
+    FitReport,
     checked_memory,
     checked_motion,
     checked_recording,
@@ -22,6 +22,7 @@ from baselines.validation import (
     positive,
     std_or_nan,
 )
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
 
 
 @dataclass(frozen=True)

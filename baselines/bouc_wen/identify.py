@@ -24,8 +24,7 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from baselines.fit_report import FitReport
-from baselines.validation import checked_recording
+from baselines.common import FitReport, checked_recording
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])

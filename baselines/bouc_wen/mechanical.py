@@ -30,7 +30,7 @@ from scipy.optimize import least_squares
 from adaptive.compiled import compiled
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray
-from baselines.validation import finite_series, positive
+from baselines.common import finite_series, positive
 
 
 def between_samples(u: FloatArray, factor: int) -> FloatArray:

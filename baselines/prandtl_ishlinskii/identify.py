@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
-from baselines.fit_report import FitReport
+from baselines.common import FitReport, checked_recording
 from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
 from baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
-from baselines.validation import checked_recording
 
 #: Weight of the scale constraint relative to the mean row; rescaling makes the constraint exact afterwards.
 _SCALE_WEIGHT = 1e3

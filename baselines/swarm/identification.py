@@ -16,11 +16,10 @@ from adaptive.types import FloatArray
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage
 from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.fit_report import FitReport
+from baselines.common import FitReport, checked_recording
 from baselines.prandtl_ishlinskii.identify import MpiGrid
 from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
 from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from baselines.validation import checked_recording
 
 # --- Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts.
 

@@ -14,10 +14,10 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, Sample
 from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
+from baselines.common import Domain
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition, with_deviation_of_at_least
 from baselines.competition.config import CompetitionConfig
-from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline

@@ -20,7 +20,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from lab.cli import main
