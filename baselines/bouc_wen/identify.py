@@ -126,8 +126,6 @@ def identify_bouc_wen(
     dt_s: float,
     *,
     hold: str = "linear",
-    initial: str = "auto",
-    k_N_per_m: float = TABLE_2_1.k_N_per_m,
 ) -> tuple[BoucWenParameters, FitReport]:
     """Bouc-Wen stage of a recording, by least squares.
 
@@ -135,17 +133,14 @@ def identify_bouc_wen(
     ----------
     u_V, y_um : (n,) voltage V and displacement µm, ``dt_s`` s apart, n >= 20.
     hold : how the voltage runs within a step, see :mod:`baselines.bouc_wen.model`.
-    initial : "rest": the stage came monotonically from 0 V to the first voltage; "free": its initial hysteresis is an
-        unknown; "auto": free where the first voltage is above 5 % of the largest.
-    k_N_per_m : stiffness to express m and b with, N/m; a recording does not show it.
 
+    The initial hysteresis is an unknown where the first voltage is above 5 % of the largest; else the stage came
+    monotonically from 0 V. m and b are expressed with the stiffness of Table 2.1: a recording does not show it.
     Returns the parameters and a report. Its errors are those with the initial transient and hysteresis that were
     found. Raises InputError on an unusable recording, and where displacement falls with voltage.
     """
     u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
-    if initial not in ("auto", "rest", "free"):
-        raise InputError(f"initial: got {initial!r}, expected 'auto', 'rest' or 'free'")
-    free = initial == "free" or (initial == "auto" and abs(u[0]) > 0.05 * float(np.max(np.abs(u))))
+    free = abs(u[0]) > 0.05 * float(np.max(np.abs(u)))
     stride = max(1, min(u.size // _SEARCH_SAMPLES, int(_SEARCH_DT_S / dt)))
     thin = _Fit(u[::stride], y[::stride], dt * stride, "linear" if stride > 1 else hold, free)
     extra = ((0.5 * math.copysign(1.0, u[0]),),) if free else ((),)
@@ -164,6 +159,7 @@ def identify_bouc_wen(
             f"y_um: falls with the voltage (gain {d:.3g} µm/V), expected a rising one; check the sign and the columns"
         )
     shape, lag, inertia = _unpack(best.x)
+    k_N_per_m = TABLE_2_1.k_N_per_m
     parameters = BoucWenParameters(
         m_kg=inertia * k_N_per_m,
         b_N_s_per_m=lag * k_N_per_m,

@@ -88,12 +88,6 @@ class ModalFit:
         """Half width of the 95 % interval of a row of ``theta`` at an amplitude (a logarithm: a relative width)."""
         return self._half_width(row, powers_of(self.model.position(amplitude_V), self.model.degree))
 
-    def interval_of_change(self, row: int, low_V: float, high_V: float) -> float:
-        """Half width of the 95 % interval of the change of a row of ``theta`` between two amplitudes."""
-        degree = self.model.degree
-        change = powers_of(self.model.position(high_V), degree) - powers_of(self.model.position(low_V), degree)
-        return self._half_width(row, change)
-
     def _half_width(self, row: int, direction: FloatArray) -> float:
         size = self.model.degree + 1
         part = self.covariance[row * size : (row + 1) * size, row * size : (row + 1) * size]
