@@ -11,6 +11,7 @@ from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
+from service.reports.tables import json_form
 from sim.recordings.repair import runs
 
 #: Window of the worst mean error, s; error that must not last, percent of the range.
@@ -114,7 +115,7 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form: values that are not finite become null, numbers have seven digits."""
-        form: dict[str, Any] = _plain(asdict(self))
+        form: dict[str, Any] = json_form(asdict(self))
         return form
 
 
@@ -138,7 +139,7 @@ class HealthyOutcome:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form: values that are not finite become null, numbers have seven digits."""
-        form: dict[str, Any] = _plain(asdict(self))
+        form: dict[str, Any] = json_form(asdict(self))
         return form
 
 
@@ -293,13 +294,3 @@ def _sensor_excess(adaptive: LoopRecord, frozen: LoopRecord, event: Event, range
     window = max(1, round(WINDOW_S / dt_s))
     one, other = (moving_mean(_error_pct(course, range_um)[part], window) for course in (adaptive, frozen))
     return float((one / np.maximum(SENSOR_PCT, SENSOR_FACTOR * other)).max())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.7g}") if np.isfinite(value) else None
-    return value

@@ -89,12 +89,3 @@ def check_seed(seed: int) -> int:
     if seed < 0:
         raise FieldError("--seed", seed, "an integer from 0 on")
     return seed
-
-
-def make_folder(path: Path) -> Path:
-    """The folder ``path`` of ``--out``, made where it is missing. Raises FieldError where it cannot be."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FieldError("--out", f"{path} ({error})", "a folder that can be written to") from error
-    return path

@@ -58,7 +58,7 @@ def _sync_folder(folder: Path) -> None:
 # --- Prepares the output folder of a command: it exists, is writable, and holds no results of an earlier run.
 
 
-def clear_output(out: Path, names: Iterable[str]) -> None:
+def clear_output(out: Path, names: Iterable[str] = ()) -> None:
     """Create ``out`` if missing, and remove the files and folders called ``names`` in it; others stay.
 
     Raises InputError if the folder cannot be written to.

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.options import add_epilog, add_shared, make_folder, progress_printer
+from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 
@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from service.server.axis_loading import load_axis
     from service.server.learner_supervisor import standing_of
     from service.storage.model_file import read_bundle, write_bundle
+    from service.storage.output import clear_output
 
     say = progress_printer(args.quiet)
     if not args.window > 0.0:
@@ -84,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         axis.adopt_at(*adopted)
         if adopted:
             say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
-    make_folder(args.out)
+    clear_output(args.out)
     start = time.perf_counter()
     shown = start
 
