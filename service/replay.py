@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from service.answers.guard import Limits
-from service.config.learner import LearnerSettings
-from service.config.settings import AxisConfig
+from service.config.settings import AxisConfig, LearnerSettings
 from service.identification.identifying import motion_of
 from service.protocol.errors import FieldError
 from service.protocol.samples import MAX_SEQ, SampleBatch

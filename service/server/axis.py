@@ -34,13 +34,15 @@ from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
     NOT_LEARNING,
+    POISON,
     LearnerSupervisor,
+    ModelWatch,
+    ModelWatchConfig,
     Revive,
     champion_of,
     check_same_learner,
     fingerprint,
 )
-from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
 from service.server.moves import Moves
 from service.server.state_schema import StateSchema
 

@@ -12,7 +12,7 @@ import pytest
 from service.answers import fallback
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits
-from service.server.model_watch import _at_rest
+from service.server.learner_supervisor import _at_rest
 from tests.service.conftest import make_models
 
 
