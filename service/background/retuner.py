@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -24,6 +23,7 @@ from service.background.job import BackgroundJob
 from service.background.retuning_worker import pack, start_job
 from service.background.settings import RetuningConfig
 from service.protocol.errors import FieldError
+from service.storage.output import append_line
 
 # --- Adoptions of hyper-parameters, each at a definite sample: announced, stored, read and applied.
 #
@@ -115,14 +115,7 @@ class Adoptions:
 
 def append_adoption(folder: Path, retuned: Retuned) -> None:
     """Append an adoption to the file in the folder of a recording and sync it to the disk. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder / ADOPTIONS_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        # One write of a whole line in append mode: a crash leaves the line or nothing.
-        os.write(handle, json.dumps(retuned.to_json()).encode() + b"\n")
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    append_line(folder / ADOPTIONS_FILE, json.dumps(retuned.to_json()).encode() + b"\n")
 
 
 def read_adoptions(folder: Path | str) -> Sequence[Retuned]:

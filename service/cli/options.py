@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.protocol.errors import FieldError
+from service.protocol.keys import check_name
 
 _SHARED: Final[dict[str, dict[str, Any]]] = {
     "stage": {"default": "demo", "metavar": "NAME", "help": "stage on the wire (%(default)s)"},
@@ -67,6 +68,19 @@ def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1
     if timeout_s is not None:
         add_shared(parser, timeout={"default": timeout_s})
     add_shared(parser, "zenoh-config", wait={"default": wait_s})
+
+
+def add_selection(parser: Any) -> None:
+    """``--stage`` and ``--axis`` of a command that shows all axes by default; see `check_selection`."""
+    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
+    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+
+
+def check_selection(args: argparse.Namespace) -> None:
+    """Raise InputError where a name of `add_selection` is none."""
+    for option, given in (("--stage", args.stage), ("--axis", args.axis)):
+        if given != "*":
+            check_name(option, given)
 
 
 def add_epilog(parser: argparse.ArgumentParser, text: str) -> None:
