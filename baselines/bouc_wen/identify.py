@@ -6,7 +6,7 @@ unknowns remain, in a space where every point is a stage that can be inverted:
 
     alpha = 0.98 share/max(1, 2 rho),   beta = rho lambda,   gamma = (1 - rho) lambda,   log lambda, log b/k, log m/k
 
-A recording shows m/k and b/k only, never m, b, k alone; the caller states the stiffness. For an overdamped stage
+A recording shows m/k and b/k only, never m, b, k alone; the stiffness is that of Table 2.1. For an overdamped stage
 sampled more slowly than its fast mode, it does not show m/k either. m/k is therefore kept only where the fit is
 significantly worse without it. Otherwise it is set to the negligible value of Table 2.1, because the inverse
 multiplies it by accelerations far above those of the recording.

@@ -39,14 +39,16 @@ class ErrorFigures:
 
     Attributes
     ----------
-    before_pct : mean absolute error of the last 2 s before the event. first_second_pct, then_pct : of the first second
-    from the event on, and of 1 to 4 s after it. during_pct : during the event, NaN if it does not last.
-    settled_pct : of the last 2 s of the run. worst_half_second_pct : largest mean over half a second from the event
-    on. worst_pct : largest error from the event on. large_s : longest time with an error above 5 % in the whole run,
-    where the reference is within reach, that is, unless the voltage is at the limit that moves the stage towards it.
-    Interruptions up to 10 ms do not count. large_at_s : when that began, s after the event (negative: before it); NaN
-    if never. rail_s : longest time at a limit of the drive that the reference did not require. ends_at_rail : whether
-    the run ended so.
+    before_pct : mean absolute error of the last 2 s before the event.
+    first_second_pct, then_pct : of the first second from the event on, and of 1 to 4 s after it.
+    during_pct : during the event, NaN if it does not last.
+    settled_pct : of the last 2 s of the run.
+    worst_half_second_pct, worst_pct : largest mean over half a second, and largest error, from the event on.
+    large_s : longest time with an error above 5 % in the whole run. It does not count where the voltage is at the limit
+        that moves the stage towards the reference. Interruptions up to 10 ms do not end it.
+    large_at_s : when that began, s after the event (negative: before it); NaN if never.
+    rail_s : longest time at a limit of the drive that the reference did not require.
+    ends_at_rail : whether the run ended there.
     """
 
     before_pct: float

@@ -178,7 +178,7 @@ class AxisLoop:
             try:
                 self.handle(item.batch)
             except Exception as error:
-                # The samples after it are as good as ever, and clients wait for their snapshots.
+                # The samples after it are handled: clients wait for their snapshots.
                 handled = False
                 self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
             self.queue.finish(item, handled)

@@ -225,8 +225,8 @@ class AxisServer:
         )
 
     def _settle(self) -> bool:
-        """After a command: tell it to the standby before it is answered, and wait for its checkpoint."""
-        # With a time: whoever changes the role waits for the thread that calls this.
+        """After a command: publish its event, which the standby reads, and wait for its checkpoint; then answer."""
+        # With a timeout: a change of the role holds this lock while it waits for the thread that calls this.
         if self._changing.acquire(timeout=_TOLD_S):
             try:
                 self._publications.publish_events()
