@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_pictures:
         from service.replay import draw_errors, draw_gates
 
-        draw_errors(args.out / "errors.png", f"{args.data.name}: foretold, then learnt", done, span_V, args.window)
+        draw_errors(args.out / "errors.png", f"{args.data.name}: predicted, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)
     print(json.dumps(numbers) if args.json else table(numbers, args.out))
     return 0
@@ -128,7 +128,7 @@ def table(numbers: dict[str, Any], out: Path) -> str:
     lines = [
         f"{numbers['recording']}: {numbers['duration_s']:.4g} s replayed in {numbers['seconds']:.3g} s, "
         f"{numbers['scored']} samples scored; {numbers['learn']} of {numbers['model']} learnt",
-        f"{'foretold less applied voltage':<30}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}{'MAE/%':>9}{'RMSE/µm':>9}",
+        f"{'predicted less applied voltage':<30}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}{'MAE/%':>9}{'RMSE/µm':>9}",
     ]
     for key, label in (("frozen", "as it was identified"), ("adaptive", "learning")):
         s = numbers[key]
