@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from baselines.bouc_wen.identify import fit_bouc_wen as fit_bouc_wen
     from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
     from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
     from baselines.common import FitReport as FitReport
     from baselines.competition.champion import ChampionInverse as ChampionInverse
     from baselines.competition.competition import Competition as Competition
     from baselines.competition.config import CompetitionConfig as CompetitionConfig
-    from baselines.fit import fit_bouc_wen as fit_bouc_wen
-    from baselines.fit import fit_linear as fit_linear
-    from baselines.fit import fit_mpi as fit_mpi
     from baselines.linear import LinearInverse as LinearInverse
     from baselines.linear import LinearOnline as LinearOnline
+    from baselines.linear import fit_linear as fit_linear
+    from baselines.prandtl_ishlinskii.identify import fit_mpi as fit_mpi
     from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
     from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 

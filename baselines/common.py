@@ -95,6 +95,11 @@ class FitReport:
         )
 
 
+def std_of_voltage(u_V: ArrayLike, report: FitReport) -> float:
+    """Standard deviation of the voltage, V: the RMSE divided by the mean slope of the recording."""
+    return report.rmse_um * float(np.ptp(np.asarray(u_V, dtype=np.float64))) / report.range_um
+
+
 # --- Argument checks: each returns the checked value as float64 and raises InputError naming the argument otherwise.
 
 

@@ -22,9 +22,9 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenParameters
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from baselines.common import FitReport, checked_recording
+from baselines.common import FitReport, checked_recording, std_of_voltage
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])
@@ -184,3 +184,11 @@ def identify_bouc_wen(
     method = f"least squares from {len(found)} starts, {hold} hold, initial hysteresis {'free' if free else 'rest'}"
     report = FitReport.of("bouc_wen", method, y, y + residual, dt, evaluations, bool(best.status > 0), notes)
     return parameters, report
+
+
+def fit_bouc_wen(
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, hold: str = "linear", serve_dt_s: float | None = None
+) -> tuple[BoucWenInverse, FitReport]:
+    """Identify a Bouc-Wen stage with ``identify_bouc_wen`` and invert it; other arguments as in ``fit_linear``."""
+    parameters, report = identify_bouc_wen(u_V, y_um, dt_s, hold=hold)
+    return BoucWenInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report

@@ -21,9 +21,9 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from baselines import fit_linear, fit_mpi
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
-from baselines.fit import fit_linear, fit_mpi
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.signals.voltages import generalisation_input, multitone, training_input
 from sim.stage.config import ParameterChange

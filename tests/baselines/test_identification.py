@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
+from baselines import fit_bouc_wen, fit_linear, fit_mpi
 from baselines.bouc_wen.identify import identify_bouc_wen
 from baselines.bouc_wen.model import TABLE_2_1
 from baselines.bounded_least_squares import bounded_least_squares, bounded_minimum
-from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
 from baselines.linear import identify_linear
 from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
 from baselines.prandtl_ishlinskii.model import from_inverse_saturation, inverse_thresholds, inverse_weights

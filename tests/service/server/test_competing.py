@@ -17,7 +17,7 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, InverseModel
-from baselines.fit import fit_linear, fit_mpi
+from baselines import fit_linear, fit_mpi
 from service.answers.guard import Limits
 from service.background.retuner import ADOPTIONS_FILE, Adoptions, Retuned, Retuner, append_adoption, read_adoptions
 from service.background.retuning_worker import start_job
