@@ -34,48 +34,20 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from adaptive.errors import DehystError, InputError, ModelFileError, NumericsError
-    from adaptive.features import FeatureMap
-    from adaptive.identification import IdentificationReport, IdentifyConfig, identify_lssvm
-    from adaptive.inverse_model import LssvmInverse
-    from adaptive.online.config import LearnerConfig
-    from adaptive.online.learner import Learner
-    from adaptive.types import Feedforward, InverseModel, OnlineModel, Sample
+    from adaptive.errors import DehystError as DehystError
+    from adaptive.errors import InputError as InputError
+    from adaptive.errors import ModelFileError as ModelFileError
+    from adaptive.errors import NumericsError as NumericsError
+    from adaptive.features import FeatureMap as FeatureMap
+    from adaptive.identification import IdentificationReport as IdentificationReport
+    from adaptive.identification import IdentifyConfig as IdentifyConfig
+    from adaptive.identification import identify_lssvm as identify_lssvm
+    from adaptive.inverse_model import LssvmInverse as LssvmInverse
+    from adaptive.online.config import LearnerConfig as LearnerConfig
+    from adaptive.online.learner import Learner as Learner
+    from adaptive.types import Feedforward as Feedforward
+    from adaptive.types import InverseModel as InverseModel
+    from adaptive.types import OnlineModel as OnlineModel
+    from adaptive.types import Sample as Sample
 
-_MODULES = {
-    "DehystError": "errors",
-    "FeatureMap": "features",
-    "Feedforward": "types",
-    "IdentificationReport": "identification",
-    "IdentifyConfig": "identification",
-    "InputError": "errors",
-    "InverseModel": "types",
-    "Learner": "online.learner",
-    "LearnerConfig": "online.config",
-    "LssvmInverse": "inverse_model",
-    "ModelFileError": "errors",
-    "NumericsError": "errors",
-    "OnlineModel": "types",
-    "Sample": "types",
-    "identify_lssvm": "identification",
-}
-
-__all__ = [
-    "DehystError",
-    "FeatureMap",
-    "Feedforward",
-    "IdentificationReport",
-    "IdentifyConfig",
-    "InputError",
-    "InverseModel",
-    "Learner",
-    "LearnerConfig",
-    "LssvmInverse",
-    "ModelFileError",
-    "NumericsError",
-    "OnlineModel",
-    "Sample",
-    "identify_lssvm",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -20,50 +20,18 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from baselines.bouc_wen.identify import fit_bouc_wen as fit_bouc_wen
     from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
     from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
+    from baselines.common import FitReport as FitReport
     from baselines.competition.champion import ChampionInverse as ChampionInverse
     from baselines.competition.competition import Competition as Competition
     from baselines.competition.config import CompetitionConfig as CompetitionConfig
-    from baselines.fit import fit_bouc_wen as fit_bouc_wen
-    from baselines.fit import fit_linear as fit_linear
-    from baselines.fit import fit_mpi as fit_mpi
-    from baselines.fit_report import FitReport as FitReport
     from baselines.linear import LinearInverse as LinearInverse
     from baselines.linear import LinearOnline as LinearOnline
+    from baselines.linear import fit_linear as fit_linear
+    from baselines.prandtl_ishlinskii.identify import fit_mpi as fit_mpi
     from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
     from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
-_MODULES = {
-    "BoucWenInverse": "bouc_wen.model",
-    "BoucWenOnline": "bouc_wen.online",
-    "ChampionInverse": "competition.champion",
-    "Competition": "competition.competition",
-    "CompetitionConfig": "competition.config",
-    "FitReport": "fit_report",
-    "LinearInverse": "linear",
-    "LinearOnline": "linear",
-    "MpiInverse": "prandtl_ishlinskii.model",
-    "MpiOnline": "prandtl_ishlinskii.online",
-    "fit_bouc_wen": "fit",
-    "fit_linear": "fit",
-    "fit_mpi": "fit",
-}
-
-__all__ = [
-    "BoucWenInverse",
-    "BoucWenOnline",
-    "ChampionInverse",
-    "Competition",
-    "CompetitionConfig",
-    "FitReport",
-    "LinearInverse",
-    "LinearOnline",
-    "MpiInverse",
-    "MpiOnline",
-    "fit_bouc_wen",
-    "fit_linear",
-    "fit_mpi",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -11,17 +11,19 @@ from numpy.typing import ArrayLike
 from adaptive.errors import InputError
 from adaptive.types import Feedforward, FloatArray, StateDict, prefixed, under
 from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.fit_report import Domain, FitReport
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
-from baselines.validation import (
+from baselines.common import (
+    Domain,
+    FitReport,
     checked_memory,
     checked_motion,
     checked_recording,
     common_fields,
     common_state,
     positive,
+    std_of_voltage,
     std_or_nan,
 )
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,18 @@ class LinearInverse:
         except KeyError as missing:
             raise InputError(f"{missing.args[0]}: missing in the state of a linear model; write it again") from None
         return LinearInverse(parameters, dt_s, domain, std_V, str(state.get("name", "linear")))
+
+
+def fit_linear(
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, serve_dt_s: float | None = None
+) -> tuple[LinearInverse, FitReport]:
+    """Identify a line and invert it. ``serve_dt_s``: sample time of the queries, s; by default that of the recording.
+
+    The three functions take (n,) voltages V and displacements µm, ``dt_s`` s apart, and raise InputError on an unusable
+    recording.
+    """
+    parameters, report = identify_linear(u_V, y_um, dt_s)
+    return LinearInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report
 
 
 class LinearOnline(LeastSquaresOnline):

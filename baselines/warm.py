@@ -8,7 +8,7 @@ from adaptive.types import Sample
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
 from baselines.bounded_least_squares import bounded_minimum
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.online_baseline import LeastSquaresConfig
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline

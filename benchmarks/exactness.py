@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from adaptive.types import StateDict
 from benchmarks.latency_setup import CONNECT_S, LatencySetup, RunningSetup
 from benchmarks.sample_feed import AXIS, STAGE, sent
-from service.background.retuning.adoption import Retuned
+from service.background.retuner import Retuned
 from service.client.client import Client
 from service.config.settings import AxisConfig, read_config
 from service.failover.state_transfer import fetch_state

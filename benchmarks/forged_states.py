@@ -28,7 +28,7 @@ import numpy as np
 from adaptive.errors import ModelFileError
 from adaptive.types import FloatArray, InverseModel, StateDict
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from benchmarks.fuzz_targets import models as small_models

@@ -19,7 +19,7 @@ from adaptive.errors import InputError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from service.failover.role_control import Claims
 from service.failover.state_transfer import join_parts

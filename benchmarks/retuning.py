@@ -24,8 +24,8 @@ from benchmarks.measuring import DIMENSION, stream
 from benchmarks.sample_feed import AXIS, STAGE
 from lab.testbed.identified_stage import WINDOW
 from service.background.job import BackgroundJob
-from service.background.retuning.settings import RetuningConfig
-from service.background.retuning.worker import pack, start_job
+from service.background.retuning_worker import pack, start_job
+from service.background.settings import RetuningConfig
 from service.client.client import Client
 
 QUANTILES = {"p50": 50.0, "p99": 99.0}

@@ -23,8 +23,8 @@ from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
+from baselines.common import Domain
 from baselines.competition.champion import ChampionInverse
-from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from service.answers.answering import Served, answer, blends, learns

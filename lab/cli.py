@@ -6,9 +6,8 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from service.cli.extras import LAB, VIEWER
 from service.cli.main import COMMANDS as SERVICE_COMMANDS
-from service.cli.main import EXPERIMENTS, Command
+from service.cli.main import EXPERIMENTS, LAB, VIEWER, Command
 from service.cli.main import main as run
 
 

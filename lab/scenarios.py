@@ -25,6 +25,7 @@ from service.client.client import PendingCommands
 from service.config.settings import AxisConfig
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
+from service.reports import tables
 from service.reports.plot_style import MOST_POINTS, figure, legend, line, save
 from service.server.axis_loading import load_axis
 from service.storage.model_file import Bundle, BundleMeta
@@ -288,37 +289,19 @@ def judge(course: ScenarioRecord) -> Verdict:
 def table(verdicts: list[Verdict], markdown: bool = False) -> str:
     """One row per scenario; ``markdown`` for a page."""
     head = (
-        "scenario",
-        "what happens",
-        "before",
-        "first 1 s",
-        "settled",
-        "frozen settled",
-        "worst / allowed",
-        "at",
-        "held",
-    )
-    rows = [head]
-    for v in verdicts:
-        rows.append(
-            (
-                v.name, v.text, f"{v.before_pct:.3f}", f"{v.first_second_pct:.3f}", f"{v.settled_pct:.3f}",
-                f"{v.frozen_settled_pct:.3f}", f"{v.worst_ratio:.2f}", f"{v.worst_s:.1f} s", "yes" if v.held else "NO",
-            )
-        )  # fmt: skip
-    if markdown:
-        lines = ["| " + " | ".join(row) + " |" for row in rows]
-        lines.insert(1, "|" + "---|" * len(head))
-        return "\n".join(lines)
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    cells = [
-        "  ".join(
-            text.ljust(w) if i < 2 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True))
+        "scenario", "what happens", "before", "first 1 s", "settled", "frozen settled", "worst / allowed", "at", "held",
+    )  # fmt: skip
+    rows = [
+        (
+            v.name, v.text, f"{v.before_pct:.3f}", f"{v.first_second_pct:.3f}", f"{v.settled_pct:.3f}",
+            f"{v.frozen_settled_pct:.3f}", f"{v.worst_ratio:.2f}", f"{v.worst_s:.1f} s", "yes" if v.held else "NO",
         )
-        for row in rows
-    ]
+        for v in verdicts
+    ]  # fmt: skip
+    if markdown:
+        return tables.markdown(head, rows)
+    cells = tables.aligned(head, rows, left=(0, 1))
     held = sum(v.held for v in verdicts)
-    cells.insert(1, "-" * len(cells[0]))
     cells.append(
         f"errors: mean absolute, % of the commanded range; allowed in every {WINDOW_S:g} s: {FACTOR:g} x the frozen "
         f"model's + {FLOORS:g} noise floors"

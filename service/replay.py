@@ -1,7 +1,7 @@
-"""The learner over a recording: the same axis as live, the same snapshots to the last bit, and how well it foretold.
+"""The learner over a recording: the same axis as live, the same snapshots to the last bit, and how well it predicted.
 
-Prequential: every block of samples is first foretold, by the snapshot that a controller would have been answered from
-(``age_s`` old when the block begins), and then learnt. What is foretold is the voltage that makes the measured motion;
+Prequential: every block of samples is first predicted, by the snapshot that a controller would have been answered from
+(``age_s`` old when the block begins), and then learnt. The prediction is the voltage that makes the measured motion;
 the motion is the recording's own, smoothed with zero phase.
 """
 
@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from service.answers.guard import Limits
-from service.config.learner import LearnerSettings
-from service.config.settings import AxisConfig
+from service.config.settings import AxisConfig, LearnerSettings
 from service.identification.identifying import motion_of
 from service.protocol.errors import FieldError
 from service.protocol.samples import MAX_SEQ, SampleBatch
@@ -52,7 +51,7 @@ class Replayed:
     Attributes
     ----------
     t_s : time, s. u_V : voltage applied. y_um : reading.
-    adaptive_V, frozen_V : foretold less applied voltage, of the learning model and of the one it began as.
+    adaptive_V, frozen_V : predicted less applied voltage, of the learning model and of the one it began as.
     std_V : what the learning model stated as one standard deviation of it.
     gain_um_per_V : mean gain of the recording, by which a voltage error is seen as displacement.
     row_seq, row_t_s, gate : of every row of the recording, in its order: number, time, and index into ``gates`` of what
@@ -101,7 +100,7 @@ def replay(
     progress: Progress = lambda _done, _all: None,
     on_snapshot: OnSnapshot = lambda _seq, _model: None,
 ) -> Replayed:
-    """Run the recording through ``axis``, which must learn, and score what it foretold.
+    """Run the recording through ``axis``, which must learn, and score its predictions.
 
     Raises InputError where the sample times differ by more than a thousandth or nothing of the recording is usable.
     """
@@ -122,7 +121,7 @@ def replay(
     n, size, age = len(grid), axis.config.snapshot_every, math.ceil(age_s / axis.dt_s - 1e-9)
     ends = _row_ends(recording, float(grid.t_s[0]), n, size)
     frozen = axis.newest.models[name]
-    # Newest last; the first entry is what a block foretells from.
+    # Newest last; the first entry predicts the block.
     ring: deque[tuple[int, InverseModel]] = deque([(-1 - age, frozen)])
     memories = [frozen.rest_memory(float(motion[0, 0]))] * 2
     error_V, std_V = np.full((2, n), np.nan), np.full(n, np.nan)

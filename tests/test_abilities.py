@@ -14,11 +14,10 @@ from baselines.bouc_wen.online import BoucWenOnline
 from baselines.competition.competition import Competition
 from baselines.linear import LinearOnline
 from baselines.prandtl_ishlinskii.online import MpiOnline
-from service.server.competing import Competing
 from tests.online_models import PlainModel
 
 ROOT = Path(__file__).resolve().parents[1]
-ONLINE = (Learner, LinearOnline, MpiOnline, BoucWenOnline, Competition, Competing, PlainModel)
+ONLINE = (Learner, LinearOnline, MpiOnline, BoucWenOnline, Competition, PlainModel)
 #: Set in the constructor of most models, and hence not visible in the class.
 ATTRIBUTES = {"base", "seq", "trouble", "why", "distrusts"}
 
@@ -67,6 +66,6 @@ def test_what_the_service_calls_on_a_learner_is_declared() -> None:
                 ):  # fmt: skip
                     found.append((node.attr, f"{path.relative_to(ROOT)}:{node.lineno}"))
     assert {"freeze", "thaw", "handle", "snapshot"} <= {name for name, _ in found}
-    known = members(OnlineModel).keys() | {"standing", "champion_model"}  # the last two where it is a Competing
+    known = members(OnlineModel).keys() | {"standing", "champion_model"}  # the last two where it is a Competition
     unknown = [f"{where}: {name}" for name, where in found if name not in known]
     assert not unknown

@@ -21,7 +21,7 @@ TRACKED = [
 
 
 #: Abilities that are still found by name. A library's object or any exception may lack the attribute; nothing of ours.
-ATTRIBUTES_BY_NAME_AT_MOST = 5
+ATTRIBUTES_BY_NAME_AT_MOST = 1
 #: Attributes of libraries that the product sets: the output while a command redirects it, a C function's result type,
 #: the clock of a process that runs with a shifted one, and whether pipython asks a controller for its errors. An object
 #: of ours changes itself, by its own methods.
@@ -34,8 +34,7 @@ def measures() -> dict[str, Any]:
 
 
 def test_no_folder_has_more_than_15_modules(measures: dict[str, Any]) -> None:
-    """A library of alike things is the exception."""
-    assert set(measures["large folders"]) <= {"sim/effects"}
+    assert not measures["large folders"]
 
 
 def test_no_modules_import_each_other(measures: dict[str, Any]) -> None:
@@ -58,11 +57,11 @@ def test_nothing_frozen_is_changed(measures: dict[str, Any]) -> None:
 
 
 def test_every_name_that_a_package_offers_can_be_imported() -> None:
-    """Names that are loaded on first use name their module by a string, which no type checker sees."""
+    """A wrong module behind a name that is loaded on first use would fail only there."""
     missing = []
     for folder in (p.parent for top in house.PACKAGES for p in (ROOT / top).rglob("__init__.py")):
         package = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
-        offered = vars(package).get("__all__", ())
+        offered = getattr(package, "__all__", ())
         modules = {file.stem for file in folder.glob("*.py")} | {inner.name for inner in folder.iterdir()}
         missing += [f"{package.__name__}.{name}" for name in {*offered} - modules if not hasattr(package, name)]
     assert not missing

@@ -12,21 +12,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.bouc_wen.identify import identify_bouc_wen
-    from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
-    from baselines.bouc_wen.online import BoucWenOnline
+    from baselines.bouc_wen.identify import identify_bouc_wen as identify_bouc_wen
+    from baselines.bouc_wen.model import BoucWenInverse as BoucWenInverse
+    from baselines.bouc_wen.model import BoucWenParameters as BoucWenParameters
+    from baselines.bouc_wen.online import BoucWenOnline as BoucWenOnline
 
-_MODULES = {
-    "BoucWenInverse": "model",
-    "BoucWenOnline": "online",
-    "BoucWenParameters": "model",
-    "identify_bouc_wen": "identify",
-}
-__all__ = [
-    "BoucWenInverse",
-    "BoucWenOnline",
-    "BoucWenParameters",
-    "identify_bouc_wen",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -6,7 +6,7 @@ unknowns remain, in a space where every point is a stage that can be inverted:
 
     alpha = 0.98 share/max(1, 2 rho),   beta = rho lambda,   gamma = (1 - rho) lambda,   log lambda, log b/k, log m/k
 
-A recording shows m/k and b/k only, never m, b, k alone; the caller states the stiffness. For an overdamped stage
+A recording shows m/k and b/k only, never m, b, k alone; the stiffness is that of Table 2.1. For an overdamped stage
 sampled more slowly than its fast mode, it does not show m/k either. m/k is therefore kept only where the fit is
 significantly worse without it. Otherwise it is set to the negligible value of Table 2.1, because the inverse
 multiplies it by accelerations far above those of the recording.
@@ -22,10 +22,9 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from baselines.bouc_wen.model import TABLE_2_1, BoucWenParameters
+from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage, settled
-from baselines.fit_report import FitReport
-from baselines.validation import checked_recording
+from baselines.common import FitReport, checked_recording, std_of_voltage
 
 #: Bounds of share, rho, log lambda (1/V), log b/k (s), log m/k (s²), initial hysteresis as a share of its limit.
 _LOWER = np.array([0.0, 0.02, math.log(1e-3), math.log(1e-6), math.log(1e-13), -1.0])
@@ -127,8 +126,6 @@ def identify_bouc_wen(
     dt_s: float,
     *,
     hold: str = "linear",
-    initial: str = "auto",
-    k_N_per_m: float = TABLE_2_1.k_N_per_m,
 ) -> tuple[BoucWenParameters, FitReport]:
     """Bouc-Wen stage of a recording, by least squares.
 
@@ -136,17 +133,14 @@ def identify_bouc_wen(
     ----------
     u_V, y_um : (n,) voltage V and displacement µm, ``dt_s`` s apart, n >= 20.
     hold : how the voltage runs within a step, see :mod:`baselines.bouc_wen.model`.
-    initial : "rest": the stage came monotonically from 0 V to the first voltage; "free": its initial hysteresis is an
-        unknown; "auto": free where the first voltage is above 5 % of the largest.
-    k_N_per_m : stiffness to express m and b with, N/m; a recording does not show it.
 
+    The initial hysteresis is an unknown where the first voltage is above 5 % of the largest; else the stage came
+    monotonically from 0 V. m and b are expressed with the stiffness of Table 2.1: a recording does not show it.
     Returns the parameters and a report. Its errors are those with the initial transient and hysteresis that were
     found. Raises InputError on an unusable recording, and where displacement falls with voltage.
     """
     u, y, dt = checked_recording(u_V, y_um, dt_s, 20)
-    if initial not in ("auto", "rest", "free"):
-        raise InputError(f"initial: got {initial!r}, expected 'auto', 'rest' or 'free'")
-    free = initial == "free" or (initial == "auto" and abs(u[0]) > 0.05 * float(np.max(np.abs(u))))
+    free = abs(u[0]) > 0.05 * float(np.max(np.abs(u)))
     stride = max(1, min(u.size // _SEARCH_SAMPLES, int(_SEARCH_DT_S / dt)))
     thin = _Fit(u[::stride], y[::stride], dt * stride, "linear" if stride > 1 else hold, free)
     extra = ((0.5 * math.copysign(1.0, u[0]),),) if free else ((),)
@@ -165,6 +159,7 @@ def identify_bouc_wen(
             f"y_um: falls with the voltage (gain {d:.3g} µm/V), expected a rising one; check the sign and the columns"
         )
     shape, lag, inertia = _unpack(best.x)
+    k_N_per_m = TABLE_2_1.k_N_per_m
     parameters = BoucWenParameters(
         m_kg=inertia * k_N_per_m,
         b_N_s_per_m=lag * k_N_per_m,
@@ -189,3 +184,11 @@ def identify_bouc_wen(
     method = f"least squares from {len(found)} starts, {hold} hold, initial hysteresis {'free' if free else 'rest'}"
     report = FitReport.of("bouc_wen", method, y, y + residual, dt, evaluations, bool(best.status > 0), notes)
     return parameters, report
+
+
+def fit_bouc_wen(
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, hold: str = "linear", serve_dt_s: float | None = None
+) -> tuple[BoucWenInverse, FitReport]:
+    """Identify a Bouc-Wen stage with ``identify_bouc_wen`` and invert it; other arguments as in ``fit_linear``."""
+    parameters, report = identify_bouc_wen(u_V, y_um, dt_s, hold=hold)
+    return BoucWenInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report

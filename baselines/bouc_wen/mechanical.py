@@ -30,7 +30,7 @@ from scipy.optimize import least_squares
 from adaptive.compiled import compiled
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray
-from baselines.validation import finite_series, positive
+from baselines.common import finite_series, positive
 
 
 def between_samples(u: FloatArray, factor: int) -> FloatArray:
@@ -203,14 +203,12 @@ class MechanicalReport:
     Attributes
     ----------
     rmse_m, noise_m : RMSE against the mean periods, and the noise of these, m.
-    starts_m : RMSE reached from each start, m.
     evaluations : runs of the model.
     std : (7,) standard deviations of m, c, k, alpha, g, d, nu; relative for the first four.
     """
 
     rmse_m: float
     noise_m: float
-    starts_m: tuple[float, ...]
     evaluations: int
     std: FloatArray
 
@@ -288,4 +286,4 @@ def identify_mechanical(
     errors = [found.steady_state(r.u_N, r.dt_s, oversample) - r.y_m for r in records]
     rmse = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     noise = float(np.sqrt(np.mean([r.noise_m**2 for r in records])))
-    return found, MechanicalReport(rmse, noise, tuple(entry[0] for entry in tried), evaluations, std)
+    return found, MechanicalReport(rmse, noise, evaluations, std)

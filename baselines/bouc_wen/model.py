@@ -25,8 +25,8 @@ from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
-from baselines.fit_report import Domain
-from baselines.validation import (
+from baselines.common import (
+    Domain,
     checked_memory,
     checked_motion,
     common_fields,

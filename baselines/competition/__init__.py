@@ -11,19 +11,8 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.competition.champion import ChampionInverse
-    from baselines.competition.competition import Competition
-    from baselines.competition.config import CompetitionConfig
+    from baselines.competition.champion import ChampionInverse as ChampionInverse
+    from baselines.competition.competition import Competition as Competition
+    from baselines.competition.config import CompetitionConfig as CompetitionConfig
 
-_MODULES = {
-    "ChampionInverse": "champion",
-    "Competition": "competition",
-    "CompetitionConfig": "config",
-}
-__all__ = [
-    "ChampionInverse",
-    "Competition",
-    "CompetitionConfig",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

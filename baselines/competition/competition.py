@@ -613,8 +613,12 @@ class Competition:
 
     # ---- out
 
-    def snapshot(self) -> ChampionInverse:
-        """What is served: the champion of the last judgement, with its present parameters. Immutable."""
+    def snapshot(self) -> InverseModel:
+        """The favourite's model; the snapshot of all contestants is `champion_model`."""
+        return self.champion_model().models[0]
+
+    def champion_model(self) -> ChampionInverse:
+        """The champion of the last judgement, with its present parameters, and the others beside it. Immutable."""
         if not self._changed:
             return self._serving
         self._changed = False

@@ -17,9 +17,10 @@ class CompetitionConfig:
     block : samples between two judgements.
     serving_age_s : age of the snapshots that are scored, s; that of the models in the hands of callers.
     horizon_s : time constant of the mean square error, s of scored motion.
-    margin : a challenger's rms error times this factor must stay below that of the champion, ...
-    floor : ... by at least this share of the voltage span, ...
-    patience_s : ... for this long, s of scored motion. The favourite returns without margin and floor.
+    margin : factor by which the champion's rms error must exceed that of a challenger.
+    floor : difference of the two errors beyond that, as a share of the voltage span.
+    patience_s : time for which both must hold before the challenger replaces the champion, s of scored motion. The
+        favourite returns without margin and floor.
     blend_s : duration of a change of champion in a caller's stream of points, s.
     cutoff_hz : bandwidth of the smoother, Hz.
     rest_share, rest_s : a stage that stays within this share of the range for this long, s, is at rest.

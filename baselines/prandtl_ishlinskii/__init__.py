@@ -11,23 +11,10 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.prandtl_ishlinskii.identify import MpiGrid, identify_mpi
-    from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-    from baselines.prandtl_ishlinskii.online import MpiOnline
+    from baselines.prandtl_ishlinskii.identify import MpiGrid as MpiGrid
+    from baselines.prandtl_ishlinskii.identify import identify_mpi as identify_mpi
+    from baselines.prandtl_ishlinskii.model import MpiInverse as MpiInverse
+    from baselines.prandtl_ishlinskii.model import MpiParameters as MpiParameters
+    from baselines.prandtl_ishlinskii.online import MpiOnline as MpiOnline
 
-_MODULES = {
-    "MpiGrid": "identify",
-    "MpiInverse": "model",
-    "MpiOnline": "online",
-    "MpiParameters": "model",
-    "identify_mpi": "identify",
-}
-__all__ = [
-    "MpiGrid",
-    "MpiInverse",
-    "MpiOnline",
-    "MpiParameters",
-    "identify_mpi",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

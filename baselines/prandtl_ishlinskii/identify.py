@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from baselines.bounded_least_squares import SLOPE_FLOOR, bounded_least_squares
-from baselines.fit_report import FitReport
-from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
+from baselines.common import FitReport, checked_recording, std_of_voltage
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, from_inverse_saturation
 from baselines.prandtl_ishlinskii.operators import play_run, play_start, ramps, slopes_to_weights
-from baselines.validation import checked_recording
 
 #: Weight of the scale constraint relative to the mean row; rescaling makes the constraint exact afterwards.
 _SCALE_WEIGHT = 1e3
@@ -174,3 +173,11 @@ def identify_mpi(
     method = f"non-negative least squares on (2.40), n={n}, m={m}"
     report = FitReport.of("mpi", method, y, parameters.simulate(u, dt), dt, evaluations, True, notes)
     return parameters, report
+
+
+def fit_mpi(
+    u_V: ArrayLike, y_um: ArrayLike, dt_s: float, *, fit_lag: bool = False, serve_dt_s: float | None = None
+) -> tuple[MpiInverse, FitReport]:
+    """Identify an MPI model with ``identify_mpi`` and invert it; other arguments as in ``fit_linear``."""
+    parameters, report = identify_mpi(u_V, y_um, dt_s, fit_lag=fit_lag)
+    return MpiInverse(parameters, serve_dt_s or report.dt_s, report.domain, std_of_voltage(u_V, report)), report

@@ -22,9 +22,8 @@ import numpy as np
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
-from baselines.fit_report import Domain
-from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
-from baselines.validation import (
+from baselines.common import (
+    Domain,
     checked_memory,
     checked_motion,
     common_fields,
@@ -33,6 +32,7 @@ from baselines.validation import (
     positive,
     std_or_nan,
 )
+from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_start, play_step
 
 
 def inverse_weights(w: FloatArray) -> FloatArray:

@@ -11,20 +11,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from baselines.swarm.evidence_search import EvidenceSearch
-    from baselines.swarm.identification import MissingTorchError, swarm_bouc_wen, swarm_mpi
+    from baselines.swarm.evidence_search import EvidenceSearch as EvidenceSearch
+    from baselines.swarm.identification import MissingTorchError as MissingTorchError
+    from baselines.swarm.identification import swarm_bouc_wen as swarm_bouc_wen
+    from baselines.swarm.identification import swarm_mpi as swarm_mpi
 
-_MODULES = {
-    "EvidenceSearch": "evidence_search",
-    "MissingTorchError": "identification",
-    "swarm_bouc_wen": "identification",
-    "swarm_mpi": "identification",
-}
-__all__ = [
-    "EvidenceSearch",
-    "MissingTorchError",
-    "swarm_bouc_wen",
-    "swarm_mpi",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

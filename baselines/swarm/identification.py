@@ -16,16 +16,14 @@ from adaptive.types import FloatArray
 from baselines.bouc_wen.model import BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, poles, run_stage
 from baselines.bounded_least_squares import SLOPE_FLOOR
-from baselines.fit_report import FitReport
+from baselines.common import FitReport, checked_recording
 from baselines.prandtl_ishlinskii.identify import MpiGrid
 from baselines.prandtl_ishlinskii.model import MpiParameters, from_inverse_saturation
 from baselines.prandtl_ishlinskii.operators import dead_zone, play_run, play_start
-from baselines.validation import checked_recording
 
 # --- Particle swarm with all particles as one batch in torch, which is imported only when a swarm starts.
 
 #: Called after each epoch with its number, from 1, and the best cost so far. Returning False stops the swarm.
-Progress = Callable[[int, float], bool | None]
 
 
 class MissingTorchError(DehystError, ImportError):
@@ -88,7 +86,6 @@ def minimise(
     lower: FloatArray,
     upper: FloatArray,
     config: SwarmConfig,
-    progress: Progress | None = None,
 ) -> SwarmResult:
     """Minimise ``cost`` over the box from ``lower`` to ``upper`` (dimensions,).
 
@@ -114,7 +111,6 @@ def minimise(
         speed = 0.5 * (high - low) * (draw() - 0.5)
         own, own_cost = position.clone(), finite(cost(position))
         history = np.empty(config.epochs)
-        epoch = 0
         for epoch in range(1, config.epochs + 1):
             best = own[torch.argmin(own_cost)]
             done = min(1.0, epoch / (0.75 * config.epochs))
@@ -129,14 +125,12 @@ def minimise(
             own = torch.where(better[:, None], position, own)
             own_cost = torch.where(better, now, own_cost)
             history[epoch - 1] = float(own_cost.min())
-            if progress is not None and progress(epoch, float(history[epoch - 1])) is False:
-                break
         winner = int(torch.argmin(own_cost))
         result = own[winner].cpu().numpy().astype(np.float64)
         final = float(own_cost[winner])
     if not np.isfinite(final):
         raise InputError("lower, upper: no particle had a finite cost; widen or move the search space")
-    return SwarmResult(result, final, history[:epoch], config.particles * (epoch + 1))
+    return SwarmResult(result, final, history, config.particles * (config.epochs + 1))
 
 
 # --- Identification by particle swarm, as in the chapter: the search space of Table 2.1, 1500 epochs.
@@ -189,12 +183,11 @@ def swarm_bouc_wen(
     *,
     hold: str = "linear",
     scale: str = "linear",
-    progress: Progress | None = None,
 ) -> tuple[BoucWenParameters, FitReport]:
     """Bouc-Wen stage by swarm over (2.3) in the search space of Table 2.1.
 
     ``scale="linear"`` searches the space as the table gives it, ``"log"`` searches m, b, k, d by their logarithms (from
-    1e-9 kg and 1e-7 m/V in place of the zeros of the table). ``progress`` is called after each epoch.
+    1e-9 kg and 1e-7 m/V in place of the zeros of the table).
 
     Takes and returns what ``identify_bouc_wen`` does. The offset of the displacement, which the chapter's model lacks,
     is solved for within the cost. The swarm is a batch in torch; a compiled loop simulates its stages, because 500
@@ -216,7 +209,7 @@ def swarm_bouc_wen(
         return torch.as_tensor(bouc_wen_costs(rows, u, y, dt, hold == "linear"), device=setup.device)
 
     low, high = (np.where(logarithmic, np.log(np.maximum(bound, 1e-300)), bound) for bound in (least, most))
-    found = minimise(cost, low, high, setup, progress)
+    found = minimise(cost, low, high, setup)
     m, b, k, d, alpha, beta, gamma = (float(value) for value in physical(found.position))
     bare = BoucWenParameters(m, b, k, d, alpha, beta, gamma, hold=hold)
     offset = float(np.mean(y - bare.simulate(u, dt, bare.at_rest(float(u[0])))))
@@ -234,14 +227,13 @@ def swarm_mpi(
     *,
     n: int = 12,
     m: int = 6,
-    progress: Progress | None = None,
 ) -> tuple[MpiParameters, FitReport]:
     """MPI model by swarm over (2.40), with weights within [0, 1] as in the chapter.
 
     The residual is measured after all weights are scaled so that the inverse saturation maps the recorded stroke onto
     itself, the scale constraint of ``identify_mpi``; all weights zero then cost infinitely much. The offset of x is
-    solved for within the cost. The whole swarm is evaluated in torch as one batch of quadratic forms. ``progress`` is
-    called after each epoch. Raises InputError, MissingTorchError.
+    solved for within the cost. The whole swarm is evaluated in torch as one batch of quadratic forms. Raises
+    InputError, MissingTorchError.
     """
     u, y, dt = checked_recording(u_V, y_um, dt_s, n + m + 4)
     setup = config or SwarmConfig()
@@ -260,7 +252,7 @@ def swarm_mpi(
 
     lower, upper = np.zeros(columns.shape[1]), np.ones(columns.shape[1])
     lower[0] = lower[n + 1] = SLOPE_FLOOR * float(np.ptp(u)) / grid.stroke_um  # both first slopes above zero
-    found = minimise(cost, lower, upper, setup, progress)
+    found = minimise(cost, lower, upper, setup)
     weights = found.position / float(at_stroke @ found.position)
     offset = -float(means @ weights)
     parameters = from_inverse_saturation(

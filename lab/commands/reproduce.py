@@ -44,10 +44,11 @@ def run(args: argparse.Namespace) -> int:
     from threadpoolctl import threadpool_limits
 
     from lab.reproduce.measured import StudyConfig, run_study
-    from lab.reproduce.report import prepare, write_study
+    from lab.reproduce.report import write_study
     from service.protocol.errors import FieldError
+    from service.storage.output import clear_output
 
-    out = prepare(args.out)
+    clear_output(args.out)
     if args.data is not None and not args.data.is_dir():
         raise FieldError("--data", str(args.data), "a folder with the measured data")
     begin = time.perf_counter()
@@ -68,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     )
     # One BLAS thread: with two, a solve of 1 ms now and then takes much longer.
     with threadpool_limits(limits=1):
-        numbers = write_study(run_study(config, say), out, say)
-    print(json.dumps(numbers, ensure_ascii=False) if args.json else summary(numbers, out))
+        numbers = write_study(run_study(config, say), args.out, say)
+    print(json.dumps(numbers, ensure_ascii=False) if args.json else summary(numbers, args.out))
     return 0
 
 

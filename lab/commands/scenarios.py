@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.options import add_epilog, add_shared, make_folder, progress_printer
+from service.cli.options import add_epilog, add_shared, progress_printer
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
     from lab.scenarios import draw_overview, table
-    from service.config.learner import read_learner_settings
+    from service.config.settings import read_learner_settings
+    from service.storage.output import clear_output
 
     if not 1 <= args.seeds <= 1000:
         raise FieldError("--seeds", args.seeds, "an integer from 1 to 1000")
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--rest", args.rest, "a time above 0 s, up to a day (86400 s)")
     settings = read_learner_settings(args.config).settings if args.config is not None else {}
     chosen = _chosen(args.only, args.seeds)
-    make_folder(args.out)
+    clear_output(args.out)
     show = progress_printer(args.quiet)
     start = time.perf_counter()
     tasks = [(kind, seed, args.rest, settings, None if args.no_pictures else args.out) for kind, seed in chosen]

@@ -10,21 +10,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from lab.demo.plan import Plan
-    from lab.demo.result import DemoRun, table
-    from lab.demo.session import run
+    from lab.demo.plan import Plan as Plan
+    from lab.demo.result import DemoRun as DemoRun
+    from lab.demo.result import table as table
+    from lab.demo.session import run as run
 
-_MODULES = {
-    "DemoRun": "result",
-    "Plan": "plan",
-    "run": "session",
-    "table": "result",
-}
-__all__ = [
-    "DemoRun",
-    "Plan",
-    "run",
-    "table",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

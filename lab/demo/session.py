@@ -15,8 +15,7 @@ import zenoh
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from lab.demo.controller import KEPT
-from lab.demo.following import FollowedModels
+from lab.demo.controller import KEPT, FollowedModels
 from lab.demo.plan import AXIS, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
 from lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
 from lab.testbed.identified_stage import READY_S, Rig, write_service_config

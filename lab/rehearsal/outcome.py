@@ -12,6 +12,7 @@ from adaptive.types import BoolArray, FloatArray
 from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
+from service.reports.tables import json_form
 from sim.recordings.repair import runs
 
 #: Window of the worst mean error, s; error that must not last, percent of the range.
@@ -43,14 +44,16 @@ class ErrorFigures:
 
     Attributes
     ----------
-    before_pct : mean absolute error of the last 2 s before the event. first_second_pct, then_pct : of the first second
-    from the event on, and of 1 to 4 s after it. during_pct : during the event, NaN if it does not last.
-    settled_pct : of the last 2 s of the run. worst_half_second_pct : largest mean over half a second from the event
-    on. worst_pct : largest error from the event on. large_s : longest time with an error above 5 % in the whole run,
-    where the reference is within reach, that is, unless the voltage is at the limit that moves the stage towards it.
-    Interruptions up to 10 ms do not count. large_at_s : when that began, s after the event (negative: before it); NaN
-    if never. rail_s : longest time at a limit of the drive that the reference did not require. ends_at_rail : whether
-    the run ended so.
+    before_pct : mean absolute error of the last 2 s before the event.
+    first_second_pct, then_pct : of the first second from the event on, and of 1 to 4 s after it.
+    during_pct : during the event, NaN if it does not last.
+    settled_pct : of the last 2 s of the run.
+    worst_half_second_pct, worst_pct : largest mean over half a second, and largest error, from the event on.
+    large_s : longest time with an error above 5 % in the whole run. It does not count where the voltage is at the limit
+        that moves the stage towards the reference. Interruptions up to 10 ms do not end it.
+    large_at_s : when that began, s after the event (negative: before it); NaN if never.
+    rail_s : longest time at a limit of the drive that the reference did not require.
+    ends_at_rail : whether the run ended there.
     """
 
     before_pct: float
@@ -122,7 +125,7 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form: values that are not finite become null, numbers have seven digits."""
-        form: dict[str, Any] = _plain(asdict(self))
+        form: dict[str, Any] = json_form(asdict(self))
         return form
 
 
@@ -146,7 +149,7 @@ class HealthyOutcome:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form: values that are not finite become null, numbers have seven digits."""
-        form: dict[str, Any] = _plain(asdict(self))
+        form: dict[str, Any] = json_form(asdict(self))
         return form
 
 
@@ -312,13 +315,3 @@ def _sensor_excess(adaptive: LoopRecord, frozen: LoopRecord, event: Event, range
     window = max(1, round(WINDOW_S / dt_s))
     one, other = (moving_mean(_error_pct(course, range_um)[part], window) for course in (adaptive, frozen))
     return float((one / np.maximum(SENSOR_PCT, SENSOR_FACTOR * other)).max())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.7g}") if np.isfinite(value) else None
-    return value

@@ -15,7 +15,7 @@ import numpy as np
 
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.types import FloatArray, InverseModel
-from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
+from baselines import fit_bouc_wen, fit_linear, fit_mpi
 from lab.rehearsal.config import RehearsalConfig
 from service.answers.guard import Limits
 from service.config.settings import LEARN

@@ -40,6 +40,7 @@ from lab.rehearsal.plant import IdentifiedPlant, PlantFactory, excitation_range,
 from lab.rehearsal.reference import Excursion, Motion, RandomReference, Reference, ReferenceRequest
 from service.config.settings import LEARN, AxisConfig
 from service.protocol.errors import FieldError
+from service.reports import tables
 from service.reports.plot_style import figure, legend, line, save
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
@@ -280,14 +281,11 @@ def remarks(result: Outcome) -> list[str]:
 
 def table(rehearsal: Rehearsal, markdown: bool = False) -> str:
     """All runs as a table; ``markdown`` for a page."""
-    rows = [HEAD, *(row(run.outcome) for run in rehearsal.runs)]
+    rows = [row(run.outcome) for run in rehearsal.runs]
     if markdown:
-        lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-        return "\n".join([lines[0], "|" + "---|" * len(HEAD), *lines[1:]])
-    widths = [max(len(cells[i]) for cells in rows) for i in range(len(HEAD))]
-    lines = ["  ".join(_aligned(cells, widths)).rstrip() for cells in rows]
+        return tables.markdown(HEAD, rows)
+    lines = tables.aligned(HEAD, rows, left=(0, len(HEAD) - 1))
     known = rehearsal.identified
-    lines.insert(1, "-" * len(lines[0]))
     lines += [
         "errors: mean absolute, % of the commanded range; identified: "
         f"{known.low_um:.4g} to {known.high_um:.4g} µm, off by {known.heldout_mae_pct:.3f} % of the voltage span",
@@ -295,12 +293,6 @@ def table(rehearsal: Rehearsal, markdown: bool = False) -> str:
         f"{SENSOR_PCT:g} % or {SENSOR_FACTOR:g} times the frozen model's",
     ]
     return "\n".join(lines)
-
-
-def _aligned(cells: Sequence[str], widths: Sequence[int]) -> list[str]:
-    last = len(cells) - 1
-    pairs = enumerate(zip(cells, widths, strict=True))
-    return [cell.ljust(width) if i in (0, last) else cell.rjust(width) for i, (cell, width) in pairs]
 
 
 # --- The picture: for each event the error of the learning and of the frozen model over time.

@@ -16,7 +16,7 @@ from baselines.bouc_wen.model import BoucWenParameters
 from baselines.prandtl_ishlinskii.model import MpiParameters, inverse_thresholds, inverse_weights
 from lab.reproduce.figures import benchmark_figure, draw_control, draw_models, stack_figure
 from lab.reproduce.measured import BENCHMARK_PUBLISHED, WINDOWS, Benchmark, PresetStudy, Stack, Study
-from service.protocol.errors import FieldError
+from service.reports.tables import json_form, markdown
 from sim.chapter import published
 from sim.chapter.control import CHANGE_S, FROZEN, GAIN_CHANGE, LEARNING
 from sim.chapter.experiments import Width
@@ -25,19 +25,6 @@ from sim.chapter.forward_lssvm import MemoryLssvm, TwoInputLssvm
 # --- ``tables.json``: every number of the report, published and computed, and whether the targets are met.
 
 SCHEMA = 1
-
-
-def json_form(value: Any) -> Any:
-    """JSON form: floats with seven digits, non-finite numbers as null, arrays and tuples as lists."""
-    if isinstance(value, dict):
-        return {str(key): json_form(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [json_form(entry) for entry in value]
-    if isinstance(value, float | np.floating):
-        return float(f"{float(value):.7g}") if math.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value
 
 
 def table_2_1(parameters: BoucWenParameters) -> dict[str, float]:
@@ -229,9 +216,7 @@ def tables(study: Study) -> dict[str, Any]:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; the first column to the left, the others to the right."""
-    lines = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+    return markdown(head, rows, left=(0,)) + "\n"
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -742,21 +727,7 @@ def report(study: Study, numbers: dict[str, Any], pictures: Pictures) -> str:
     return "\n".join(parts)
 
 
-def write_report(path: Path, text: str) -> None:
-    """Write the report. Raises OSError from the disk."""
-    path.write_text(text, encoding="utf-8")
-
-
 # --- A study onto the disk: ``report.md``, ``tables.json``, and one PNG a figure in a folder for each stage.
-
-
-def prepare(out: Path) -> Path:
-    """Make the folder for the results. Raises InputError if that fails."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FieldError("--out", str(out), f"a folder that can be written ({error.strerror})") from error
-    return out
 
 
 def write_study(study: Study, out: Path, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
@@ -777,5 +748,5 @@ def write_study(study: Study, out: Path, progress: Callable[[str], None] = lambd
     numbers = tables(study)
     numbers["pictures"] = pictures
     (out / "tables.json").write_text(json.dumps(numbers, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    write_report(out / "report.md", report(study, numbers, pictures))
+    (out / "report.md").write_text(report(study, numbers, pictures), encoding="utf-8")
     return numbers

@@ -6,22 +6,15 @@ processes of a soak import this package and must start fast.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from lab.soak.fault_plan import FAULT_KINDS, SoakPlan, make_plan, select_kinds
-    from lab.soak.session import run
+    from lab.soak.fault_plan import FAULT_KINDS as FAULT_KINDS
+    from lab.soak.fault_plan import SoakPlan as SoakPlan
+    from lab.soak.fault_plan import make_plan as make_plan
+    from lab.soak.fault_plan import select_kinds as select_kinds
+    from lab.soak.session import run as run
 
-__all__ = ["FAULT_KINDS", "SoakPlan", "make_plan", "run", "select_kinds"]
-
-_MODULES: Final = {
-    "FAULT_KINDS": "fault_plan",
-    "SoakPlan": "fault_plan",
-    "make_plan": "fault_plan",
-    "select_kinds": "fault_plan",
-    "run": "session",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

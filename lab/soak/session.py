@@ -211,8 +211,8 @@ OURS = ("soak.json", "report.md", "plan.json", SECONDS, "error.png", "latency.pn
         "soak.rrd", "model.npz", "a", "b", "logs")  # fmt: skip
 #: Limit of the error for a stage from a file, as a multiple of the error before the first fault.
 OWN_STAGE_RATIO = 2.0
-#: Records that wait to be written when the disk is full, or to be sent when the router dies, are lost too, s. Seconds
-#: are identified by their beginning.
+#: Age of records that may also be lost, s: they wait to be written when the disk is full, or to be sent when the
+#: router dies. The seconds of a soak are named by their beginning.
 WAITING_S = 1.0
 #: Longest gap between two seconds with samples, s.
 _BEFORE_S = 30.0

@@ -1,10 +1,10 @@
-"""What the threads of the services did in a moment in which nobody was answered: evidence for `queries_answered`.
+"""What the threads of the services did while no query was answered: evidence for `queries_answered`.
 
-A silence has two kinds of causes. Either a thread of the service waited for another one (a lock, the disk): that is
-ours. Or it was ready and got no processor: that is the machine. The kernel counts both for each thread
-(``/proc/PID/task/TID/schedstat``: time on a processor, time ready and waiting for one). `StallWatch` keeps the counts
-of the last second, and when the prober reports a silence it writes what has happened since, the state of each thread
-and the kernel function in which it waits, and lets the services write the Python stacks of all their threads
+A silence has two kinds of causes. If a thread of the service waited for another one (a lock, the disk), the service is
+the cause. If the thread was ready and got no processor, the machine is the cause. The kernel counts both for each
+thread (``/proc/PID/task/TID/schedstat``: time on a processor, time ready and waiting for one). `StallWatch` keeps the
+counts of the last second, and when the prober reports a silence it writes what has happened since, the state of each
+thread and the kernel function in which it waits, and lets the services write the Python stacks of all their threads
 (``logs/stacks-PID.txt``, see `lab.testbed.shifted_clock`), as soon as its main thread gets the interpreter lock. Linux
 only.
 """

@@ -13,24 +13,16 @@ own libraries: `service.adapters.pi`, `service.adapters.jena`, `service.adapters
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.adapters.adapter import AdapterError, StageAdapter
-    from service.adapters.recording import excitation, record, write_recording
-    from service.adapters.stage_loop import StageLoop
+    from service.adapters.adapter import AdapterError as AdapterError
+    from service.adapters.adapter import StageAdapter as StageAdapter
+    from service.adapters.recording import excitation as excitation
+    from service.adapters.recording import record as record
+    from service.adapters.recording import write_recording as write_recording
+    from service.adapters.stage_loop import StageLoop as StageLoop
 
-__all__ = ["AdapterError", "StageAdapter", "StageLoop", "excitation", "record", "write_recording"]
-
-_MODULES: Final = {
-    "AdapterError": "adapter",
-    "StageAdapter": "adapter",
-    "StageLoop": "stage_loop",
-    "excitation": "recording",
-    "record": "recording",
-    "write_recording": "recording",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -208,16 +208,15 @@ def run(args: argparse.Namespace) -> int:
             "PVAccess has no passwords: with --insecure-beyond-loopback everybody there may freeze the axis",
         )  # fmt: skip
     keys = Keys(args.stage, args.axis)
-    session = open_client(args.endpoint, args.wait, args.zenoh_config)
-    try:
-        with EpicsAxis(session, keys, args.prefix, args.interface, args.port, args.timeout) as axis:
-            shown = axis.poll()
-            print(f"ready: {args.prefix}:STATUS {shown} at {args.interface}, port {args.port}", flush=True)
-            until = math.inf if args.duration is None else time.monotonic() + args.duration
-            while not stop.reason and time.monotonic() < until:
-                stop.wait(min(args.every, max(0.0, until - time.monotonic())))
-                if not stop.reason:
-                    axis.poll()
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
+    with (
+        open_client(args.endpoint, args.wait, args.zenoh_config) as session,
+        EpicsAxis(session, keys, args.prefix, args.interface, args.port, args.timeout) as axis,
+    ):
+        shown = axis.poll()
+        print(f"ready: {args.prefix}:STATUS {shown} at {args.interface}, port {args.port}", flush=True)
+        until = math.inf if args.duration is None else time.monotonic() + args.duration
+        while not stop.reason and time.monotonic() < until:
+            stop.wait(min(args.every, max(0.0, until - time.monotonic())))
+            if not stop.reason:
+                axis.poll()
     return 0

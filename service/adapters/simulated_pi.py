@@ -29,7 +29,7 @@ IDENTITY: Final = "simulated, E-709.CRG, 0, 1.0"
 UNKNOWN_COMMAND, SERVO_IS_ON, UNKNOWN_AXIS, OUT_OF_LIMITS = 2, 5, 15, 302
 #: Volts at the piezo for a volt at the simulated stage.
 AMPLIFIER: Final = 10.0
-#: Longest time that the stage moves at once, s: a stage that nobody asks for longer is at rest.
+#: Longest time that the stage is simulated at once, s: after a longer pause between requests it is at rest.
 _CATCH_UP_S: Final = 1.0
 _POLL_S: Final = 0.005
 

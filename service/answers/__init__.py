@@ -12,29 +12,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.answers.answering import MemoryTracker, Served, answer, derivatives, trust_by_age
-    from service.answers.fallback import Rules, answer_safely
-    from service.answers.guard import Limits
+    from service.answers.answering import MemoryTracker as MemoryTracker
+    from service.answers.answering import Served as Served
+    from service.answers.answering import answer as answer
+    from service.answers.answering import derivatives as derivatives
+    from service.answers.answering import trust_by_age as trust_by_age
+    from service.answers.fallback import Rules as Rules
+    from service.answers.fallback import answer_safely as answer_safely
+    from service.answers.guard import Limits as Limits
 
-_MODULES = {
-    "Limits": "guard",
-    "MemoryTracker": "answering",
-    "Rules": "fallback",
-    "Served": "answering",
-    "answer": "answering",
-    "answer_safely": "fallback",
-    "derivatives": "answering",
-    "trust_by_age": "answering",
-}
-__all__ = [
-    "Limits",
-    "MemoryTracker",
-    "Rules",
-    "Served",
-    "answer",
-    "answer_safely",
-    "derivatives",
-    "trust_by_age",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

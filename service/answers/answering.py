@@ -79,7 +79,7 @@ class MemoryTracker:
         advanced = {}
         for name, model in models.items():
             memory = memories[name]
-            # Before the first samples nobody knew where the stage rests.
+            # Before the first samples the position of the stage is unknown.
             if not self._begun or memory.size != model.memory_size:
                 memory = model.rest_memory(float(y[0]))
             after = model.track(y, v, a, u, memory)
@@ -207,7 +207,7 @@ def answer(
     if query.as_of == NEWEST:
         trust, stale = trust_by_age(age_s or 0.0, config.stale_s, config.last_good_s)
         if served.frozen:
-            trust = 1.0  # it follows no samples: without them it is as good as with them
+            trust = 1.0  # a frozen model follows no samples, so their age does not matter
     else:
         served, behind = _as_of(ring, query.as_of, handled, config.snapshot_every)
     default = served.default or config.served
@@ -246,7 +246,7 @@ def answer(
         memory,
         (y_um, v_um_per_s, a_um_per_s2),
         query.u_before_V,
-        # What does not learn is as good as ever, whatever the samples are.
+        # The trust in the samples concerns only models that learn from them.
         Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
         served.standing_in_for(name, query.memory is not None),
         blends(name, default, config),

@@ -10,9 +10,12 @@ on. The stand-in is a baseline whose form bounds what it says far from its data.
 
 from __future__ import annotations
 
+import logging
 import math
+import threading
+import time
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +25,32 @@ from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.guard import Limits, guard, guarded
-from service.answers.model_errors import log_model_error
 from service.answers.slices import Pace, in_slices
 from service.protocol.model import StandIn
 from service.protocol.query import BLENDED, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN, STALE, STAND_IN, Answer, Trajectory
+
+# --- Errors that a model raises, which no model may: the answer is replaced, the reason is logged.
+
+_LOGGER: Final = logging.getLogger("dehyst.model")
+#: An error is logged again after this time, s; so many different ones are told apart.
+_AGAIN_S: Final = 60.0
+_MOST: Final = 64
+_lock: Final = threading.Lock()
+_logged: dict[tuple[str, str], float] = {}
+
+
+def log_model_error(model: InverseModel, error: Exception) -> None:
+    """Log what ``model`` raised, with its traceback, at most once a minute for each kind of model and error."""
+    key = type(model).__name__, type(error).__name__
+    now = time.monotonic()
+    with _lock:
+        if now - _logged.get(key, -_AGAIN_S) < _AGAIN_S or len(_logged) >= _MOST:
+            return
+        _logged[key] = now
+    _LOGGER.error("%s raised %s: %s; its answer is replaced", *key, error, exc_info=error)
+
+
+# --- Answers with a stand-in.
 
 #: Time constant with which the difference between two snapshots fades, s, and the least of it, in samples.
 FADE_S, FADE_SAMPLES = 0.006, 6.0

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from service.protocol.errors import FieldError
+from service.protocol.keys import check_name
 
 _SHARED: Final[dict[str, dict[str, Any]]] = {
     "stage": {"default": "demo", "metavar": "NAME", "help": "stage on the wire (%(default)s)"},
@@ -69,6 +70,19 @@ def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1
     add_shared(parser, "zenoh-config", wait={"default": wait_s})
 
 
+def add_selection(parser: Any) -> None:
+    """``--stage`` and ``--axis`` of a command that shows all axes by default; see `check_selection`."""
+    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
+    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+
+
+def check_selection(args: argparse.Namespace) -> None:
+    """Raise InputError where a name of `add_selection` is none."""
+    for option, given in (("--stage", args.stage), ("--axis", args.axis)):
+        if given != "*":
+            check_name(option, given)
+
+
 def add_epilog(parser: argparse.ArgumentParser, text: str) -> None:
     """Show ``text``, line by line as it is, below the options."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -89,12 +103,3 @@ def check_seed(seed: int) -> int:
     if seed < 0:
         raise FieldError("--seed", seed, "an integer from 0 on")
     return seed
-
-
-def make_folder(path: Path) -> Path:
-    """The folder ``path`` of ``--out``, made where it is missing. Raises FieldError where it cannot be."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FieldError("--out", f"{path} ({error})", "a folder that can be written to") from error
-    return path

@@ -15,17 +15,9 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.client.client import Client
-    from service.client.follower import Follower
-    from service.protocol.query import Point, Trajectory
+    from service.client.client import Client as Client
+    from service.client.follower import Follower as Follower
+    from service.protocol.query import Point as Point
+    from service.protocol.query import Trajectory as Trajectory
 
-__all__ = ["Client", "Follower", "Point", "Trajectory"]
-
-_MODULES = {
-    "Client": "client",
-    "Follower": "follower",
-    "Point": ".protocol.query",
-    "Trajectory": ".protocol.query",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -11,29 +11,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.config.learner import LearnerSettings, read_learner_settings
-    from service.config.schema import Setting, build_settings
-    from service.config.settings import AxisConfig, ServeConfig, parse_config, read_config
+    from service.config.schema import Setting as Setting
+    from service.config.schema import build_settings as build_settings
+    from service.config.settings import AxisConfig as AxisConfig
+    from service.config.settings import LearnerSettings as LearnerSettings
+    from service.config.settings import ServeConfig as ServeConfig
+    from service.config.settings import parse_config as parse_config
+    from service.config.settings import read_config as read_config
+    from service.config.settings import read_learner_settings as read_learner_settings
 
-_MODULES = {
-    "AxisConfig": "settings",
-    "LearnerSettings": "learner",
-    "ServeConfig": "settings",
-    "Setting": "schema",
-    "build_settings": "schema",
-    "parse_config": "settings",
-    "read_config": "settings",
-    "read_learner_settings": "learner",
-}
-__all__ = [
-    "AxisConfig",
-    "LearnerSettings",
-    "ServeConfig",
-    "Setting",
-    "build_settings",
-    "parse_config",
-    "read_config",
-    "read_learner_settings",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

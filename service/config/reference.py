@@ -15,8 +15,7 @@ from types import UnionType
 from typing import Any, Literal, get_args, get_origin
 
 from baselines.competition.config import CompetitionConfig
-from service.background.diagnosing.settings import WatchConfig
-from service.background.retuning.settings import RetuningConfig
+from service.background.settings import RetuningConfig, WatchConfig
 from service.config.schema import Key, inline_keys, keys_of
 from service.config.settings import AxisConfig, ServeConfig
 from service.fleet.settings import FleetSettings

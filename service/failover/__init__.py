@@ -8,21 +8,14 @@ some of these modules, and `role_control` needs the server.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.failover.role_control import Reachability, RoleControl
-    from service.failover.standby_model import PeerFiles, standby_folder
+    from service.failover.role_control import Reachability as Reachability
+    from service.failover.role_control import RoleControl as RoleControl
+    from service.failover.standby_model import PeerFiles as PeerFiles
+    from service.failover.standby_model import standby_folder as standby_folder
 
-__all__ = ["PeerFiles", "Reachability", "RoleControl", "standby_folder"]
-
-_MODULES: Final = {
-    "PeerFiles": "standby_model",
-    "Reachability": "role_control",
-    "RoleControl": "role_control",
-    "standby_folder": "standby_model",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -111,7 +111,7 @@ def claim_parts(keys: Keys, epoch: int, instance: str) -> tuple[object, ...]:
 
 # --- Whether an instance behind routers is connected to one of them.
 #
-# An instance that loses its router sees the claims of all others disappear. It must not take over then: nobody could
+# An instance that loses its router sees the claims of all others disappear. It must not take over then: no client could
 # query it, and after the reconnection two instances would serve, of which the one that never failed would stand down.
 
 #: Time from the loss of a claim until the loss of the router is known too, s; 5 ms were measured.
@@ -396,7 +396,7 @@ class RoleControl:
 
     def _leave_standby(self) -> None:
         axis = self.server.axis
-        # The first instance takes over from nobody and continues from its own state.
+        # In the first epoch there is no other state to take over: continue from its own.
         source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
         self._apply_switch()
         self.server.loop.set_gate(None)

@@ -41,7 +41,7 @@ NO_SECRET: Final = PeerSecret()
 
 
 class UnprovenError(ServiceError):
-    """Something came from somebody who does not prove to be an instance of this service."""
+    """A message does not prove that its sender is an instance of this service."""
 
 
 def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any], secret: PeerSecret = NO_SECRET) -> None:

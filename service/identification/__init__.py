@@ -11,21 +11,10 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.identification.identifying import Identified, Stretch, draw_identification, identify_all, identify_one
+    from service.identification.identifying import Identified as Identified
+    from service.identification.identifying import Stretch as Stretch
+    from service.identification.identifying import draw_identification as draw_identification
+    from service.identification.identifying import identify_all as identify_all
+    from service.identification.identifying import identify_one as identify_one
 
-_MODULES = {
-    "Identified": "identifying",
-    "Stretch": "identifying",
-    "draw_identification": "identifying",
-    "identify_all": "identifying",
-    "identify_one": "identifying",
-}
-__all__ = [
-    "Identified",
-    "Stretch",
-    "draw_identification",
-    "identify_all",
-    "identify_one",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

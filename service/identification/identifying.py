@@ -15,8 +15,8 @@ from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import BoolArray, FloatArray, InverseModel
+from baselines import fit_bouc_wen, fit_linear, fit_mpi
 from baselines.bouc_wen.model import BoucWenInverse
-from baselines.fit import fit_bouc_wen, fit_linear, fit_mpi
 from baselines.linear import LinearInverse
 from baselines.prandtl_ishlinskii.model import MpiInverse
 from service.protocol.errors import FieldError

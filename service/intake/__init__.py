@@ -11,19 +11,8 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.intake.clock import SampleClock
-    from service.intake.sample_queue import SampleQueue
-    from service.intake.sequence import SequenceTracker
+    from service.intake.sample_queue import SampleQueue as SampleQueue
+    from service.intake.sequence import SampleClock as SampleClock
+    from service.intake.sequence import SequenceTracker as SequenceTracker
 
-_MODULES = {
-    "SampleClock": "clock",
-    "SampleQueue": "sample_queue",
-    "SequenceTracker": "sequence",
-}
-__all__ = [
-    "SampleClock",
-    "SampleQueue",
-    "SequenceTracker",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -11,29 +11,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.operating.remote import Standbys, operate, screen, statuses
-    from service.operating.server import Journal, OperationsServer
-    from service.operating.verbs import Request, Verbs
+    from service.operating.remote import Standbys as Standbys
+    from service.operating.remote import operate as operate
+    from service.operating.remote import screen as screen
+    from service.operating.remote import statuses as statuses
+    from service.operating.server import Journal as Journal
+    from service.operating.server import OperationsServer as OperationsServer
+    from service.operating.verbs import Request as Request
+    from service.operating.verbs import Verbs as Verbs
 
-_MODULES = {
-    "Journal": "server",
-    "OperationsServer": "server",
-    "Request": "verbs",
-    "Standbys": "remote",
-    "Verbs": "verbs",
-    "operate": "remote",
-    "screen": "remote",
-    "statuses": "remote",
-}
-__all__ = [
-    "Journal",
-    "OperationsServer",
-    "Request",
-    "Standbys",
-    "Verbs",
-    "operate",
-    "screen",
-    "statuses",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

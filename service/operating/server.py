@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import queue
 import threading
 import time
@@ -21,6 +20,7 @@ from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request
 from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
+from service.storage.output import append_line
 
 # --- The journal of operations: one JSON line per operation in a folder of the axis.
 
@@ -88,17 +88,9 @@ class Journal:
             return True
         line = json.dumps({"time_unix_s": self._wall_s(), **entry}, default=str).encode() + b"\n"
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             if self.path.exists() and self.path.stat().st_size + len(line) > self._max_bytes:
                 self.path.replace(self.path.with_name(FILE_BEFORE))
-            # One write per line in append mode, so that lines of two processes do not mix.
-            handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-            try:
-                if os.write(handle, line) != len(line):
-                    raise OSError("incomplete write")
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+            append_line(self.path, line)
         except OSError:
             self.lost += 1
             return False

@@ -124,11 +124,6 @@ class Keys:
         """Liveliness, and publication 1 Hz: JSON, the status of a standby."""
         return f"{self.base}/standby/{check_name('instance', instance)}"
 
-    @property
-    def alive_any(self) -> str:
-        """Matches the liveliness tokens of all instances that serve this axis."""
-        return f"{self.base}/alive/*"
-
     def alive(self, instance: str) -> str:
         """Liveliness of one instance; declared last: an alive instance answers queries."""
         return f"{self.base}/alive/{check_name('instance', instance)}"

@@ -11,27 +11,12 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.reports.diagnosis import write_report
-    from service.reports.diagnosis_page import Source
-    from service.reports.plot_style import envelope, figure, legend, line, save
+    from service.reports.diagnosis import write_report as write_report
+    from service.reports.diagnosis_page import Source as Source
+    from service.reports.plot_style import envelope as envelope
+    from service.reports.plot_style import figure as figure
+    from service.reports.plot_style import legend as legend
+    from service.reports.plot_style import line as line
+    from service.reports.plot_style import save as save
 
-_MODULES = {
-    "Source": "diagnosis_page",
-    "envelope": "plot_style",
-    "figure": "plot_style",
-    "legend": "plot_style",
-    "line": "plot_style",
-    "save": "plot_style",
-    "write_report": "diagnosis",
-}
-__all__ = [
-    "Source",
-    "envelope",
-    "figure",
-    "legend",
-    "line",
-    "save",
-    "write_report",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -12,9 +12,10 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.reports.plot_style import figure, label, legend, line, save
+from service.reports.tables import markdown
 from service.viewer.colours import AFTER, BEFORE, MEASURED, NOISE_BAND, SERIES
 from sim.modal import ModalStudy
-from sim.modal.response import smoothed
+from sim.modal.periods import smoothed
 from sim.modal.study import RAYLEIGH_RATIO, Level, Mode
 
 
@@ -126,30 +127,22 @@ def _plural(word: str, count: int) -> str:
 def errors_table(levels: Sequence[Level]) -> list[str]:
     """Errors by amplitude, µm, as lines of Markdown."""
     several = len(levels) > 1
-    extra = (" one linear model |", "---:|") if several else ("", "")
-    outputs = levels[0].train_um.size
-    lines = [
-        "| drive / V rms | output / µm rms | noise | noise and distortion | training | held out | by output |"
-        + extra[0],
-        "|---:|---:|---:|---:|---:|---:|---|" + extra[1],
-    ]
+    head = ["drive / V rms", "output / µm rms", "noise", "noise and distortion", "training", "held out", "by output"]
+    rows = []
     for level in levels:
         spectra = level.response.spectra
-        distortion = f"{level.response.distortion_um.mean():.4f}" if level.response.knows_distortion else "not known"
         shown = level.train_um if level.test_um is None else level.test_um
         row = [
             f"{spectra.amplitude_V:.4g}",
             f"{spectra.signal_um.mean():.3f}",
             f"{spectra.floor_um.mean():.4f}" if np.isfinite(spectra.floor_um).all() else "not known",
-            distortion,
+            f"{level.response.distortion_um.mean():.4f}" if level.response.knows_distortion else "not known",
             f"{level.train_um.mean():.4f}",
             "none" if level.test_um is None else f"{level.test_um.mean():.4f}",
-            ", ".join(f"{shown[i]:.4f}" for i in range(outputs)),
+            ", ".join(f"{value:.4f}" for value in shown),
         ]
-        if several:
-            row.append(f"{level.constant_um.mean():.4f}")
-        lines.append("| " + " | ".join(row) + " |")
-    return lines
+        rows.append([*row, f"{level.constant_um.mean():.4f}"] if several else row)
+    return markdown([*head, "one linear model"] if several else head, rows, left=(len(head) - 1,)).split("\n")
 
 
 def modes_table(modes: Sequence[Mode]) -> list[str]:
@@ -158,12 +151,10 @@ def modes_table(modes: Sequence[Mode]) -> list[str]:
         return ["No pair is weakly damped and large enough to be called a mode."]
     several = modes[0].frequency_hz.size > 1
     outputs = modes[0].participation_um.size
-    names = "".join(f" y{i + 1} / µm |" for i in range(outputs))
-    lines = [
-        f"| frequency / Hz | damping / % |{names}"
-        + (" softening / % | damping at the end / % | gain change / % |" if several else ""),
-        "|---:|---:|" + "---:|" * outputs + ("---:|---:|---:|" if several else ""),
-    ]
+    head = ["frequency / Hz", "damping / %", *(f"y{i + 1} / µm" for i in range(outputs))]
+    if several:
+        head += ["softening / %", "damping at the end / %", "gain change / %"]
+    rows = []
     for mode in modes:
         row = [
             f"{mode.frequency_hz[0]:.2f} ± {mode.frequency_half_hz[0]:.2g}",
@@ -176,7 +167,7 @@ def modes_table(modes: Sequence[Mode]) -> list[str]:
                 f"{100.0 * mode.damping[-1]:.3f} ± {100.0 * mode.damping_half[-1]:.2g}",
                 f"{100.0 * mode.gain_change:+.1f}",
             ]
-        lines.append("| " + " | ".join(row) + " |")
+        rows.append(row)
     end = (
         " Frequency and damping are those at the smallest amplitude; softening is the fall of the frequency to the "
         "largest one, gain change that of the residues' norm."
@@ -184,7 +175,7 @@ def modes_table(modes: Sequence[Mode]) -> list[str]:
         else ""
     )
     return [
-        *lines,
+        markdown(head, rows, left=()),
         "",
         "± is half of the 95 % interval. yN: the mode's rms contribution to an output for flat lines on all drives, at "
         f"the middle amplitude; contributions of close modes overlap.{end}",

@@ -11,27 +11,12 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.runtime.logging_setup import set_up_logging
-    from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, open_client, open_router, open_service
-    from service.runtime.stopping import StopSignal
+    from service.runtime.logging_setup import set_up_logging as set_up_logging
+    from service.runtime.session import DEFAULT_ENDPOINT as DEFAULT_ENDPOINT
+    from service.runtime.session import check_endpoint as check_endpoint
+    from service.runtime.session import open_client as open_client
+    from service.runtime.session import open_router as open_router
+    from service.runtime.session import open_service as open_service
+    from service.runtime.stopping import StopSignal as StopSignal
 
-_MODULES = {
-    "DEFAULT_ENDPOINT": "session",
-    "StopSignal": "stopping",
-    "check_endpoint": "session",
-    "open_client": "session",
-    "open_router": "session",
-    "open_service": "session",
-    "set_up_logging": "logging_setup",
-}
-__all__ = [
-    "DEFAULT_ENDPOINT",
-    "StopSignal",
-    "check_endpoint",
-    "open_client",
-    "open_router",
-    "open_service",
-    "set_up_logging",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -12,39 +12,18 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.security.access import ROLES, Plan, access_control, add, create, read_plan, remove
-    from service.security.check import check_reach, has_access_control
-    from service.security.refusals import Refusals, count_refusals
+    from service.security.access import ROLES as ROLES
+    from service.security.access import Plan as Plan
+    from service.security.access import access_control as access_control
+    from service.security.access import add as add
+    from service.security.access import create as create
+    from service.security.access import read_plan as read_plan
+    from service.security.access import remove as remove
+    from service.security.check import check_reach as check_reach
+    from service.security.check import has_access_control as has_access_control
+    from service.security.peers import PeerSecret as PeerSecret
+    from service.security.peers import read_secret as read_secret
+    from service.security.refusals import Refusals as Refusals
+    from service.security.refusals import count_refusals as count_refusals
 
-_MODULES = {
-    "ROLES": "access",
-    "Plan": "access",
-    "Refusals": "refusals",
-    "access_control": "access",
-    "add": "access",
-    "check_reach": "check",
-    "count_refusals": "refusals",
-    "PeerSecret": "peers",
-    "create": "access",
-    "has_access_control": "check",
-    "read_plan": "access",
-    "read_secret": "peers",
-    "remove": "access",
-}
-__all__ = [
-    "ROLES",
-    "PeerSecret",
-    "Plan",
-    "Refusals",
-    "access_control",
-    "add",
-    "check_reach",
-    "count_refusals",
-    "create",
-    "has_access_control",
-    "read_plan",
-    "read_secret",
-    "remove",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -52,7 +52,7 @@ def _bytes(part: object) -> bytes:
 
 
 def new_nonce() -> str:
-    """A number that nobody can foretell, as text."""
+    """A random number that cannot be predicted, as text."""
     return secrets.token_hex(16)
 
 

@@ -11,30 +11,12 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.server.axis import Axis, EventLog
-    from service.server.axis_loading import load_axis
-    from service.server.axis_loop import AxisLoop
-    from service.server.axis_server import AxisServer
-    from service.server.process import Service
-    from service.server.status import axis_status
+    from service.server.axis import Axis as Axis
+    from service.server.axis import EventLog as EventLog
+    from service.server.axis_loading import load_axis as load_axis
+    from service.server.axis_loop import AxisLoop as AxisLoop
+    from service.server.axis_server import AxisServer as AxisServer
+    from service.server.process import Service as Service
+    from service.server.status import axis_status as axis_status
 
-_MODULES = {
-    "Axis": "axis",
-    "AxisLoop": "axis_loop",
-    "AxisServer": "axis_server",
-    "EventLog": "axis",
-    "Service": "process",
-    "axis_status": "status",
-    "load_axis": "axis_loading",
-}
-__all__ = [
-    "Axis",
-    "AxisLoop",
-    "AxisServer",
-    "EventLog",
-    "Service",
-    "axis_status",
-    "load_axis",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

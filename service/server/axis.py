@@ -24,19 +24,25 @@ from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateD
 from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
 from service.answers.guard import Limits
 from service.answers.slices import Pace
-from service.background.retuning.adoption import Retuned
+from service.background.retuner import Retuned
 from service.config.settings import LEARN, AxisConfig
-from service.intake.clock import SampleClock
-from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SequenceTracker
+from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
-from service.protocol.model import Safety
-from service.protocol.model_classes import build_model, stored_kind
+from service.protocol.model import Safety, build_model, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
-from service.server.competing import champion_of
-from service.server.learner_supervisor import NOT_LEARNING, LearnerSupervisor, Revive, check_same_learner, fingerprint
-from service.server.model_watch import POISON, ModelWatch, ModelWatchConfig
+from service.server.learner_supervisor import (
+    NOT_LEARNING,
+    POISON,
+    LearnerSupervisor,
+    ModelWatch,
+    ModelWatchConfig,
+    Revive,
+    champion_of,
+    check_same_learner,
+    fingerprint,
+)
 from service.server.moves import Moves
 from service.server.state_schema import StateSchema
 

@@ -11,14 +11,16 @@ from typing import Any, Final
 import numpy as np
 
 from adaptive.errors import ModelFileError
+from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel, OnlineModel, Sample
+from baselines.competition.competition import Competition
 from service.answers import guard
 from service.answers.guard import Limits
 from service.config.schema import build_settings
 from service.config.settings import COMPETE, AxisConfig
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
-from service.server.competing import champion_of, compete
+from service.server.learner_supervisor import champion_of
 from service.storage.checkpoint import CheckpointFolder
 from service.storage.model_file import Bundle, BundleMeta, read_bundle
 
@@ -33,7 +35,6 @@ LearnerFactory = Callable[[InverseModel, dict[str, Any], Limits], OnlineModel]
 
 def make_learner(model: InverseModel, settings: dict[str, Any], limits: Limits) -> OnlineModel:
     """The learner of this project, started from ``model``. Raises InputError on an unknown setting."""
-    from adaptive.inverse_model import LssvmInverse
     from adaptive.online.config import LearnerConfig
     from adaptive.online.learner import Learner
 
@@ -67,10 +68,16 @@ def load_axis(
             raise FieldError("compete", repr(name), expected)
     others = {name: models[name] for name in config.compete if name in models and name != config.learn}
 
+    def make(model: InverseModel) -> OnlineModel:
+        return factory(model, config.learner, limits)
+
     def begin(model: InverseModel) -> OnlineModel:
-        return compete(
-            config.learn, model, lambda start: factory(start, config.learner, limits), others, config.competition
-        )
+        """What learns from ``model``, against the online forms of the others; alone where none has one."""
+        learner = make(model)
+        if not others or not isinstance(model, LssvmInverse):
+            return learner
+        made = Competition.from_models(config.learn, learner, model, others, config.competition, make)
+        return made if len(made.names) > 1 else learner
 
     learner = template = None
     if config.learn:

@@ -14,13 +14,12 @@ from typing import Any, Final, Protocol
 
 from numpy.typing import ArrayLike
 
-from service.background.retuning.retuner import Retuner
-from service.intake.sample_queue import Job, SampleQueue
+from service.background.retuner import Retuner
+from service.intake.sample_queue import Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
-from service.intake.thinning import Thinner
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
-from service.server.competing import standing_of
+from service.server.learner_supervisor import standing_of
 
 #: Verdict, in a recording, on samples that were never handled because too many waited.
 DROPPED: Final = "dropped"
@@ -179,7 +178,7 @@ class AxisLoop:
             try:
                 self.handle(item.batch)
             except Exception as error:
-                # The samples after it are as good as ever, and clients wait for their snapshots.
+                # The samples after it are handled: clients wait for their snapshots.
                 handled = False
                 self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
             self.queue.finish(item, handled)

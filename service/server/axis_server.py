@@ -11,9 +11,8 @@ from typing import Any, Final
 import zenoh
 
 from service.answers.answering import trust_by_age
-from service.background.retuning.retuner import Retuner
+from service.background.retuner import Retuner
 from service.failover.state_transfer import NO_SECRET
-from service.intake.losses import Arrivals, SampleLosses
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
@@ -23,7 +22,7 @@ from service.security.peers import PeerSecret
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
-from service.server.health import Health
+from service.server.health import Arrivals, Health, SampleLosses
 from service.server.long_queries import LongQueries
 from service.server.query_answers import LatencyMeter, QueryAnswers
 from service.server.status import Publications, WriteRate, axis_status
@@ -226,8 +225,8 @@ class AxisServer:
         )
 
     def _settle(self) -> bool:
-        """After a command: tell it to the standby before it is answered, and wait for its checkpoint."""
-        # With a time: whoever changes the role waits for the thread that calls this.
+        """After a command: publish its event, which the standby reads, and wait for its checkpoint; then answer."""
+        # With a timeout: a change of the role holds this lock while it waits for the thread that calls this.
         if self._changing.acquire(timeout=_TOLD_S):
             try:
                 self._publications.publish_events()

@@ -18,7 +18,7 @@ from service.protocol.model import model_parts
 from service.server.axis import Axis
 from service.server.moves import Move
 
-#: Interval at which is looked whether somebody follows, s.
+#: Interval of the check for followers, s.
 _LOOK_S: Final = 0.05
 
 
@@ -34,7 +34,7 @@ class _Stream:
     sent_at_s: float = -math.inf
 
     def send(self, change: tuple[FollowedState, DeltaMessage | None]) -> None:
-        # First the state: whoever is told of a change can ask for a model that has it.
+        # First the state: a follower that gets the change may ask at once for a model that has it.
         self.state, message = change
         if message is not None:
             self.put(encode_delta(message))
@@ -87,7 +87,7 @@ class DeltaStreams:
                     stream.send(stream.state.changed(self._entries(stream.name, move), move.seq))
 
     def _look(self) -> None:
-        """Begin with the streams that somebody follows now, and end those that nobody does."""
+        """Begin the streams that have followers now, and end those that have none."""
         for stream in self._streams.values():
             followed = stream.followed()
             if followed and stream.served is None:

@@ -1,7 +1,7 @@
 """What moves in the model that learns between two snapshots, for followers.
 
-The learner's linear part, frame, domain, deviation and memory go on, and the kernel part stays that of the snapshot.
-Nothing is done while nobody follows, and nothing that queries are answered from depends on it.
+A move has the learner's present linear part, frame, domain, deviation and memory; the kernel part is that of the
+snapshot. Nothing is done while there are no followers. Answers to queries do not depend on moves.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import is_loopback, open_service
 from service.security.peers import PeerSecret, read_secret
 from service.server.axis import Axis
-from service.server.axis_loading import LearnerFactory, load_axis, make_learner
+from service.server.axis_loading import load_axis
 from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.long_queries import LongQueries
@@ -62,7 +62,7 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     """The background diagnosis of an axis, or None if the configuration switches it off."""
     if not axis.config.diagnosis.enabled:
         return None
-    from service.background.diagnosing.watcher import Watcher
+    from service.background.watcher import Watcher
 
     return Watcher(axis, axis.config.diagnosis)
 
@@ -119,8 +119,6 @@ class Service:
     Parameters
     ----------
     config : what to serve.
-    factory : makes what learns.
-    sinks : makes the recorder of an axis, or None.
     standby : look longer for another that serves before serving; listen at ``standby_listen``, keep files apart.
     stopped : ends the wait for the state of the one that serves.
     """
@@ -128,8 +126,6 @@ class Service:
     def __init__(
         self,
         config: ServeConfig,
-        factory: LearnerFactory = make_learner,
-        sinks: Callable[[AxisConfig], SampleSink | None] = make_recorder,
         standby: bool = False,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -147,8 +143,6 @@ class Service:
         self.axes: list[AxisServer] = []
         self._long_queries = LongQueries(config.busy_after_s)
         self._role_controls: list[RoleControl] = []
-        self._factory = factory
-        self._sinks = sinks
         self._session: zenoh.Session | None = None
         self._wake = threading.Event()
         self._stopping = threading.Event()
@@ -170,7 +164,7 @@ class Service:
         # Everything that can be refused is read before anything appears on the wire.
         secret = read_secret(config.peer_secret)
         warn_without_secret(config, secret)
-        loaded = [load_axis(config.stage, axis, self._factory) for axis in config.axes]
+        loaded = [load_axis(config.stage, axis) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
         # (1.10) left the two without half of what they had declared to each other, for good: both served.
@@ -185,7 +179,7 @@ class Service:
                     axis,
                     self.instance,
                     self._wake.set,
-                    self._sinks(axis.config),
+                    make_recorder(axis.config),
                     make_watcher(axis),
                     secret,
                     self._long_queries,

@@ -114,7 +114,7 @@ class QueryAnswers:
         self._long = long_queries
         self._instance = instance
         self._secret = secret
-        #: Queries for the state from somebody who did not prove to be an instance of this service.
+        #: Queries for the state without a proof that an instance of this service asks.
         self.states_refused = 0
         self._sends = threading.BoundedSemaphore(_MOST_STATES)
 
@@ -211,7 +211,7 @@ class QueryAnswers:
         """Reply from a thread of its own: the copy of the state waits for the learner, and a callback must not."""
 
         def reply() -> None:
-            # The state must contain each sample that was routed before whoever asks was known.
+            # The asking standby gets samples from its connection on: the state must contain all that came before.
             time.sleep(_ROUTING_S)
             with query:
                 try:

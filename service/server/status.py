@@ -13,7 +13,7 @@ import zenoh
 
 from service.protocol.container import JSON, to_json
 from service.protocol.keys import AUTO, Keys
-from service.protocol.model_classes import stored_kind
+from service.protocol.model import stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed

@@ -6,23 +6,16 @@ The names are loaded on first use: the keys and faults alone do not load the sim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.stage_node.faults import Fault, Injector, fault_key
-    from service.stage_node.node import NodeConfig, StageNode, status_key
+    from service.stage_node.faults import Fault as Fault
+    from service.stage_node.faults import Injector as Injector
+    from service.stage_node.faults import fault_key as fault_key
+    from service.stage_node.node import NodeConfig as NodeConfig
+    from service.stage_node.node import StageNode as StageNode
+    from service.stage_node.node import status_key as status_key
 
-__all__ = ["Fault", "Injector", "NodeConfig", "StageNode", "fault_key", "status_key"]
-
-_MODULES: Final = {
-    "NodeConfig": "node",
-    "StageNode": "node",
-    "status_key": "node",
-    "Fault": "faults",
-    "Injector": "faults",
-    "fault_key": "faults",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

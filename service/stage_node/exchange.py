@@ -155,7 +155,7 @@ class SampleRing:
         rows = (seq, seq.astype(np.float64) * self.dt_s, self._u_V[slots], self._y_um[slots])
         self._sent += n
         if self._put_sound is not None:
-            # Not counted: it is for tests, and one that is lost is judged by nobody.
+            # Losses are not counted: this signal is for tests only.
             with contextlib.suppress(zenoh.ZError):
                 self._put_sound(wire.encode_samples(*rows[:3], self._sound_um[slots]))
         for message in [rows] if self._injector is None else self._injector.deliver(rows):

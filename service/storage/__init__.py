@@ -13,44 +13,17 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.storage.checkpoint import (
-        CheckpointFolder,
-        CheckpointKeeper,
-        CheckpointMeta,
-        learn_again,
-        restore_newest,
-    )
-    from service.storage.model_file import Bundle, BundleMeta, read_bundle, write_bundle
-    from service.storage.output import clear_output
-    from service.storage.recorder import Recorder, RecorderConfig
+    from service.storage.checkpoint import CheckpointFolder as CheckpointFolder
+    from service.storage.checkpoint import CheckpointKeeper as CheckpointKeeper
+    from service.storage.checkpoint import CheckpointMeta as CheckpointMeta
+    from service.storage.checkpoint import learn_again as learn_again
+    from service.storage.checkpoint import restore_newest as restore_newest
+    from service.storage.model_file import Bundle as Bundle
+    from service.storage.model_file import BundleMeta as BundleMeta
+    from service.storage.model_file import read_bundle as read_bundle
+    from service.storage.model_file import write_bundle as write_bundle
+    from service.storage.output import clear_output as clear_output
+    from service.storage.recorder import Recorder as Recorder
+    from service.storage.recorder import RecorderConfig as RecorderConfig
 
-_MODULES = {
-    "Bundle": "model_file",
-    "BundleMeta": "model_file",
-    "CheckpointFolder": "checkpoint",
-    "CheckpointKeeper": "checkpoint",
-    "CheckpointMeta": "checkpoint",
-    "Recorder": "recorder",
-    "RecorderConfig": "recorder",
-    "clear_output": "output",
-    "learn_again": "checkpoint",
-    "read_bundle": "model_file",
-    "restore_newest": "checkpoint",
-    "write_bundle": "model_file",
-}
-__all__ = [
-    "Bundle",
-    "BundleMeta",
-    "CheckpointFolder",
-    "CheckpointKeeper",
-    "CheckpointMeta",
-    "Recorder",
-    "RecorderConfig",
-    "clear_output",
-    "learn_again",
-    "read_bundle",
-    "restore_newest",
-    "write_bundle",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel, StateDict
 from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_header, encode_header, split_state
-from service.protocol.model_classes import build_model, stored_kind
+from service.protocol.model import build_model, stored_kind
 from service.storage.output import atomic_write
 
 SCHEMA: Final = 1

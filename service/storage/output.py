@@ -55,10 +55,28 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+# --- Appending to a file of lines.
+
+
+def append_line(path: Path, line: bytes) -> None:
+    """Append a whole ``line`` and sync it to the disk; its folder is made where it is missing. Raises OSError.
+
+    One write in append mode: a crash leaves the line or nothing, and lines of two processes do not mix.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        if os.write(handle, line) != len(line):
+            raise OSError("incomplete write")
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 # --- Prepares the output folder of a command: it exists, is writable, and holds no results of an earlier run.
 
 
-def clear_output(out: Path, names: Iterable[str]) -> None:
+def clear_output(out: Path, names: Iterable[str] = ()) -> None:
     """Create ``out`` if missing, and remove the files and folders called ``names`` in it; others stay.
 
     Raises InputError if the folder cannot be written to.

@@ -129,7 +129,7 @@ class Journal:
 
     @property
     def vanished(self) -> bool:
-        """Whether the file is no longer at its path: rows would be written to where nobody finds them."""
+        """Whether the file is no longer at its path: further rows would be lost."""
         return not is_still_at(self._fd, self.path)
 
     def handle(self) -> int:

@@ -8,44 +8,22 @@ use: the records alone load neither zenoh nor Rerun.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from service.viewer.consumer import Consumer, ConsumerConfig
-    from service.viewer.output import Output, OutputConfig
-    from service.viewer.records import Diagnostics, Event, Health, Record, SceneConfig, Status, Tracking
-    from service.viewer.rerun_sink import write_recording
+    from service.viewer.consumer import Consumer as Consumer
+    from service.viewer.consumer import ConsumerConfig as ConsumerConfig
+    from service.viewer.output import Output as Output
+    from service.viewer.output import OutputConfig as OutputConfig
+    from service.viewer.records import Diagnostics as Diagnostics
+    from service.viewer.records import Event as Event
+    from service.viewer.records import Health as Health
+    from service.viewer.records import Record as Record
+    from service.viewer.records import SceneConfig as SceneConfig
+    from service.viewer.records import Status as Status
+    from service.viewer.records import Tracking as Tracking
+    from service.viewer.rerun_sink import write_recording as write_recording
 
-__all__ = [
-    "Consumer",
-    "ConsumerConfig",
-    "Diagnostics",
-    "Event",
-    "Health",
-    "Output",
-    "OutputConfig",
-    "Record",
-    "SceneConfig",
-    "Status",
-    "Tracking",
-    "write_recording",
-]
-
-_MODULES: Final = {
-    "Diagnostics": "records",
-    "Event": "records",
-    "Health": "records",
-    "Record": "records",
-    "SceneConfig": "records",
-    "Status": "records",
-    "Tracking": "records",
-    "Consumer": "consumer",
-    "ConsumerConfig": "consumer",
-    "Output": "output",
-    "OutputConfig": "output",
-    "write_recording": "rerun_sink",
-}
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -13,9 +13,7 @@ Colour = tuple[int, int, int]
 COLOURS: dict[str, Colour] = {model: rgb(value) for model, value in MODELS.items()}
 SPARE_COLOURS: tuple[Colour, ...] = ((213, 94, 0), (240, 228, 66), (148, 103, 189), (140, 86, 75), (23, 190, 207))
 WHITE: Colour = (235, 235, 235)
-GREY: Colour = (120, 120, 120)
 AMBER: Colour = (255, 190, 70)
-RED: Colour = (255, 90, 80)
 FRAME: Colour = (70, 70, 74)
 LABEL: Colour = (190, 190, 190)
 

@@ -11,27 +11,12 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from sim.chapter.control import run_control, track_learning
-    from sim.chapter.experiments import Experiments, Record, Score, characterise
-    from sim.chapter.modelling import identify_forward
+    from sim.chapter.control import run_control as run_control
+    from sim.chapter.control import track_learning as track_learning
+    from sim.chapter.experiments import Experiments as Experiments
+    from sim.chapter.experiments import Record as Record
+    from sim.chapter.experiments import Score as Score
+    from sim.chapter.experiments import characterise as characterise
+    from sim.chapter.modelling import identify_forward as identify_forward
 
-_MODULES = {
-    "Experiments": "experiments",
-    "Record": "experiments",
-    "Score": "experiments",
-    "characterise": "experiments",
-    "identify_forward": "modelling",
-    "run_control": "control",
-    "track_learning": "control",
-}
-__all__ = [
-    "Experiments",
-    "Record",
-    "Score",
-    "characterise",
-    "identify_forward",
-    "run_control",
-    "track_learning",
-]
-
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = lazy_names(__name__)

@@ -14,8 +14,8 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from baselines import fit_bouc_wen, fit_mpi
 from baselines.competition.competition import online_form
-from baselines.fit import fit_bouc_wen, fit_mpi
 from sim.chapter.experiments import DT_S, Experiments, Record, Score
 from sim.effects import effect
 from sim.signals.references import Reference, blend_step, demo_reference

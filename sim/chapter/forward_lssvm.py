@@ -171,10 +171,6 @@ class MemoryLssvm:
         basis, kernel = self._inputs(u_V)
         return np.asarray(basis @ self.beta + self.kernel.predict(kernel), dtype=np.float64)
 
-    def linear_part(self, u_V: FloatArray) -> FloatArray:
-        """The prediction without the kernel part, µm."""
-        return np.asarray(self._inputs(u_V)[0] @ self.beta, dtype=np.float64)
-
 
 def _motion(u_V: FloatArray) -> FloatArray:
     """(n, 3) voltage V and its derivatives V/s, V/s², of a commanded voltage without noise."""

@@ -10,8 +10,6 @@ from scipy import stats
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
 from sim.diagnosis.causes.catalogue import NAMES, same_set
-from sim.diagnosis.ceiling import black_box_error, black_box_on_other
-from sim.diagnosis.defects import recording_defects
 from sim.diagnosis.model.calibration import (
     ModelFit,
     begins_at_rest,
@@ -28,14 +26,15 @@ from sim.diagnosis.model.readings import (
     NoiseFloor,
     converter_grid,
     noise_floor,
+    recording_defects,
     repeated_readings,
 )
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.prepare import Prepared
-from sim.diagnosis.rest import where_left
 from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
 from sim.diagnosis.search.held_out import HeldOut, split
 from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
+from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
 from sim.diagnosis.witnesses import Readings, Sight, witnesses
 from sim.stage.config import StageConfig
 

@@ -165,12 +165,11 @@ _RULE = DampingRule(least=1e-8, least_after_failure=0.0, rcond=1e-12)
 class ExportedStage:
     """A stage configuration and the RMS difference (µm) of its free run from the extended model.
 
-    ``left_out``: causes that the effects library cannot express. ``rms_before_um``: the difference before the fit.
+    ``left_out``: causes that the effects library cannot express.
     """
 
     config: StageConfig
     rms_um: float
-    rms_before_um: float
     left_out: tuple[str, ...] = ()
 
 
@@ -202,8 +201,7 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
     step = next((c.parameters["step_um"] for c in diagnosis.causes if c.name == "quantisation"), 0.0)
     clean = Chain(tuple(effects))
     target, skip = _target(fit), _settling(fit)
-    before = _rms((_free_run(clean, data) - target)[skip:])
-    fitted, after = clean, before
+    fitted, after = clean, _rms((_free_run(clean, data) - target)[skip:])
     if not loose <= {"bouc_wen", "linear_actuator", OFFSET}:
         fitted, after = _fit(clean, loose, data, target, skip)
     left_out = tuple(missing)
@@ -227,7 +225,7 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
         u_min_V=min(0.0, data.u_low_V - margin),
         u_max_V=max(0.0, data.u_high_V + margin),
     )
-    return ExportedStage(config, after, before, left_out)
+    return ExportedStage(config, after, left_out)
 
 
 def _apart(e: Effect, others: list[Effect]) -> Effect:

@@ -7,9 +7,9 @@ from typing import Any
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.diagnosis.defects import Defect
 from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.model.readings import Defect
+from sim.diagnosis.witnesses.readings import Sight
 
 #: Schemas of report.json. 1 has no verdict "partly", no witnesses, no ceiling and no defects.
 SCHEMAS = (1, 2)

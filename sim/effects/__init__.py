@@ -1,8 +1,8 @@
-"""Library of the effects that a simulated stage is composed of; each module is one effect.
+"""Library of the effects that a simulated stage is composed of; each module holds those of one part of the chain.
 
 ``effect("creep", gain_per_decade=0.012)`` makes an effect with parameter values, ``a + b`` makes a chain, and
-``simulate`` runs it over voltages. ``EFFECTS`` holds all kinds by name. To add one, add a module with a ``KIND``; see
-``docs/effects.md``.
+``simulate`` runs it over voltages. ``EFFECTS`` holds all kinds by name. To add one, define a `Kind` in the module of
+its part or in a new one; see ``docs/effects.md``.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ from sim.effects.simulation import Plan, plan, simulate
 
 
 def _find() -> dict[str, Kind]:
-    """The ``KIND`` of every module of this package that has one."""
-    found: dict[str, Kind] = {}
-    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
-        kind = getattr(importlib.import_module(f"{__name__}.{module}"), "KIND", None)
-        if isinstance(kind, Kind):
-            found[kind.name] = kind
-    return dict(sorted(found.items(), key=lambda item: item[1].place))
+    """Every kind that a module of this package defines."""
+    modules = (importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__))
+    kinds = {value.name: value for module in modules for value in vars(module).values() if isinstance(value, Kind)}
+    return dict(sorted(kinds.items(), key=lambda item: (item[1].place, item[0])))
 
 
 #: All kinds by name, in the order of the chain.

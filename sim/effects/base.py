@@ -130,8 +130,8 @@ def _no_state(values: Mapping[str, float], context: Context) -> Sequence[float]:
 
 
 def _kind_named(name: str) -> Kind:
-    """The kind ``name``, from the module of its name. Pickled kinds are loaded by it."""
-    kind: Kind = importlib.import_module(f"sim.effects.{name}").KIND
+    """The kind ``name`` of the library. Pickled kinds are loaded by it."""
+    kind: Kind = importlib.import_module("sim.effects").EFFECTS[name]
     return kind
 
 
@@ -141,7 +141,7 @@ class Kind:
 
     Attributes
     ----------
-    name : its name in stage files, reports and tests; also that of its module.
+    name : its name in stage files, reports and tests.
     place : where in the chain it acts.
     parameters : in the order of the documentation.
     derive : (values, context) -> the coefficients ``p`` that the block reads.

@@ -4,14 +4,20 @@
     found = study([PeriodicRecord("100 mV", u_V, y_um, dt_s), ...], tests=[...])
     print(found.levels[0].test_um, [mode.sentence(0.1, 0.3) for mode in found.modes])
 
-``periods`` averages and measures the noise, ``response`` solves for the response matrix, ``poles`` starts the fit,
-``fit`` makes it, ``model`` predicts, ``study`` judges and names, ``reading`` reads files.
+``periods`` averages, measures the noise and solves for the response matrix, ``model`` has the start of the fit and
+predicts, ``fit`` fits, ``study`` judges and names, ``reading`` reads files.
 """
 
 from sim.modal.fit import FitSettings, ModalFit, fit_modes
 from sim.modal.model import ModalModel, output_errors
-from sim.modal.periods import LineSpectra, PeriodicRecord, average, cut_into_periods
-from sim.modal.response import FrequencyResponse, frequency_response
+from sim.modal.periods import (
+    FrequencyResponse,
+    LineSpectra,
+    PeriodicRecord,
+    average,
+    cut_into_periods,
+    frequency_response,
+)
 from sim.modal.study import Level, ModalStudy, Mode, study
 
 __all__ = [

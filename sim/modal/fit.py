@@ -21,10 +21,8 @@ from scipy.linalg import solve_triangular
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray, IntArray
-from sim.modal.model import ModalModel, poles_at, powers_of
-from sim.modal.periods import ComplexArray
-from sim.modal.poles import basis, stacked, vector_fit
-from sim.modal.response import FrequencyResponse
+from sim.modal.model import ModalModel, basis, poles_at, powers_of, stacked, vector_fit
+from sim.modal.periods import ComplexArray, FrequencyResponse
 
 #: Powers of 1/z beside the modes: the direct term and what the anti-alias filter adds beyond the band.
 DIRECT: Final = 4
@@ -89,12 +87,6 @@ class ModalFit:
     def interval(self, row: int, amplitude_V: float) -> float:
         """Half width of the 95 % interval of a row of ``theta`` at an amplitude (a logarithm: a relative width)."""
         return self._half_width(row, powers_of(self.model.position(amplitude_V), self.model.degree))
-
-    def interval_of_change(self, row: int, low_V: float, high_V: float) -> float:
-        """Half width of the 95 % interval of the change of a row of ``theta`` between two amplitudes."""
-        degree = self.model.degree
-        change = powers_of(self.model.position(high_V), degree) - powers_of(self.model.position(low_V), degree)
-        return self._half_width(row, change)
 
     def _half_width(self, row: int, direction: FloatArray) -> float:
         size = self.model.degree + 1
@@ -207,24 +199,31 @@ class _Problem:
             found.append(out)
         return found
 
+    def _along(self, state: _State, changes: list[FloatArray]) -> FloatArray:
+        """(columns, E, 2N + Q, degree + 1): the changes of all levels along the orthogonal columns."""
+        along = np.zeros((state.q.shape[1], self.target.shape[1], len(state.theta), self.degree + 1))
+        start = 0
+        for level, change in zip(self.levels, changes, strict=True):
+            part = state.q[start : start + len(change)].T @ change.reshape(len(change), -1)
+            along += part.reshape(len(along), -1, len(state.theta))[..., None] * level.powers
+            start += len(change)
+        return along
+
     def normal_equations(self, state: _State, modes: int) -> tuple[FloatArray, FloatArray]:
         """``JᵀJ`` (n, n) and ``Jᵀ r`` (n,) of the projected residual; parameters in the order of ``theta.ravel()``."""
         rows, size = len(state.theta), self.degree + 1
         squares = np.zeros((rows, size, rows, size))
         gradient = np.zeros((rows, size))
-        entries = self.target.shape[1]
-        along = np.zeros((state.q.shape[1], entries, rows, size))
+        changes = self.sensitivities(state, modes)
         start = 0
-        for level, change in zip(self.levels, self.sensitivities(state, modes), strict=True):
+        for level, change in zip(self.levels, changes, strict=True):
             stop = start + len(change)
             flat = change.reshape(-1, rows)
             power = level.powers
             squares += np.einsum("ij,a,b->iajb", flat.T @ flat, power, power)
             gradient += np.outer(flat.T @ state.left[start:stop].ravel(), power)
-            part = (state.q[start:stop].T @ change.reshape(len(change), -1)).reshape(-1, entries, rows)
-            along += part[..., None] * power
             start = stop
-        flat_along = along.reshape(-1, rows * size)
+        flat_along = self._along(state, changes).reshape(-1, rows * size)
         prior = self.prior(state.theta, modes)
         whole = squares.reshape(rows * size, -1) - flat_along.T @ flat_along + np.diag(prior.ravel())
         return whole, (gradient - prior * state.theta).ravel()
@@ -238,13 +237,7 @@ class _Problem:
         rows, size = len(state.theta), self.degree + 1
         squares, _ = self.normal_equations(state, modes)
         changes = self.sensitivities(state, modes)
-        entries = self.target.shape[1]
-        along = np.zeros((state.q.shape[1], entries, rows, size))
-        start = 0
-        for level, change in zip(self.levels, changes, strict=True):
-            part = state.q[start : start + len(change)].T @ change.reshape(len(change), -1)
-            along += part.reshape(-1, entries, rows)[..., None] * level.powers
-            start += len(change)
+        along = self._along(state, changes)
         start, scores = 0, []
         for level, change in zip(self.levels, changes, strict=True):
             stop = start + len(change)

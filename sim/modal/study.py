@@ -12,8 +12,15 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.modal.fit import QUANTILE_95, FitSettings, ModalFit, fit_modes, refitted
 from sim.modal.model import output_errors, powers_of
-from sim.modal.periods import LineSpectra, PeriodicRecord, average, joined, realisations
-from sim.modal.response import FrequencyResponse, frequency_response
+from sim.modal.periods import (
+    FrequencyResponse,
+    LineSpectra,
+    PeriodicRecord,
+    average,
+    frequency_response,
+    joined,
+    realisations,
+)
 
 #: Records whose amplitudes differ by less than this share are of the same amplitude.
 SAME_AMPLITUDE: Final = 0.02

@@ -3,8 +3,6 @@
 from sim.signals.references import DemoReference, Motion, Reference, demo_reference
 from sim.signals.voltages import (
     CHAPTER_AMPLITUDE_V,
-    Excitation,
-    diagnosis_excitation,
     generalisation_input,
     growing_triangles,
     minor_loops,
@@ -18,11 +16,9 @@ from sim.signals.voltages import (
 __all__ = [
     "CHAPTER_AMPLITUDE_V",
     "DemoReference",
-    "Excitation",
     "Motion",
     "Reference",
     "demo_reference",
-    "diagnosis_excitation",
     "generalisation_input",
     "growing_triangles",
     "minor_loops",

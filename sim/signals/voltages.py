@@ -1,4 +1,4 @@
-"""Voltage signals: those of the chapter, triangles, sines, multi-tones, and the excitation for a diagnosis.
+"""Voltage signals: those of the chapter, triangles, sines and multi-tones.
 
 All return ``(t_s, u_V)``, (n,) arrays with times ``k dt_s``; voltages are at the scale of the command.
 """
@@ -6,7 +6,6 @@ All return ``(t_s, u_V)``, (n,) arrays with times ``k dt_s``; voltages are at th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -116,70 +115,3 @@ def multitone(
     weight /= weight.sum()
     wave = np.sin(2.0 * np.pi * frequency * t[:, None] + phase) @ weight
     return t, 0.5 * (low_V + high_V) + 0.5 * (high_V - low_V) * wave
-
-
-@dataclass(frozen=True, slots=True)
-class Excitation:
-    """Commands for both axes, and where each part of them lies.
-
-    Attributes
-    ----------
-    t_s, u_V, u2_V : (n,) times s, voltages of the first and of the second axis V.
-    parts : (name, first sample, sample after the last) in order.
-    """
-
-    t_s: FloatArray
-    u_V: FloatArray
-    u2_V: FloatArray
-    parts: tuple[tuple[str, int, int], ...]
-
-
-def diagnosis_excitation(dt_s: float = 5e-4, full_V: float = 8.0) -> Excitation:
-    """About 65 s that make every cause of the catalogue visible.
-
-    It holds rests, steps with holds, nested triangles, sines of 1 to 20 Hz, a small chirp, the chapter's decaying sine,
-    and motion of the other axis alone.
-    """
-    half = 0.5 * full_V
-    rate = full_V / 1.0
-
-    def rest(seconds: float, level: float = 0.0) -> FloatArray:
-        return np.full(sample_times(seconds, dt_s).size, level)
-
-    def path(corners: tuple[float, ...]) -> FloatArray:
-        at = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(corners)) / rate)))
-        return np.interp(sample_times(float(at[-1]), dt_s), at, corners)
-
-    t_chirp = sample_times(4.0, dt_s)
-    top_Hz = min(600.0, 0.35 / dt_s)
-    growth = math.log(top_Hz / 2.0)
-    sweep = 2.0 * np.pi * 2.0 * 4.0 / growth * np.expm1(t_chirp / 4.0 * growth)
-    # faded in and out, so that the chirp begins and ends without a step
-    fade = np.clip(np.minimum(t_chirp, 4.0 - t_chirp) / 0.2, 0.0, 1.0)
-    other = sine(0.0, 0.75 * full_V, 1.0, 4.0, dt_s)[1]
-    sections: list[tuple[str, FloatArray]] = [
-        ("rest", rest(3.0)),
-        ("decaying_sine", training_input(dt_s, 10.0, half)[1]),
-        ("rest", rest(1.0)),
-        ("steps", np.concatenate((rest(9.0, 0.75 * full_V), rest(2.0, 0.25 * full_V), rest(4.0, half), rest(1.0)))),
-        ("triangles", path((0, 1.0 * full_V, 0.2 * full_V, 0.8 * full_V, 0.35 * full_V, 0.6 * full_V, 0.0))),
-        ("sine_1Hz", sine(0.0, 0.9 * full_V, 1.0, 4.0, dt_s)[1]),
-        ("sine_5Hz", sine(0.0, 0.9 * full_V, 5.0, 10.0, dt_s)[1]),
-        ("sine_5Hz_small", sine(0.0, 0.2 * full_V, 5.0, 10.0, dt_s)[1]),
-        ("sine_20Hz", sine(0.0, 0.5 * full_V, 20.0, 40.0, dt_s)[1]),
-        ("to_middle", path((0.0, half))),
-        ("chirp", half + 0.02 * full_V * fade * np.sin(sweep)),
-        ("to_rest", path((half, 0.0))),
-        ("rest", rest(2.0)),
-        ("other_axis", np.zeros(other.size)),
-        ("slow_triangle", triangle(0.0, 0.9 * full_V, 0.125, 1.0, dt_s)[1]),
-        ("rest", rest(3.0)),
-    ]
-    ends = np.cumsum([values.size for _, values in sections])
-    parts = tuple((name, int(end) - values.size, int(end)) for (name, values), end in zip(sections, ends, strict=True))
-    u = np.concatenate([values for _, values in sections])
-    u2 = np.zeros_like(u)
-    for name, first, last in parts:
-        if name == "other_axis":
-            u2[first:last] = other
-    return Excitation(np.arange(u.size, dtype=np.float64) * dt_s, u, u2, parts)

@@ -90,15 +90,6 @@ class Run:
         """Reference minus reading (n,), µm."""
         return self.reference_um - self.y_um
 
-    def errors_pct(self, range_um: float) -> dict[str, float]:
-        """MAE (2.43), RMSE (2.44) and largest error in percent of ``range_um``."""
-        e = np.abs(self.error_um) * (100.0 / range_um)
-        return {
-            "mae_pct": float(e.mean()),
-            "rmse_pct": float(np.sqrt(np.mean(e * e))),
-            "max_pct": float(e.max()),
-        }
-
 
 def track(
     stage: Stage,

@@ -21,9 +21,9 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from baselines import fit_linear, fit_mpi
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
-from baselines.fit import fit_linear, fit_mpi
 from baselines.prandtl_ishlinskii.online import MpiOnline
 from sim.signals.voltages import generalisation_input, multitone, training_input
 from sim.stage.config import ParameterChange
@@ -164,7 +164,7 @@ def test_what_is_served_by_default_while_learning_a_stage_that_changes(seed: int
     competition = Competition.from_models("lssvm_adaptive", Learner.from_model(model), model, others)
     u_V = excitation(seed, 12.0)
     error_V, std_V = foretold(competition, u_V, rich(seed, u_V, GAIN_STEP))
-    champion = competition.snapshot()
+    champion = competition.champion_model()
     assert (type(champion), champion.name) == (ChampionInverse, "auto")
     for part in (slice(2000, 6000), slice(8000, None)):
         assert_calibrated(error_V[part], std_V[part], LEARNING)

@@ -17,8 +17,8 @@ from adaptive.online.learner import Learner
 from adaptive.types import InverseModel, OnlineModel, Sample
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
+from baselines.common import Domain
 from baselines.competition.competition import Competition
-from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearOnline, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline

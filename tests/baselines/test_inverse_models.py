@@ -12,7 +12,7 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.types import InverseModel
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 

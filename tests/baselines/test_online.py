@@ -11,7 +11,7 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray, Sample
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline, TrackingConfig
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearOnline, LinearParameters
 from baselines.online_baseline import LeastSquaresConfig
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters

@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 # leave everything below the next line as it is.
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.types import InverseModel
-from baselines.fit import fit_linear, fit_mpi
+from baselines import fit_linear, fit_mpi
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.protocol.model import decode_model, encode_model

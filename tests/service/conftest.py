@@ -18,7 +18,7 @@ import pytest
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import InverseModel
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from service.storage.model_file import BundleMeta, write_bundle
 

@@ -10,7 +10,7 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.smoothing import SmootherConfig, smooth_recording
 from adaptive.types import FloatArray, InverseModel
-from baselines.fit import fit_mpi
+from baselines import fit_mpi
 from sim.changes import Comparison, Scales, Stretch, compare, frozen_answer
 from sim.signals.voltages import training_input
 from sim.stage.config import StageConfig

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from adaptive.errors import InputError
 from sim.signals.references import DemoReference, demo_reference
 from sim.signals.voltages import (
-    diagnosis_excitation,
     generalisation_input,
     growing_triangles,
     minor_loops,
@@ -59,25 +58,6 @@ def test_shapes() -> None:
     assert np.array_equal(a, b)
     assert a.min() >= 0.5
     assert a.max() <= 7.5
-
-
-def test_diagnosis_excitation() -> None:
-    e = diagnosis_excitation()
-    assert 60.0 < e.t_s[-1] < 70.0
-    assert e.t_s.size == e.u_V.size == e.u2_V.size
-    assert e.u_V.min() >= 0.0
-    assert e.u_V.max() <= 8.0
-    assert e.parts[0][1] == 0
-    assert e.parts[-1][2] == e.u_V.size
-    assert all(a[2] == b[1] for a, b in zip(e.parts, e.parts[1:], strict=False))
-    (_, first, last) = next(p for p in e.parts if p[0] == "other_axis")
-    assert e.u2_V[first:last].max() > 5.0
-    assert not e.u_V[first:last].any()
-    assert not e.u2_V[:first].any()
-    # no steps but those that are meant
-    jumps = np.flatnonzero(np.abs(np.diff(e.u_V)) > 0.5)
-    inside = {name for name, a, b in e.parts for j in jumps if a <= j + 1 < b}
-    assert inside <= {"steps", "chirp"}
 
 
 @settings(max_examples=12, deadline=None)

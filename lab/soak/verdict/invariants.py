@@ -410,8 +410,8 @@ def faults_told(observed: Observations) -> Invariant:
 
 
 def faults_held(observed: Observations) -> Invariant:
-    """What must hold in a fault of its own kind: sensor faults are named and cost little, nobody is deposed, frozen
-    is frozen, a folder that vanishes is told of and made anew."""
+    """What a kind of fault requires beyond recovery: a sensor fault is named and costs little, no serving instance is
+    replaced without need, a frozen axis stays frozen, a folder that vanishes is reported and made again."""
     broken = [fault for fault in observed.faults if fault.breaches]
     text = "faults in which something did not hold that must in this kind"
     if broken:

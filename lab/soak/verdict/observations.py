@@ -31,7 +31,7 @@ from lab.soak.machine_load import MachineLoad
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
-from service.server.model_watch import SAMPLES_POISONED, SENSOR_FROZEN
+from service.server.learner_supervisor import SAMPLES_POISONED, SENSOR_FROZEN
 from service.stage_node.faults import sound_key
 from service.stage_node.node import status_key
 

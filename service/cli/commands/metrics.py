@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from service.cli.options import add_connection, add_epilog, add_shared
+from service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
 from service.protocol.errors import FieldError
-from service.protocol.keys import check_name
 
 EPILOG = """\
 Grafana: import deploy/grafana-dashboard.json. Names and alarms: docs/monitoring.md.
@@ -21,8 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser)
-    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
-    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+    add_selection(parser)
     add("--port", type=int, default=9464, metavar="N", help="port of the page, 0 for a free one (%(default)s)")
     add("--address", default="127.0.0.1", metavar="IP", help="address to listen at (%(default)s, this machine only)")
     add("--once", action="store_true", help="print the page once, and exit")
@@ -31,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until interrupted. Returns 0. Raises InputError where the package or the port is missing."""
-    for name, given in (("--stage", args.stage), ("--axis", args.axis)):
-        if given != "*":
-            check_name(name, given)
+    check_selection(args)
     if not 0 <= args.port <= 65535:
         raise FieldError("--port", args.port, "0 to 65535")
     from service.operating.metrics import page, serve_page
@@ -42,8 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from service.runtime.stopping import StopSignal
 
     stop = StopSignal()
-    session = open_client(args.endpoint, args.wait, args.zenoh_config)
-    try:
+    with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
 
         def collect() -> bytes:
             return page(statuses(session, args.stage, args.axis, args.timeout))
@@ -55,6 +50,4 @@ def run(args: argparse.Namespace) -> int:
         with serve_page(args.address, args.port, collect) as port:
             print(f"metrics at http://{args.address}:{port}/metrics", flush=True)
             print(f"stopped: {stop.wait(args.duration)}", flush=True)
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
     return 0

@@ -52,11 +52,8 @@ def run(args: argparse.Namespace) -> int:
     """Send the command and print the answer. Returns 0. Raises RefusedError with the service's message."""
     keys = Keys(args.stage, args.axis)
     verb = {"ask-diagnosis": "diagnose"}.get(args.verb, args.verb)
-    session = open_client(args.endpoint, args.wait, args.zenoh_config)
-    try:
+    with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
         answer = operate(session, keys, verb, args.who or _login(), _arguments(args), args.timeout)
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
     if args.json:
         print(json.dumps(answer))
     elif verb == "checkpoints":

@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.options import add_epilog, add_shared, make_folder, progress_printer
+from service.cli.options import add_epilog, add_shared, progress_printer
 from service.identification.recording_options import add_mapping_arguments, describe, load
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from service.config.learner import LearnerSettings
+    from service.config.settings import LearnerSettings
 
 EPILOG = """\
 For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
@@ -58,12 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
     from adaptive.inverse_model import LssvmInverse
-    from service.background.retuning.adoption import read as read_adoptions
-    from service.config.learner import read_learner_settings
+    from service.background.retuner import read_adoptions
+    from service.config.settings import read_learner_settings
     from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from service.server.axis_loading import load_axis
-    from service.server.competing import standing_of
+    from service.server.learner_supervisor import standing_of
     from service.storage.model_file import read_bundle, write_bundle
+    from service.storage.output import clear_output
 
     say = progress_printer(args.quiet)
     if not args.window > 0.0:
@@ -84,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         axis.adopt_at(*adopted)
         if adopted:
             say(f"  {len(adopted)} re-tunings of the recording are adopted at their samples")
-    make_folder(args.out)
+    clear_output(args.out)
     start = time.perf_counter()
     shown = start
 
@@ -116,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_pictures:
         from service.replay import draw_errors, draw_gates
 
-        draw_errors(args.out / "errors.png", f"{args.data.name}: foretold, then learnt", done, span_V, args.window)
+        draw_errors(args.out / "errors.png", f"{args.data.name}: predicted, then learnt", done, span_V, args.window)
         draw_gates(args.out / "gates.png", args.data.name, done)
     print(json.dumps(numbers) if args.json else table(numbers, args.out))
     return 0
@@ -127,7 +128,7 @@ def table(numbers: dict[str, Any], out: Path) -> str:
     lines = [
         f"{numbers['recording']}: {numbers['duration_s']:.4g} s replayed in {numbers['seconds']:.3g} s, "
         f"{numbers['scored']} samples scored; {numbers['learn']} of {numbers['model']} learnt",
-        f"{'foretold less applied voltage':<30}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}{'MAE/%':>9}{'RMSE/µm':>9}",
+        f"{'predicted less applied voltage':<30}{'MAE/mV':>9}{'RMSE/mV':>9}{'max/mV':>9}{'MAE/%':>9}{'RMSE/µm':>9}",
     ]
     for key, label in (("frozen", "as it was identified"), ("adaptive", "learning")):
         s = numbers[key]

@@ -37,13 +37,10 @@ def run(args: argparse.Namespace) -> int:
     stop = StopSignal()
     if has_access_control(args.zenoh_config):
         count_refusals()
-    session = open_router(listen, connect, args.zenoh_config)
-    try:
+    with open_router(listen, connect, args.zenoh_config):
         ready = {"ready": True, "listen": listen, "connect": connect}
         print(json.dumps(ready) if args.json else f"ready: router at {', '.join(listen)}", flush=True)
         reason = stop.wait(args.duration)
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
     refused = refusal_counters()
     if args.json:
         print(json.dumps({"stopped": reason, "refused": refused}), flush=True)

@@ -11,11 +11,11 @@ from typing import Any
 
 import zenoh
 
-from service.cli.options import add_connection, add_epilog, add_shared
+from service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
 from service.operating.remote import Standbys, in_order, screen, statuses, table
 from service.protocol.container import fields_of
 from service.protocol.errors import FieldError
-from service.protocol.keys import ROOT, check_name
+from service.protocol.keys import ROOT
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
 
@@ -37,8 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_epilog(parser, EPILOG)
     add = parser.add_argument
     add_connection(parser)
-    add_shared(parser, stage={"default": "*", "help": "only this stage (all)"})
-    add_shared(parser, axis={"default": "*", "help": "only this axis (all)"})
+    add_selection(parser)
     add("--check", action="store_true", help="print what needs attention, and exit: a health check, see below")
     add("--once", action="store_true", help="print the table once, and exit")
     add("--period", type=float, default=1.0, metavar="S", help="period of the live table, s (%(default)s)")
@@ -47,13 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the table. Returns 0, or 1 where --once finds no service; Ctrl-C ends the live table with 0."""
-    for name, given in (("--stage", args.stage), ("--axis", args.axis)):
-        if given != "*":
-            check_name(name, given)
+    check_selection(args)
     if not 0.1 <= args.period <= 3600.0:
         raise FieldError("--period", args.period, "0.1 to 3600 s")
-    session = open_client(args.endpoint, args.wait, args.zenoh_config)
-    try:
+    with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
         standbys = Standbys(session, args.stage, args.axis)
         try:
             if not args.once and not args.check:
@@ -68,8 +64,6 @@ def run(args: argparse.Namespace) -> int:
             return 0 if found else 1
         finally:
             standbys.undeclare()
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
 
 
 def _check(found: list[dict[str, Any]]) -> int:

@@ -9,6 +9,7 @@ from sim.diagnosis.causes.motion import Creep, CrossTalk, GainDrift, StickSlip, 
 from sim.diagnosis.causes.reading import MainsHum, SensorNonlinearity, Timing
 from sim.diagnosis.causes.slips import Slips
 from sim.diagnosis.model.stage_model import CauseModel
+from sim.effects import CAUSES
 
 #: Every model that is tried. Models of one name are variants of one cause.
 CAUSE_MODELS: tuple[CauseModel, ...] = (
@@ -56,25 +57,5 @@ def same_set(names: set[str]) -> set[str]:
     return names.union(*(s for s in SETS if s & names))
 
 
-#: The names of the catalogue. Quantisation has no model; it is found in the readings.
-NAMES: tuple[str, ...] = (
-    "hysteresis_shape",
-    "asymmetry",
-    "rate_dependence",
-    "creep",
-    "thermal_drift",
-    "gain_drift",
-    "resonance",
-    "payload_change",
-    "amplifier_lag",
-    "slew_limit",
-    "saturation",
-    "delay",
-    "sensor_lag",
-    "sensor_nonlinearity",
-    "cross_talk",
-    "mains_hum",
-    "quantisation",
-    "stick_slip",
-    "timing",
-)
+#: The names of the catalogue, in the order of the chain. Quantisation has no model; it is found in the readings.
+NAMES: tuple[str, ...] = tuple(CAUSES)

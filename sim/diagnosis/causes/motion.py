@@ -140,10 +140,9 @@ class CrossTalk(CauseModel):
 
 
 @dataclass(frozen=True)
-class ThermalDrift(CauseModel):
-    """A slow additive drift: a spline in time or, as ``variant`` "temperature", proportional to the temperature."""
+class _Drift(CauseModel):
+    """A slow change: a spline in time or, as ``variant`` "temperature", with the recorded temperature."""
 
-    name: str = "thermal_drift"
     unseen_is_absent: bool = True
     imitates_others: bool = True
     of_one_recording: bool = True
@@ -155,6 +154,13 @@ class ThermalDrift(CauseModel):
 
     def spans(self, data: FitData) -> int:
         return int(np.clip(data.duration_s // 10.0, 2, 6))
+
+
+@dataclass(frozen=True)
+class ThermalDrift(_Drift):
+    """A slow additive drift."""
+
+    name: str = "thermal_drift"
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         r = data.range_um
@@ -179,25 +185,17 @@ class ThermalDrift(CauseModel):
 
 
 @dataclass(frozen=True)
-class GainDrift(CauseModel):
-    """A gain that changes with time (a spline) or, as ``variant`` "temperature", with the recorded temperature."""
+class GainDrift(_Drift):
+    """A slow change of the gain."""
 
     name: str = "gain_drift"
-    unseen_is_absent: bool = True
-    imitates_others: bool = True
-    of_one_recording: bool = True
-
-    def missing(self, data: FitData) -> str:
-        if self.variant == "temperature" and data.warmth_K is None:
-            return "a temperature that was recorded and moved"
-        return "" if data.duration_s > 1.0 else "a record longer than a second"
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         if self.variant == "temperature":
             return (ModelParameter("gain_per_K", "1/K", 0.0, -0.05, 0.05, 1e-3, ActsOn.MOTION),)
-        spans = ThermalDrift().spans(data)
         return tuple(
-            ModelParameter(f"gain{j + 1}", "1", 0.0, -0.2, 0.2, 2e-3, ActsOn.MOTION, True) for j in range(spans)
+            ModelParameter(f"gain{j + 1}", "1", 0.0, -0.2, 0.2, 2e-3, ActsOn.MOTION, True)
+            for j in range(self.spans(data))
         )
 
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:

@@ -24,8 +24,7 @@ from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.witnesses.other import slips_are_borne_out
-from sim.diagnosis.witnesses.readings import Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Readings, Sight
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ import numpy as np
 from scipy import stats
 
 from adaptive.types import FloatArray
-from sim.diagnosis.witnesses.readings import Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Readings, Sight
 
 
 def slew_limit(readings: Readings) -> list[Sight]:

@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.witnesses.readings import Cycle, Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Cycle, Readings, Sight
 
 _GRID = np.linspace(-0.94, 0.94, 48)
 

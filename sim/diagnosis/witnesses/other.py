@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.witnesses.readings import Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Readings, Sight
 from sim.recordings.repair import runs
 
 

@@ -1,4 +1,4 @@
-"""What the direct tests share: rests, cycles, a quasi-static description of the readings, and the frequency response.
+"""What the direct tests share: their answer, and the rests, cycles, quasi-static description and frequency response.
 
 Nothing here knows the nominal stage or a fitted cause. The quasi-static description is a linear regression of the
 readings on plays of the voltage; it takes the loop out of the readings before a small effect is looked for.
@@ -17,6 +17,24 @@ from sim.diagnosis.causes.drive import lag_ends
 from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.model.readings import samples_since
 from sim.recordings.repair import runs
+
+# --- What a direct test says of one cause.
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a direct test of the readings says of the cause ``name``.
+
+    ``seen``: True or False; None where the recording does not excite the test. ``words``: what was seen, with its
+    numbers, or what is missing.
+    """
+
+    name: str
+    seen: bool | None
+    words: str
+
+
+# --- What the direct tests read.
 
 #: A drive counts as standing after this time without a change of voltage, s: lags and modes have settled.
 SETTLE_S = 0.15

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from adaptive.types import FloatArray
-from sim.diagnosis.witnesses.readings import Readings, Response
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Readings, Response, Sight
 
 ComplexArray = NDArray[np.complex128]
 

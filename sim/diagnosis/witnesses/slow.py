@@ -8,8 +8,7 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.diagnosis.causes.motion import slow_poles
-from sim.diagnosis.witnesses.readings import Cycle, Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Cycle, Readings, Sight
 
 #: Time constants (s) of the slow motion that a rest may show after the moves before it.
 _TAUS_S = (0.1, 0.4, 1.6, 6.4, 25.0, 100.0)

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.witnesses import drive, loop, other, response, slow
-from sim.diagnosis.witnesses.readings import Readings
-from sim.diagnosis.witnesses.sight import Sight
+from sim.diagnosis.witnesses.readings import Readings, Sight
 
 #: A direct test: from the readings to what it says of one or several causes.
 Test = Callable[[Readings], list[Sight]]

@@ -17,7 +17,7 @@ from adaptive.types import FloatArray
 from baselines.bouc_wen.mechanical import MechanicalBoucWen, PeriodicRecord, between_samples, identify_mechanical
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse, BoucWenParameters
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
-from baselines.fit_report import Domain
+from baselines.common import Domain
 
 # --- The Bouc-Wen stage and its inverse: closed forms against fine integration, and round trips.
 

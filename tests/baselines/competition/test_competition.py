@@ -14,10 +14,10 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel, Sample
 from baselines.bouc_wen.model import BoucWenInverse, BoucWenParameters
+from baselines.common import Domain
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import BETTER, FAILED, ChampionChoice, Competition, with_deviation_of_at_least
 from baselines.competition.config import CompetitionConfig
-from baselines.fit_report import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from baselines.prandtl_ishlinskii.online import MpiOnline
@@ -138,18 +138,18 @@ def test_errors_are_those_of_the_answers_for_the_motion() -> None:
 def test_a_baseline_states_what_its_answers_were_wrong_by() -> None:
     """Not less than its own fit says, and only as champion; a state goes on with it."""
     model, one, _ = contest(1.1 * GAIN, 1.3 * GAIN)
-    assert [m.voltage_std_V for m in model.snapshot().models] == [0.1, 0.1]
+    assert [m.voltage_std_V for m in model.champion_model().models] == [0.1, 0.1]
     feed(model, 4000, 0)
     rms_V = model.standing()["contestants"]["one"]["rms_V"]
-    assert [m.voltage_std_V for m in model.snapshot().models] == [rms_V, 0.1]
+    assert [m.voltage_std_V for m in model.champion_model().models] == [rms_V, 0.1]
     assert rms_V > 0.2
     at = np.array([40.0])
     still = np.zeros(1)
-    served = model.snapshot()
+    served = model.champion_model()
     assert served.feedforward(at, still, still, served.rest_memory(40.0)).std_V == rms_V
     one.gain = GAIN
     feed(model, 20_000, 4000)
-    assert [m.voltage_std_V for m in model.snapshot().models] == [0.1, 0.1]
+    assert [m.voltage_std_V for m in model.champion_model().models] == [0.1, 0.1]
 
 
 def test_before_any_answer_was_judged_nothing_is_stated() -> None:
@@ -255,7 +255,7 @@ def test_a_champion_that_is_not_finite_is_replaced_at_once() -> None:
     feed(model, 160, 2000)  # the age of an answer, a block, and the smoother's lag
     assert model.champion == "two"
     y, zero = np.full(3, 40.0), np.zeros(3)
-    served = model.snapshot()
+    served = model.champion_model()
     assert np.isfinite(served.feedforward(y, zero, zero, served.rest_memory(40.0)).u_V).all()
 
 

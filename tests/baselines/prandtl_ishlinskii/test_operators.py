@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.prandtl_ishlinskii import operators
 from baselines.prandtl_ishlinskii.model import (
     MpiInverse,

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.answers import model_errors
+from service.answers import fallback
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits
-from service.server.model_watch import _at_rest
+from service.server.learner_supervisor import _at_rest
 from tests.service.conftest import make_models
 
 
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(model_errors, "_logged", {})
+    monkeypatch.setattr(fallback, "_logged", {})
 
     class Broken:
         dt_s = 1e-3
@@ -50,7 +50,7 @@ def test_another_error_is_logged_too_and_a_sound_model_logs_nothing(
     broken: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR, "dehyst.model"):
-        model_errors.log_model_error(broken, ValueError("one"))
-        model_errors.log_model_error(broken, TypeError("other"))
+        fallback.log_model_error(broken, ValueError("one"))
+        fallback.log_model_error(broken, TypeError("other"))
         _at_rest(make_models()["linear"], np.linspace(0.0, 1.0, 3))
     assert len(caplog.records) == 2

@@ -18,10 +18,10 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.types import InverseModel
 from service.answers.guard import Limits
-from service.background.diagnosing.settings import WatchConfig
-from service.background.diagnosing.watcher import WORKER, Watcher
-from service.background.diagnosing.worker import diagnose
+from service.background.diagnosis_worker import diagnose
 from service.background.job import BackgroundJob
+from service.background.settings import WatchConfig
+from service.background.watcher import WORKER, Watcher
 from service.client.client import Client
 from service.config.settings import AxisConfig
 from service.identification.identifying import identify_one
@@ -286,7 +286,7 @@ def test_a_stage_that_rests_gives_no_reference(model_file: Path) -> None:
 
 def test_watching_brings_neither_torch_nor_plots_into_the_service() -> None:
     code = (
-        "import sys, service.server.process, service.background.diagnosing.watcher;"
+        "import sys, service.server.process, service.background.watcher;"
         "print([m for m in ('torch', 'matplotlib', 'rerun', 'sim.diagnosis', 'sim.changes') if m in sys.modules])"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

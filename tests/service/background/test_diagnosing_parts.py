@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.background.diagnosing.alarm import Alarm, Levels
-from service.background.diagnosing.buffer import SampleBuffer
-from service.background.diagnosing.settings import WatchConfig
+from service.background.settings import WatchConfig
+from service.background.watcher import Alarm, Levels, SampleBuffer
 from service.config.settings import parse_config
 from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch

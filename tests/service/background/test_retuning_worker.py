@@ -20,9 +20,9 @@ from adaptive.tuning import retuning as retune
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, WindowData
 from service.answers.guard import Limits
-from service.background.retuning.retuner import Retuner
-from service.background.retuning.settings import RetuningConfig
-from service.background.retuning.worker import pack, start_job, tuned
+from service.background.retuner import Retuner
+from service.background.retuning_worker import pack, start_job, tuned
+from service.background.settings import RetuningConfig
 from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -143,7 +143,7 @@ class Working:
 @pytest.fixture
 def retuner(monkeypatch: pytest.MonkeyPatch) -> Iterator[Retuner]:
     Working.made = 0
-    monkeypatch.setattr("service.background.retuning.retuner.start_job", Working)
+    monkeypatch.setattr("service.background.retuner.start_job", Working)
     made = Retuner(RetuningConfig(period_s=0.0, fresh=100))
     yield made
     made.close()

@@ -135,7 +135,7 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         assert changes[-1].beta.shape[1] == make_models()["lssvm_adaptive"].state_dict()["beta"].size
         model = decode_model(ask(session, KEYS.model, b'{"axis": 9}')).model
         assert model.features.gain == pytest.approx(GAINS[9], rel=0.05)  # type: ignore[attr-defined]
-        assert len(list(session.liveliness().get(KEYS.alive_any))) == 1
+        assert len(list(session.liveliness().get(f"{KEYS.base}/alive/*"))) == 1
     code, last, complaints = service.stop()
     assert (code, complaints) == (0, "")
     assert last["fleet"]["samples"]["points_refused"] == 3

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from adaptive.online.learner import Learner
 from adaptive.types import InverseModel
-from service.intake.clock import RESYNC_AFTER, SET_AFTER, SampleClock
+from service.intake.sequence import RESYNC_AFTER, SET_AFTER, SampleClock
 from service.protocol.samples import SampleBatch
 from tests.service.server.test_axis import make_axis, recording
 

@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from service.intake.losses import (
+from service.protocol.samples import SampleBatch
+from service.server.axis import Axis
+from service.server.health import (
     SAMPLES_DROPPED,
     SAMPLES_MALFORMED,
     SAMPLES_OUT_OF_ORDER,
@@ -14,8 +16,6 @@ from service.intake.losses import (
     Arrivals,
     SampleLosses,
 )
-from service.protocol.samples import SampleBatch
-from service.server.axis import Axis
 from tests.service.storage.test_stored_files import make_axis, recording
 
 #: Pause between two looks of the publishing thread, s, and samples in it at 1 kHz.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.intake.thinning import Thinner
+from service.intake.sample_queue import Thinner
 from service.protocol.samples import SampleBatch
 
 

@@ -20,13 +20,12 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, InverseModel
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from lab.cli import main
 from service.answers.guard import Limits
-from service.config.learner import read_learner_settings
-from service.config.settings import AxisConfig
+from service.config.settings import AxisConfig, read_learner_settings
 from service.protocol.samples import SampleBatch
 from service.replay import Replayed, covered, replay, sequence, summary, write_gates
 from service.server.axis import Axis

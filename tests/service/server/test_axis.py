@@ -395,7 +395,7 @@ def test_the_counters_of_the_window_reach_the_status(models: dict[str, InverseMo
     loop = loop_of(axis)
     give(loop, 0, 1000)
     learner: Any = axis.learner
-    window = (learner.competition.favourite if compete else learner).parts.window
+    window = (learner.favourite if compete else learner).parts.window
     first = told(loop)
     assert first.keys() >= {f"window_{name}" for name in WINDOW}
     assert {f"window_{name}": count for name, count in window.counters().items()} == {

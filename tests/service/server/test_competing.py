@@ -17,20 +17,18 @@ import pytest
 from adaptive.errors import InputError
 from adaptive.tuning.config import RetuneConfig
 from adaptive.types import FloatArray, Hyperparameters, InverseModel
-from baselines.fit import fit_linear, fit_mpi
+from baselines import fit_linear, fit_mpi
 from service.answers.guard import Limits
-from service.background.retuning import adoption
-from service.background.retuning.adoption import Adoptions, Retuned
-from service.background.retuning.retuner import Retuner
-from service.background.retuning.settings import RetuningConfig
-from service.background.retuning.worker import start_job
+from service.background.retuner import ADOPTIONS_FILE, Adoptions, Retuned, Retuner, append_adoption, read_adoptions
+from service.background.retuning_worker import start_job
+from service.background.settings import RetuningConfig
 from service.config.settings import AxisConfig, parse_config
 from service.protocol.errors import FieldError
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
-from service.server import competing
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
+from service.server.learner_supervisor import champion_of
 from service.storage.model_file import Bundle, BundleMeta
 from sim.signals.voltages import training_input
 from sim.stage.presets import preset
@@ -96,7 +94,7 @@ def ask(axis: Axis, name: str = "") -> Any:
 def degrade(axis: Axis, by_V: float) -> None:
     """Poison the learner: what its linear part gives is off by ``by_V``, whatever it learns."""
     learner: Any = axis.learner
-    favourite = learner.competition.favourite
+    favourite = learner.favourite
     inner = favourite.snapshot
 
     def snapshot() -> InverseModel:
@@ -132,16 +130,16 @@ def test_a_poisoned_learner_is_replaced_by_a_baseline_and_comes_back(
     axis = axis_of(bundle)
     give(axis, recorded, 0, 3000)
     learner: Any = axis.learner
-    inner = learner.competition.favourite.snapshot
+    inner = learner.favourite.snapshot
     degrade(axis, 0.6)
     give(axis, recorded, 3000, 5000)
-    assert learner.competition.champion == "mpi"
+    assert learner.champion == "mpi"
     assert [event["event"] for event in axis.take_events()].count("champion_changed") == 1
     bad, served, baseline = (ask(axis, name).u_V[-1] for name in ("lssvm_adaptive", "", "mpi"))
     assert abs(served - baseline) < 0.15 < 0.4 < abs(bad - served)
-    learner.competition.favourite.snapshot = inner
+    learner.favourite.snapshot = inner
     give(axis, recorded, 5000, 9000)
-    assert learner.competition.champion == "lssvm_adaptive"
+    assert learner.champion == "lssvm_adaptive"
     np.testing.assert_array_equal(ask(axis).u_V, ask(axis, "lssvm_adaptive").u_V)
 
 
@@ -252,10 +250,10 @@ def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_sam
     assert hyper_of(axis) == Retuned.from_json(done["retuned"]).hyper != before
     tuned_mV = prequential_mV(axis, rippled, 12500, 14000)
     until = time.monotonic() + 10.0
-    while not adoption.read(tmp_path) and time.monotonic() < until:
+    while not read_adoptions(tmp_path) and time.monotonic() < until:
         time.sleep(0.01)
     again, without = tunable(bundle), tunable(bundle)
-    again.adopt_at(*adoption.read(tmp_path))
+    again.adopt_at(*read_adoptions(tmp_path))
     for other in (again, without):
         give(other, rippled, 6000, 12500, size=37)
     untuned_mV = prequential_mV(without, rippled, 12500, 14000)
@@ -279,7 +277,7 @@ def test_a_bad_proposal_is_found_out_by_its_trial(
     def job(order: dict[str, Any], *rest: Any) -> Any:
         return Misled() if order["kind"] == "propose" else start_job(order, *rest)
 
-    monkeypatch.setattr("service.background.retuning.retuner.start_job", job)
+    monkeypatch.setattr("service.background.retuner.start_job", job)
     axis = tunable(bundle)
     before = hyper_of(axis)
     events = [event["event"] for event in retuned_from_7500(axis, recorded, retuner)]
@@ -330,7 +328,7 @@ def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Told(PROPOSED, OPEN, OPEN, OPEN)
-    monkeypatch.setattr("service.background.retuning.retuner.start_job", told)
+    monkeypatch.setattr("service.background.retuner.start_job", told)
     axis = tunable(bundle)
     give(axis, recorded, 6000, 8000, retuner)
     retuner.request({})
@@ -390,8 +388,8 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] == 'torch': raise ImportError(name)\n"
         "sys.meta_path.insert(0, Blocked())\n"
-        "import service.server.axis_server, service.server.axis_loading, service.background.retuning.retuner\n"
-        "from service.background.retuning.worker import _search\n"
+        "import service.server.axis_server, service.server.axis_loading, service.background.retuner\n"
+        "from service.background.retuning_worker import _search\n"
         "assert 'baselines.swarm.evidence_search' not in sys.modules\n"
         "print(_search(True)[1])"
     )
@@ -426,14 +424,14 @@ def test_adoptions_are_made_once_in_order_at_their_sample(bundle: Bundle, tmp_pa
     assert learner.taken == [1.0, 2.0, 3.0]
     assert (adoptions.adopted, adoptions.refused, bool(adoptions)) == (2, 1, False)
     for retuned in (Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))):
-        adoption.append(tmp_path, retuned)
-    assert list(adoption.read(tmp_path)) == [Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))]
-    with (tmp_path / adoption.FILE).open("a") as file:
+        append_adoption(tmp_path, retuned)
+    assert list(read_adoptions(tmp_path)) == [Retuned(3, 0.1 + 0.2, (1 / 3, 7.0)), Retuned(5, 1e7, (0.5,))]
+    with (tmp_path / ADOPTIONS_FILE).open("a") as file:
         file.write('{"seq": 7, "gam')
-    assert len(adoption.read(tmp_path)) == 2
-    (tmp_path / adoption.FILE).write_text('{"seq": 1, "gamma": -1, "widths": [1]}\n')
+    assert len(read_adoptions(tmp_path)) == 2
+    (tmp_path / ADOPTIONS_FILE).write_text('{"seq": 1, "gamma": -1, "widths": [1]}\n')
     with pytest.raises(InputError, match="gamma"):
-        adoption.read(tmp_path)
+        read_adoptions(tmp_path)
 
 
 def test_settings_come_from_the_configuration(tmp_path: Path) -> None:
@@ -448,4 +446,4 @@ def test_settings_come_from_the_configuration(tmp_path: Path) -> None:
     for bad in ("margin = 1.5\n", 'compete = ["mpi"]'):
         with pytest.raises(InputError):
             parse_config(text.replace(bad, bad.replace("1.5", "0.5").replace('"mpi"', "3")), "serve.toml", tmp_path)
-    assert competing.champion_of(None) == {}
+    assert champion_of(None) == {}

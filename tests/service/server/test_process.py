@@ -58,7 +58,7 @@ def test_it_serves_learns_publishes_and_goes(serve: Callable[..., Any], tmp_path
         base = client.keys.base
         stage.declare_subscriber(f"{base}/status", lambda s: statuses.append(json.loads(s.payload.to_bytes())))
         stage.declare_subscriber(f"{base}/diagnostics", lambda s: diagnostics.append(json.loads(s.payload.to_bytes())))
-        tokens = [reply.ok.key_expr for reply in stage.liveliness().get(client.keys.alive_any) if reply.ok]
+        tokens = [reply.ok.key_expr for reply in stage.liveliness().get(f"{client.keys.base}/alive/*") if reply.ok]
         assert [str(key) for key in tokens] == [client.keys.alive(process.ready["instance"])]
         before = client.point(40.0)
         assert (before.snapshot_seq, before.model, before.tracked_memory) == (-1, "auto", True)

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
+from baselines import fit_bouc_wen
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
-from baselines.fit import fit_bouc_wen
-from baselines.fit_report import Domain
+from baselines.common import Domain
 from sim.chapter import published
 from sim.chapter.control import (
     BlockConfig,

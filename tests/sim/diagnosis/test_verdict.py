@@ -13,15 +13,13 @@ from hypothesis import strategies as st
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.diagnosis import diagnose
-from sim.diagnosis.ceiling import black_box_error, black_box_on_other
-from sim.diagnosis.defects import recording_defects
 from sim.diagnosis.diagnose import Options, explained_share, verdict_of
 from sim.diagnosis.model.calibration import ModelFit, calibrate_nominal, fit_on_other_recording
 from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.readings import RepeatedReadings, noise_floor, repeated_readings
-from sim.diagnosis.rest import where_left
+from sim.diagnosis.model.readings import RepeatedReadings, noise_floor, recording_defects, repeated_readings
 from sim.diagnosis.result import Diagnosis, NamedCause
 from sim.diagnosis.search.held_out import split
+from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
 
 DT = 1e-3
 SIGMA_UM = 0.01

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -237,15 +235,6 @@ def test_parameters_change_without_compiling_anew() -> None:
     for gain in np.linspace(0.0, 0.05, 20):
         simulate(chain, STAIRS, 1e-3, params={"creep.gain_per_decade": gain})
     assert (time.perf_counter() - start) / 20 < 0.02
-
-
-def test_every_effect_file_is_its_own_kind() -> None:
-    import sim.effects
-
-    folder = Path(sim.effects.__file__).parent
-    for kind in EFFECTS.values():
-        assert (folder / f"{kind.name}.py").is_file()
-    assert dataclasses.is_dataclass(next(iter(EFFECTS.values())))
 
 
 def test_chains_travel_between_processes_and_are_hashable() -> None:

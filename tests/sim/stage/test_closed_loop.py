@@ -70,7 +70,6 @@ def test_feedback_removes_what_feedforward_leaves() -> None:
     assert errors[2] < 0.6 * errors[1] < 0.6 * errors[0]
     np.testing.assert_allclose(both.u_V, both.feedforward_V + both.feedback_V, atol=1e-12)
     assert ff.feedback_V.tolist() == [0.0] * 4000
-    assert ff.errors_pct(89.0)["max_pct"] == pytest.approx(100 * np.abs(ff.error_um).max() / 89.0)
 
 
 def test_runs_repeat_and_continue() -> None:
@@ -134,7 +133,7 @@ def test_ziegler_nichols_gains_stabilise_the_rich_stage() -> None:
     assert pid.k_i == pytest.approx(pid.k_p * 1.2 / found.period_s)
     reference = demo_reference(3.0, DT, (5.0, 60.0), seed=1)
     run = track(stage, reference, pid=pid)
-    assert run.errors_pct(89.0)["mae_pct"] < 3.0
+    assert np.abs(run.error_um).mean() < 0.03 * 89.0
     # and the edge is an edge: half as much again is unstable
     wild = track(stage, reference, pid=PID(k_p=1.5 * found.gain_V_per_um, k_i=0.0))
     assert np.abs(wild.error_um).max() > 50.0

@@ -1,4 +1,4 @@
-"""The process that diagnoses (see `service.background.job`): ``-m service.background.diagnosing.worker FOLDER``."""
+"""The process that diagnoses (see `service.background.job`): ``-m service.background.diagnosis_worker FOLDER``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The process that tunes, ``python -m service.background.retuning.worker FOLDER``, and how the service starts it.
+"""The process that tunes, ``python -m service.background.retuning_worker FOLDER``, and how the service starts it.
 
 `start_job` and `pack` are the side of the service, `tuned` is the work of the process (see `service.background.job`).
 """
@@ -18,7 +18,7 @@ from service.background.job import BackgroundJob, run_worker
 
 def start_job(order: dict[str, Any], arrays: dict[str, FloatArray], timeout_s: float) -> BackgroundJob:
     """Start the process with an ``order`` and the windows in ``arrays`` (see `tuned` and `pack`)."""
-    job = BackgroundJob("service.background.retuning.worker", order, arrays, timeout_s)
+    job = BackgroundJob("service.background.retuning_worker", order, arrays, timeout_s)
     job.start()
     return job
 

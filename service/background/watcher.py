@@ -6,21 +6,165 @@ the learner four times per second. A process of the lowest priority does the res
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray
-from service.background.diagnosing.alarm import Alarm, Levels
-from service.background.diagnosing.buffer import SampleBuffer
-from service.background.diagnosing.settings import WatchConfig
 from service.background.job import BackgroundJob
+from service.background.settings import WatchConfig
 from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
+
+# --- The newest samples of one axis in a ring buffer of fixed size. One thread writes; any thread may copy.
+
+#: Most samples that are kept, at any sample rate.
+MOST_SAMPLES: Final = 200_000
+#: Old samples in a row that mean a restarted count of the stage rather than late samples.
+_RESTART_AFTER: Final = 200
+
+
+class SampleBuffer:
+    """The newest samples as rows (seq, t_s, u_V, y_um) of a (4, n) array; new samples overwrite the oldest."""
+
+    def __init__(self, samples: int) -> None:
+        self._rows = np.full((4, max(1, min(samples, MOST_SAMPLES))), np.nan)
+        self._end = 0
+        self._kept = 0
+        self._last = -1
+        self._old = 0
+        self._lock = threading.Lock()
+
+    @property
+    def last_seq(self) -> int:
+        """Number of the newest sample; -1 for none."""
+        return self._last
+
+    @property
+    def size(self) -> int:
+        """Number of samples kept."""
+        return self._kept
+
+    def add(self, batch: SampleBatch) -> bool:
+        """Append the samples newer than all earlier ones. Returns False if the stage has restarted its count."""
+        new = batch.seq > self._last
+        going_on = True
+        if not new.all():
+            # Skip duplicates and late samples; a long run of them means a restarted stage.
+            self._old = self._old + int(batch.seq.size - new.sum()) if not new.any() else 0
+            if self._old >= _RESTART_AFTER:
+                self.clear()
+                new = np.ones_like(new)
+                going_on = False
+            elif not new.any():
+                return True
+        else:
+            self._old = 0
+        block = np.stack([batch.seq, batch.t_s, batch.u_V, batch.y_um])[:, new]
+        n, room = block.shape[1], self._rows.shape[1]
+        block = block[:, -room:]
+        where = (self._end + np.arange(block.shape[1])) % room
+        with self._lock:
+            self._rows[:, where] = block
+            self._end = int((self._end + block.shape[1]) % room)
+            self._kept = min(room, self._kept + n)
+            self._last = int(batch.seq[new][-1])
+        return going_on
+
+    def clear(self) -> None:
+        """Remove all samples."""
+        with self._lock:
+            self._end = self._kept = self._old = 0
+            self._last = -1
+
+    def copy(self, samples: int | None = None) -> FloatArray:
+        """The newest ``samples`` (all by default) as (4, n): seq, t_s, u_V, y_um; oldest first."""
+        with self._lock:
+            n = self._kept if samples is None else min(samples, self._kept)
+            where = (self._end - n + np.arange(n)) % self._rows.shape[1]
+            return np.asarray(self._rows[:, where])
+
+
+# --- The alarm of the diagnosis: compares the figures of the learner with those of a reference period.
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Figures of a learner: gain of the stage, offset in V, recent rms error in % of the voltage span, validity."""
+
+    gain: float
+    offset_V: float
+    error_pct: float
+    valid: bool
+
+    @staticmethod
+    def of(diagnostics: Mapping[str, Any]) -> Levels | None:
+        """From the diagnostics of a learner; None if they lack a figure or one is not finite."""
+        try:
+            levels = Levels(
+                float(diagnostics["gain"]),
+                float(diagnostics["offset_V"]),
+                float(diagnostics["recent_rms_error_pct"]),
+                bool(diagnostics.get("valid", 1.0)),
+            )
+        except (KeyError, TypeError, ValueError):
+            return None
+        return levels if all(math.isfinite(v) for v in (levels.gain, levels.offset_V, levels.error_pct)) else None
+
+
+class Alarm:
+    """Raises an alarm when a figure has been out of bounds for ``hold_s``. The caller passes the time."""
+
+    def __init__(self, config: WatchConfig, span_V: float) -> None:
+        self._config = config
+        self._span_V = max(abs(span_V), 1e-12)
+        self._normal: Levels | None = None
+        self._since_s: float | None = None
+
+    @property
+    def armed(self) -> bool:
+        """Whether it has reference levels."""
+        return self._normal is not None
+
+    def arm(self, levels: Levels | None) -> None:
+        """Take ``levels`` as the reference; None disarms."""
+        self._normal, self._since_s = levels, None
+
+    def check(self, t_s: float, now: Levels) -> str:
+        """The reason for an alarm at ``t_s``; "" for no alarm."""
+        if self._normal is None:
+            return ""
+        why = self._out_of_bounds(now, self._normal)
+        if not why:
+            self._since_s = None
+            return ""
+        if self._since_s is None or t_s < self._since_s:
+            self._since_s = t_s
+        return why if t_s - self._since_s >= self._config.hold_s else ""
+
+    def _out_of_bounds(self, now: Levels, normal: Levels) -> str:
+        c = self._config
+        gain = now.gain / normal.gain - 1.0 if normal.gain else 0.0
+        if abs(gain) > c.gain_alarm:
+            return f"the learner's gain moved by {100.0 * gain:+.1f} %"
+        offset = (now.offset_V - normal.offset_V) / self._span_V
+        if abs(offset) > c.offset_alarm:
+            return f"the learner's offset moved by {100.0 * offset:+.1f} % of the span"
+        if now.error_pct > max(c.error_factor * normal.error_pct, c.error_floor_pct):
+            return f"the learner's error grew from {normal.error_pct:.2g} to {now.error_pct:.2g} % of the span"
+        if normal.valid and not now.valid:
+            return "the learner lost its validity"
+        return ""
+
+
+# --- The watch over an axis.
 
 #: Interval at which the figures of the learner are read, s of samples.
 _LOOK_S: Final = 0.25
@@ -30,7 +174,7 @@ _TOLD: Final = ("job", "seq", "why", "text")
 #: Least motion in a reference, as a share of the range of the axis.
 _LEAST_MOTION: Final = 0.05
 #: Module of the process.
-WORKER: Final = "service.background.diagnosing.worker"
+WORKER: Final = "service.background.diagnosis_worker"
 _ARGUMENTS: Final = ("recent_s", "report")
 
 
