@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from adaptive import kernels
+from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
@@ -47,6 +48,7 @@ class WeightConfig:
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"weights.{name}: got {value}, expected a finite number, not negative")
 
+    @shared
     def of(self, near_bad: bool, on_probation: bool, a_share: float) -> float:
         """Weight of a pair; ``a_share`` is its acceleration as a share of full scale."""
         weight = (self.near_bad if near_bad else 1.0) * (self.on_probation if on_probation else 1.0)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from adaptive.compiled import shared
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
@@ -76,11 +77,12 @@ class Judgement:
     fallen_s: float = 0.0
     doubt_V2: float = 0.0
 
+    @shared
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """Take one error of the learnt and of the frozen model, V."""
         squared = error_V * error_V
         slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
-        if self.judged > 0 and squared <= self.variance_V2:
+        if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
             self.inside += 1
         self.error_V = error_V
         self.judged += 1
@@ -91,6 +93,7 @@ class Judgement:
         self.frozen_V2 += (frozen - self.frozen_V2) * slow
         self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
 
+    @shared
     def decide(self, enter_V: float, leave_V: float) -> bool:
         """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
         rms = sqrt(self.short_V2)
@@ -100,6 +103,7 @@ class Judgement:
             self.valid = True
         return self.valid
 
+    @shared
     def choose(self, floor_V: float, step_s: float) -> bool:
         """Whether to serve the frozen model: taken when clearly better, left when worse."""
         learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
@@ -665,10 +669,10 @@ class Learner:
             if switched:
                 parts.expect_change()
             if not taken.refused:
-                outcome = admission.SETTLING if pair is None else self._teach(pair)
+                outcome = admission.SETTLING if pair is None else self.teach(pair)
         return outcome
 
-    def _teach(self, pair: Pair) -> str:
+    def teach(self, pair: Pair) -> str:
         """Learn the pair at the smoothed instant, in filter and window, if the gates allow it."""
         c, parts, intake = self.config, self.parts, self.parts.intake
         gates, track = intake.gates, intake.track
