@@ -97,6 +97,14 @@ def fade(A: WindowArrays, clock: int, born: IntArray, own: FloatArray, fade_step
 
 
 @compiled
+def fade_alone(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, fade_steps: float) -> None:
+    """`fade` of each axis."""
+    for k in range(lo, hi):
+        b = axes[k]
+        fade(arrays_of(handles[b]), s.numbers[b].clock, s.born[b], s.own[b], fade_steps)
+
+
+@compiled
 def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: float) -> None:
     """`ResidualWindow.let_go` of each axis."""
     for k in range(lo, hi):
