@@ -12,6 +12,7 @@ smoother is a fixed linear recursion, equal to Rauch-Tung-Striebel on the same s
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from math import factorial, pi
 
 import numpy as np
@@ -191,6 +192,12 @@ class FixedLagSmoother:
         return SmootherState(
             np.array(values["x"], dtype=np.float64), np.array(values["ring"], dtype=np.float64), int(values["count"])
         )
+
+
+@cache
+def smoother_of(config: SmootherConfig) -> FixedLagSmoother:
+    """The smoother of a configuration; made once, because its gains take a millisecond, and many axes share them."""
+    return FixedLagSmoother(config)
 
 
 def _checked(y_um: FloatArray) -> FloatArray:

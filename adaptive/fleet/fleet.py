@@ -67,13 +67,14 @@ class Fleet:
         self._shells: dict[int, Learner] = {}
         self._is_apart = np.zeros(B, dtype=np.bool_)
         self._cache: FleetSnapshot | None = None
-        starts = [template.parts.state_dict(arrays=False) | {"frozen": False} for template in templates]
+        self._threads.share(B, self._fill_windows, [arrays[number] for number in numbers])
         for i in range(B):
-            self._windows.put(i, arrays[numbers[i]])
             # Before its first sample an axis has no place: the single learner takes that one.
-            learner = self._learner(i)
-            learner.resume(starts[numbers[i]] | {"domain": models[i].domain.copy()}, arrays=False)
-            self._set_apart(i, learner)
+            self._set_apart(i, self._learner(i))
+
+    def _fill_windows(self, first: int, last: int, arrays: list[WindowArrays]) -> None:
+        for i in range(first, last):
+            self._windows.put(i, arrays[i])
 
     def _make_windows(self, example: WindowArrays) -> Windows:
         rows, config = self._state.rows, self.config
