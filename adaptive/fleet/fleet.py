@@ -211,8 +211,10 @@ class Fleet:
         """The whole state of an axis, as of ``Learner.state_dict``."""
         return self.learner_of(axis).state_dict()
 
-    def load_axis(self, axis: int, state: StateDict) -> None:
+    def load_axis(self, axis: int, state: StateDict, anew: bool = False) -> None:
         """Continue an axis from the state of a single learner of the same model and configuration.
+
+        ``anew`` : its next sample is taken whatever its number.
 
         Raises ModelFileError, and leaves the axis as it is, where it is of another.
         """
@@ -225,6 +227,8 @@ class Fleet:
         self._windows.put(axis, given.parts.window.window_arrays)
         learner = self._learner(axis)
         learner.resume(state, arrays=False)
+        if anew:
+            learner.resync()
         # Its next sample shows whether it is ordinary.
         self._set_apart(axis, learner)
 
