@@ -15,12 +15,15 @@ import pytest
 import zenoh
 
 from adaptive.errors import InputError
+from adaptive.online.learner import Learner
+from adaptive.types import under
 from service.config.settings import parse_config
 from service.fleet import wire
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
 from service.runtime.session import open_client
+from service.storage.checkpoint import decode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
@@ -154,6 +157,51 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
     code, last, complaints = service.stop()
     assert (code, complaints) == (0, "")
     assert last["fleet"]["samples"]["points_refused"] == 3
+
+
+@pytest.mark.e2e
+def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    path, folder = tmp_path / "serve.toml", tmp_path / "kept"
+    port = unused_port()
+    path.write_text(configuration(port, 'checkpoints = "kept"\ncheckpoint_s = 0.5\n'), encoding="utf-8")
+    process = ServeProcess(path, port)
+    with open_client(process.endpoint) as session:
+        for first in range(0, 900, 20):
+            send(session, samples(*motion(first, 20)))
+        eventually(lambda: status(session)["seq"] == 899)
+        # Each axis is written after the last sample.
+        written = status(session)["checkpoints"]["written"]
+        for first in range(900, 2900, 20):
+            send(session, samples(*motion(first, 20)))
+            if status(session)["checkpoints"]["written"] > written + 2 * AXES:
+                break
+            time.sleep(0.02)
+        learnt = status(session, axis=9)["gates"]["learnt"]
+    process.kill()
+    # The file of an axis is a single learner's: it goes on from there.
+    meta, state = decode_checkpoint((folder / "axis-0009.ckpt").read_bytes())
+    single = Learner.from_state(under("learner.", state))
+    assert (meta.axis, single.seq) == ("9", meta.seq)
+    assert single.snapshot().features.gain == pytest.approx(GAINS[9], rel=0.05)
+    (folder / "axis-0011.ckpt").write_bytes(b"damaged")
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            now = status(session)
+            assert now["checkpoints"]["restored"] == AXES - 1
+            assert now["checkpoints"]["refused"] == 1
+            before = status(session, axis=9)["gates"]["learnt"]
+            assert 0 < before <= learnt
+            assert status(session, axis=11)["gates"]["learnt"] == 0
+            # Whatever the number that the stage has come to, or began with again.
+            for first in range(50, 250, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["samples"]["received"] == 200)
+            eventually(lambda: status(session, axis=9)["gates"]["learnt"] > before)
+            assert status(session, axis=9)["gates"]["out_of_order"] == 0
+    finally:
+        process.kill()
 
 
 def parts_of(kind: int, rng: np.random.Generator) -> dict[str, Any]:
