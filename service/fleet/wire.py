@@ -16,10 +16,10 @@ from service.fleet.settings import MOST_AXES
 from service.protocol.errors import FieldError
 from service.protocol.samples import VERSION, check_length, check_seq
 
-FLEET_SAMPLES: Final = 7
-FLEET_QUERY: Final = 8
-FLEET_REPLY: Final = 9
-FLEET_CHANGES: Final = 10
+FLEET_SAMPLES: Final = 8
+FLEET_QUERY: Final = 9
+FLEET_REPLY: Final = 10
+FLEET_CHANGES: Final = 11
 _NAMES: Final = {FLEET_SAMPLES: "fleet samples", FLEET_QUERY: "fleet query", FLEET_REPLY: "fleet reply",
                  FLEET_CHANGES: "fleet changes"}  # fmt: skip
 #: What follows the header, in order: name, type, sizes.

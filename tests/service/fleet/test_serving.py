@@ -115,7 +115,7 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         u, y = np.pad(u, ((0, 0), (0, 2))), np.pad(y, ((0, 0), (0, 2)))
         u[0, 3] = y[0, 3] = y[0, 5] = np.nan
         bad = samples(seq, t_s, u, y)
-        for payload in (bad, bad, b"\x01\x07", b"\x01\x07" + bytes(40)):
+        for payload in (bad, bad, b"\x01\x08", b"\x01\x08" + bytes(40)):
             send(session, payload)
         eventually(lambda: status(session)["samples"]["malformed"] == 2)
         after = eventually(lambda: (now := status(session))["samples"]["received"] == 602 and now)
