@@ -52,7 +52,7 @@ def shared(function: F) -> F:
     So that a fleet steps its axes by the rules of the single learner themselves. Such a function uses attributes,
     numbers and other shared or compiled functions, and no methods.
     """
-    return cast(F, register_jitable(function)) if COMPILES else function
+    return register_jitable(function) if COMPILES else function
 
 
 def in_numpy(version: F) -> Callable[[F], F]:

@@ -10,7 +10,7 @@ learner holds for each axis, and a refused axis costs the others nothing but the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,18 +29,8 @@ from adaptive.online.track import Pair
 from adaptive.types import FloatArray, IntArray, Sample, StateDict
 from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED, WindowArrays
 
-
-class Windows(Protocol):
-    """Windows of B axes, see `CompiledWindows`."""
-
-    shares: bool
-
-    def arrays(self, axis: int) -> WindowArrays: ...
-    def put(self, axis: int, arrays: WindowArrays) -> None: ...
-    def samples(self) -> dict[str, FloatArray]: ...
-    def predict(self, axes: IntArray) -> FloatArray: ...
-    def learn(self, axes: IntArray, step: Step) -> IntArray: ...
-    def let_go(self, axes: IntArray, most: float) -> None: ...
+if TYPE_CHECKING:
+    from adaptive.fleet.in_torch import TorchWindows
 
 
 class Fleet:
@@ -51,9 +41,10 @@ class Fleet:
         self.config = config = config or FleetConfig()
         self.bases = tuple(models)
         check_alike(models)
-        numbers, firsts = distinct(models)
-        templates = [Learner(models[i], config.learner) for i in firsts]
-        self._c = c = fixed_of(models, config.learner, templates, numbers)
+        numbers = distinct(models)
+        made = [Learner(models[numbers.index(i)], config.learner) for i in range(max(numbers) + 1)]
+        templates = [made[number] for number in numbers]
+        self._c = c = fixed_of(models, config.learner, templates)
         self._state = FleetState(c, config.learner.window, templates[0].parts.delay.steps)
         self._threads = Threads(config.threads)
         B, p = c.beta.shape
@@ -67,7 +58,7 @@ class Fleet:
         self._shells: dict[int, Learner] = {}
         self._is_apart = np.zeros(B, dtype=np.bool_)
         self._cache: FleetSnapshot | None = None
-        self._threads.share(B, self._fill_windows, [arrays[number] for number in numbers])
+        self._threads.share(B, self._fill_windows, arrays)
         for i in range(B):
             # Before its first sample an axis has no place: the single learner takes that one.
             self._set_apart(i, self._learner(i))
@@ -76,7 +67,7 @@ class Fleet:
         for i in range(first, last):
             self._windows.put(i, arrays[i])
 
-    def _make_windows(self, example: WindowArrays) -> Windows:
+    def _make_windows(self, example: WindowArrays) -> CompiledWindows | TorchWindows:
         rows, config = self._state.rows, self.config
         if not config.in_torch:
             return CompiledWindows(rows, example, self._threads)
@@ -99,13 +90,13 @@ class Fleet:
         """
         taken = self._given("present", present, np.bool_)
         numbers = (("t_s", t_s), ("u_V", u_V), ("y_um", y_um))
-        sample = (self._given("seq", seq, np.int64), *(self._given(name, value, np.float64) for name, value in numbers))
+        sample = [self._given("seq", seq, np.int64), *(self._given(name, value, np.float64) for name, value in numbers)]
         outcome = self._work.outcome
         outcome[:] = NO_SAMPLE
         apart = [axis for axis in self._apart if taken[axis]]
         inside = np.flatnonzero(taken & ~self._is_apart)
         if inside.size:
-            self._step_together(inside, Samples(*sample, self._may_check(inside)))
+            self._step_together(inside, Samples._make([*sample, self._may_check(inside)]))
             doubtful = np.flatnonzero(outcome == DOUBT).tolist()
             for axis in doubtful:
                 self._take_out(axis)
@@ -117,7 +108,7 @@ class Fleet:
         return outcome.copy()
 
     def _given(self, name: str, value: object, kind: type) -> Any:
-        given = np.asarray(value, dtype=kind)
+        given: Any = np.asarray(value, dtype=kind)
         if given.ndim > 1 or (given.ndim == 1 and given.shape[0] != self.axes):
             raise InputError(f"{name}: got shape {given.shape}, expected ({self.axes},) or one value for all")
         return np.ascontiguousarray(np.broadcast_to(given, (self.axes,)))
@@ -161,9 +152,9 @@ class Fleet:
         s, w, c = self._state.rows, self._work, self.config.learner
         fade_steps = c.weights.half_life_s / (c.learn_every * self.bases[0].dt_s)
         step = Step(s.point[axes], w.targets[axes], w.weights[axes], fade_steps, c.eviction == "fifo")
-        status = self._windows.learn(axes, step)
+        status: IntArray = self._windows.learn(axes, step)
         w.outcome[axes] = np.where(status == ACCEPTED, OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS))
-        return axes[status == ILL_CONDITIONED]
+        return np.asarray(axes[status == ILL_CONDITIONED])
 
     def _pair(self, axis: int) -> Pair:
         """The instant that an axis has come to, for its single learner to learn."""
@@ -171,7 +162,8 @@ class Fleet:
         slots = s.voltages.shape[1]
         now = int(s.numbers[axis]["count"]) + 1 - slots
         u_V, before_V = (s.voltages[axis, k % slots].item() for k in (now, now - 1))
-        return Pair(now, *s.motion[axis].tolist(), u_V, before_V, True, not s.good[axis].all())
+        y, v, a = s.motion[axis].tolist()
+        return Pair(now, y, v, a, u_V, before_V, True, not s.good[axis].all())
 
     # ---- in and out of the batch
 

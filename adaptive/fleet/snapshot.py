@@ -87,31 +87,38 @@ class _Windows(NamedTuple):
 
 
 @compiled
-def _pack(lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray) -> None:
+def _pack(
+    lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray
+) -> None:
     """The learnt models of all axes in the layout of `LssvmInverse.packed`."""
-    K, A, M = c.thresholds.shape[1], c.arcs.shape[1], c.retain.shape[1]
-    p, d = s.beta.shape[1], w.scaled.shape[1]
+    p, d, m = s.beta.shape[1], w.scaled.shape[1], c.features
     for b in range(lo, hi):
         out, r, f, n = packed[b], s.numbers[b], c.axis[b], w.C[b, COUNT]
-        j, size, span = r.judgement, counts[b], s.domain[b, 1::2] - s.domain[b, ::2]
-        size[0], size[1], size[2], size[3], size[4], size[5], size[6] = K, A, M, p, d, n, 0
-        size[7], size[8], size[9], size[10:] = c.flags[0], c.flags[1], f.allowed_V > 0.0, c.kernel_plays
+        j, span, bounded = r.judgement, s.domain[b, 1::2] - s.domain[b, ::2], f.allowed_V > 0.0
+        counts[b] = c.sizes[f.model]
+        counts[b, 5], counts[b, 6], counts[b, 9] = n, 0, bounded
         out[0:3] = s.frames[b]
         out[3] = max(j.long_V2, j.short_V2) + j.doubt_V2
         out[4], out[5], out[6] = r.kernel_variance, 1.0 / (1.0 + 1.0 / w.F[b, GAMMA]), f.allowed_V
         out[7:13:2] = s.domain[b, ::2] - margin * span
         out[8:13:2] = s.domain[b, 1::2] + margin * span
-        out[13:17] = c.scale[b]
+        out[13:17] = m.scale[b]
         at = 17
-        for part in (c.thresholds[b], c.arcs[b], c.retain[b], s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]):
+        for part in (m.thresholds[b], m.arcs[b], m.retain[b], s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]):
             out[at : at + part.size] = part
             at += part.size
-        out[17 + K + A + M] += w.F[b, BETA]
+        out[_constant(c)] += w.F[b, BETA]
         for i in range(d):
             out[at : at + n] = w.scaled[b, i, :n]
             at += n
-        if f.allowed_V > 0.0:
+        if bounded:
             out[at : at + p] = c.beta[b]
+
+
+@compiled
+def _constant(c: Fixed) -> int:
+    """Place of the linear part in a packed model."""
+    return int(17 + c.sizes[0, 0] + c.sizes[0, 1] + c.sizes[0, 2])
 
 
 def snapshot_of(
@@ -120,11 +127,10 @@ def snapshot_of(
 ) -> FleetSnapshot:  # fmt: skip
     """Copies of what is served now; ``apart`` : models of the axes that are not in the batch."""
     B, p = s.beta.shape
-    scaled = windows["scaled"]
-    d, most = scaled.shape[1], max(scaled.shape[2], c.model_alpha.shape[1])
-    at = 17 + c.thresholds.shape[1] + c.arcs.shape[1] + c.retain.shape[1]
-    length = at + 2 * p + p * p + d + (1 + d) * most
-    packed, counts = np.empty((B, length)), np.empty((B, 10 + c.kernel_plays.size), dtype=np.int64)
+    d, most = windows["scaled"].shape[1:]
+    at = _constant(c)
+    length = max(at + 2 * p + d + (1 + d) * most, c.models.shape[1])
+    packed, counts = np.empty((B, length)), np.empty((B, c.sizes.shape[1]), dtype=np.int64)
     parts = _Windows(*(windows[name] for name in _Windows._fields))  # type: ignore[arg-type]
     threads.share(B, _pack, s, c, parts, DOMAIN_MARGIN, packed, counts)
     seq, valid = s.numbers["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()

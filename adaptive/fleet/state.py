@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from adaptive.errors import InputError
+from adaptive.features import FeatureArrays
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
@@ -139,79 +140,54 @@ class Rows(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What does not change. config : one record. axis (B,) : a record for each axis. models : (M, ...) of M distinct
-    identified models. frames (B, 3), beta, walks, bursts (B, p) : of the identified models and their filters."""
+    """What does not change. config : one record. axis (B,) : a record for each axis. features (B, ...) : of the
+    identified models. beta, walks, bursts (B, p) : of them and their filters. models, sizes (M, ...) : M distinct
+    identified models as `LssvmInverse.packed` has them. The others are the smoother's."""
 
     config: Any
     axis: Any
-    thresholds: FloatArray
-    arcs: FloatArray
-    retain: FloatArray
-    scale: FloatArray
-    kernel_plays: IntArray
-    flags: BoolArray
-    frames: FloatArray
+    features: FeatureArrays
     beta: FloatArray
     walks: FloatArray
     bursts: FloatArray
-    model_beta: FloatArray
-    model_scaled: FloatArray
-    model_alpha: FloatArray
-    model_inverse_widths: FloatArray
+    models: FloatArray
+    sizes: IntArray
     transition: FloatArray
     gain: FloatArray
     lag_gains: FloatArray
     output_scale: FloatArray
 
 
-def distinct(bases: Sequence[LssvmInverse]) -> tuple[IntArray, list[int]]:
-    """(B,) number of the distinct model of each axis, frames aside, and the first axis of each of them."""
-    found: dict[tuple[object, ...], int] = {}
-    firsts: list[int] = []
-    numbers = np.zeros(len(bases), dtype=np.int64)
-    for i, base in enumerate(bases):
-        arrays = (base.beta, base.support, base.alpha, base.widths, base.beta_covariance)
-        key = (*(array.tobytes() for array in arrays), base.gamma, base.span_V, base.kernel_variance)
-        if key not in found:
-            found[key] = len(firsts)
-            firsts.append(i)
-        numbers[i] = found[key]
-    return numbers, firsts
+def distinct(bases: Sequence[LssvmInverse]) -> list[int]:
+    """(B,) number of the distinct model of each axis, frames aside, in the order of their first axes."""
+    found: dict[tuple[bytes, float], int] = {}
+    return [found.setdefault((base.packed[0][3:].tobytes(), base.span_V), len(found)) for base in bases]
 
 
 def check_alike(bases: Sequence[LssvmInverse]) -> None:
     """Raise InputError naming the first axis whose model has another shape than that of axis 0."""
     if not bases:
         raise InputError("models: got none, expected one for each axis")
-
-    def shape(base: LssvmInverse) -> dict[str, object]:
-        f = base.features
-        inputs = (f.basis_size, f.kernel_size, f.memory_size, len(f.thresholds_um), len(f.arc_lengths_um))
-        return {"dt_s": f.dt_s, "inputs": inputs, "kernel_plays": f.kernel_plays,
-                "linear, asymmetric": (f.linear, f.asymmetric)}  # fmt: skip
-
-    expected = shape(bases[0])
-    for i, base in enumerate(bases):
-        for name, got in shape(base).items():
-            if got != expected[name]:
+    # Of the packed sizes all but the number of samples, the covariance and the bound.
+    shapes = [{"dt_s": base.dt_s, "shape": np.delete(base.packed[1], (5, 6, 9)).tolist()} for base in bases]
+    for i, shape in enumerate(shapes):
+        for name, got in shape.items():
+            if got != shapes[0][name]:
                 raise InputError(
-                    f"models[{i}].{name}: got {got}, expected {expected[name]} as of axis 0; identify all alike"
+                    f"models[{i}].{name}: got {got}, expected {shapes[0][name]} as of axis 0; identify all alike"
                 )
 
 
-def fixed_of(
-    bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Sequence[Learner], model_of: IntArray
-) -> Fixed:
-    """The constants of a fleet; ``templates`` : a learner of each distinct model, ``model_of`` (B,) : whose it is."""
-    parts, maps = templates[0].parts, [base.features for base in bases]
-    step_s, dt_s = parts.filter.step_s, bases[0].dt_s
+def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Sequence[Learner]) -> Fixed:
+    """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
+    parts, step_s, dt_s = templates[0].parts, templates[0].parts.filter.step_s, bases[0].dt_s
     settings = np.zeros(1, _CONFIG)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": parts.check_s, "check_every": parts.check_every,
              "mark_every": max(1, round(MARK_S / step_s))}  # fmt: skip
     _fill(settings, asdict(config) | {"admission": asdict(config.admission.at(dt_s))} | steps)
-    axis = np.zeros(len(bases), _AXIS)
-    for row, base, number in zip(axis, bases, model_of, strict=True):
-        f, template = base.features, templates[number]
+    axis, numbers = np.zeros(len(bases), _AXIS), distinct(bases)
+    for row, base, template, number in zip(axis, bases, templates, numbers, strict=True):
+        f = base.features
         # The identified kernel part is allowed on top of the linear one, which depends on the frame.
         reach_V = template.parts.allowed_V - config.envelope.shape * drive_V(template.base)
         row["middle_um"], row["range_um"] = 0.5 * (f.y_max_um + f.y_min_um), f.y_max_um - f.y_min_um
@@ -219,22 +195,17 @@ def fixed_of(
         row["slope_V_per_um"], row["tells"] = mean_slope(base), answers(base)
         row["allowed_V"] = config.envelope.shape * drive_V(base) + reach_V if f.linear else 0.0
         row["a_scale"], row["model"] = f.a_scale_um_per_s2, number
-    models = [template.base for template in templates]
-    most = max(model.alpha.size for model in models)
-    # Rows of zero weight far away fill up those of models with fewer samples.
-    scaled = np.full((len(models), bases[0].features.kernel_size, most), 1e9)
-    alpha = np.zeros((len(models), most))
-    for m, model in enumerate(models):
-        scaled[m, :, : model.alpha.size], alpha[m, : model.alpha.size] = (model.support / model.widths).T, model.alpha
-    variances = [templates[number].parts.filter.variances for number in model_of]
-    smoother, first = parts.intake.smoother, maps[0].arrays
+    models = [bases[numbers.index(number)].packed for number in range(max(numbers) + 1)]
+    packed = np.zeros((len(models), max(row.size for row, _ in models)))
+    for row, (model, _) in zip(packed, models, strict=True):
+        row[: model.size] = model
+    walks, bursts = zip(*(template.parts.filter.variances for template in templates), strict=True)
+    smoother = parts.intake.smoother
     return Fixed(
-        settings, axis, *(np.array([getattr(f.arrays, name) for f in maps]) for name in ("thresholds", "arcs", "retain", "scale")),
-        np.array(first.kernel_plays), np.array(first.flags), np.array([f.arrays.frame for f in maps]),
-        np.array([base.beta for base in bases]), np.array([walk for walk, _ in variances]),
-        np.array([burst for _, burst in variances]), np.array([model.beta for model in models]), scaled, alpha,
-        np.array([1.0 / model.widths for model in models]),
-        *(np.array(part) for part in (smoother.transition, smoother.gain, smoother.lag_gains, smoother.scale)),
+        settings, axis, FeatureArrays(*map(np.array, zip(*(base.features.arrays for base in bases), strict=True))),
+        np.array([base.beta for base in bases]), np.array(walks), np.array(bursts), packed,
+        np.array([sizes for _, sizes in models]),
+        *map(np.array, (smoother.transition, smoother.gain, smoother.lag_gains, smoother.scale)),
     )  # fmt: skip
 
 
@@ -244,8 +215,8 @@ class FleetState:
     def __init__(self, c: Fixed, window: int, delay_steps: int) -> None:
         B, p = c.beta.shape
         slots, order = c.lag_gains.shape[0] + 1, c.gain.size
-        K, A, M = (part.shape[1] for part in (c.thresholds, c.arcs, c.retain))
-        m, d, lag, marks = K + A + M + (A > 0), 2 + c.kernel_plays.size, slots - 2, len(MARKS)
+        K, A, M, _, d = c.sizes[0, :5].tolist()
+        m, lag, marks = K + A + M + (A > 0), slots - 2, len(MARKS)
         floats: dict[str, tuple[int, ...]] = {
             "x": (order,), "ring": (lag + 1, 4), "voltages": (slots,), "readings": (slots,), "motion": (3,),
             "memory": (m,), "frozen_memory": (m,), "frames": (3,), "beta": (p,), "covariance": (p, p),
@@ -262,7 +233,7 @@ class FleetState:
             **{name: np.zeros((B, *shape)) for name, shape in floats.items()},
             **{name: np.zeros((B, *shape), dtype=np.int64) for name, shape in integers.items()},
         )  # fmt: skip
-        self._dead_um = c.frames[:, 2]
+        self._dead_um = c.features.frame[:, 2]
         self._rest: list[StateDict] = [{} for _ in range(B)]
 
     def load(self, axis: int, state: StateDict) -> None:

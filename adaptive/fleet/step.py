@@ -15,7 +15,7 @@ import numpy as np
 from adaptive.compiled import compiled, dot
 from adaptive.features import FeatureArrays, advance, fill
 from adaptive.fleet.state import OUTCOMES, Fixed, Rows
-from adaptive.inverse_model import mean_of, track_memory
+from adaptive.inverse_model import mean_of, track_memory, unpacked
 from adaptive.online import gates, intake, learner
 from adaptive.online.drift import RestCreep, update
 from adaptive.online.gates import AdmissionState
@@ -86,8 +86,9 @@ def _number_of(outcome: str) -> int:
 @compiled
 def _map(c: Fixed, b: int, frames: FloatArray) -> FeatureArrays:
     """The feature map of an axis in a frame."""
+    m = c.features
     return FeatureArrays(
-        c.thresholds[b], c.arcs[b], c.retain[b], c.scale[b], c.kernel_plays, c.flags, frames[b],
+        m.thresholds[b], m.arcs[b], m.retain[b], m.scale[b], m.kernel_plays[b], m.flags[b], frames[b],
     )  # fmt: skip
 
 
@@ -125,7 +126,7 @@ def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
 
 
 @compiled
-def _admit(s: Rows, c: Fixed, b: int, sample: _Sample, control: bool) -> int:
+def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
     """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
     r, f, a = s.numbers[b], c.axis[b], c.config[0].admission
     g, dt_s = r.gates, c.config[0].dt_s
@@ -134,7 +135,7 @@ def _admit(s: Rows, c: Fixed, b: int, sample: _Sample, control: bool) -> int:
         refused = gates.OUT_OF_RANGE
     if refused != "":
         # The single learner keeps the voltage of a sample in its place whose reading cannot be used.
-        without = _Sample(sample.seq, sample.t_s, sample.u_V, 0.0)
+        without: Any = _Sample(sample.seq, sample.t_s, sample.u_V, 0.0)
         return DOUBT if gates.check_sample(a, g, without, dt_s) == "" else _number_of(refused)
     if sample.seq != g.seq + 1:
         return DOUBT
@@ -170,7 +171,7 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
     for i in range(3):
         motion[i] *= c.output_scale[i]
     advance(motion[0], s.memory[b], _map(c, b, s.frames))
-    advance(motion[0], s.frozen_memory[b], _map(c, b, c.frames))
+    advance(motion[0], s.frozen_memory[b], _map(c, b, c.features.frame))
 
 
 @compiled
@@ -191,7 +192,7 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, given: Samples, w:
     for k in range(lo, hi):
         b = axes[k]
         w.kept[b] = s.numbers[b]
-        sample = _Sample(given.seq[b], given.t_s[b], given.u_V[b], given.y_um[b])
+        sample: Any = _Sample(given.seq[b], given.t_s[b], given.u_V[b], given.y_um[b])
         w.outcome[b] = _admit(s, c, b, sample, given.controls[b])
         if w.outcome[b] != TEACHES:
             s.numbers[b] = w.kept[b]
@@ -232,11 +233,9 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
             if not isfinite(target):
                 w.outcome[b] = _NUMERICS
                 continue
-            fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.frames), basis, kernel)
-            m = f.model
-            frozen_V = mean_of(
-                basis, kernel, c.model_beta[m], c.model_scaled[m], c.model_alpha[m], c.model_inverse_widths[m]
-            )
+            fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
+            _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
+            frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
             if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
                 s.numbers[b] = w.kept[b]
                 w.outcome[b] = ODD
@@ -291,8 +290,12 @@ def _finds_fault(
     fault = j.fallen_s > learner.ROLLBACK_S
     confirms = places = False
     if checks:
-        fault = _left(r, f, u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p), config.check_s) or fault
-        fault = _railed(r, f, saturated, config.check_s) or fault
+        away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
+        outside = f.allowed_V > 0.0 and away_V > f.allowed_V
+        r.left_s = learner.time_outside(r.left_s, outside, config.check_s)
+        r.rail_s = learner.time_at_rail(r.rail_s, saturated, config.check_s)
+        fault = fault or (outside and r.left_s >= learner.RAIL_S)
+        fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
         if not saturated:
             r.confirmed = False
             if f.tells and r.credit > 0:
@@ -333,26 +336,6 @@ def _copy_mark(s: Rows, b: int, source: int, target: int) -> None:
 
 
 @compiled
-def _left(r: Any, f: Any, away_V: float, check_s: float) -> bool:
-    """`Parts.watch_shape`: whether the model has to begin again."""
-    if f.allowed_V > 0.0 and abs(away_V) > f.allowed_V:
-        r.left_s = max(r.left_s, 0.0) + check_s
-        return bool(r.left_s >= learner.RAIL_S)
-    r.left_s = max(min(r.left_s, 0.0) - check_s, -learner.LEFT_S)
-    return False
-
-
-@compiled
-def _railed(r: Any, f: Any, saturated: bool, check_s: float) -> bool:
-    """`Parts.watch_rail`: whether the model has to begin again."""
-    if not saturated:
-        r.rail_s = max(min(r.rail_s, 0.0) - check_s, -learner.RAIL_S)
-        return False
-    r.rail_s = min(max(r.rail_s, 0.0) + check_s, learner.RAIL_S)
-    return bool(r.rail_s >= learner.RAIL_S and r.judgement.short_V2 > (learner.RAIL_SHARE * f.span_V) ** 2)
-
-
-@compiled
 def memory_now(s: Rows, c: Fixed, frozen: BoolArray, out: FloatArray) -> None:
     """(B, m) memory at the last reading: the smoothed one, carried along the readings since; see `Track.memory_now`."""
     slots, lag = s.readings.shape[1], s.readings.shape[1] - 2
@@ -361,4 +344,4 @@ def memory_now(s: Rows, c: Fixed, frozen: BoolArray, out: FloatArray) -> None:
         for i in range(lag):
             readings[i] = s.readings[b, (s.numbers[b].count - lag + i) % slots]
         out[b] = s.frozen_memory[b] if frozen[b] else s.memory[b]
-        track_memory(readings, out[b], _map(c, b, c.frames if frozen[b] else s.frames))
+        track_memory(readings, out[b], _map(c, b, c.features.frame if frozen[b] else s.frames))

@@ -305,7 +305,22 @@ class DriftFilter:
         """
         x, P, walk, burst = self._x, self._P, self._walk, self._burst
         span_V, step_s = self.span_V, self.step_s
-        return update(self.config, self.state, x, P, walk, burst, span_V, step_s, basis, target_V, moving, weight, self._k, self._row)
+        return update(
+            self.config,
+            self.state,
+            x,
+            P,
+            walk,
+            burst,
+            span_V,
+            step_s,
+            basis,
+            target_V,
+            moving,
+            weight,
+            self._k,
+            self._row,
+        )
 
     def expect_change(self) -> None:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""

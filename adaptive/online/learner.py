@@ -221,6 +221,18 @@ def _mark(values: StateDict) -> Mark:
     return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)
 
 
+@shared
+def time_outside(left_s: float, outside: bool, step_s: float) -> float:
+    """Time outside the envelope, or inside where negative, s, after one more check."""
+    return max(left_s, 0.0) + step_s if outside else max(min(left_s, 0.0) - step_s, -LEFT_S)
+
+
+@shared
+def time_at_rail(rail_s: float, saturated: bool, step_s: float) -> float:
+    """Time of the voltage at a limit, or off it where negative, s, after one more check."""
+    return min(max(rail_s, 0.0) + step_s, RAIL_S) if saturated else max(min(rail_s, 0.0) - step_s, -RAIL_S)
+
+
 class Parts:
     """The changing state of a learner, and the operations on several of its parts.
 
@@ -344,14 +356,12 @@ class Parts:
         ``railed`` is True from then until the voltage has been off the limits for as long.
         """
         limit_V = RAIL_SHARE * self.filter.span_V
-        step_s = self.check_s
+        self.rail_s = time_at_rail(self.rail_s, saturated, self.check_s)
         if saturated:
-            self.rail_s = min(max(self.rail_s, 0.0) + step_s, RAIL_S)
             if self.rail_s >= RAIL_S and self.judgement.short_V2 > limit_V * limit_V and not self.railed:
                 self.railed = True
                 self.begin_again()
         else:
-            self.rail_s = max(min(self.rail_s, 0.0) - step_s, -RAIL_S)
             self.railed = self.railed and self.rail_s > -RAIL_S
 
     def watch_shape(self, away_V: float) -> None:
@@ -359,14 +369,13 @@ class Parts:
 
         ``left`` is True from then until it has been inside for a second.
         """
-        step_s = self.check_s
-        if self.allowed_V and abs(away_V) > self.allowed_V:
-            self.left_s = max(self.left_s, 0.0) + step_s
+        outside = self.allowed_V > 0.0 and abs(away_V) > self.allowed_V
+        self.left_s = time_outside(self.left_s, outside, self.check_s)
+        if outside:
             if self.left_s >= RAIL_S:
                 self.left, self.left_s = True, 0.0
                 self.begin_again()
         else:
-            self.left_s = max(min(self.left_s, 0.0) - step_s, -LEFT_S)
             self.left = self.left and self.left_s > -LEFT_S
 
     def watch_trial(self) -> bool:

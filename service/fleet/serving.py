@@ -287,8 +287,9 @@ class FleetService:
         axes = np.flatnonzero(np.any(now != self._published, axis=1))
         self._published = now
         if axes.size:
-            parts = {"frames": now[axes, :2], "beta": now[axes, 2:]}
-            self._publisher.put(encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, **parts))
+            frames, beta = now[axes, :2], now[axes, 2:]
+            changes = encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, frames=frames, beta=beta)
+            self._publisher.put(changes)
 
     def _axis_of(self, payload: bytes) -> int | None:
         """The axis that a request names; None for none. Raises InputError."""

@@ -53,7 +53,8 @@ class FleetSettings:
         float, Setting(help="highest rate at which changes of models are published", unit="1/s", low=0, above=True)
     ] = 5.0
     checkpoints: Annotated[
-        Path | None, Setting(help="folder for one checkpoint of each axis; relative to this file", example="checkpoints/fleet")
+        Path | None,
+        Setting(help="folder for one checkpoint of each axis; relative to this file", example="checkpoints/fleet"),
     ] = None
     checkpoint_s: Annotated[
         float, Setting(help="time in which each axis is written once", unit="s", low=0.05, high=86400)
