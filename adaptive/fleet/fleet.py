@@ -107,6 +107,17 @@ class Fleet:
             self._settle(axis, learner, said)
         return outcome.copy()
 
+    def warm(self) -> None:
+        """Load or compile every step, so that no sample waits for the compiler."""
+        s, c, w, share, none = self._state.rows, self._c, self._work, self._threads.share, np.arange(0)
+        samples = Samples(none, w.targets, w.targets, w.targets, w.learns)
+        share(0, steps.take, none, s, c, samples, w)
+        share(0, steps.teach, none, self._windows.predict(none), s, c, w)
+        self._windows.let_go(none, 1.0)
+        self._windows.learn(none, Step(s.point[none], w.targets[none], w.weights[none], 0.0, False))
+        still = np.zeros((self.axes, 1))
+        self.snapshot().feedforward(still, still, still, self.memory())
+
     def _given(self, name: str, value: object, kind: type) -> Any:
         given: Any = np.asarray(value, dtype=kind)
         if given.ndim > 1 or (given.ndim == 1 and given.shape[0] != self.axes):

@@ -71,12 +71,14 @@ def load_fleet(settings: FleetSettings) -> Fleet:
         given = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **given}
     learner = build_settings(LearnerConfig, {**settings.learner, "admission": given}, "fleet.learner")
     try:
-        return Fleet(models, FleetConfig(learner, settings.device, threads=settings.threads))
+        fleet = Fleet(models, FleetConfig(learner, settings.device, threads=settings.threads))
     except ImportError as error:
         raise FieldError(
             "[fleet]", f"device {settings.device!r}, without torch ({error})", "torch, for a device but the processor",
             "pip install 'dehyst[torch]'",
         ) from error  # fmt: skip
+    fleet.warm()
+    return fleet
 
 
 def answer(
@@ -273,7 +275,7 @@ class FleetService:
         present = ~(np.isnan(u) & np.isnan(y))
         for i in range(k):
             self._fleet.step(p["seq"][i], p["t_s"][i], u[i], y[i], present[i])
-        self._count(missing=int((~present).sum()), unknown_axes=k * (batch.axes - known))
+        self._count(missing=int((~present[:, here]).sum()), unknown_axes=k * (batch.axes - known))
         with self._counting:
             self._waiting -= k
         return k

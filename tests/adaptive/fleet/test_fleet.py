@@ -123,6 +123,24 @@ def test_each_axis_equals_the_single_learner(models: list[LssvmInverse]) -> None
     assert [name for name in wanted if not total[name]] == []
 
 
+def test_axes_equal_single_learners_while_stages_drift_beside_the_voltage(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60)
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    n = 4000
+    u, y = np.empty((4, n)), np.empty((4, n))
+    for axis in range(4):
+        stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
+        u[axis] = 4.0 + 1.5 * np.sin(2.0 * np.pi * (0.8 + 0.3 * axis) * np.arange(n) * DT)
+        y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+        y[axis] += 18.0 * axis * np.clip((np.arange(n) - 1500) * DT, 0.0, 1.0)
+    compare(fleet, singles, 0, u, y, 250)
+    # The sums of the sensor check have followed, and some of them stand for a drift.
+    rates = [learner.parts.intake.following.drift_V_per_s for learner in singles]
+    assert max(map(abs, rates)) > 0.0
+    got = [fleet.learner_of(axis).parts.intake.following.drift_V_per_s for axis in range(4)]
+    np.testing.assert_allclose(got, rates, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInverse], backend: str) -> None:
     config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
