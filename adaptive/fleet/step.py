@@ -33,10 +33,11 @@ TEACHES: Final = -2
 DOUBT: Final = -3
 ODD: Final = -4
 
-# Compiled code knows methods by plain names only.
+# Compiled code knows methods by plain names only. Fields of a record are read as attributes, as those of the single
+# learner's dataclasses, and written as items.
 _judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
 _follow, _rest_shift_um, _leave_rest, _weight_of = Following.take, RestCreep.shift_um, RestCreep.leave, WeightConfig.of
-_note_taken, _note_step = AdmissionState.take, AdmissionState.step
+_note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
 _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
     OUTCOMES.index(name)
     for name in (gates.FROZEN, gates.OUTLIER, gates.NUMERICS, gates.SATURATED, gates.UNEXCITED, gates.LEARNT)
@@ -108,7 +109,7 @@ def _remember_place(s: Rows, b: int, keep: bool) -> None:
         past = (r.count - slots + 2 + i) % slots
         s.past_lag_V[b, at, i], s.past_lag_um[b, at, i] = s.voltages[b, past], s.readings[b, past]
     s.past_from[b, at] = r.past_written
-    r.past_count = at + 1
+    r["past_count"] = at + 1
 
 
 @compiled
@@ -149,7 +150,7 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
     if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
         return DOUBT
     gates.watch_innovation(a, g, innovation)
-    r.until_control -= 1
+    r["until_control"] -= 1
     return DOUBT if known and f.tells and r.until_control <= 0 and control else TEACHES
 
 
@@ -158,16 +159,16 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
     """`Intake.advance`: one step of the smoother, and of the hysteresis memory in both frames."""
     r, slots = s.numbers[b], s.voltages.shape[1]
     _note_step(r.gates)
-    r.calm += 1
+    r["calm"] += 1
     s.past_voltages[b, r.past_written % s.past_voltages.shape[1]] = u_V
-    r.past_written += 1
+    r["past_written"] += 1
     if r.past_count > 0 and r.past_written - s.past_from[b, 0] > MOST_BRIDGED:
         # At rest nothing is checked, and the present place is as good as the past one.
         _remember_place(s, b, True)
     slot, motion = r.count % slots, s.motion[b]
     s.readings[b, slot], s.voltages[b, slot], s.good[b, slot] = y_um, u_V, True
     smooth_one(y_um, r.count, s.x[b], s.ring[b], c.transition, c.gain, c.lag_gains, motion)
-    r.count += 1
+    r["count"] += 1
     for i in range(3):
         motion[i] *= c.output_scale[i]
     advance(motion[0], s.memory[b], _map(c, b, s.frames))
@@ -254,11 +255,11 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
                 w.outcome[b] = _OUTLIER
                 continue
             if said == "burst":
-                r.changed, r.next = r.clock, 0
+                r["changed"], r["next"] = r.clock, 0
             w.lets_go[b] = r.judgement.valid and r.next != NOWHERE
             if rests:
                 shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
-                r.offset_um += shift_um
+                r["offset_um"] += shift_um
                 s.frames[b, 0] = r.offset_um
             else:
                 _leave_rest(r.rest)
@@ -281,27 +282,27 @@ def _finds_fault(
     r, f, config, p = s.numbers[b], c.axis[b], c.config[0], h.size
     j, span_V, size = r.judgement, f.span_V, s.delay.shape[1]
     s.delay[b, r.delay_count % size] = s.beta[b]
-    r.delay_count += 1
+    r["delay_count"] += 1
     served_V = dot(h, s.delay[b, max(r.delay_count - size + 1, 0) % size], p)
     _judge(j, target - served_V, u - frozen_V, config.step_s)
     _is_valid(j, config.valid_enter * span_V, config.valid_leave * span_V)
     before = j.fallback
-    r.fallbacks += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
+    r["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
     fault = j.fallen_s > learner.ROLLBACK_S
     confirms = places = False
     if checks:
         away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
         outside = f.allowed_V > 0.0 and away_V > f.allowed_V
-        r.left_s = learner.time_outside(r.left_s, outside, config.check_s)
-        r.rail_s = learner.time_at_rail(r.rail_s, saturated, config.check_s)
+        r["left_s"] = learner.time_outside(r.left_s, outside, config.check_s)
+        r["rail_s"] = learner.time_at_rail(r.rail_s, saturated, config.check_s)
         fault = fault or (outside and r.left_s >= learner.RAIL_S)
         fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
         if not saturated:
-            r.confirmed = False
+            r["confirmed"] = False
             if f.tells and r.credit > 0:
                 fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
                 fault = _follow(r.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
-                r.confirmed = r.following.good >= CONFIRMED or r.past_count == 0
+                r["confirmed"] = r.following.good >= CONFIRMED or r.past_count == 0
             places = r.confirmed
         confirms = r.confirmed
     if fault:
@@ -314,7 +315,7 @@ def _finds_fault(
         s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
         s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
     if places:
-        r.following.good = 0
+        _count_again(r.following)
         _remember_place(s, b, False)
     return False
 

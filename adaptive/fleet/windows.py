@@ -70,7 +70,7 @@ def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, step: St
         A, r = arrays_of(handles[b]), s.numbers[b]
         n = A.C[COUNT]
         slot, value = steps.nearest(A, x)
-        r.clock += 1
+        r["clock"] += 1
         room = n < A.S.shape[0] and value < SAME
         if room:
             slot = n
@@ -113,13 +113,13 @@ def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: f
         found = False
         while 0 <= r.next < A.C[COUNT] and not found:
             slot = r.next
-            r.next += 1
+            r["next"] += 1
             if s.born[b, slot] <= r.changed and s.own[b, slot] > most:
                 found = True
                 if steps.reweight(A, slot, most) == ACCEPTED:
                     s.own[b, slot] = most
         if not found:
-            r.next = NOWHERE
+            r["next"] = NOWHERE
 
 
 class CompiledWindows:

@@ -100,6 +100,7 @@ class Following:
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
         self.drift_V_per_s = self.drift2 = 0.0
 
+    @shared
     def count_again(self) -> None:
         """Count the steps in which the readings followed from zero again."""
         self.good = 0
