@@ -123,10 +123,18 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         assert after["samples"]["unknown_axes"] == 4
         assert after["gates"]["duplicate"] == AXES - 2
         assert after["gates"]["not_finite"] == 2
-        # What is refused of one axis costs the others nothing.
-        for first in range(601, 901, 20):
-            send(session, samples(*motion(first, 20)))
-        eventually(lambda: status(session)["seq"] >= 899)
+        # What is refused of one axis costs the others nothing. Now half of the axes in a message, and one actuator dead.
+        for first in range(601, 1801, 20):
+            seq, t_s, u, y = motion(first, 20)
+            y[:, 20] = 40.0
+            send(session, samples(seq, t_s, u[:, :32], y[:, :32]))
+            send(session, samples(seq, t_s, u[:, 32:], y[:, 32:], first=32))
+            eventually(lambda: status(session)["samples"]["waiting"] < 500)
+        eventually(lambda: status(session)["samples"]["received"] == 602 + 2400)
+        now = eventually(lambda: (now := status(session))["seq"] >= 1799 and now)
+        assert (now["samples"]["missing"], now["samples"]["dropped"]) == (2, 0)
+        assert (now["worst"][0]["axis"], now["worst"][0]["trouble"]) == (20, "sensor_stuck")
+        assert now["in_trouble"] == 1
         one, other = status(session, axis=5), status(session, axis=6)
         assert one["gates"]["not_finite"] == 2
         assert other["gates"]["not_finite"] == 0
