@@ -123,7 +123,7 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         assert after["samples"]["unknown_axes"] == 4
         assert after["gates"]["duplicate"] == AXES - 2
         assert after["gates"]["not_finite"] == 2
-        # What is refused of one axis costs the others nothing. Now half of the axes in a message, and one actuator dead.
+        # What is refused of one axis costs the others nothing. Now half of the axes a message, and one actuator dead.
         for first in range(601, 1801, 20):
             seq, t_s, u, y = motion(first, 20)
             y[:, 20] = 40.0
