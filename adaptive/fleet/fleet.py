@@ -70,10 +70,10 @@ class Fleet:
     def _make_windows(self, example: WindowArrays) -> CompiledWindows | TorchWindows:
         rows, config = self._state.rows, self.config
         if not config.in_torch:
-            return CompiledWindows(rows, example, self._threads)
+            return CompiledWindows(rows, self._c, example, self._threads)
         from adaptive.fleet.in_torch import TorchWindows
 
-        return TorchWindows(rows, example, config.device)
+        return TorchWindows(rows, self._c, example, config.device)
 
     # ---- samples in
 
@@ -161,8 +161,8 @@ class Fleet:
         if not axes.size:
             return axes
         s, w, c = self._state.rows, self._work, self.config.learner
-        fade_steps = c.weights.half_life_s / (c.learn_every * self.bases[0].dt_s)
-        step = Step(s.point[axes], w.targets[axes], w.weights[axes], fade_steps, c.eviction == "fifo")
+        step_s, fifo = c.learn_every * self.bases[0].dt_s, c.eviction == "fifo"
+        step = Step(s.point[axes], w.targets[axes], w.weights[axes], step_s, fifo)
         status: IntArray = self._windows.learn(axes, step)
         w.outcome[axes] = np.where(status == ACCEPTED, OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS))
         return np.asarray(axes[status == ILL_CONDITIONED])

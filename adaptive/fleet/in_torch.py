@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from adaptive.fleet import windows
-from adaptive.fleet.state import Rows
+from adaptive.fleet.state import Fixed, Rows
 from adaptive.fleet.windows import Step
-from adaptive.online.kernel_window import NOWHERE, SAME
+from adaptive.online.kernel_window import LEAST_FADED, NOWHERE, SAME
 from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
 from adaptive.window.arrays import ACCEPTED, WindowArrays
@@ -33,8 +33,8 @@ class TorchWindows:
 
     shares = False
 
-    def __init__(self, rows: Rows, example: WindowArrays, device: str) -> None:
-        self._rows, self._device = rows, torch.device(device)
+    def __init__(self, rows: Rows, fixed: Fixed, example: WindowArrays, device: str) -> None:
+        self._rows, self._fixed, self._device = rows, fixed, torch.device(device)
         B = rows.x.shape[0]
         self._all = {
             name: torch.zeros((B, *field.shape), dtype=torch.as_tensor(field).dtype, device=self._device)
@@ -94,15 +94,16 @@ class TorchWindows:
         done, slot = axes[good], slots.cpu().numpy()[good]
         s.numbers["clock"][done] += 1
         s.born[done, slot], s.own[done, slot] = s.numbers["clock"][done], step.weights[good]
-        if step.fade_steps > 0.0 and done.size:
+        half_life_s = float(self._fixed.config["weights"]["half_life_s"][0])
+        if half_life_s > 0.0 and done.size:
             slot = s.numbers["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
-            share = 0.5 ** ((s.numbers["clock"][done] - s.born[done, slot]) / step.fade_steps)
-            faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, 1e-3))
-            self._alone(done[~faded], windows.fade_alone, s, step.fade_steps)
+            share = 0.5 ** ((s.numbers["clock"][done] - s.born[done, slot]) * step.step_s / half_life_s)
+            faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, LEAST_FADED))
+            self._alone(done[~faded], windows.fade, s, self._fixed, step.step_s)
         rest = ~good
         said = np.empty(int(rest.sum()), dtype=np.int64)
         alone = step._replace(points=step.points[rest], targets=step.targets[rest], weights=step.weights[rest])
-        self._alone(axes[rest], windows.learn, s, alone, said)
+        self._alone(axes[rest], windows.learn, s, self._fixed, alone, said)
         status[rest] = said
         return status
 

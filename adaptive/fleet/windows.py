@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from adaptive.compiled import compiled
-from adaptive.fleet.state import Rows
-from adaptive.online.kernel_window import NOWHERE, SAME
+from adaptive.fleet.state import Fixed, Rows
+from adaptive.online import kernel_window as window
 from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
 from adaptive.window import steps
-from adaptive.window.arrays import ACCEPTED, COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
+from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
 
 #: Fewest axes for which a second thread is worth its wake-up.
 _LEAST_AXES = 16
@@ -46,13 +46,13 @@ class Threads:
 class Step(NamedTuple):
     """One sample for each of k windows: points (k, d), targets in V and noise weights (k,).
 
-    fade_steps : half-life in steps of a window, 0 for none. fifo : whether the oldest sample makes way.
+    step_s : time between two steps. fifo : whether the oldest sample makes way.
     """
 
     points: FloatArray
     targets: FloatArray
     weights: FloatArray
-    fade_steps: float
+    step_s: float
     fifo: bool
 
 
@@ -63,45 +63,24 @@ def _predict(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, out: 
 
 
 @compiled
-def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, step: Step, out: IntArray) -> None:
+def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step: Step, out: IntArray) -> None:
     """`ResidualWindow.learn` and ``fade`` of each axis."""
     for k in range(lo, hi):
-        b, x, weight = axes[k], step.points[k], step.weights[k]
+        b = axes[k]
         A, r = arrays_of(handles[b]), s.numbers[b]
-        n = A.C[COUNT]
-        slot, value = steps.nearest(A, x)
-        r["clock"] += 1
-        room = n < A.S.shape[0] and value < SAME
-        if room:
-            slot = n
-            status = steps.append(A, x, step.targets[k], weight)
-        else:
-            if step.fifo:
-                slot = int(np.argmin(s.born[b, :n]))
-            status = steps.replace(A, slot, x, step.targets[k], weight)
-        if status == ACCEPTED:
-            s.born[b, slot] = r.clock
-            s.own[b, slot] = weight
-        out[k] = status if status != ILL_CONDITIONED or n > 0 else ws.BAD_INPUT
-        fade(A, r.clock, s.born[b], s.own[b], step.fade_steps)
+        empty = A.C[COUNT] == 0
+        status = window.learn(A, r, step.points[k], step.targets[k], step.weights[k], s.born[b], s.own[b], step.fifo)
+        # An empty window has nothing that a new factorisation could mend.
+        out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
+        window.fade(A, r, c.config[0].weights, step.step_s, s.born[b], s.own[b])
 
 
 @compiled
-def fade(A: WindowArrays, clock: int, born: IntArray, own: FloatArray, fade_steps: float) -> None:
-    """`ResidualWindow.fade` of one axis."""
-    n = A.C[COUNT]
-    if fade_steps > 0.0 and n > 0:
-        slot = clock % n
-        age = float(clock - born[slot]) / fade_steps
-        steps.reweight(A, slot, own[slot] * max(0.5**age, 1e-3))
-
-
-@compiled
-def fade_alone(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, fade_steps: float) -> None:
-    """`fade` of each axis."""
+def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step_s: float) -> None:
+    """`ResidualWindow.fade` of each axis."""
     for k in range(lo, hi):
         b = axes[k]
-        fade(arrays_of(handles[b]), s.numbers[b].clock, s.born[b], s.own[b], fade_steps)
+        window.fade(arrays_of(handles[b]), s.numbers[b], c.config[0].weights, step_s, s.born[b], s.own[b])
 
 
 @compiled
@@ -109,17 +88,7 @@ def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: f
     """`ResidualWindow.let_go` of each axis."""
     for k in range(lo, hi):
         b = axes[k]
-        A, r = arrays_of(handles[b]), s.numbers[b]
-        found = False
-        while 0 <= r.next < A.C[COUNT] and not found:
-            slot = r.next
-            r["next"] += 1
-            if s.born[b, slot] <= r.changed and s.own[b, slot] > most:
-                found = True
-                if steps.reweight(A, slot, most) == ACCEPTED:
-                    s.own[b, slot] = most
-        if not found:
-            r["next"] = NOWHERE
+        window.let_go(arrays_of(handles[b]), s.numbers[b], most, s.born[b], s.own[b])
 
 
 class CompiledWindows:
@@ -128,9 +97,9 @@ class CompiledWindows:
     #: Whether ``arrays`` gives the state itself, not a copy.
     shares = True
 
-    def __init__(self, rows: Rows, example: WindowArrays, threads: Threads) -> None:
+    def __init__(self, rows: Rows, fixed: Fixed, example: WindowArrays, threads: Threads) -> None:
         B = rows.x.shape[0]
-        self._rows, self._threads = rows, threads
+        self._rows, self._fixed, self._threads = rows, fixed, threads
         self._all = {name: np.zeros((B, *field.shape), field.dtype) for name, field in example._asdict().items()}
         self._views = [WindowArrays(**{name: field[b] for name, field in self._all.items()}) for b in range(B)]
         self._handles = np.array([ws.handle_of(view) for view in self._views])
@@ -157,7 +126,7 @@ class CompiledWindows:
     def learn(self, axes: IntArray, step: Step) -> IntArray:
         """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
         out = np.empty(axes.size, dtype=np.int64)
-        self._threads.share(axes.size, learn, self._handles, axes, self._rows, step, out)
+        self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, step, out)
         return out
 
     def let_go(self, axes: IntArray, most: float) -> None:

@@ -14,6 +14,7 @@ from adaptive.fleet.state import OUTCOMES
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
+from adaptive.online.kernel_window import WeightConfig
 from adaptive.online.learner import Learner
 from adaptive.types import Sample
 from adaptive.window.window import SolverConfig
@@ -153,6 +154,17 @@ def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInvers
     for axis, single in enumerate(singles):
         fleet.load_axis(axis, single.state_dict())
     compare(fleet, out, 700, u[:, 700:], y[:, 700:], 100)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], backend: str) -> None:
+    weights, solver = WeightConfig(half_life_s=0.3, acceleration=1.0), SolverConfig(form="inverse")
+    config = LearnerConfig(window=60, eviction="fifo", weights=weights, solver=solver)
+    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    singles = [Learner(model, config) for model in models]
+    u, y = samples(1200)
+    compare(fleet, singles, 0, u, y, 100)
+    assert min(single.counters()["window_steps"] for single in singles) > 20
 
 
 def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:
