@@ -19,6 +19,7 @@ from adaptive.types import FloatArray
 
 try:
     import numba
+    from numba.extending import register_jitable
 except ImportError:
     #: Whether the loops are compiled.
     COMPILES = False
@@ -43,6 +44,15 @@ def _interpreted(function: F) -> F:
             return function(*arguments)
 
     return cast(F, run)
+
+
+def shared(function: F) -> F:
+    """A Python function that compiled code may call too: on a record with the fields of the object that it is given.
+
+    So that a fleet steps its axes by the rules of the single learner themselves. Such a function uses attributes,
+    numbers and other shared or compiled functions, and no methods.
+    """
+    return register_jitable(function) if COMPILES else function
 
 
 def in_numpy(version: F) -> Callable[[F], F]:

@@ -127,7 +127,7 @@ def unpacked(
 
 
 @compiled
-def _evaluate_packed(
+def evaluate_packed(
     y: FloatArray,
     v: FloatArray,
     a: FloatArray,
@@ -179,10 +179,10 @@ def voltage_of(
 def evaluate_point(
     y: float, v: float, a: float, memory: FloatArray, constants: FloatArray, counts: IntArray
 ) -> tuple[float, float, bool]:  # pragma: no cover - compiled
-    """`_evaluate_packed` of one point with plain numbers: an array costs as much to hand over as five of them."""
+    """`evaluate_packed` of one point with plain numbers: an array costs as much to hand over as five of them."""
     five, inside = np.empty(5), np.empty(1, dtype=np.bool_)
     five[0], five[1], five[2] = y, v, a
-    _evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
+    evaluate_packed(five[0:1], five[1:2], five[2:3], memory, constants, counts, five[3:4], five[4:5], inside)
     return five[3], five[4], inside[0]
 
 
@@ -266,7 +266,7 @@ class LssvmInverse:
     like: InitVar[LssvmInverse | None] = None
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
     _inverse_widths: FloatArray = field(init=False, repr=False, compare=False)
-    #: All that `_evaluate_packed` needs.
+    #: All that `evaluate_packed` needs.
     _constants: FloatArray = field(init=False, repr=False, compare=False)
     _counts: IntArray = field(init=False, repr=False, compare=False)
 
@@ -352,7 +352,7 @@ class LssvmInverse:
         after = self._memory(memory)
         n = y.size
         u, std, inside = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        _evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
+        evaluate_packed(y, v, a, after, self._constants, self._counts, u, std, inside)
         return Feedforward(u, std, inside, after)
 
     def moved(

@@ -12,6 +12,7 @@ smoother is a fixed linear recursion, equal to Rauch-Tung-Striebel on the same s
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from math import factorial, pi
 
 import numpy as np
@@ -74,7 +75,7 @@ class SmootherState:
 
 
 @compiled
-def _step(
+def smooth_one(
     y: float, count: int, x: FloatArray, ring: FloatArray, f: FloatArray, k: FloatArray, g: FloatArray, out: FloatArray
 ) -> None:
     """One sample: out (3,) is the smoothed state ``lag`` samples ago (sample units); x, ring change in place."""
@@ -105,7 +106,7 @@ def _run(y: FloatArray, x: FloatArray, ring: FloatArray, f: FloatArray, k: Float
     n = y.shape[0]
     out = np.empty((n, 3))
     for i in range(n):
-        _step(y[i], i, x, ring, f, k, g, out[i])
+        smooth_one(y[i], i, x, ring, f, k, g, out[i])
     return out
 
 
@@ -163,7 +164,7 @@ class FixedLagSmoother:
     def step(self, state: SmootherState, y_um: float) -> tuple[float, float, float] | None:
         """Take one sample; return (y_um, v_um_per_s, a_um_per_s2) ``lag`` samples ago, None before there is one."""
         out = np.empty(OUTPUTS)
-        _step(y_um, state.count, state.x, state.ring, self.transition, self.gain, self.lag_gains, out)
+        smooth_one(y_um, state.count, state.x, state.ring, self.transition, self.gain, self.lag_gains, out)
         state.count += 1
         if state.count <= self.config.lag:
             return None
@@ -191,6 +192,12 @@ class FixedLagSmoother:
         return SmootherState(
             np.array(values["x"], dtype=np.float64), np.array(values["ring"], dtype=np.float64), int(values["count"])
         )
+
+
+@cache
+def smoother_of(config: SmootherConfig) -> FixedLagSmoother:
+    """The smoother of a configuration; made once, because its gains take a millisecond, and many axes share them."""
+    return FixedLagSmoother(config)
 
 
 def _checked(y_um: FloatArray) -> FloatArray:

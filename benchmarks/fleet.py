@@ -2,6 +2,7 @@
 
 ``python -m benchmarks.fleet [--axes 64 256 1024] [--window 100] [--learn-every 10] [--device cuda] [--steps 200]``
 
+The single learners run on one core, the fleet on ``--threads``: the ratio is what a service gains on that machine.
 For each number of axes: time of a step of all axes (median, p99), the same of as many single learners one after the
 other (measured on at most 64 of them, times the number of axes), and of solving all kernel matrices anew with
 ``torch.linalg.solve``, which a step of all windows replaces; evaluation of all axes at one point; start-up; memory; and
@@ -92,6 +93,7 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
     models = [replace(model, features=replace(model.features, gain=float(gain))) for gain in gains]
     begin = time.perf_counter()
     fleet = Fleet(models, FleetConfig(config, args.device, args.backend, args.threads))
+    fleet.warm()
     start_s = time.perf_counter() - begin
     u, y = recording(stage, args.before + args.steps)
     singles = [Learner(one, config) for one in models[: min(axes, MOST_SINGLE)]]
@@ -118,7 +120,8 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
     print(f"  fleet         mean {steps.mean() * ms:8.2f} ms a sample of all axes, median {np.median(steps) * ms:.2f}, "
           f"p99 {np.percentile(steps, 99) * ms:.2f}; {apart / args.steps:.1f} axes apart on average, "
           f"{0.5 * stepped:.0f} window steps of an axis")  # fmt: skip
-    print(f"  single x B    mean {loops.mean() * ms:8.2f} ms, {loops.mean() / steps.mean():.2f} times the fleet's")
+    print(f"  single x B    mean {loops.mean() * ms:8.2f} ms on one core, {loops.mean() / steps.mean():.2f} times the "
+          f"fleet's on {args.threads}")  # fmt: skip
     print(f"  solve x B     mean {solved * ms:8.2f} ms for the windows alone, {solved / steps.mean():.1f} times")
     share = triangles / moved_bytes_s / steps.mean()
     print(f"  inverses      {triangles / 1e6:.1f} MB a sample, {triangles / moved_bytes_s * ms:.2f} ms at a copy's "

@@ -30,6 +30,7 @@ from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from service.answers.answering import Served, answer, blends, learns
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
+from service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
 from service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
 from service.protocol.keys import AUTO
 from service.protocol.model import Safety, check_model, encode_model
@@ -480,6 +481,52 @@ def plain_payloads() -> dict[str, tuple[bytes, list[tuple[str, list[float]]]]]:
     }
 
 
+def fleet_payloads() -> dict[str, tuple[int, dict[str, list[float] | list[list[float]]]]]:
+    """Kind and parts of payloads of a fleet, of three axes from axis 2 on, by file name."""
+    two = [[5.0, 5.25, 4.75], [5.5, math.nan, 4.5]]
+    return {
+        "samples": (
+            FLEET_SAMPLES,
+            {
+                "seq": [1000, 1001],
+                "t_s": [1.0, 1.001],
+                "u_V": two,
+                "y_um": [[40.25, math.inf, -0.125], [41.0, math.nan, 0.5]],
+            },
+        ),
+        "query": (
+            FLEET_QUERY,
+            {
+                "y_um": two,
+                "v_um_per_s": [[1.0, 2.0, 3.0]] * 2,
+                "a_um_per_s2": [[-8.0, 0.0, 0.25]] * 2,
+                "memory": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]],
+                "u_before_V": [0.5, math.nan, 1.5],
+            },
+        ),
+        "query-alone": (FLEET_QUERY, {"y_um": two, "v_um_per_s": two, "a_um_per_s2": two}),
+        "reply": (
+            FLEET_REPLY,
+            {
+                "snapshot_seq": [2**40],
+                "u_V": two,
+                "std_V": [[0.125] * 3] * 2,
+                "memory": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]],
+                "flags": [[0, 1, 2], [4, 128, 0]],
+            },
+        ),
+        "changes": (
+            FLEET_CHANGES,
+            {
+                "snapshot_seq": [7],
+                "axes": [3, 5, 900],
+                "frames": [[1.0, 0.0], [0.94, 1.8], [1.5, -2.0]],
+                "beta": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]],
+            },
+        ),
+    }
+
+
 def write(out: Path) -> int:
     """Write all files to ``out``, which is created; returns the bytes written."""
     out.mkdir(parents=True, exist_ok=True)
@@ -504,6 +551,13 @@ def write(out: Path) -> int:
         files[f"{name}.payload"] = payload
         table += [f"{name}.payload {key} {i} {value!r}" for key, values in columns for i, value in enumerate(values)]
     files["payloads.txt"] = ("\n".join(table) + "\n").encode()
+    table = ["# file field index value"]
+    for name, (kind, parts) in fleet_payloads().items():
+        files[f"fleet-{name}.payload"] = encode_fleet(kind, 0 if name == "changes" else 2, **parts)
+        for key, given in parts.items():
+            values = np.ravel(given).tolist()
+            table += [f"fleet-{name}.payload {key} {i} {float(value)!r}" for i, value in enumerate(values)]
+    files["fleet.txt"] = ("\n".join(table) + "\n").encode()
     table = ["# step message file outcome fingerprint snapshot_seq"]
     files["deltas.query.payload"] = delta_query()
     for step in delta_steps():

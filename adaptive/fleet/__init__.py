@@ -1,4 +1,4 @@
 """Many learners as one batch: the same mathematics as ``adaptive.online``, for a mirror or a machine with many axes.
 
-Needs torch (``pip install dehyst[torch]``). See docs/fleet.md.
+`in_torch` needs torch (``pip install dehyst[torch]``), the rest does not. See docs/fleet.md.
 """

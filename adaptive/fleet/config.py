@@ -1,4 +1,4 @@
-"""Frozen configuration of a fleet, and the constants of its axes. Imports no torch."""
+"""Frozen configuration of a fleet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from adaptive.errors import InputError
 from adaptive.online.config import LearnerConfig
 
-#: What the matrices of all axes are stepped by: compiled loops over the axes, or operations of torch.
+#: What the windows of all axes are stepped by: compiled loops over the axes, or operations of torch.
 Backend = Literal["auto", "compiled", "torch"]
 
 
@@ -17,10 +17,10 @@ class FleetConfig:
     """Frozen configuration of a fleet.
 
     learner : of every axis, see there.
-    device : of torch, ``cpu`` or ``cuda``. backend : ``compiled`` steps the matrices by the single learner's own
+    device : ``cpu``, or a device of torch. backend : ``compiled`` steps the windows by the single learner's own
     compiled code, on the processor; ``torch`` by operations of torch on any device, in the inverse form; ``auto`` takes
     the one that suits the device.
-    threads : that share the axes of a compiled step; the result does not depend on them.
+    threads : that share the axes of a step; the result does not depend on them.
     checks : most axes at a time whose model is under a control trial (`docs/learner.md`); others wait for their turn.
     """
 
@@ -36,7 +36,7 @@ class FleetConfig:
         if self.backend == "compiled" and self.device != "cpu":
             raise InputError(f"backend: got 'compiled' with device {self.device!r}, expected 'torch' there")
         if not self.device:
-            raise InputError("device: got nothing, expected a device of torch, 'cpu' or 'cuda'")
+            raise InputError("device: got nothing, expected 'cpu' or a device of torch, as 'cuda'")
         if not 1 <= self.threads <= 256:
             raise InputError(f"threads: got {self.threads}, expected 1 to 256")
         if self.checks < 1:
@@ -48,5 +48,5 @@ class FleetConfig:
 
     @property
     def in_torch(self) -> bool:
-        """Whether the matrices are stepped by torch."""
+        """Whether the windows are stepped by torch."""
         return self.backend == "torch" or (self.backend == "auto" and self.device != "cpu")

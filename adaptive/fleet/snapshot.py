@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from adaptive.compiled import compiled
 from adaptive.errors import InputError
-from adaptive.fleet.in_torch import column_of
-from adaptive.fleet.motion import advance, inputs
-from adaptive.fleet.state import AxisConstants, BatchState
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse
-from adaptive.online.learner import Learner
+from adaptive.fleet.state import Fixed, Rows
+from adaptive.fleet.windows import Threads
+from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed
 from adaptive.types import BoolArray, FloatArray, IntArray
+from adaptive.window.arrays import ALPHA, BETA, COUNT, GAMMA
 
 
 class Answers(NamedTuple):
@@ -29,145 +26,122 @@ class Answers(NamedTuple):
     memory: FloatArray
 
 
-class Samples(Protocol):
-    """What holds the windows."""
-
-    def samples(self) -> tuple[Tensor, ...]:
-        """(B, d, N) scaled inputs, (B, N) dual weights, (B,) bias, counts, (B, d) inverse widths and (B,) gamma."""
-        ...
+@compiled
+def _evaluate(
+    lo: int, hi: int, packed: FloatArray, counts: IntArray, motion: FloatArray, memory: FloatArray, u: FloatArray,
+    std: FloatArray, inside: BoolArray,
+) -> None:  # fmt: skip
+    for b in range(lo, hi):
+        y, v, a = motion[0, b], motion[1, b], motion[2, b]
+        evaluate_packed(y, v, a, memory[b], packed[b], counts[b], u[b], std[b], inside[b])
 
 
 @dataclass(frozen=True)
 class FleetSnapshot:
     """B models. seq (B,) : last sample that each has seen. valid (B,) : whether its learner vouches for it.
 
-    fallback (B,) : whether the identified model is served. gain, offset_um (B,) : frames.
+    linear : (B, 2 + p) gain and offset (µm) of each axis' frame, and its linear part, V.
+    packed (B, L), counts (B, C) : the models as `LssvmInverse.packed` has them.
     """
 
-    constants: AxisConstants
+    bases: tuple[LssvmInverse, ...]
     seq: IntArray
     valid: BoolArray
-    fallback: BoolArray
-    gain: Tensor
-    offset_um: Tensor
-    beta: Tensor
-    scaled: Tensor
-    alpha: Tensor
-    inverse_widths: Tensor
-    gamma: Tensor
-    noise_V2: Tensor
-    kernel_V2: Tensor
-    domain: Tensor
-    bounded: Tensor
-    #: (p, p) covariance of the linear part, V², by axis: of the identified models that are served.
-    covariances: dict[int, Tensor] = field(default_factory=dict)
+    linear: FloatArray
+    packed: FloatArray
+    counts: IntArray
+    threads: Threads
 
     @property
     def memory_size(self) -> int:
         """m."""
-        return self.constants.sizes["m"]
+        return self.bases[0].memory_size
 
     def rest_memory(self) -> FloatArray:
         """(B, m) memory of stages that have always been at rest."""
-        return np.array([base.rest_memory(base.features.y_rest_um) for base in self.constants.bases])
+        return np.array([base.rest_memory(base.features.y_rest_um) for base in self.bases])
 
     def feedforward(
         self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
     ) -> Answers:
         """Voltages at (B, n) points, one sample time apart. Raises InputError on shapes that do not fit together."""
-        c = self.constants
-        B, device = c.axes, self.beta.device
-        given = [np.asarray(part, dtype=np.float64) for part in (y_um, v_um_per_s, a_um_per_s2)]
+        B, given = len(self.bases), [np.asarray(part, dtype=np.float64) for part in (y_um, v_um_per_s, a_um_per_s2)]
         shapes = [part.shape for part in given]
         if len(shapes[0]) != 2 or shapes[0][0] != B or len(set(shapes)) != 1:
             raise InputError(f"y_um, v_um_per_s, a_um_per_s2: got shapes {shapes}, expected three of equal ({B}, n)")
         if np.shape(memory) != (B, self.memory_size):
             raise InputError(f"memory: got shape {np.shape(memory)}, expected ({B}, {self.memory_size})")
-        motion = torch.as_tensor(np.stack(given, 2)).to(device)
-        kept = torch.as_tensor(np.array(memory, dtype=np.float64)).to(device)
-        axes = torch.arange(B, device=device)
-        shrink = 1.0 / (1.0 + 1.0 / self.gamma)
-        low, high = self.domain[:, ::2], self.domain[:, 1::2]
-        margin = DOMAIN_MARGIN * (high - low)
-        out: list[tuple[Tensor, Tensor, Tensor]] = []
-        for k in range(motion.shape[1]):
-            now = motion[:, k]
-            kept = advance(c, now[:, 0], kept, self.gain, self.offset_um)
-            basis, kernel = inputs(c, axes, now, kept, self.gain, self.offset_um)
-            column = column_of(self.scaled, kernel * self.inverse_widths)
-            mean = (self.beta * basis).sum(1) + (self.alpha * column).sum(1)
-            known = (c.beta * basis).sum(1)
-            held = torch.minimum(torch.maximum(mean, known - c.allowed_V), known + c.allowed_V)
-            nearest = column.amax(1)
-            variance = self.noise_V2 + self.kernel_V2 * (1.0 - shrink * nearest * nearest)
-            for axis, covariance in self.covariances.items():
-                variance[axis] += basis[axis] @ covariance @ basis[axis]
-            within = ((now >= low - margin) & (now <= high + margin)).all(1)
-            out.append((torch.where(self.bounded, held, mean), variance.clamp(min=0.0).sqrt(), within))
-        u, std, inside = (torch.stack(part, 1).cpu().numpy() for part in zip(*out, strict=True))
-        return Answers(u, std, inside, kept.cpu().numpy())
-
-    def linear(self) -> FloatArray:
-        """(B, 2 + p) gain and offset (µm) of each axis' frame, and its linear part, V. A copy."""
-        parts = (self.gain[:, None], self.offset_um[:, None], self.beta)
-        return np.asarray(torch.cat(parts, 1).cpu().numpy(), dtype=np.float64)
-
-    def model(self, axis: int) -> dict[str, FloatArray]:
-        """The arrays of one axis' model, by name: what those that follow it need."""
-        names = ("beta", "scaled", "alpha", "inverse_widths", "domain")
-        return {name: self._row(name, axis) for name in names}
-
-    def _row(self, name: str, axis: int) -> FloatArray:
-        rows: Tensor = {"beta": self.beta, "scaled": self.scaled, "alpha": self.alpha, "domain": self.domain,
-                        "inverse_widths": self.inverse_widths}[name]  # fmt: skip
-        return np.asarray(rows[axis].cpu().numpy(), dtype=np.float64)
+        after, (u, std) = np.array(memory, dtype=np.float64), np.empty((2, *shapes[0]))
+        inside = np.empty(shapes[0], dtype=np.bool_)
+        motion = np.array(given)
+        self.threads.share(B, _evaluate, self.packed, self.counts, motion, after, u, std, inside)
+        return Answers(u, std, inside, after)
 
 
-def snapshot_of(c: AxisConstants, s: BatchState, matrices: Samples, apart: Mapping[int, Learner]) -> FleetSnapshot:
-    """Copies of what is served now."""
-    scaled, alpha, bias, counts, inverse_widths, gamma = matrices.samples()
-    width = max(scaled.shape[2], c.model_scaled.shape[2])
-    device = scaled.device
-    unused = torch.arange(scaled.shape[2], device=device) >= counts[:, None]
-    wide = torch.full((c.axes, c.sizes["d"], width), 1e9, dtype=torch.float64, device=device)
-    weights = torch.zeros((c.axes, width), dtype=torch.float64, device=device)
-    wide[:, :, : scaled.shape[2]] = torch.where(unused[:, None], 1e9, scaled)
-    weights[:, : scaled.shape[2]] = torch.where(unused, 0.0, alpha)
-    beta = s["filter.beta"].clone()
-    beta[:, 0] += bias
-    long, short = s["judgement.long_V2"], s["judgement.short_V2"]
-    noise = torch.maximum(long, short) + s["judgement.doubt_V2"]
-    fallback = s["judgement.fallback"].clone()
-    made = FleetSnapshot(
-        c, s["front.gates.seq"].cpu().numpy().copy(), s["judgement.valid"].cpu().numpy().copy(),
-        fallback.cpu().numpy().copy(), s["front.track.served.gain"].clone(), s["front.track.served.offset_um"].clone(),
-        beta, wide, weights, inverse_widths.clone(), gamma.clone(), noise, s["window.kernel_variance"].clone(),
-        s["domain"].clone(), (c.allowed_V > 0.0) & ~fallback,
-    )  # fmt: skip
-    for axis in fallback.nonzero()[:, 0].tolist():
-        if axis not in apart:
-            made.noise_V2[axis] = s["judgement.frozen_short_V2"][axis]
-            _fill(made, axis, c.bases[axis], keep_noise=True)
-    for axis, learner in apart.items():
-        model = learner.snapshot()
-        made.seq[axis], made.valid[axis], made.fallback[axis] = model.seq, model.valid, not model.anchor.size
-        made.bounded[axis] = bool(model.anchor.size)
-        _fill(made, axis, model)
-    return made
+class _Windows(NamedTuple):
+    V: FloatArray
+    F: FloatArray
+    C: IntArray
+    scaled: FloatArray
+    inverse_widths: FloatArray
 
 
-def _fill(made: FleetSnapshot, axis: int, model: LssvmInverse, keep_noise: bool = False) -> None:
-    """Write a single model into its row."""
-    n = model.alpha.size
-    made.scaled[axis] = 1e9
-    made.alpha[axis] = 0.0
-    made.scaled[axis, :, :n] = torch.as_tensor((model.support / model.widths).T.copy())
-    made.alpha[axis, :n] = torch.as_tensor(model.alpha.copy())
-    made.beta[axis], made.domain[axis] = torch.as_tensor(model.beta.copy()), torch.as_tensor(model.domain.copy())
-    made.inverse_widths[axis] = torch.as_tensor(1.0 / model.widths)
-    made.gamma[axis], made.kernel_V2[axis] = model.gamma, model.kernel_variance
-    made.gain[axis], made.offset_um[axis] = model.features.gain, model.features.offset_um
-    if model.beta_covariance.size:
-        made.covariances[axis] = torch.as_tensor(model.beta_covariance.copy()).to(made.beta.device)
-    if not keep_noise:
-        made.noise_V2[axis] = model.noise_variance
+@compiled
+def _pack(
+    lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray
+) -> None:
+    """The learnt models of all axes in the layout of `LssvmInverse.packed`."""
+    p, d, m = s.beta.shape[1], w.scaled.shape[1], c.features
+    for b in range(lo, hi):
+        out, r, f, n = packed[b], s.numbers[b], c.axis[b], w.C[b, COUNT]
+        j, span, bounded = r.judgement, s.domain[b, 1::2] - s.domain[b, ::2], f.allowed_V > 0.0
+        counts[b] = c.sizes[f.model]
+        counts[b, 5], counts[b, 6], counts[b, 9] = n, 0, bounded
+        out[0:3] = s.frames[b]
+        out[3] = max(j.long_V2, j.short_V2) + j.doubt_V2
+        out[4], out[5], out[6] = r.kernel_variance, 1.0 / (1.0 + 1.0 / w.F[b, GAMMA]), f.allowed_V
+        out[7:13:2] = s.domain[b, ::2] - margin * span
+        out[8:13:2] = s.domain[b, 1::2] + margin * span
+        out[13:17] = m.scale[b]
+        at = 17
+        for part in (m.thresholds[b], m.arcs[b], m.retain[b], s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]):
+            out[at : at + part.size] = part
+            at += part.size
+        out[_constant(c)] += w.F[b, BETA]
+        for i in range(d):
+            out[at : at + n] = w.scaled[b, i, :n]
+            at += n
+        if bounded:
+            out[at : at + p] = c.beta[b]
+
+
+@compiled
+def _constant(c: Fixed) -> int:
+    """Place of the linear part in a packed model."""
+    return int(17 + c.sizes[0, 0] + c.sizes[0, 1] + c.sizes[0, 2])
+
+
+def snapshot_of(
+    bases: tuple[LssvmInverse, ...], s: Rows, c: Fixed, windows: dict[str, FloatArray], apart: dict[int, LssvmInverse],
+    threads: Threads,
+) -> FleetSnapshot:  # fmt: skip
+    """Copies of what is served now; ``apart`` : models of the axes that are not in the batch."""
+    B, p = s.beta.shape
+    d, most = windows["scaled"].shape[1:]
+    at = _constant(c)
+    length = max(at + 2 * p + d + (1 + d) * most, c.models.shape[1])
+    packed, counts = np.empty((B, length)), np.empty((B, c.sizes.shape[1]), dtype=np.int64)
+    parts = _Windows(*(windows[name] for name in _Windows._fields))  # type: ignore[arg-type]
+    threads.share(B, _pack, s, c, parts, DOMAIN_MARGIN, packed, counts)
+    seq, valid = s.numbers["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
+    linear = np.column_stack((s.numbers["gain"], s.numbers["offset_um"], packed[:, at : at + p]))
+    fallen = [axis for axis in np.flatnonzero(s.numbers["judgement"]["fallback"]).tolist() if axis not in apart]
+    for axis, model in (apart | {axis: bases[axis] for axis in fallen}).items():
+        row, sizes = model.packed
+        packed[axis, : row.size], counts[axis] = row, sizes
+        linear[axis] = model.features.gain, model.features.offset_um, *model.beta
+    # The fourth number of a packed model is the variance of its noise.
+    packed[fallen, 3] = s.numbers["judgement"]["frozen_short_V2"][fallen]
+    for axis, model in apart.items():
+        seq[axis], valid[axis] = model.seq, model.valid
+    return FleetSnapshot(bases, seq, valid, linear, packed, counts, threads)

@@ -17,7 +17,7 @@ from math import isnan, nan
 
 import numpy as np
 
-from adaptive.compiled import compiled
+from adaptive.compiled import compiled, shared
 from adaptive.errors import InputError, ModelFileError
 from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
 from adaptive.types import FloatArray, StateDict
@@ -199,6 +199,54 @@ SLOW_S = 2.0
 DEAD_S = 0.25
 
 
+@shared
+def _expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, bursts: FloatArray) -> None:
+    """See `DriftFilter.expect_change`; ``bursts`` (p,) V²."""
+    walk(x, P, bursts, c.burst_gain**2)
+    s.quiet = 0
+    s.bursts += 1
+
+
+@shared
+def update(
+    c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, walks: FloatArray, bursts: FloatArray, span_V: float,
+    step_s: float, basis: FloatArray, target_V: float, moving: bool, weight: float, k: FloatArray, row: FloatArray,
+) -> str:  # fmt: skip
+    """See `DriftFilter.update`. ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V².
+
+    x (p,), P (p, p) change in place; k, row (p,) are scratch.
+    """
+    if moving:
+        innovation, variance = _walk_and_innovation(x, P, walks, c.gain_walk**2 * step_s, basis, target_V, row)
+    else:
+        P[0, 0] += walks[0]
+        innovation, variance = innovation_of(x, P, basis, target_V, row)
+    noise_V2 = (c.noise * span_V) ** 2 / weight
+    if innovation * innovation > c.gate_sigma**2 * (variance + noise_V2) and s.rejected < c.gate_persistence:
+        s.rejected += 1
+        return "outlier"
+    s.rejected = 0
+    squared = innovation * innovation
+    s.fast_V2 += (squared - s.fast_V2) * min(1.0, step_s / FAST_S)
+    s.quiet += 1
+    outcome = "updated"
+    threshold = max(c.burst_ratio * s.slow_V2, (c.burst_floor * span_V) ** 2)
+    if s.fast_V2 > threshold and s.quiet * step_s > DEAD_S and moving:
+        _expect_change(c, s, x, P, bursts)
+        outcome = "burst"
+    # Limited, so that a change does not raise the long-term level and hide the next change.
+    s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, step_s / SLOW_S)
+    if moving:
+        if outcome == "burst":
+            # The burst has changed the covariance.
+            innovation, variance = innovation_of(x, P, basis, target_V, row)
+        take_in(x, P, basis, innovation, variance, noise_V2, k, row)
+    else:
+        update_constant(x, P, basis, target_V, noise_V2, row)
+    s.updates += 1
+    return outcome
+
+
 class DriftFilter:
     """Random-walk Kalman filter on ``beta`` (p,), in V per normalised input.
 
@@ -218,9 +266,7 @@ class DriftFilter:
         self.config = config
         self.step_s = step_s
         self.span_V = span_V
-        self._noise_V2 = (config.noise * span_V) ** 2
-        self._floor_V2 = (config.burst_floor * span_V) ** 2
-        self.state = DriftState(slow_V2=self._noise_V2, fast_V2=0.0)
+        self.state = DriftState(slow_V2=(config.noise * span_V) ** 2, fast_V2=0.0)
         self._x = np.array(beta, dtype=np.float64)
         self._P = np.array(covariance, dtype=np.float64, order="C")
         self._k, self._row = np.empty(p), np.empty(p)
@@ -257,43 +303,28 @@ class DriftFilter:
         one position would change the model at all others, and would give too much weight to the next motion's first
         samples. ``weight`` : of the measurement, above 0; its noise variance is divided by it.
         """
-        c, s, x, P = self.config, self.state, self._x, self._P
-        if moving:
-            gain_V2 = c.gain_walk**2 * self.step_s
-            innovation, variance = _walk_and_innovation(x, P, self._walk, gain_V2, basis, target_V, self._row)
-        else:
-            P[0, 0] += self._walk[0]
-            innovation, variance = innovation_of(x, P, basis, target_V, self._row)
-        noise_V2 = self._noise_V2 / weight
-        if innovation * innovation > c.gate_sigma**2 * (variance + noise_V2) and s.rejected < c.gate_persistence:
-            s.rejected += 1
-            return "outlier"
-        s.rejected = 0
-        squared = innovation * innovation
-        s.fast_V2 += (squared - s.fast_V2) * min(1.0, self.step_s / FAST_S)
-        s.quiet += 1
-        outcome = "updated"
-        threshold = max(c.burst_ratio * s.slow_V2, self._floor_V2)
-        if s.fast_V2 > threshold and s.quiet * self.step_s > DEAD_S and moving:
-            self.expect_change()
-            outcome = "burst"
-        # Limited, so that a change does not raise the long-term level and hide the next change.
-        s.slow_V2 += (min(squared, threshold) - s.slow_V2) * min(1.0, self.step_s / SLOW_S)
-        if moving:
-            if outcome == "burst":
-                # The burst has changed the covariance.
-                innovation, variance = innovation_of(x, P, basis, target_V, self._row)
-            take_in(x, P, basis, innovation, variance, noise_V2, self._k, self._row)
-        else:
-            update_constant(x, P, basis, target_V, noise_V2, self._row)
-        s.updates += 1
-        return outcome
+        x, P, walk, burst = self._x, self._P, self._walk, self._burst
+        span_V, step_s = self.span_V, self.step_s
+        return update(
+            self.config,
+            self.state,
+            x,
+            P,
+            walk,
+            burst,
+            span_V,
+            step_s,
+            basis,
+            target_V,
+            moving,
+            weight,
+            self._k,
+            self._row,
+        )
 
     def expect_change(self) -> None:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""
-        walk(self._x, self._P, self._burst, self.config.burst_gain**2)
-        self.state.quiet = 0
-        self.state.bursts += 1
+        _expect_change(self.config, self.state, self._x, self._P, self._burst)
 
     def mark(self) -> tuple[FloatArray, FloatArray]:
         """(beta, covariance) as copies, for `restore` and `go_back`."""
@@ -374,10 +405,12 @@ class RestCreep:
     steps: int = 0
     u_V: float = nan
 
+    @shared
     def leave(self) -> None:
         """End the rest: the stage moves. The constant keeps its value."""
         self.constant_V, self.steps, self.u_V = nan, 0, nan
 
+    @shared
     def shift_um(
         self, constant_V: float, u_V: float, span_V: float, range_um: float, step_s: float, creep_s: float
     ) -> float:
@@ -394,7 +427,7 @@ class RestCreep:
             return 0.0
         change_V, self.u_V = abs(u_V - self.u_V), u_V
         if change_V > STILL_PER_S * span_V * FRAME_EVERY * step_s:
-            self.leave()
+            self.constant_V, self.steps, self.u_V = nan, 0, nan
             return 0.0
         gained_um = (constant_V - self.constant_V) * range_um / span_V
         most_um = FASTEST_PER_S * range_um * FRAME_EVERY * step_s

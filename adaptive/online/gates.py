@@ -16,6 +16,7 @@ from math import isfinite
 
 import numpy as np
 
+from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap
 from adaptive.types import Sample, StateDict
@@ -148,6 +149,7 @@ class AdmissionState:
     low_V: float = 0.0
     high_V: float = 0.0
 
+    @shared
     def take(self, sample: Sample, steps: int) -> None:
         """Note a sample that has passed `check_sample`, ``steps`` sample times after the last one."""
         self.seq, self.t_s = sample.seq, sample.t_s
@@ -157,6 +159,7 @@ class AdmissionState:
         """The smoother starts again."""
         self.since_start = self.since_jump = self.moved = 0
 
+    @shared
     def step(self) -> None:
         """The smoother makes a step."""
         self.since_start += 1
@@ -179,6 +182,7 @@ class AdmissionState:
         return cls(**{name: kind(values[name]) for name, kind in kinds.items()})
 
 
+@shared
 def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample, dt_s: float) -> str:
     """Gate of the raw sample: "" where it may go on. Does not change the state. Never raises on data."""
     # The square of a reading must be finite too.
@@ -196,6 +200,7 @@ def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample,
     return ""
 
 
+@shared
 def check_pair(config: AdmissionConfig, u_V: float, u_before_V: float, y_um: float) -> str:
     """Gate of a smoothed pair: "" where it may be learnt. The voltage before it counts too, because of lags."""
     low, high = config.u_min_V + config.rail_margin_V, config.u_max_V - config.rail_margin_V
@@ -211,6 +216,7 @@ def new_counters() -> dict[str, int]:
     return dict.fromkeys((LEARNT, PASSED, *REASONS), 0)
 
 
+@shared
 def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, span_V: float) -> None:
     """Detect a commanded step: a kink of the voltage that moves the stage by more than the share of a glitch.
 
@@ -222,6 +228,7 @@ def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, sp
     state.u_before_V, state.u_V = state.u_V, u_V
 
 
+@shared
 def surprise(config: AdmissionConfig, state: AdmissionState, span_V: float) -> float:
     """Distance from the smoother's prediction beyond which a reading is held back, in ranges.
 
@@ -231,6 +238,7 @@ def surprise(config: AdmissionConfig, state: AdmissionState, span_V: float) -> f
     return float(usual + KINK_SHARE * state.kink_V / span_V)
 
 
+@shared
 def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation: float) -> None:
     """Update the mean square prediction error of the smoother, in ranges²; outliers are limited to ``FAR_RMS``."""
     most = max(FAR_RMS * state.innovation2**0.5, config.surprise_share / config.surprise_sigma)
@@ -238,11 +246,13 @@ def watch_innovation(config: AdmissionConfig, state: AdmissionState, innovation:
     state.innovation2 += (error * error - state.innovation2) / INNOVATION_SAMPLES
 
 
+@shared
 def stuck_share(state: AdmissionState) -> float:
     """Motion of the stage, in ranges, after which equal readings show a stuck sensor."""
     return max(STUCK_SHARE, STUCK_SIGMA * float(state.innovation2**0.5))
 
 
+@shared
 def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float) -> bool:
     """Whether the sensor repeats its reading while the voltage moves. Call it with every reading and its voltage."""
     if y_um != state.y_um:
@@ -253,11 +263,13 @@ def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float)
     return state.same >= REPEATED and state.high_V - state.low_V > stuck_share(state) * span_V
 
 
+@shared
 def settling(config: AdmissionConfig, state: AdmissionState) -> bool:
     """Whether the smoother has just started or the voltage stepped: large prediction errors are then expected."""
     return min(state.since_start, state.since_step) <= config.settle
 
 
+@shared
 def at_rest(
     config: AdmissionConfig, state: AdmissionState, y_um: float, count: int, range_um: float, dt_s: float
 ) -> bool:

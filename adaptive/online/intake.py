@@ -27,7 +27,7 @@ from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from adaptive.online.sensor_trust import CONFIRMED, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
-from adaptive.smoothing import FixedLagSmoother
+from adaptive.smoothing import FixedLagSmoother, smoother_of
 from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, under
 
 # --- What a intake holds beside its numbers, as flat entries and back.
@@ -104,7 +104,7 @@ class Intake:
         self.base = base
         self.dt_s = base.dt_s
         self.range_um = base.features.y_max_um - base.features.y_min_um
-        self.smoother = FixedLagSmoother(config.smoother(self.dt_s))
+        self.smoother = smoother_of(config.smoother(self.dt_s))
         self.gates = admission.AdmissionState()
         self.track: Track | None = None
         self._doubt_V = 0.0  # Standard deviation of the model's predictions as of the last sample, V.

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from adaptive import kernels
+from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, prefixed, under
 from adaptive.window import arrays as ws
+from adaptive.window import steps
 from adaptive.window.arrays import Status, WindowArrays
 from adaptive.window.healing import Healing
 from adaptive.window.window import SolverConfig, Window, WindowConfig
+
+#: Least share of its own weight that an old sample keeps.
+LEAST_FADED = 1e-3
 
 # --- Sample weights: a weight w means 1/w times the noise variance, in window and filter. An ordinary sample has 1.
 
@@ -47,6 +52,7 @@ class WeightConfig:
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"weights.{name}: got {value}, expected a finite number, not negative")
 
+    @shared
     def of(self, near_bad: bool, on_probation: bool, a_share: float) -> float:
         """Weight of a pair; ``a_share`` is its acceleration as a share of full scale."""
         weight = (self.near_bad if near_bad else 1.0) * (self.on_probation if on_probation else 1.0)
@@ -54,16 +60,74 @@ class WeightConfig:
             weight /= 1.0 + (self.acceleration * a_share) ** 2
         return weight
 
+    @shared
     def faded(self, weight: float, age_s: float) -> float:
         """Weight of a sample after ``age_s`` in the window, s; at least a thousandth of its own."""
-        return weight * max(float(0.5 ** (age_s / self.half_life_s)), 1e-3) if self.half_life_s > 0.0 else weight
+        return weight * max(float(0.5 ** (age_s / self.half_life_s)), LEAST_FADED) if self.half_life_s > 0.0 else weight
 
 
+# Compiled code knows methods by plain names only.
+_faded = WeightConfig.faded
 Eviction = Literal["nearest", "fifo"]
 #: A sample with a kernel value above this to a held one takes its slot even where there are free slots.
 SAME = 0.98
 #: No slot.
 NOWHERE = -1
+
+
+@dataclass(slots=True)
+class Turn:
+    """clock : steps so far. Samples up to step ``changed`` are from before the last change; slots from ``next`` on may
+    hold some."""
+
+    clock: int = 0
+    changed: int = 0
+    next: int = NOWHERE
+
+
+@shared
+def learn(
+    A: WindowArrays, turn: Turn, x: FloatArray, target_V: float, weight: float, born: IntArray, own: FloatArray,
+    fifo: bool,
+) -> int:  # fmt: skip
+    """See `ResidualWindow.learn`: the status of the step. born, own (N,) : step and weight that a sample came with."""
+    n = A.C[ws.COUNT]
+    slot, value = steps.nearest(A, x)
+    turn.clock += 1
+    room = n < A.S.shape[0] and value < SAME
+    if room:
+        slot = n
+        status = steps.append(A, x, target_V, weight)
+    else:
+        if fifo:
+            slot = int(np.argmin(born[:n]))
+        status = steps.replace(A, slot, x, target_V, weight)
+    if status == ws.ACCEPTED:
+        born[slot] = turn.clock
+        own[slot] = weight
+    return int(status)
+
+
+@shared
+def fade(A: WindowArrays, turn: Turn, weights: WeightConfig, step_s: float, born: IntArray, own: FloatArray) -> None:
+    """See `ResidualWindow.fade`."""
+    n = A.C[ws.COUNT]
+    if weights.half_life_s > 0.0 and n > 0:
+        slot = turn.clock % n
+        steps.reweight(A, slot, _faded(weights, own[slot], float(turn.clock - born[slot]) * step_s))
+
+
+@shared
+def let_go(A: WindowArrays, turn: Turn, most: float, born: IntArray, own: FloatArray) -> None:
+    """See `ResidualWindow.let_go`."""
+    while 0 <= turn.next < A.C[ws.COUNT]:
+        slot = turn.next
+        turn.next += 1
+        if born[slot] <= turn.changed and own[slot] > most:
+            if steps.reweight(A, slot, most) == ws.ACCEPTED:
+                own[slot] = most
+            return
+    turn.next = NOWHERE
 
 
 class ResidualWindow:
@@ -87,9 +151,7 @@ class ResidualWindow:
         self._born = np.zeros(capacity, dtype=np.int64)
         # The weights that samples came with, before they faded.
         self._own = np.ones(capacity)
-        self._clock = 0
-        # The samples up to this one are from before the last change; the slots from here on may hold some (-1: none).
-        self._changed, self._next = 0, NOWHERE
+        self._turn = Turn()
 
     @classmethod
     def from_model(
@@ -163,42 +225,24 @@ class ResidualWindow:
         refused, until a new factorisation is swapped in `adaptive.window.healing.STEPS` samples later.
         """
         self._healing.step()
-        window, n = self._window, len(self._window)
-        slot, value = window.nearest(kernel)
-        self._clock += 1
-        room = n < self._config.capacity and value < SAME
-        if room:
-            slot = n
-        elif self.eviction == "fifo":
-            slot = int(np.argmin(self._born[:n]))
-        if room:
-            status = window.append(kernel, target_V, weight)
-        else:
-            status = window.replace(slot, kernel, target_V, weight)
+        A, n, x = self._window.arrays, len(self._window), np.ascontiguousarray(kernel, dtype=np.float64)
+        fifo = self.eviction == "fifo"
+        status = learn(A, self._turn, x, float(target_V), float(weight), self._born, self._own, fifo)
         if status == Status.ILL_CONDITIONED and n:
             self._healing.begin()
-        if status != Status.ACCEPTED:
-            return admission.NUMERICS
-        self._born[slot] = self._clock
-        self._own[slot] = weight
-        return admission.LEARNT
+        return admission.LEARNT if status == Status.ACCEPTED else admission.NUMERICS
 
     def fade(self, weights: WeightConfig, step_s: float) -> None:
         """Reweight one sample by its age, the next one at each call; ``step_s``: time between two steps, s."""
-        n = len(self._window)
-        if weights.half_life_s <= 0.0 or n == 0:
-            return
-        slot = self._clock % n
-        age_s = float(self._clock - self._born[slot]) * step_s
-        self._window.reweight(slot, weights.faded(float(self._own[slot]), age_s))
+        fade(self._window.arrays, self._turn, weights, step_s, self._born, self._own)
 
     def expect_change(self) -> None:
         """The stage has changed: mark all samples as from before the change. See `let_go`."""
-        self._changed, self._next = self._clock, 0
+        self._turn.changed, self._turn.next = self._turn.clock, 0
 
     def keep(self) -> None:
         """There was no change: leave the remaining samples as they are."""
-        self._next = NOWHERE
+        self._turn.next = NOWHERE
 
     def let_go(self, most: float) -> None:
         """Limit the weight of one sample from before the last change to ``most``, the next one at each call.
@@ -206,15 +250,7 @@ class ResidualWindow:
         Old samples are down-weighted, not removed: where nothing newer has come they are the best there are. One per
         call, because 500 steps of the window at once would delay a sample.
         """
-        n = len(self._window)
-        while 0 <= self._next < n:
-            slot = self._next
-            self._next += 1
-            if self._born[slot] <= self._changed and self._own[slot] > most:
-                if self._window.reweight(slot, most) == Status.ACCEPTED:
-                    self._own[slot] = most
-                return
-        self._next = NOWHERE
+        let_go(self._window.arrays, self._turn, most, self._born, self._own)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""
@@ -234,7 +270,7 @@ class ResidualWindow:
     def data(self) -> WindowData:
         """A copy of samples and hyper-parameters."""
         window, n = self._window, len(self._window)
-        age = (self._clock - self._born[:n]).astype(np.float64)
+        age = (self._turn.clock - self._born[:n]).astype(np.float64)
         return WindowData(window.X, window.y, window.weights, age, self.hyper)
 
     def newest(self, count: int) -> FloatArray:
@@ -253,9 +289,8 @@ class ResidualWindow:
         """
         made = object.__new__(ResidualWindow)
         c = self._config
-        made.eviction, made._clock, made._born = self.eviction, self._clock, self._born.copy()
+        made.eviction, made._turn, made._born = self.eviction, replace(self._turn), self._born.copy()
         made._own = self._own.copy()
-        made._changed, made._next = self._changed, self._next
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
@@ -279,9 +314,7 @@ class ResidualWindow:
         own = {
             "born": self._born.copy(),
             "own_weights": self._own.copy(),
-            "clock": self._clock,
-            "changed": self._changed,
-            "next": self._next,
+            **asdict(self._turn),
             "kernel_variance": self.kernel_variance,
         }
         hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
@@ -301,6 +334,5 @@ class ResidualWindow:
         self._healing = Healing.from_state(self._window, under("healing.", values))
         self._born = np.array(values["born"], dtype=np.int64)
         self._own = np.array(values["own_weights"], dtype=np.float64)
-        self._clock = int(values["clock"])
-        self._changed, self._next = int(values["changed"]), int(values["next"])
+        self._turn = Turn(int(values["clock"]), int(values["changed"]), int(values["next"]))
         self.kernel_variance = float(values["kernel_variance"])

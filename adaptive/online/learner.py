@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from adaptive.compiled import shared
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
@@ -76,11 +77,12 @@ class Judgement:
     fallen_s: float = 0.0
     doubt_V2: float = 0.0
 
+    @shared
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
         """Take one error of the learnt and of the frozen model, V."""
         squared = error_V * error_V
         slow, fast = min(1.0, step_s / LONG_S), min(1.0, step_s / SHORT_S)
-        if self.judged > 0 and squared <= self.variance_V2:
+        if self.judged > 0 and squared <= max(self.long_V2, self.short_V2) + self.doubt_V2:
             self.inside += 1
         self.error_V = error_V
         self.judged += 1
@@ -91,6 +93,7 @@ class Judgement:
         self.frozen_V2 += (frozen - self.frozen_V2) * slow
         self.frozen_short_V2 += (frozen - self.frozen_short_V2) * fast
 
+    @shared
     def decide(self, enter_V: float, leave_V: float) -> bool:
         """Validity with hysteresis: lost when the short-term rms exceeds ``leave_V``, regained below ``enter_V``."""
         rms = sqrt(self.short_V2)
@@ -100,6 +103,7 @@ class Judgement:
             self.valid = True
         return self.valid
 
+    @shared
     def choose(self, floor_V: float, step_s: float) -> bool:
         """Whether to serve the frozen model: taken when clearly better, left when worse."""
         learnt, frozen = sqrt(self.short_V2), sqrt(self.frozen_short_V2)
@@ -215,6 +219,18 @@ def _ages(values: object) -> tuple[int, int]:
 def _mark(values: StateDict) -> Mark:
     """A mark of the drift filter from its entries."""
     return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)
+
+
+@shared
+def time_outside(left_s: float, outside: bool, step_s: float) -> float:
+    """Time outside the envelope, or inside where negative, s, after one more check."""
+    return max(left_s, 0.0) + step_s if outside else max(min(left_s, 0.0) - step_s, -LEFT_S)
+
+
+@shared
+def time_at_rail(rail_s: float, saturated: bool, step_s: float) -> float:
+    """Time of the voltage at a limit, or off it where negative, s, after one more check."""
+    return min(max(rail_s, 0.0) + step_s, RAIL_S) if saturated else max(min(rail_s, 0.0) - step_s, -RAIL_S)
 
 
 class Parts:
@@ -340,14 +356,12 @@ class Parts:
         ``railed`` is True from then until the voltage has been off the limits for as long.
         """
         limit_V = RAIL_SHARE * self.filter.span_V
-        step_s = self.check_s
+        self.rail_s = time_at_rail(self.rail_s, saturated, self.check_s)
         if saturated:
-            self.rail_s = min(max(self.rail_s, 0.0) + step_s, RAIL_S)
             if self.rail_s >= RAIL_S and self.judgement.short_V2 > limit_V * limit_V and not self.railed:
                 self.railed = True
                 self.begin_again()
         else:
-            self.rail_s = max(min(self.rail_s, 0.0) - step_s, -RAIL_S)
             self.railed = self.railed and self.rail_s > -RAIL_S
 
     def watch_shape(self, away_V: float) -> None:
@@ -355,14 +369,13 @@ class Parts:
 
         ``left`` is True from then until it has been inside for a second.
         """
-        step_s = self.check_s
-        if self.allowed_V and abs(away_V) > self.allowed_V:
-            self.left_s = max(self.left_s, 0.0) + step_s
+        outside = self.allowed_V > 0.0 and abs(away_V) > self.allowed_V
+        self.left_s = time_outside(self.left_s, outside, self.check_s)
+        if outside:
             if self.left_s >= RAIL_S:
                 self.left, self.left_s = True, 0.0
                 self.begin_again()
         else:
-            self.left_s = max(min(self.left_s, 0.0) - step_s, -LEFT_S)
             self.left = self.left and self.left_s > -LEFT_S
 
     def watch_trial(self) -> bool:
@@ -665,10 +678,10 @@ class Learner:
             if switched:
                 parts.expect_change()
             if not taken.refused:
-                outcome = admission.SETTLING if pair is None else self._teach(pair)
+                outcome = admission.SETTLING if pair is None else self.teach(pair)
         return outcome
 
-    def _teach(self, pair: Pair) -> str:
+    def teach(self, pair: Pair) -> str:
         """Learn the pair at the smoothed instant, in filter and window, if the gates allow it."""
         c, parts, intake = self.config, self.parts, self.parts.intake
         gates, track = intake.gates, intake.track

@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adaptive.compiled import shared
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, correlated, slope_of, tolerance_um
@@ -99,10 +100,12 @@ class Following:
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
         self.drift_V_per_s = self.drift2 = 0.0
 
+    @shared
     def count_again(self) -> None:
         """Count the steps in which the readings followed from zero again."""
         self.good = 0
 
+    @shared
     def take(self, u_V: float, p_V: float, span_V: float, dt_s: float, drift_V_per_s: float = 0.0) -> bool:
         """Process one pair (u, p). Returns True if the last steps show a fault.
 
@@ -141,22 +144,9 @@ class Following:
         self.driven = FORGET * self.driven + (abs(u) >= STEP_STILL)
         if self.count < ENOUGH or self.driven < OF_VOLTAGE * self.count:
             return False
-        fault = self._fault(abs(p - u) <= STEADY, drift_V_per_s)
+        fault = _shows_fault(self, abs(p - u) <= STEADY, drift_V_per_s)
         self.good = 0 if fault else self.good + 1
         return fault or self.still >= STILL_STEPS
-
-    def _fault(self, follows: bool, fastest_V_per_s: float) -> bool:
-        """Whether the sums show a fault. ``follows`` : whether p went with u in the last step."""
-        slope, straight = self.up / self.uu, self.up * self.up / (self.uu * self.pp) if self.pp > 0.0 else 0.0
-        if straight < FOLLOWING_STRAIGHT:
-            mean2 = self.drift_V_per_s**2
-            drifts = self.drift2 - mean2 <= STEADY**2 * mean2 and mean2 <= fastest_V_per_s**2 and not self.still
-            if follows or drifts:
-                # A steady drift beside the voltage, or the first steps after one: the stage changes, not the sensor.
-                return False
-            # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
-            return self.pp <= FOLLOWING_SLOPES[1] ** 2 * self.uu
-        return self.count >= ENOUGH_SLOPE and not follows and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
 
     def state_dict(self) -> StateDict:
         return asdict(self)
@@ -169,6 +159,21 @@ class Following:
         # States of before there was a drift have no entries for it.
         values = {"drift_V_per_s": 0.0, "drift2": 0.0} | values
         return cls(**{name: type(value)(values[name]) for name, value in asdict(cls()).items()})
+
+
+@shared
+def _shows_fault(sums: Following, follows: bool, fastest_V_per_s: float) -> bool:
+    """Whether the sums show a fault. ``follows`` : whether p went with u in the last step."""
+    slope, straight = sums.up / sums.uu, sums.up * sums.up / (sums.uu * sums.pp) if sums.pp > 0.0 else 0.0
+    if straight < FOLLOWING_STRAIGHT:
+        mean2 = sums.drift_V_per_s**2
+        drifts = sums.drift2 - mean2 <= STEADY**2 * mean2 and mean2 <= fastest_V_per_s**2 and not sums.still
+        if follows or drifts:
+            # A steady drift beside the voltage, or the first steps after one: the stage changes, not the sensor.
+            return False
+        # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
+        return sums.pp <= FOLLOWING_SLOPES[1] ** 2 * sums.uu
+    return sums.count >= ENOUGH_SLOPE and not follows and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
 
 
 # --- The trial of a suspected sensor.

@@ -27,7 +27,7 @@ Displacements in µm, errors in percent of the commanded range.
   dehyst demo
   dehyst demo --fast --out out/fast
   dehyst demo --view                 # and watch it in the Rerun viewer
-  dehyst demo --mirror --duration 4  # a mirror of 1024 actuators, learnt as one batch (needs torch; docs/fleet.md)
+  dehyst demo --mirror --duration 4  # a mirror of 1024 actuators, learnt as one batch (docs/fleet.md)
 """
 
 

@@ -16,7 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.errors import InputError
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import Fleet
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
@@ -24,12 +25,6 @@ from adaptive.types import FloatArray
 from service.reports.plot_style import figure, label, legend, line, save
 from sim.mirror import Mirror, MirrorConfig, Wavefront
 from sim.signals.voltages import training_input
-
-try:
-    from adaptive.fleet.config import FleetConfig
-    from adaptive.fleet.fleet import Fleet
-except ImportError as error:
-    raise InputError(f"--mirror: needs torch ({error}); install it with pip install 'dehyst[torch]'") from error
 
 WINDOW: Final = 60
 #: Voltage in the middle, V; amplifiers' limits, V; samples between two snapshots; ramp from rest, s.

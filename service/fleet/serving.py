@@ -15,45 +15,41 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from adaptive.compiled import compiled
 from adaptive.errors import DehystError
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.snapshot import FleetSnapshot
+from adaptive.fleet.state import OUTCOMES
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.types import BoolArray, FloatArray
-from service.answers.guard import Limits
+from service.answers.guard import Limits, limit
 from service.config.schema import build_settings
 from service.config.settings import LEARN, ServeConfig
+from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
 from service.fleet.wire import (
+    FLEET_CHANGES,
+    FLEET_QUERY,
+    FLEET_REPLY,
+    FLEET_SAMPLES,
     REFUSED,
-    FleetChanges,
-    FleetQuery,
-    FleetReply,
-    FleetSamples,
-    decode_fleet_query,
-    decode_fleet_samples,
-    encode_fleet_changes,
-    encode_fleet_reply,
+    FleetMessage,
+    decode_fleet,
+    encode_fleet,
 )
 from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, error_to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
-from service.protocol.query import LIMITED_SLEW, LIMITED_VOLTAGE, NOT_FINITE_REPLACED, OUTSIDE_DOMAIN
 from service.runtime.session import open_service
 from service.storage.model_file import read_bundle
 
-try:
-    from adaptive.fleet.config import FleetConfig
-    from adaptive.fleet.fleet import Fleet
-    from adaptive.fleet.snapshot import FleetSnapshot
-    from adaptive.fleet.state import OUTCOMES
-except ImportError as error:
-    raise FieldError(
-        "[fleet]", f"a fleet, without torch ({error})", "torch, which fleets need", "pip install 'dehyst[torch]'"
-    ) from error
-
 #: Name of a fleet in the keys, in place of an axis.
 NAME: Final = "fleet"
+_COUNTED: Final = ("received", "dropped", "malformed", "missing", "unknown_axes", "queries", "query_errors",
+                   "points_refused")  # fmt: skip
 #: Axes that the summary lists, worst first; time between two statuses, s.
 _WORST, _STATUS_S = 10, 1.0
 
@@ -74,61 +70,63 @@ def load_fleet(settings: FleetSettings) -> Fleet:
     if isinstance(given, dict):
         given = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **given}
     learner = build_settings(LearnerConfig, {**settings.learner, "admission": given}, "fleet.learner")
-    config = FleetConfig(learner, settings.device, settings.backend, settings.threads, settings.checks)
-    return Fleet(models, config)
+    try:
+        fleet = Fleet(models, FleetConfig(learner, settings.device, threads=settings.threads))
+    except ImportError as error:
+        raise FieldError(
+            "[fleet]", f"device {settings.device!r}, without torch ({error})", "torch, for a device but the processor",
+            "pip install 'dehyst[torch]'",
+        ) from error  # fmt: skip
+    fleet.warm()
+    return fleet
 
 
 def answer(
-    snapshot: FleetSnapshot, tracked: FloatArray, limits: Limits, query: FleetQuery, seq: int
-) -> tuple[FleetReply, int]:
-    """The reply to a query, and the number of its points that were refused. Pure."""
-    axes, dt_s = len(tracked), snapshot.constants.dt_s
-    k, asked = query.y_um.shape
+    snapshot: FleetSnapshot, tracked: FloatArray, limits: Limits, query: FleetMessage, seq: int
+) -> tuple[bytes, int]:
+    """The payload of the reply to a query, and the number of its points that were refused. Pure."""
+    axes, asked, k, q = len(tracked), query.axes, query.rows, query.parts
     here = slice(query.first, min(query.first + asked, axes))
     known = max(here.stop - here.start, 0)
-    if query.memory is not None and query.memory.shape[1] != snapshot.memory_size:
-        raise FieldError("columns", query.memory.shape[1], f"{snapshot.memory_size}, the size of a memory")
-    given = np.stack((query.y_um, query.v_um_per_s, query.a_um_per_s2))[:, :, :known]
+    if q["memory"] is not None and q["memory"].shape[1] != snapshot.memory_size:
+        raise FieldError("columns", q["memory"].shape[1], f"{snapshot.memory_size}, the size of a memory")
+    given = np.stack([q[name][:, :known].T for name in ("y_um", "v_um_per_s", "a_um_per_s2")])
     refused = ~np.isfinite(given).all(0) | ~((given[0] >= limits.y_min_um) & (given[0] <= limits.y_max_um))
     memory = tracked.copy()
-    if query.memory is not None and known:
-        sound = np.isfinite(query.memory[:known]).all(1)
-        refused |= ~sound
-        memory[here][sound] = query.memory[:known][sound]
+    if q["memory"] is not None and known:
+        sound = np.isfinite(q["memory"][:known]).all(1)
+        refused |= ~sound[:, None]
+        memory[here][sound] = q["memory"][:known][sound]
     # From its first refused point on, an axis' memory would be unknown.
-    refused = np.logical_or.accumulate(refused, axis=0)
+    refused = np.logical_or.accumulate(refused, axis=1)
     motion = np.zeros((3, axes, k))
-    motion[:, here] = np.where(refused, 0.0, given).transpose(0, 2, 1)
+    motion[:, here] = np.where(refused, 0.0, given)
     said = snapshot.feedforward(motion[0], motion[1], motion[2], memory)
-    u, std = np.full((k, asked), np.nan), np.full((k, asked), np.nan)
-    flags = np.full((k, asked), REFUSED, dtype=np.uint8)
-    before = np.full(known, np.nan) if query.u_before_V is None else query.u_before_V[:known]
-    safe, bits = _limited(said.u_V[here].T, said.inside[here].T, before, limits, dt_s)
-    u[:, :known], flags[:, :known] = np.where(refused, np.nan, safe), np.where(refused, REFUSED, bits)
-    std[:, :known] = np.where(refused, np.nan, said.std_V[here].T)
+    u, std = np.full((2, asked, k), np.nan)
+    flags = np.zeros((asked, k), dtype=np.uint8)
+    u[:known], std[:known] = said.u_V[here], said.std_V[here]
+    before = np.full(asked, np.nan) if q["u_before_V"] is None else q["u_before_V"]
+    step_V = limits.slew_V_per_s * snapshot.bases[0].dt_s
+    _limit_all(u[:known], said.inside[here], before, limits.u_min_V, limits.u_max_V, step_V, flags)
     after = np.full((asked, snapshot.memory_size), np.nan)
-    after[:known] = np.where(refused[-1][:, None], memory[here], said.memory[here])
-    count = int(refused.sum()) + k * (asked - known)
-    return FleetReply(query.first, seq, u, std, flags, after), count
+    after[:known] = np.where(refused[:, -1:], memory[here], said.memory[here])
+    unanswered = np.ones((asked, k), dtype=np.bool_)
+    unanswered[:known] = refused
+    u[unanswered], std[unanswered], flags[unanswered] = np.nan, np.nan, REFUSED
+    reply = encode_fleet(
+        FLEET_REPLY, query.first, snapshot_seq=[seq], u_V=u.T, std_V=std.T, memory=after, flags=flags.T
+    )
+    return reply, int(unanswered.sum())
 
 
-def _limited(
-    u_V: FloatArray, inside: BoolArray, before: FloatArray, limits: Limits, dt_s: float
-) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """`service.answers.guard.limit_voltage` for (k, B) points of all axes at once."""
-    out, flags = np.empty_like(u_V), np.where(inside, 0, OUTSIDE_DOMAIN).astype(np.uint8)
-    low, high, step = limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * dt_s
-    previous = np.clip(np.where(np.isfinite(before), before, np.nan), low, high)
-    for i, row in enumerate(u_V):
-        known, sound = np.isfinite(previous), np.isfinite(row)
-        wanted = np.where(sound, row, np.where(known, previous, 0.5 * (low + high)))
-        kept = np.clip(wanted, low, high)
-        slow = np.where(known, np.clip(kept, previous - step, previous + step), kept)
-        flags[i] |= np.where(sound, 0, NOT_FINITE_REPLACED).astype(np.uint8)
-        flags[i] |= np.where(kept != wanted, LIMITED_VOLTAGE, 0).astype(np.uint8)
-        flags[i] |= np.where(slow != kept, LIMITED_SLEW, 0).astype(np.uint8)
-        out[i] = previous = slow
-    return out, flags
+@compiled
+def _limit_all(
+    u: FloatArray, inside: BoolArray, before: FloatArray, low_V: float, high_V: float, step_V: float,
+    flags: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """`service.answers.guard.limit` of each axis, in place."""
+    for b in range(u.shape[0]):
+        limit(u[b], inside[b], before[b], low_V, high_V, step_V, flags[b])
 
 
 class FleetService:
@@ -140,23 +138,16 @@ class FleetService:
         self.keys = Keys(config.stage, NAME)
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self._fleet = load_fleet(self.settings)
+        self._checkpoints = None
+        if self.settings.checkpoints is not None:
+            folder, period_s = self.settings.checkpoints, self.settings.checkpoint_s
+            self._checkpoints = FleetCheckpoints(self._fleet, folder, config.stage, self.instance, period_s)
+            self._checkpoints.restore()
         self._newest = self._fleet.snapshot(), self._fleet.memory(), -1
-        self._published = self._newest[0].linear()
-        self._queue: queue.Queue[FleetSamples | Callable[[], None]] = queue.Queue()
+        self._published = self._newest[0].linear
+        self._queue: queue.Queue[FleetMessage | Callable[[], None]] = queue.Queue()
         self._waiting = 0
-        self._counts = dict.fromkeys(
-            (
-                "received",
-                "dropped",
-                "malformed",
-                "missing",
-                "unknown_axes",
-                "queries",
-                "query_errors",
-                "points_refused",
-            ),
-            0,
-        )
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._counting = threading.Lock()
         self._stopping = threading.Event()
         self._session: zenoh.Session | None = None
@@ -187,6 +178,8 @@ class FleetService:
         self._queue.put(lambda: None)
         if self._thread.is_alive():
             self._thread.join()
+        if self._checkpoints is not None:
+            self._checkpoints.close()
         if self._publisher is not None:
             self._publisher.undeclare()
         if self._session is not None:
@@ -209,14 +202,14 @@ class FleetService:
 
     def _on_samples(self, sample: zenoh.Sample) -> None:
         try:
-            batch = decode_fleet_samples(sample.payload.to_bytes())
+            batch = decode_fleet(FLEET_SAMPLES, sample.payload.to_bytes())
         except DehystError:
             self._count(malformed=1)
             return
         with self._counting:
-            room = self._waiting + batch.seq.size <= self.settings.queue_samples
-            self._counts["received" if room else "dropped"] += batch.seq.size
-            self._waiting += batch.seq.size if room else 0
+            room = self._waiting + batch.rows <= self.settings.queue_samples
+            self._counts["received" if room else "dropped"] += batch.rows
+            self._waiting += batch.rows if room else 0
         if room:
             self._queue.put(batch)
 
@@ -242,10 +235,10 @@ class FleetService:
 
     def _feedforward(self, payload: bytes) -> tuple[bytes, str]:
         snapshot, memory, seq = self._newest
-        reply, refused = answer(snapshot, memory, self.settings.limits, decode_fleet_query(payload), seq)
-        if refused:
-            self._count(points_refused=refused)
-        return encode_fleet_reply(reply), "application/octet-stream"
+        query = decode_fleet(FLEET_QUERY, payload)
+        reply, refused = answer(snapshot, memory, self.settings.limits, query, seq)
+        self._count(points_refused=refused)
+        return reply, "application/octet-stream"
 
     # ---- the thread that learns
 
@@ -256,10 +249,12 @@ class FleetService:
                 item = self._queue.get(timeout=0.1)
             except queue.Empty:
                 item = None
-            if isinstance(item, FleetSamples):
+            if isinstance(item, FleetMessage):
                 before, handled = handled // self.settings.snapshot_every, handled + self._learn(item)
                 if handled // self.settings.snapshot_every > before:
-                    self._newest = self._fleet.snapshot(), self._fleet.memory(), int(item.seq.max())
+                    self._newest = self._fleet.snapshot(), self._fleet.memory(), int(item.parts["seq"].max())
+                if self._checkpoints is not None:
+                    self._checkpoints.write_due()
             elif item is not None:
                 item()
             now_s = time.monotonic()
@@ -270,33 +265,33 @@ class FleetService:
                 changed_s = now_s
                 self._publish_changes()
 
-    def _learn(self, batch: FleetSamples) -> int:
+    def _learn(self, batch: FleetMessage) -> int:
         """Take all samples of a message; returns their number."""
-        axes = self.settings.axes
-        k, given = batch.u_V.shape
-        here = slice(batch.first, min(batch.first + given, axes))
+        axes, k, p = self.settings.axes, batch.rows, batch.parts
+        here = slice(batch.first, min(batch.first + batch.axes, axes))
         known = max(here.stop - here.start, 0)
-        u, y = np.full((k, axes), np.nan), np.full((k, axes), np.nan)
-        u[:, here], y[:, here] = batch.u_V[:, :known], batch.y_um[:, :known]
+        u, y = np.full((2, k, axes), np.nan)
+        u[:, here], y[:, here] = p["u_V"][:, :known], p["y_um"][:, :known]
         present = ~(np.isnan(u) & np.isnan(y))
-        self._count(missing=int((~present).sum()), unknown_axes=k * (given - known))
         for i in range(k):
-            self._fleet.step(int(batch.seq[i]), float(batch.t_s[i]), u[i], y[i], present[i])
+            self._fleet.step(p["seq"][i], p["t_s"][i], u[i], y[i], present[i])
+        self._count(missing=int((~present[:, here]).sum()), unknown_axes=k * (batch.axes - known))
         with self._counting:
             self._waiting -= k
-        return int(k)
+        return k
 
     def _publish_changes(self) -> None:
         """Send the linear parts and frames that have changed since the last time, to those that follow."""
         if not self._publisher.matching_status.matching:
             return
         snapshot, _, seq = self._newest
-        now = snapshot.linear()
+        now = snapshot.linear
         axes = np.flatnonzero(np.any(now != self._published, axis=1))
         self._published = now
         if axes.size:
-            changes = FleetChanges(seq, axes, now[axes, :2], now[axes, 2:])
-            self._publisher.put(encode_fleet_changes(changes))
+            frames, beta = now[axes, :2], now[axes, 2:]
+            changes = encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, frames=frames, beta=beta)
+            self._publisher.put(changes)
 
     def _axis_of(self, payload: bytes) -> int | None:
         """The axis that a request names; None for none. Raises InputError."""
@@ -333,6 +328,7 @@ class FleetService:
             "gates": {name: int(n) for name, n in zip(OUTCOMES, outcomes.sum(0), strict=True)},
             "rms_error_pct": {"median": float(np.median(errors)), "max": float(errors.max())},
             "apart": len(fleet.apart), "in_trouble": len(troubles),
+            "checkpoints": self._checkpoints.counts if self._checkpoints is not None else None,
             "worst": [{"axis": axis, "rms_error_pct": float(errors[axis]), "trouble": troubles.get(axis, "")}
                       for axis in order[:_WORST]],
         }  # fmt: skip

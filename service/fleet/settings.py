@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from service.answers.guard import Limits
 from service.config.schema import Setting
@@ -41,12 +41,8 @@ class FleetSettings:
         tuple[float, ...],
         Setting(help="gain of each axis over the model's, where one model file is for all; [] for 1"),
     ] = ()
-    device: Annotated[str, Setting(help="device of torch: 'cpu', 'cuda'")] = "cpu"
-    backend: Annotated[
-        Literal["auto", "compiled", "torch"], Setting(help="what steps the matrices, see docs/fleet.md")
-    ] = "auto"
+    device: Annotated[str, Setting(help="'cpu', or the device of torch that has the windows, as 'cuda'")] = "cpu"
     threads: Annotated[int, Setting(help="threads that share the axes of a step", low=1, high=256)] = 2
-    checks: Annotated[int, Setting(help="axes whose model is checked at a time", low=1, high=MOST_AXES)] = 16
     snapshot_every: Annotated[
         int, Setting(help="samples between two snapshots, which answer the queries", low=1, high=100_000)
     ] = 20
@@ -56,6 +52,13 @@ class FleetSettings:
     model_hz: Annotated[
         float, Setting(help="highest rate at which changes of models are published", unit="1/s", low=0, above=True)
     ] = 5.0
+    checkpoints: Annotated[
+        Path | None,
+        Setting(help="folder for one checkpoint of each axis; relative to this file", example="checkpoints/fleet"),
+    ] = None
+    checkpoint_s: Annotated[
+        float, Setting(help="time in which each axis is written once", unit="s", low=0.05, high=86400)
+    ] = 60.0
     learner: Annotated[dict[str, Any], Setting(help="settings of the learner of each axis, see docs/learner.md")] = (
         field(default_factory=dict)
     )

@@ -21,6 +21,7 @@ from service.answers.guard import Limits
 from service.client import follower as follower_module
 from service.client.follower import Follower
 from service.config.settings import AxisConfig
+from service.fleet.wire import decode_fleet
 from service.protocol.delta import FollowedState, decode_delta
 from service.protocol.model import ModelMessage, decode_model
 from service.protocol.query import Trajectory, decode_query, decode_reply
@@ -208,6 +209,23 @@ def test_payloads_without_an_answer_hold_the_values_of_the_table() -> None:
         assert got.keys() == fields.keys()
         for name, values in fields.items():
             np.testing.assert_array_equal(got[name], values)
+
+
+def test_payloads_of_a_fleet_hold_the_values_of_the_table() -> None:
+    read: dict[str, dict[str, list[float]]] = {}
+    for file, field, _, value in table("fleet.txt"):
+        read.setdefault(file, {}).setdefault(field, []).append(float(value))
+    assert len(read) == 5
+    for file, fields in read.items():
+        data = (FOLDER / file).read_bytes()
+        first, got = page_client.decode_fleet(data)
+        assert got.keys() == fields.keys()
+        for name, values in fields.items():
+            np.testing.assert_array_equal(got[name], values)
+        message = decode_fleet(data[1], data)
+        assert message.first == first
+        there = {name: np.ravel(part).tolist() for name, part in message.parts.items() if part is not None}
+        np.testing.assert_equal(there, got)
 
 
 class Step(NamedTuple):

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_fleet(config: ServeConfig, args: argparse.Namespace, started: Callable[[], None]) -> int:
-    """Serve a fleet until interrupted. Only here torch is imported."""
+    """Serve a fleet until interrupted. Only here a fleet is imported."""
     if args.standby:
         raise FieldError("--standby", "a fleet", "[[axis]] tables", "a fleet has no standby")
     from service.fleet.serving import FleetService

@@ -15,12 +15,15 @@ import pytest
 import zenoh
 
 from adaptive.errors import InputError
+from adaptive.online.learner import Learner
+from adaptive.types import under
 from service.config.settings import parse_config
 from service.fleet import wire
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
 from service.runtime.session import open_client
+from service.storage.checkpoint import decode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
@@ -55,6 +58,25 @@ def motion(first: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     return k, k * DT_S, np.repeat((stage_um - 1.0) / 11.0, AXES, 1), stage_um * GAINS
 
 
+def samples(seq: np.ndarray, t_s: np.ndarray, u_V: np.ndarray, y_um: np.ndarray, first: int = 0) -> bytes:
+    return wire.encode_fleet(wire.FLEET_SAMPLES, first, seq=seq, t_s=t_s, u_V=u_V, y_um=y_um)
+
+
+def send(session: zenoh.Session, payload: bytes) -> None:
+    """Publish samples; the sender waits where the network is full, so that none is lost."""
+    session.put(KEYS.sample, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+def query(y_um: np.ndarray, memory: np.ndarray | None = None, u_before_V: np.ndarray | None = None) -> bytes:
+    """A query of resting points."""
+    still, rest = np.zeros_like(y_um), {"memory": memory, "u_before_V": u_before_V}
+    return wire.encode_fleet(wire.FLEET_QUERY, y_um=y_um, v_um_per_s=still, a_um_per_s2=still, **rest)
+
+
+def reply_to(session: zenoh.Session, payload: bytes) -> dict[str, Any]:
+    return wire.decode_fleet(wire.FLEET_REPLY, ask(session, KEYS.feedforward, payload)).parts
+
+
 def ask(session: zenoh.Session, key: str, payload: bytes = b"") -> Any:
     """The reply to a query: its bytes, or what a refusal says as a dictionary."""
     reply = next(iter(session.get(key, payload=payload, timeout=60.0)))  # the first one compiles
@@ -76,13 +98,13 @@ def eventually(condition: Callable[[], Any]) -> Any:
 
 @pytest.mark.e2e
 def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) -> None:
-    changes: list[wire.FleetChanges] = []
+    changes: list[wire.FleetMessage] = []
     with open_client(service.endpoint) as session:
         session.declare_subscriber(
-            KEYS.model, lambda s: changes.append(wire.decode_fleet_changes(s.payload.to_bytes()))
+            KEYS.model, lambda s: changes.append(wire.decode_fleet(wire.FLEET_CHANGES, s.payload.to_bytes()))
         )
         for first in range(0, 600, 20):
-            session.put(KEYS.sample, wire.encode_fleet_samples(*motion(first, 20)))
+            send(session, samples(*motion(first, 20)))
         eventually(lambda: status(session)["seq"] == 599)
         before = status(session)
         assert before["gates"]["learnt"] > 50 * AXES
@@ -92,19 +114,27 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         seq, t_s, u, y = motion(600, 1)
         u, y = np.pad(u, ((0, 0), (0, 2))), np.pad(y, ((0, 0), (0, 2)))
         u[0, 3] = y[0, 3] = y[0, 5] = np.nan
-        bad = wire.encode_fleet_samples(seq, t_s, u, y)
-        for payload in (bad, bad, b"\x01\x07", b"\x01\x07" + bytes(40)):
-            session.put(KEYS.sample, payload)
+        bad = samples(seq, t_s, u, y)
+        for payload in (bad, bad, b"\x01\x08", b"\x01\x08" + bytes(40)):
+            send(session, payload)
         eventually(lambda: status(session)["samples"]["malformed"] == 2)
         after = eventually(lambda: (now := status(session))["samples"]["received"] == 602 and now)
         assert after["samples"]["missing"] == 2
         assert after["samples"]["unknown_axes"] == 4
         assert after["gates"]["duplicate"] == AXES - 2
         assert after["gates"]["not_finite"] == 2
-        # What is refused of one axis costs the others nothing.
-        for first in range(601, 901, 20):
-            session.put(KEYS.sample, wire.encode_fleet_samples(*motion(first, 20)))
-        eventually(lambda: status(session)["seq"] >= 899)
+        # What is refused of one axis costs the others nothing. Now half of the axes a message, and one actuator dead.
+        for first in range(601, 1801, 20):
+            seq, t_s, u, y = motion(first, 20)
+            y[:, 20] = 40.0
+            send(session, samples(seq, t_s, u[:, :32], y[:, :32]))
+            send(session, samples(seq, t_s, u[:, 32:], y[:, 32:], first=32))
+            eventually(lambda: status(session)["samples"]["waiting"] < 500)
+        eventually(lambda: status(session)["samples"]["received"] == 602 + 2400)
+        now = eventually(lambda: (now := status(session))["seq"] >= 1799 and now)
+        assert (now["samples"]["missing"], now["samples"]["dropped"]) == (2, 0)
+        assert (now["worst"][0]["axis"], now["worst"][0]["trouble"]) == (20, "sensor_stuck")
+        assert now["in_trouble"] == 1
         one, other = status(session, axis=5), status(session, axis=6)
         assert one["gates"]["not_finite"] == 2
         assert other["gates"]["not_finite"] == 0
@@ -113,26 +143,22 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         # One query for all axes: the same place of the stages is another reading of each axis.
         at = np.full((2, AXES), 40.0) * GAINS
         at[1, 7], at[0, 8] = np.nan, 1e4
-        still = np.zeros_like(at)
-        reply = wire.decode_fleet_reply(ask(session, KEYS.feedforward, wire.encode_fleet_query(at, still, still)))
+        reply = reply_to(session, query(at))
         refused = np.zeros((2, AXES), dtype=np.bool_)
         refused[1, 7] = refused[:, 8] = True
-        np.testing.assert_array_equal(reply.flags == wire.REFUSED, refused)
-        np.testing.assert_array_equal(np.isnan(reply.u_V), refused)
-        np.testing.assert_allclose(reply.u_V[~refused], 39.0 / 11.0, atol=0.1)
+        np.testing.assert_array_equal(reply["flags"] == wire.REFUSED, refused)
+        np.testing.assert_array_equal(np.isnan(reply["u_V"]), refused)
+        np.testing.assert_allclose(reply["u_V"][~refused], 39.0 / 11.0, atol=0.1)
         # Its own memory gives the same answer again.
-        whole = np.full((1, AXES), 41.0) * GAINS
-        first_reply = wire.encode_fleet_query(whole, 0 * whole, 0 * whole, reply.memory, np.full(AXES, 3.0))
-        again = [wire.decode_fleet_reply(ask(session, KEYS.feedforward, first_reply)) for _ in range(2)]
-        np.testing.assert_array_equal(again[0].u_V, again[1].u_V)
-        assert again[0].u_V.max() <= 5.0
-        wrong = ask(
-            session, KEYS.feedforward, wire.encode_fleet_query(whole, 0 * whole, 0 * whole, reply.memory[:, :3])
-        )
+        whole, before_V = np.full((1, AXES), 41.0) * GAINS, np.full(AXES, 3.0)
+        again = [reply_to(session, query(whole, reply["memory"], before_V)) for _ in range(2)]
+        np.testing.assert_array_equal(again[0]["u_V"], again[1]["u_V"])
+        assert again[0]["u_V"].max() <= 5.0
+        wrong = ask(session, KEYS.feedforward, query(whole, reply["memory"][:, :3]))
         assert wrong["field"] == "columns"
         # Changes are small, and a whole model comes on demand.
         eventually(lambda: bool(changes))
-        assert changes[-1].beta.shape[1] == make_models()["lssvm_adaptive"].state_dict()["beta"].size
+        assert changes[-1].parts["beta"].shape[1] == make_models()["lssvm_adaptive"].state_dict()["beta"].size
         model = decode_model(ask(session, KEYS.model, b'{"axis": 9}')).model
         assert model.features.gain == pytest.approx(GAINS[9], rel=0.05)  # type: ignore[attr-defined]
         assert len(list(session.liveliness().get(f"{KEYS.base}/alive/*"))) == 1
@@ -141,36 +167,104 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
     assert last["fleet"]["samples"]["points_refused"] == 3
 
 
-def test_payloads_survive_the_way_and_damage_is_named() -> None:
-    rng = np.random.default_rng(0)
+@pytest.mark.e2e
+def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    path, folder = tmp_path / "serve.toml", tmp_path / "kept"
+    port = unused_port()
+    path.write_text(configuration(port, 'checkpoints = "kept"\ncheckpoint_s = 0.5\n'), encoding="utf-8")
+    process = ServeProcess(path, port)
+    with open_client(process.endpoint) as session:
+        for first in range(0, 900, 20):
+            send(session, samples(*motion(first, 20)))
+        eventually(lambda: status(session)["seq"] == 899)
+        # Each axis is written after the last sample.
+        written = status(session)["checkpoints"]["written"]
+        for first in range(900, 2900, 20):
+            send(session, samples(*motion(first, 20)))
+            if status(session)["checkpoints"]["written"] > written + 2 * AXES:
+                break
+            time.sleep(0.02)
+        learnt = status(session, axis=9)["gates"]["learnt"]
+    process.kill()
+    # The file of an axis is a single learner's: it goes on from there.
+    meta, state = decode_checkpoint((folder / "axis-0009.ckpt").read_bytes())
+    single = Learner.from_state(under("learner.", state))
+    assert (meta.axis, single.seq) == ("9", meta.seq)
+    assert single.snapshot().features.gain == pytest.approx(GAINS[9], rel=0.05)
+    (folder / "axis-0011.ckpt").write_bytes(b"damaged")
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            now = status(session)
+            assert now["checkpoints"]["restored"] == AXES - 1
+            assert now["checkpoints"]["refused"] == 1
+            before = status(session, axis=9)["gates"]["learnt"]
+            assert 0 < before <= learnt
+            assert status(session, axis=11)["gates"]["learnt"] == 0
+            # Whatever the number that the stage has come to, or began with again.
+            for first in range(50, 250, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["samples"]["received"] == 200)
+            eventually(lambda: status(session, axis=9)["gates"]["learnt"] > before)
+            assert status(session, axis=9)["gates"]["out_of_order"] == 0
+    finally:
+        process.kill()
+
+
+def parts_of(kind: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Parts of a message of 3 samples or points of 5 axes."""
     u, y = rng.normal(size=(2, 3, 5))
-    got = wire.decode_fleet_samples(wire.encode_fleet_samples([7, 8, 9], [0.1, 0.2, 0.3], u, y, first=2))
-    assert (got.first, got.seq.tolist()) == (2, [7, 8, 9])
-    np.testing.assert_array_equal(got.y_um, y)
-    reply = wire.FleetReply(1, 42, u, y, np.full((3, 5), LIMITED_VOLTAGE, dtype=np.uint8), rng.normal(size=(5, 4)))
-    back = wire.decode_fleet_reply(wire.encode_fleet_reply(reply))
-    for name, value in reply._asdict().items():
-        np.testing.assert_array_equal(getattr(back, name), value)
-    query = wire.encode_fleet_query(u, y, y, rng.normal(size=(5, 4)), np.zeros(5))
-    assert wire.decode_fleet_query(query).memory is not None
+    memory = rng.normal(size=(5, 4))
+    return {
+        wire.FLEET_SAMPLES: {"seq": [7, 8, 9], "t_s": [0.1, 0.2, 0.3], "u_V": u, "y_um": y},
+        wire.FLEET_QUERY: {"y_um": u, "v_um_per_s": y, "a_um_per_s2": y, "memory": memory, "u_before_V": y[0]},
+        wire.FLEET_REPLY: {"snapshot_seq": [42], "u_V": u, "std_V": y, "memory": memory,
+                           "flags": np.full((3, 5), LIMITED_VOLTAGE)},
+        wire.FLEET_CHANGES: {"snapshot_seq": [42], "axes": [1, 3, 4, 5, 9], "frames": rng.normal(size=(5, 2)),
+                             "beta": memory},
+    }[kind]  # fmt: skip
+
+
+KINDS = (wire.FLEET_SAMPLES, wire.FLEET_QUERY, wire.FLEET_REPLY, wire.FLEET_CHANGES)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_payloads_survive_the_way(kind: int) -> None:
+    parts = parts_of(kind, np.random.default_rng(0))
+    got = wire.decode_fleet(kind, wire.encode_fleet(kind, 2, **parts))
+    assert (got.first, got.axes) == (2, 5)
+    assert got.parts.keys() == parts.keys()
+    for name, value in parts.items():
+        np.testing.assert_array_equal(got.parts[name], value)
+
+
+def test_damage_is_named() -> None:
+    parts = parts_of(wire.FLEET_QUERY, np.random.default_rng(0))
+    whole = wire.encode_fleet(wire.FLEET_QUERY, **parts)
+    less = wire.encode_fleet(wire.FLEET_QUERY, **(parts | {"memory": None, "u_before_V": None}))
+    assert wire.decode_fleet(wire.FLEET_QUERY, less).parts["memory"] is None
     for data, field in (
-        (query[:-1], "payload"), (b"\x02" + query[1:], "version"), (query[:2] + b"\xff" + query[3:], "options"),
-        (query[:4] + bytes(4) + query[8:], "axes"), (query[:12] + bytes(4) + query[16:], "rows"),
+        (whole[:-1], "payload"), (b"\x02" + whole[1:], "version"), (whole[:2] + b"\xff" + whole[3:], "options"),
+        (whole[:4] + bytes(4) + whole[8:], "axes"), (whole[:12] + bytes(4) + whole[16:], "rows"),
+        (whole[:16] + bytes(4) + whole[20:], "columns"), (less[:16] + b"\x01" + less[17:], "columns"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^{field}: got"):
-            wire.decode_fleet_query(data)
+            wire.decode_fleet(wire.FLEET_QUERY, data)
+    with pytest.raises(InputError, match=r"memory: got shape \(4, 4\), expected \(B, m\)"):
+        wire.encode_fleet(wire.FLEET_QUERY, **(parts | {"memory": np.zeros((4, 4))}))
 
 
 def test_damaged_payloads_never_raise_anything_else() -> None:
     rng = np.random.default_rng(1)
-    whole = wire.encode_fleet_query(*rng.normal(size=(3, 2, 4)))
+    whole = wire.encode_fleet(wire.FLEET_QUERY, **parts_of(wire.FLEET_QUERY, rng))
     for _ in range(2000):
         data = bytearray(whole[: rng.integers(0, len(whole) + 1)])
         for place in rng.integers(0, max(len(data), 1), 3) if data else ():
             data[place] = rng.integers(0, 256)
-        for decode in (wire.decode_fleet_query, wire.decode_fleet_samples, wire.decode_fleet_reply):
+        for kind in KINDS:
             try:
-                decode(bytes(data))
+                wire.decode_fleet(kind, bytes(data))
             except InputError:
                 continue
 
@@ -191,12 +285,14 @@ def test_a_configuration_names_what_does_not_fit(tmp_path: Path) -> None:
 
 
 def test_without_torch_the_extra_is_named(tmp_path: Path) -> None:
-    (tmp_path / "serve.toml").write_text(configuration(unused_port()), encoding="utf-8")
+    write_bundle(tmp_path / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    more = 'device = "cuda"\nlearner = { solver = { form = "inverse" } }\n'
+    (tmp_path / "serve.toml").write_text(configuration(unused_port(), more), encoding="utf-8")
     code = (
         "import sys; sys.modules['torch'] = None\nfrom lab.cli import main\n"
         f"sys.exit(main(['serve', '--config', {str(tmp_path / 'serve.toml')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode != 0
-    assert "[fleet]: got a fleet, without torch" in done.stderr
+    assert "[fleet]: got device 'cuda', without torch" in done.stderr
     assert "pip install 'dehyst[torch]'" in done.stderr

@@ -89,6 +89,28 @@ def decode_plain(data: bytes) -> dict[str, list[float]]:
     return {"seq": list(struct.unpack_from("<q", data, 8)), {2: "u_V", 3: "y_um"}[kind]: values}
 
 
+def decode_fleet(data: bytes) -> tuple[int, dict[str, list[float]]]:
+    """(first axis, values in order by name) of a payload of kind 8 to 11."""
+    version, kind, options, b, first, k, m = struct.unpack_from("<BBHIIII", data, 0)
+    assert version == 1
+    assert options == 0 or kind == 9
+    matrix, memory = ("d", k * b), ("d", b * m)
+    follows = {
+        8: {"seq": ("q", k), "t_s": ("d", k), "u_V": matrix, "y_um": matrix},
+        9: {"y_um": matrix, "v_um_per_s": matrix, "a_um_per_s2": matrix}
+        | ({"memory": memory} if options & 1 else {})
+        | ({"u_before_V": ("d", b)} if options & 2 else {}),
+        10: {"snapshot_seq": ("q", 1), "u_V": matrix, "std_V": matrix, "memory": memory, "flags": ("B", k * b)},
+        11: {"snapshot_seq": ("q", 1), "axes": ("q", b), "frames": ("d", 2 * b), "beta": memory},
+    }[kind]
+    at, values = 20, {}
+    for name, (letter, count) in follows.items():
+        values[name] = list(struct.unpack_from(f"<{count}{letter}", data, at))
+        at += struct.calcsize(f"<{count}{letter}")
+    assert at == len(data)
+    return first, values
+
+
 # --- Changes of a model.
 
 

@@ -1,0 +1,348 @@
+"""One ordinary sample of each axis, in compiled loops over the axes: intake, then what it teaches.
+
+The rules are the single learner's own functions, on records in place of its dataclasses (`adaptive.compiled.shared`).
+What is written here is their order, as in `Intake.take`, `Track.advance` and `Learner.teach`. A sample that is not an
+ordinary one changes nothing and is left to a single learner.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from adaptive.compiled import compiled, dot
+from adaptive.features import FeatureArrays, advance, fill
+from adaptive.fleet.state import OUTCOMES, Fixed, Rows
+from adaptive.inverse_model import mean_of, track_memory, unpacked
+from adaptive.online import gates, intake, learner
+from adaptive.online.drift import RestCreep, update
+from adaptive.online.gates import AdmissionState
+from adaptive.online.glitch_or_jump import MOST_BRIDGED
+from adaptive.online.kernel_window import NOWHERE, WeightConfig
+from adaptive.online.learner import Judgement
+from adaptive.online.sensor_trust import CONFIRMED, Following
+from adaptive.smoothing import smooth_one
+from adaptive.types import BoolArray, FloatArray, IntArray
+
+#: In place of an outcome: no sample; the sample is due for learning; it is for a single learner from its intake on, or
+#: from what it teaches on.
+NO_SAMPLE: Final = -1
+TEACHES: Final = -2
+DOUBT: Final = -3
+ODD: Final = -4
+
+# Compiled code knows methods by plain names only. Fields of a record are read as attributes, as those of the single
+# learner's dataclasses, and written as items.
+_judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
+_follow, _rest_shift_um, _leave_rest, _weight_of = Following.take, RestCreep.shift_um, RestCreep.leave, WeightConfig.of
+_note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
+_FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
+    OUTCOMES.index(name)
+    for name in (gates.FROZEN, gates.OUTLIER, gates.NUMERICS, gates.SATURATED, gates.UNEXCITED, gates.LEARNT)
+)
+
+
+class Samples(NamedTuple):
+    """(B,) samples. controls : axes whose control trial may begin now."""
+
+    seq: IntArray
+    t_s: FloatArray
+    u_V: FloatArray
+    y_um: FloatArray
+    controls: BoolArray
+
+
+class _Sample(NamedTuple):
+    seq: int
+    t_s: float
+    u_V: float
+    y_um: float
+
+
+class Work(NamedTuple):
+    """Scratch and results, (B, ...). kept : numbers to return to. outcome : of the sample, or a number from above.
+
+    basis (B, p) : of the instant to learn. lets_go, learns : steps that the windows are to make, of ``targets`` in V.
+    """
+
+    kept: Any
+    outcome: IntArray
+    basis: FloatArray
+    lets_go: BoolArray
+    learns: BoolArray
+    targets: FloatArray
+    weights: FloatArray
+
+
+@compiled
+def _number_of(outcome: str) -> int:
+    for i in range(len(OUTCOMES)):
+        if OUTCOMES[i] == outcome:
+            return i
+    return NO_SAMPLE
+
+
+@compiled
+def _map(c: Fixed, b: int, frames: FloatArray) -> FeatureArrays:
+    """The feature map of an axis in a frame."""
+    m = c.features
+    return FeatureArrays(
+        m.thresholds[b], m.arcs[b], m.retain[b], m.scale[b], m.kernel_plays[b], m.flags[b], frames[b],
+    )  # fmt: skip
+
+
+@compiled
+def _remember_place(s: Rows, b: int, keep: bool) -> None:
+    """The present place becomes the newest known one: after the last, or with ``keep`` in its stead."""
+    r, slots = s.numbers[b], s.voltages.shape[1]
+    at = r.past_count - 1 if keep else min(r.past_count, 1)
+    if r.past_count == 2:
+        for part in (s.past_motion[b], s.past_lag_V[b], s.past_lag_um[b], s.past_memory[b]):
+            part[0] = part[1]
+        s.past_u_before_V[b, 0] = s.past_u_before_V[b, 1]
+        s.past_from[b, 0] = s.past_from[b, 1]
+    s.past_motion[b, at], s.past_memory[b, at] = s.motion[b], s.memory[b]
+    s.past_u_before_V[b, at] = s.voltages[b, (r.count - slots + 1) % slots]
+    for i in range(slots - 2):
+        past = (r.count - slots + 2 + i) % slots
+        s.past_lag_V[b, at, i], s.past_lag_um[b, at, i] = s.voltages[b, past], s.readings[b, past]
+    s.past_from[b, at] = r.past_written
+    r["past_count"] = at + 1
+
+
+@compiled
+def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
+    """`Intake._lags`: whether the reading has not moved with the voltage, by a rough measure."""
+    r, f, slots = s.numbers[b], c.axis[b], s.voltages.shape[1]
+    if not (f.tells and r.credit > 0) or r.past_count == 0 or r.gates.since_start < r.look_from:
+        return False
+    last, first = r.count - 1, r.count + 1 - slots
+    x_um = (s.voltages[b, last % slots] - s.voltages[b, first % slots]) / f.slope_V_per_um
+    dy_um = y_um - s.readings[b, (first + 1) % slots]
+    if abs(x_um) <= intake.LAGS_SHARE * f.range_um or intake.LAGS[0] <= dy_um / x_um <= intake.LAGS[1]:
+        return False
+    return bool(abs(x_um) > intake.LAGS_SIGMA * r.gates.innovation2**0.5 * f.range_um)
+
+
+@compiled
+def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
+    """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
+    r, f, a = s.numbers[b], c.axis[b], c.config[0].admission
+    g, dt_s = r.gates, c.config[0].dt_s
+    refused = gates.check_sample(a, g, sample, dt_s)
+    if refused == "" and abs(sample.y_um - f.middle_um) > intake.FAR_OUT * f.range_um:
+        refused = gates.OUT_OF_RANGE
+    if refused != "":
+        # A sample in its place whose reading cannot be used advances the place of the single learner.
+        without: Any = _Sample(sample.seq, sample.t_s, sample.u_V, 0.0)
+        return DOUBT if gates.check_sample(a, g, without, dt_s) == "" else _number_of(refused)
+    if sample.seq != g.seq + 1:
+        return DOUBT
+    gates.watch_voltage(a, g, sample.u_V, f.span_V)
+    _note_taken(g, sample, 1)
+    stuck = gates.watch_reading(g, sample.u_V, sample.y_um, f.span_V)
+    innovation = (sample.y_um - s.x[b, 0]) / f.range_um
+    known = g.since_start > a.settle
+    if stuck or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
+        return DOUBT
+    if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
+        return DOUBT
+    gates.watch_innovation(a, g, innovation)
+    r["until_control"] -= 1
+    return DOUBT if known and f.tells and r.until_control <= 0 and control else TEACHES
+
+
+@compiled
+def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
+    """`Intake.advance`: one step of the smoother, and of the hysteresis memory in both frames."""
+    r, slots = s.numbers[b], s.voltages.shape[1]
+    _note_step(r.gates)
+    r["calm"] += 1
+    s.past_voltages[b, r.past_written % s.past_voltages.shape[1]] = u_V
+    r["past_written"] += 1
+    if r.past_count > 0 and r.past_written - s.past_from[b, 0] > MOST_BRIDGED:
+        # At rest nothing is checked, and the present place is as good as the past one.
+        _remember_place(s, b, True)
+    slot, motion = r.count % slots, s.motion[b]
+    s.readings[b, slot], s.voltages[b, slot], s.good[b, slot] = y_um, u_V, True
+    smooth_one(y_um, r.count, s.x[b], s.ring[b], c.transition, c.gain, c.lag_gains, motion)
+    r["count"] += 1
+    for i in range(3):
+        motion[i] *= c.output_scale[i]
+    advance(motion[0], s.memory[b], _map(c, b, s.frames))
+    advance(motion[0], s.frozen_memory[b], _map(c, b, c.features.frame))
+
+
+@compiled
+def _instant(s: Rows, b: int) -> tuple[int, int, bool, bool]:
+    """The smoothed instant: its number and slot, whether its readings are good, and whether others nearby are not."""
+    slots = s.voltages.shape[1]
+    now = s.numbers[b].count + 1 - slots
+    clean = True
+    for i in range(slots):
+        clean = clean and s.good[b, i]
+    return now, now % slots, clean or (s.good[b, now % slots] and s.good[b, (now - 1) % slots]), not clean
+
+
+@compiled
+def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, given: Samples, w: Work) -> None:
+    """Intake of one sample of each of ``axes``; the first gates of what it teaches."""
+    config, slots = c.config[0], s.voltages.shape[1]
+    for k in range(lo, hi):
+        b = axes[k]
+        w.kept[b] = s.numbers[b]
+        sample: Any = _Sample(given.seq[b], given.t_s[b], given.u_V[b], given.y_um[b])
+        w.outcome[b] = _admit(s, c, b, sample, given.controls[b])
+        if w.outcome[b] != TEACHES:
+            s.numbers[b] = w.kept[b]
+            continue
+        _advance(s, c, b, sample.u_V, sample.y_um)
+        now, at, good, _ = _instant(s, b)
+        motion = s.motion[b]
+        refused = gates.check_pair(config.admission, s.voltages[b, at], s.voltages[b, (now - 1) % slots], motion[0])
+        if gates.settling(config.admission, s.numbers[b].gates):
+            refused = gates.SETTLING
+        elif not good:
+            refused = gates.GLITCH
+        due = now % config.filter_every == 0 or now % config.learn_every == 0
+        if not due or (refused != "" and refused != gates.SATURATED):
+            w.outcome[b] = _number_of(refused if refused != "" else gates.PASSED)
+            continue
+        fill(motion[0], motion[1], motion[2], s.memory[b], _map(c, b, s.frames), w.basis[b], s.point[b])
+
+
+@compiled
+def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fixed, w: Work) -> None:
+    """What the samples of ``axes`` teach, all but the steps of the windows; ``kernel_V`` : their predictions, V."""
+    config, p, d = c.config[0], s.beta.shape[1], s.point.shape[1]
+    basis, kernel, gain, row = np.empty(p), np.empty(d), np.empty(p), np.empty(p)
+    for k in range(lo, hi):
+        b = axes[k]
+        r, f, h, motion = s.numbers[b], c.axis[b], w.basis[b], s.motion[b]
+        now, at, _, near_bad = _instant(s, b)
+        u, before = s.voltages[b, at], s.voltages[b, (now - 1) % s.voltages.shape[1]]
+        saturated = gates.check_pair(config.admission, u, before, motion[0]) != ""
+        w.kept[b] = r
+        w.lets_go[b] = w.learns[b] = False
+        w.outcome[b] = _SATURATED if saturated else _number_of(gates.PASSED)
+        rests = gates.at_rest(config.admission, r.gates, motion[0], r.count, f.range_um, config.dt_s)
+        w.weights[b] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
+        if now % config.filter_every == 0:
+            target = u - kernel_V[k]
+            if not isfinite(target):
+                w.outcome[b] = _NUMERICS
+                continue
+            fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
+            _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
+            frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
+            if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
+                s.numbers[b] = w.kept[b]
+                w.outcome[b] = ODD
+                continue
+            if saturated:
+                continue
+            if r.frozen:
+                w.outcome[b] = _FROZEN
+                continue
+            weight = w.weights[b]
+            said = update(
+                config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
+                target, not rests, weight, gain, row,
+            )  # fmt: skip
+            if said == "outlier":
+                w.outcome[b] = _OUTLIER
+                continue
+            if said == "burst":
+                r["changed"], r["next"] = r.clock, 0
+            w.lets_go[b] = r.judgement.valid and r.next != NOWHERE
+            if rests:
+                shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
+                r["offset_um"] += shift_um
+                s.frames[b, 0] = r.offset_um
+            else:
+                _leave_rest(r.rest)
+            w.outcome[b] = _UNEXCITED if rests else _LEARNT
+        if now % config.learn_every == 0 and not (saturated or rests or r.frozen) and r.judgement.valid:
+            w.learns[b], w.targets[b] = True, u - dot(h, s.beta[b], p)
+            for i in range(3):
+                s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
+                s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
+
+
+@compiled
+def _finds_fault(
+    s: Rows, c: Fixed, b: int, h: FloatArray, target: float, u: float, frozen_V: float, saturated: bool, checks: bool
+) -> bool:
+    """Errors of the models as they were served, all checks, and marks (`Parts.judge`, `Learner._check`).
+
+    True where the learner has to return to an earlier estimate, to the identified model, or to a trial of the sensor.
+    """
+    r, f, config, p = s.numbers[b], c.axis[b], c.config[0], h.size
+    j, span_V, size = r.judgement, f.span_V, s.delay.shape[1]
+    s.delay[b, r.delay_count % size] = s.beta[b]
+    r["delay_count"] += 1
+    served_V = dot(h, s.delay[b, max(r.delay_count - size + 1, 0) % size], p)
+    _judge(j, target - served_V, u - frozen_V, config.step_s)
+    _is_valid(j, config.valid_enter * span_V, config.valid_leave * span_V)
+    before = j.fallback
+    r["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
+    fault = j.fallen_s > learner.ROLLBACK_S
+    confirms = places = False
+    if checks:
+        away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
+        outside = f.allowed_V > 0.0 and away_V > f.allowed_V
+        r["left_s"] = learner.time_outside(r.left_s, outside, config.check_s)
+        r["rail_s"] = learner.time_at_rail(r.rail_s, saturated, config.check_s)
+        fault = fault or (outside and r.left_s >= learner.RAIL_S)
+        fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
+        if not saturated:
+            r["confirmed"] = False
+            if f.tells and r.credit > 0:
+                fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
+                fault = _follow(r.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
+                r["confirmed"] = r.following.good >= CONFIRMED or r.past_count == 0
+            places = r.confirmed
+        confirms = r.confirmed
+    if fault:
+        return True
+    if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
+        _mark(s, b)
+    if confirms:
+        newer = int(s.confirmed_ages[b, 1] >= s.confirmed_ages[b, 0])
+        _copy_mark(s, b, 2 + newer, 2)
+        s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
+        s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
+    if places:
+        _count_again(r.following)
+        _remember_place(s, b, False)
+    return False
+
+
+@compiled
+def _mark(s: Rows, b: int) -> None:
+    """A good estimate becomes the next mark; see `Parts.judge`."""
+    _copy_mark(s, b, 1, 0)
+    s.marks[b, 1], s.mark_covariances[b, 1] = s.beta[b], s.covariance[b]
+    s.mark_ages[b, 0], s.mark_ages[b, 1] = s.mark_ages[b, 1], s.numbers[b].judgement.judged
+    if s.confirmed_ages[b, 0] < s.mark_ages[b, 0]:
+        _copy_mark(s, b, 0, 2)
+        s.confirmed_ages[b, 0] = s.mark_ages[b, 0]
+
+
+@compiled
+def _copy_mark(s: Rows, b: int, source: int, target: int) -> None:
+    s.marks[b, target], s.mark_covariances[b, target] = s.marks[b, source], s.mark_covariances[b, source]
+
+
+@compiled
+def memory_now(s: Rows, c: Fixed, frozen: BoolArray, out: FloatArray) -> None:
+    """(B, m) memory at the last reading: the smoothed one, carried along the readings since; see `Track.memory_now`."""
+    slots, lag = s.readings.shape[1], s.readings.shape[1] - 2
+    readings = np.empty(lag)
+    for b in range(out.shape[0]):
+        for i in range(lag):
+            readings[i] = s.readings[b, (s.numbers[b].count - lag + i) % slots]
+        out[b] = s.frozen_memory[b] if frozen[b] else s.memory[b]
+        track_memory(readings, out[b], _map(c, b, c.features.frame if frozen[b] else s.frames))

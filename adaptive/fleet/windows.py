@@ -1,0 +1,134 @@
+"""The windows of all axes on the processor: the single learner's own compiled steps, in loops over the axes.
+
+A step of a window reads and writes one triangle once, which operations of torch cannot do; that is why the processor
+has this form. Some threads share the axes. Each axis is stepped by one of them, so the result does not depend on their
+number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from adaptive.compiled import compiled
+from adaptive.fleet.state import Fixed, Rows
+from adaptive.online import kernel_window as window
+from adaptive.types import FloatArray, IntArray
+from adaptive.window import arrays as ws
+from adaptive.window import steps
+from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
+
+#: Fewest axes for which a second thread is worth its wake-up.
+_LEAST_AXES = 16
+
+
+class Threads:
+    """Some threads that share a loop over axes; for several callers at once."""
+
+    def __init__(self, count: int) -> None:
+        self._pool = ThreadPoolExecutor(count - 1, "fleet") if count > 1 else None
+        self._count = count
+
+    def share(self, count: int, work: Callable[..., None], *arguments: object) -> None:
+        """``work(lo, hi, ...)`` over ``count`` axes, in parts on the threads."""
+        parts = max(1, min(self._count, count // _LEAST_AXES))
+        ends = [count * i // parts for i in range(parts + 1)]
+        pool = self._pool
+        others = [pool.submit(work, ends[i], ends[i + 1], *arguments) for i in range(1, parts)] if pool else []
+        work(0, ends[1], *arguments)
+        for one in others:
+            one.result()
+
+
+class Step(NamedTuple):
+    """One sample for each of k windows: points (k, d), targets in V and noise weights (k,).
+
+    step_s : time between two steps. fifo : whether the oldest sample makes way.
+    """
+
+    points: FloatArray
+    targets: FloatArray
+    weights: FloatArray
+    step_s: float
+    fifo: bool
+
+
+@compiled
+def _predict(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, out: FloatArray) -> None:
+    for k in range(lo, hi):
+        out[k] = steps.predict(arrays_of(handles[axes[k]]), s.point[axes[k]])
+
+
+@compiled
+def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step: Step, out: IntArray) -> None:
+    """`ResidualWindow.learn` and ``fade`` of each axis."""
+    for k in range(lo, hi):
+        b = axes[k]
+        A, r = arrays_of(handles[b]), s.numbers[b]
+        empty = A.C[COUNT] == 0
+        status = window.learn(A, r, step.points[k], step.targets[k], step.weights[k], s.born[b], s.own[b], step.fifo)
+        # An empty window has nothing that a new factorisation could mend.
+        out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
+        window.fade(A, r, c.config[0].weights, step.step_s, s.born[b], s.own[b])
+
+
+@compiled
+def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step_s: float) -> None:
+    """`ResidualWindow.fade` of each axis."""
+    for k in range(lo, hi):
+        b = axes[k]
+        window.fade(arrays_of(handles[b]), s.numbers[b], c.config[0].weights, step_s, s.born[b], s.own[b])
+
+
+@compiled
+def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: float) -> None:
+    """`ResidualWindow.let_go` of each axis."""
+    for k in range(lo, hi):
+        b = axes[k]
+        window.let_go(arrays_of(handles[b]), s.numbers[b], most, s.born[b], s.own[b])
+
+
+class CompiledWindows:
+    """Windows of B axes, stepped by compiled code. ``axes`` (k,) are numbers of axes, without repeats."""
+
+    #: Whether ``arrays`` gives the state itself, not a copy.
+    shares = True
+
+    def __init__(self, rows: Rows, fixed: Fixed, example: WindowArrays, threads: Threads) -> None:
+        B = rows.x.shape[0]
+        self._rows, self._fixed, self._threads = rows, fixed, threads
+        self._all = {name: np.zeros((B, *field.shape), field.dtype) for name, field in example._asdict().items()}
+        self._views = [WindowArrays(**{name: field[b] for name, field in self._all.items()}) for b in range(B)]
+        self._handles = np.array([ws.handle_of(view) for view in self._views])
+
+    def arrays(self, axis: int) -> WindowArrays:
+        """The solver's state of an axis: views, stepped in place by whoever has them."""
+        return self._views[axis]
+
+    def put(self, axis: int, arrays: WindowArrays) -> None:
+        """Take over the state of a solver; nothing where it is the axis' own."""
+        if arrays is not self._views[axis]:
+            ws.take_over(self._views[axis], arrays)
+
+    def samples(self) -> dict[str, FloatArray]:
+        """The windows' arrays by name; views."""
+        return self._all
+
+    def predict(self, axes: IntArray) -> FloatArray:
+        """(k,) kernel parts, V, at the present points of ``axes``."""
+        out = np.empty(axes.size)
+        self._threads.share(axes.size, _predict, self._handles, axes, self._rows, out)
+        return out
+
+    def learn(self, axes: IntArray, step: Step) -> IntArray:
+        """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
+        out = np.empty(axes.size, dtype=np.int64)
+        self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, step, out)
+        return out
+
+    def let_go(self, axes: IntArray, most: float) -> None:
+        """`ResidualWindow.let_go` of each axis."""
+        self._threads.share(axes.size, let_go, self._handles, axes, self._rows, most)

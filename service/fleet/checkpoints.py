@@ -1,0 +1,91 @@
+"""Checkpoints of a fleet: one file for each axis, in the format of a single learner's (docs/protocol.md).
+
+The axes are written in turn, so that each is once in a period; a file replaces the axis' last one. The learner of such
+a file and that of an axis of its own are the same entries. Numbers of samples are not continued: after a restart an
+axis takes its next sample whatever its number.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from pathlib import Path
+
+from adaptive.errors import DehystError
+from adaptive.fleet.fleet import Fleet
+from adaptive.types import StateDict, prefixed, under
+from service.storage.checkpoint import SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
+from service.storage.output import atomic_write
+from service.storage.segments import claim
+
+
+class FleetCheckpoints:
+    """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet``.
+
+    Raises BlockingIOError where another process writes into the folder.
+    """
+
+    def __init__(self, fleet: Fleet, directory: Path, stage: str, instance: str, period_s: float) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self._lock = claim(directory, ".lock-checkpoints", "keeps its checkpoints in")
+        self._fleet, self._directory, self._names = fleet, directory, (stage, instance)
+        self._step_s = period_s / fleet.axes
+        self._axis, self._due_s = 0, time.monotonic()
+        self._queue: queue.Queue[tuple[int, CheckpointMeta, StateDict] | None] = queue.Queue(maxsize=2)
+        self.counts = {"written": 0, "errors": 0, "restored": 0, "refused": 0}
+        self._thread = threading.Thread(target=self._run, name="checkpoints-fleet", daemon=True)
+        self._thread.start()
+
+    def restore(self) -> None:
+        """Continue each axis from its file; what does not fit is counted, and its axis begins with its model."""
+        stage, dt_s = self._names[0], self._fleet.bases[0].dt_s
+        for axis in range(self._fleet.axes):
+            if not self._path(axis).exists():
+                continue
+            try:
+                meta, state = decode_checkpoint(self._path(axis).read_bytes())
+                meta.refuse_unless(stage, str(axis), dt_s)
+                self._fleet.load_axis(axis, under("learner.", state), anew=True)
+                self.counts["restored"] += 1
+            except (OSError, DehystError):
+                self.counts["refused"] += 1
+
+    def write_due(self) -> None:
+        """Copy the axes that are due, in the thread that learns; fewer where the disk is slower."""
+        while time.monotonic() >= self._due_s and not self._queue.full():
+            self._copy(self._axis)
+            self._axis = (self._axis + 1) % self._fleet.axes
+            self._due_s += self._step_s
+        self._due_s = max(self._due_s, time.monotonic() - self._step_s)
+
+    def close(self) -> None:
+        """Write all axes once more and end the thread."""
+        for axis in range(self._fleet.axes):
+            self._copy(axis)
+        self._queue.put(None)
+        self._thread.join()
+        self._lock.close()
+
+    def _copy(self, axis: int) -> None:
+        learner, (stage, instance) = self._fleet.learner_of(axis), self._names
+        if learner.seq < 0:
+            return
+        meta = CheckpointMeta(
+            stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, sum(learner.parts.counters.values()), time.time(),
+            instance,
+        )  # fmt: skip
+        self._queue.put((axis, meta, learner.state_dict()))
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            axis, meta, state = item
+            try:
+                with atomic_write(self._path(axis)) as file:
+                    file.writelines(encode_checkpoint(meta, prefixed("learner.", state)))
+                self.counts["written"] += 1
+            except OSError:
+                self.counts["errors"] += 1
+
+    def _path(self, axis: int) -> Path:
+        return self._directory / f"axis-{axis:04d}{SUFFIX}"
