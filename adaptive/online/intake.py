@@ -278,15 +278,15 @@ class Intake:
     def _after_gap(self, sample: Sample, missing: int, model: Model) -> Taken:
         """Begin smoothing anew after ``missing`` samples, 0 for an unknown number, or at the first sample."""
         track, earlier = self.track, self.missing
+        from_um = sample.y_um if track is None else track.last_um
         taken = self._restart(sample, admission.GAP if missing else admission.SETTLING)
         if track is None or not track.served.memory_size:
             return taken
         seconds = (missing + 1) * self.dt_s if missing else UNKNOWN_S
-        before, model_now = track.memory if earlier is None else earlier.members, self._of_track(track, model())
         self.missing = gap = MissingMotion.begin(
-            model_now, before, track.last_um, sample.y_um, sample.u_V, seconds, self._recent_V
-        )
-        gap.moved_s = 0.0 if earlier is None else earlier.moved_s
+            self._of_track(track, model()), track.memory, from_um, sample.y_um, sample.u_V, seconds,
+            self._recent_V, earlier,
+        )  # fmt: skip
         track.remember(gap.memory)
         return taken
 
@@ -301,16 +301,14 @@ class Intake:
         if pair.now % every:
             return not gap.rests
         if self.rests(pair.y_um):
-            gap.rests = True
+            gap.stand()
             return False
-        if gap.rests:
-            gap.rests, gap.model = False, self._of_track(track, model())
+        gap.move(lambda: self._of_track(track, model()), every * self.dt_s)
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
         if pair.good and not admission.check_pair(self._admission, pair.u_V, pair.u_before_V, pair.y_um):
             # The smoother's first instants are worse: it does not know the velocity when it begins.
             gap.correct(motion, pair.u_V, min(1.0, (gap.since / (2 * track.lag)) ** 2))
             track.remember(gap.memory)
-        gap.moved_s += every * self.dt_s
         if pair.now // every % PROBE_EVERY == 0:
             gap.compare(motion)
             if gap.closed:

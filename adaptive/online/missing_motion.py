@@ -14,6 +14,7 @@ of the model.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -76,10 +77,11 @@ class MissingMotion:
         u_V: float,
         seconds: float,
         noise_V: float,
+        earlier: MissingMotion | None = None,
     ) -> MissingMotion:
         """Between two readings, µm, that are ``seconds`` apart; ``u_V`` : voltage of the second one.
 
-        ``memory`` : (m,) at the first one, or (c, m) where an earlier gap is still open.
+        ``memory`` : (m,) at the first one. ``earlier`` : a gap that was still open there.
         """
         top_um, bottom_um = max(from_um, to_um), min(from_um, to_um)
         fastest = float(np.max(np.abs(model.domain[2:4])))
@@ -88,7 +90,7 @@ class MissingMotion:
         below = min(reach_um, max(0.0, bottom_um - float(model.domain[0])))
         turns = [(top_um + up * above, bottom_um - down * below) for up in TURNS for down in TURNS]
         paths = [*turns, *((low, high) for high, low in turns)]
-        before = np.atleast_2d(memory)
+        before = memory[np.newaxis] if earlier is None else earlier.members
         arrays = model.features.arrays
         # A path has fewer points than samples are missing: the slow states relax by several samples in each step.
         arrays = arrays._replace(retain=arrays.retain ** (seconds / model.dt_s / PATH_POINTS))
@@ -97,7 +99,8 @@ class MissingMotion:
             # An earlier gap's members are dealt out so that like ones do not get like paths.
             members[i] = before[(7 * i + 3) % before.shape[0]]
             track_memory(_path(from_um, first, second, to_um), members[i], arrays)
-        made = cls(model, members, max(NOISE_FACTOR * noise_V, LEAST_SHARE * model.span_V))
+        noise_V = max(NOISE_FACTOR * noise_V, LEAST_SHARE * model.span_V)
+        made = cls(model, members, noise_V, moved_s=0.0 if earlier is None else earlier.moved_s)
         _correct(to_um, 0.0, 0.0, u_V, (FIRST_SHARE * model.span_V) ** 2, members, *model.packed)
         made.compare((to_um, 0.0, 0.0))
         return made
@@ -112,6 +115,16 @@ class MissingMotion:
         """All members follow one smoothed place, µm."""
         _advance_all(y_um, self.members, *self.model.packed)
         self.since += 1
+
+    def stand(self) -> None:
+        """The stage is at rest: the learner learns the zero, and the memory stays as it is."""
+        self.rests = True
+
+    def move(self, model: Callable[[], LssvmInverse], step_s: float) -> None:
+        """The stage has moved for ``step_s``; ``model`` returns the model with what was learnt at rest."""
+        if self.rests:
+            self.rests, self.model = False, model()
+        self.moved_s += step_s
 
     def correct(self, motion: tuple[float, float, float], u_V: float, weight: float) -> None:
         """Correct the members, advanced to ``motion`` (µm, µm/s, µm/s²), by the voltage there. ``weight`` : 0 to 1."""
