@@ -35,7 +35,11 @@ def advice(package: str, extras: tuple[str, ...] = ()) -> str:
     bring = extras or tuple(extra for extra, packages in PACKAGES.items() if package in packages)
     if not bring:
         return ""
-    return f"needs the package {package}, which is not installed here: pip install 'dehyst[{','.join(bring)}]'"
+    extra = f"[{','.join(bring)}]"
+    return (
+        f"needs the package {package}, which is not installed here: pip install 'dehyst{extra}' "
+        f"(from a wheel: pip install 'dehyst-VERSION-py3-none-any.whl{extra}')"
+    )
 
 
 def _is_there(package: str) -> bool:
