@@ -19,7 +19,7 @@ PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/base
 # Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
 PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py) \
           $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
-          viewer/test_sink.py viewer/test_live.py operating security server/test_process.py storage/test_recorder.py \
+          viewer/test_sink.py viewer/test_live.py operating security server/test_process.py server/test_gap_live.py storage/test_recorder.py \
           stage_node fleet adapters client/test_fair.py client/test_thin.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab

@@ -12,7 +12,7 @@ from service.cli.main import main as run
 
 
 def _experiment(module: str, help_line: str, *extras: str) -> Command:
-    return Command(f"lab.commands.{module}", EXPERIMENTS, help_line, (LAB, *extras))
+    return Command(f"lab.commands.{module}", EXPERIMENTS, help_line, (LAB, *extras), compiles=True)
 
 
 COMMANDS: Final[dict[str, Command]] = {

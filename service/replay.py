@@ -3,6 +3,8 @@
 Prequential: every block of samples is first predicted, by the snapshot that a controller would have been answered from
 (``age_s`` old when the block begins), and then learnt. The prediction is the voltage that makes the measured motion;
 the motion is the recording's own, smoothed with zero phase.
+
+After a gap the memory is the learner's, as for a query live. What is predicted from before the gap is not scored.
 """
 
 from __future__ import annotations
@@ -14,12 +16,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.errors import InputError
+from adaptive.online.gates import GAP
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig, LearnerSettings
@@ -114,7 +117,6 @@ def replay(
         )
     if not 0.0 <= age_s <= 10.0:
         raise InputError(f"age_s: got {age_s:g}, expected 0 to 10 s")
-    # The hysteresis memory goes on through a gap, as it does live: along a straight line, which is what is known.
     seq, whole = sequence(recording), repaired(recording, longest_fill=LONGEST_BRIDGED)
     grid = whole.recording
     motion = motion_of(grid)
@@ -122,8 +124,10 @@ def replay(
     ends = _row_ends(recording, float(grid.t_s[0]), n, size)
     frozen = axis.newest.models[name]
     # Newest last; the first entry predicts the block.
-    ring: deque[tuple[int, InverseModel]] = deque([(-1 - age, frozen)])
+    ring: deque[_Snapshot] = deque([_Snapshot(-1 - age, frozen, ())])
     memories = [frozen.rest_memory(float(motion[0, 0]))] * 2
+    # The first sample after the last gap, and the end of the blocks that take their memory from the learner after it.
+    after_gap, until, restarts = 0, 0, 1
     error_V, std_V = np.full((2, n), np.nan), np.full(n, np.nan)
     names: dict[str, int] = {}
     gate = np.zeros(len(recording), dtype=np.int16)
@@ -132,23 +136,37 @@ def replay(
     row, told = 0, axis.learner.diagnostics
     for block, stop_row in enumerate(ends):
         part = slice(block * size, min(n, (block + 1) * size))
-        while len(ring) > 1 and ring[1][0] <= part.start - age:
+        while len(ring) > 1 and ring[1].stop <= part.start - age:
             ring.popleft()
+        known = ring[0].stop > after_gap
+        if part.start < until and known:
+            way = slice(ring[0].stop, part.start)
+            pairs = zip((ring[0].model, frozen), ring[0].memories, strict=True)
+            memories = [_carried(model, memory, motion[way], grid.u_V[way]) for model, memory in pairs]
         if part.start < n:
-            y_um, v_um_per_s, a_um_per_s2 = (np.ascontiguousarray(motion[part, i]) for i in range(3))
-            for i, model in enumerate((ring[0][1], frozen)):
-                forward = model.feedforward(y_um, v_um_per_s, a_um_per_s2, memories[i])
-                error_V[i, part] = forward.u_V - grid.u_V[part]
-                memories[i] = forward.memory
-                if i == 0:
-                    std_V[part] = forward.std_V
+            models = ring[0].model, frozen
+            error_V[:, part], std_V[part], memories = _foretold(models, memories, motion[part], grid.u_V[part])
+        if part.start < until and not known:
+            # Foretold from before the gap: how the stage moved in it was not known.
+            error_V[:, part] = np.nan
         before = axis.newest.seq
         for verdict in feed(axis, recording, seq, row, stop_row):
             gate[row] = names.setdefault(verdict, len(names))
+            if verdict == GAP and part.start < until:
+                until = part.stop + age + size
             row += 1
+        began = axis.learner.counters().get("restarts", 0)
+        if began > restarts:
+            # The learner has lost the track, and takes its memory from the samples that follow.
+            restarts, after_gap, until = began, part.start, part.stop + age + size
+            error_V[:, part] = np.nan
         if axis.newest.seq != before:
             on_snapshot(axis.newest.seq, axis.newest.models[name])
-            ring.append((part.stop, axis.newest.models[name]))
+            tracked = axis.newest.memories[name]
+            at_start = axis.learner.memory_for(frozen)
+            ring.append(
+                _Snapshot(part.stop, axis.newest.models[name], (tracked, tracked if at_start is None else at_start))
+            )
         note_t_s.append(float(grid.t_s[min(part.stop, n) - 1]))
         # Some of what a learner tells is more than a number, such as the places of its samples.
         notes.append({key: float(value) for key, value in told().items() if np.ndim(value) == 0})
@@ -173,6 +191,31 @@ def replay(
         counters=counters,
         repaired=whole.done,
     )
+
+
+class _Snapshot(NamedTuple):
+    """A snapshot as it was published: the next sample, the model, and the memories of it and of the first one."""
+
+    stop: int
+    model: InverseModel
+    memories: tuple[FloatArray, ...]
+
+
+def _carried(model: InverseModel, memory: FloatArray, motion: FloatArray, u_V: FloatArray) -> FloatArray:
+    """(m,) memory of a model after (k, 3) more points of the motion; the same where there are none."""
+    if not u_V.size:
+        return memory
+    y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
+    return model.track(y, v, a, u_V, memory)
+
+
+def _foretold(
+    models: tuple[InverseModel, InverseModel], memories: list[FloatArray], motion: FloatArray, u_V: FloatArray
+) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+    """(2, k) errors of two models over (k, 3) points of the motion, (k,) deviations of the first, memories after it."""
+    y, v, a = (np.ascontiguousarray(motion[:, i]) for i in range(3))
+    forward = [model.feedforward(y, v, a, memory) for model, memory in zip(models, memories, strict=True)]
+    return np.array([f.u_V - u_V for f in forward]), forward[0].std_V, [f.memory for f in forward]
 
 
 def _row_ends(recording: Recording, start_s: float, n: int, size: int) -> list[int]:

@@ -1,5 +1,7 @@
 """Compile every loop once, so that no process compiles at its start: ``python -m service.warm``.
 
+A checkout does it at set-up. Installed from a wheel, the first command that needs the loops does it (`at_first_use`).
+
 It also writes the bytecode of all sources, even where Python is configured to write none, which saves 0.2 s of each
 start. numba keeps its machine code on disk beside the sources. Its cache checks the file of a function, not the files
 of the functions that it calls. So this module compares the digest of all sources, and compiles all when one changes.
@@ -9,10 +11,13 @@ from __future__ import annotations
 
 import compileall
 import hashlib
+import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TextIO
 
 PACKAGES = ("adaptive", "baselines", "sim", "service", "lab")
 #: Modules with a ``warm()``. One process compiles each group, all at the same time.
@@ -41,28 +46,61 @@ def make_bytecode(root: Path) -> list[str]:
     return [name for name in PACKAGES if not compileall.compile_dir(root / name, quiet=1)]
 
 
+#: Names of the folders that pip installs into.
+_INSTALLED = ("site-packages", "dist-packages")
+#: Compiled loops of a whole installation, for the progress; a little more or less does not matter.
+_LOOPS = 150
+_ROOT = Path(__file__).resolve().parents[1]
+
+
+def at_first_use(root: Path = _ROOT) -> None:
+    """Compile where this is an installed package whose loops have not been compiled; says so on stderr.
+
+    Where its folder cannot be written to, numba compiles each loop for the user when it is called.
+    """
+    if root.name in _INSTALLED and os.access(root / "service", os.W_OK):
+        compile_all(root, sys.stderr)
+
+
 def main() -> int:
     """Call each ``warm()``, unless no source has changed since the last time. Returns the exit status."""
-    root = Path(__file__).resolve().parents[1]
+    return compile_all(_ROOT, sys.stdout)
+
+
+def compile_all(root: Path, out: TextIO) -> int:
+    """Call each ``warm()`` below ``root``, unless no source has changed. Tells ``out``; returns the exit status."""
     stamp = root / "service" / "__pycache__" / "compiled.sha256"
     now = digest(root)
     if stamp.exists() and stamp.read_text() == now:
         return 0
     forget(root)
     start = time.perf_counter()
-    print("compiling the loops, once (a minute or two) ...", flush=True)
+    print("compiling the loops, once (a minute or two) ...", file=out, flush=True)
     children = [
         subprocess.Popen([sys.executable, "-c", "".join(f"import {m}; {m}.warm();" for m in group)], cwd=root)
         for group in GROUPS
     ]
-    failed: list[object] = [*make_bytecode(root), *(child.args for child in children if child.wait() != 0)]
+    failed: list[object] = list(make_bytecode(root))
+    if out.isatty():
+        _show_progress(root, children, out)
+    failed += [child.args for child in children if child.wait() != 0]
     if failed:
         print(f"service.warm: compiling failed: {failed}", file=sys.stderr)
         return 1
     stamp.parent.mkdir(exist_ok=True)
     stamp.write_text(now)
-    print(f"compiled in {time.perf_counter() - start:.0f} s", flush=True)
+    print(f"compiled in {time.perf_counter() - start:.0f} s", file=out, flush=True)
     return 0
+
+
+def _show_progress(root: Path, children: Sequence[subprocess.Popen[bytes]], out: TextIO) -> None:
+    """A bar that grows with the machine code on the disk, until all ``children`` have ended."""
+    while any(child.poll() is None for child in children):
+        done = sum(1 for package in PACKAGES for _ in (root / package).rglob("*.nbi"))
+        bar = "#" * min(30, 30 * done // _LOOPS)
+        print(f"\r  [{bar:<30}] {done} loops", end="", file=out, flush=True)
+        time.sleep(0.5)
+    print(file=out)
 
 
 if __name__ == "__main__":

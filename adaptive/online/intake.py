@@ -25,6 +25,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slope
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
+from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
 from adaptive.online.sensor_trust import CONFIRMED, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother, smoother_of
@@ -107,10 +108,12 @@ class Intake:
         self.smoother = smoother_of(config.smoother(self.dt_s))
         self.gates = admission.AdmissionState()
         self.track: Track | None = None
-        self._doubt_V = 0.0  # Standard deviation of the model's predictions as of the last sample, V.
+        # Standard deviation of the model's predictions as of the last sample, V; that of the most recent ones.
+        self._doubt_V = self._recent_V = 0.0
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.confirmed = False
+        self.missing: MissingMotion | None = None
         self._look_every = max(1, round(LOOK_S / self.dt_s))
         self._least_um = LAGS_SHARE * self.range_um
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
@@ -183,12 +186,13 @@ class Intake:
 
     # ---- what a sample is
 
-    def take(self, sample: Sample, model: Model, doubt_V: float) -> Taken:
+    def take(self, sample: Sample, model: Model, doubt_V: float, recent_V: float) -> Taken:
         """Judge one sample; ``model`` returns the served model, for dead reckoning if needed.
 
-        ``doubt_V`` : standard deviation of the model's predictions, V. Never raises on data.
+        ``doubt_V`` : standard deviation of the model's predictions, V; ``recent_V`` : of the most recent ones. Never
+        raises on data.
         """
-        self._doubt_V = doubt_V
+        self._doubt_V, self._recent_V = doubt_V, recent_V
         c, gates, track = self._admission, self.gates, self.track
         refused = self._refusal(sample)
         if refused:
@@ -209,7 +213,7 @@ class Intake:
             if refused:
                 self._lost = True
                 return Taken(refused)
-            return self._restart(sample, admission.GAP if missing else admission.SETTLING)
+            return self._after_gap(sample, missing, model)
         for u in between:
             self._keep(track, model, u, nan)
         if refused:
@@ -224,7 +228,7 @@ class Intake:
         if self._hold is None and not doubtful:
             admission.watch_innovation(c, gates, innovation)
             self._until_control -= 1
-            if known and (self._control is not None or self._until_control <= 0):
+            if known and self.missing is None and (self._control is not None or self._until_control <= 0):
                 self._check_model(track, sample, model)
             return Taken("", (Step(sample.y_um, sample.u_V),))
         # Dead reckoning knows the motion that a kink of the voltage causes; only the smoother does not.
@@ -256,8 +260,49 @@ class Intake:
         self._hold, self._lost = None, True
         return Taken(refused)
 
+    def _after_gap(self, sample: Sample, missing: int, model: Model) -> Taken:
+        """Begin smoothing anew after ``missing`` samples, 0 for an unknown number, or at the first sample."""
+        track, earlier = self.track, self.missing
+        from_um = sample.y_um if track is None else track.last_um
+        taken = self._restart(sample, admission.GAP if missing else admission.SETTLING)
+        if track is None or not track.served.memory_size:
+            return taken
+        seconds = (missing + 1) * self.dt_s if missing else UNKNOWN_S
+        self.missing = gap = MissingMotion.begin(
+            self._of_track(track, model()), track.memory, from_um, sample.y_um, sample.u_V, seconds,
+            self._recent_V, earlier,
+        )  # fmt: skip
+        track.remember(gap.memory)
+        return taken
+
+    def recall(self, pair: Pair, model: Model, every: int) -> bool:
+        """After a gap: correct the memory by a pair. Returns whether nothing may be learnt from it yet.
+
+        ``every`` : samples between two steps of the filter. At rest the zero is learnt on: the memory stays as it is.
+        """
+        gap, track = self.missing, self.track
+        assert gap is not None
+        assert track is not None
+        if pair.now % every:
+            return not gap.rests
+        if self.rests(pair.y_um):
+            gap.stand()
+            return False
+        gap.move(lambda: self._of_track(track, model()), every * self.dt_s)
+        motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
+        if pair.good and not admission.check_pair(self._admission, pair.u_V, pair.u_before_V, pair.y_um):
+            # The smoother's first instants are worse: it does not know the velocity when it begins.
+            gap.correct(motion, pair.u_V, min(1.0, (gap.since / (2 * track.lag)) ** 2))
+            track.remember(gap.memory)
+        if pair.now // every % PROBE_EVERY == 0:
+            gap.compare(motion)
+            if gap.closed:
+                self.missing = None
+        return self.missing is not None
+
     def _restart(self, sample: Sample, why: str) -> Taken:
         """Begin smoothing anew at a sample."""
+        self.missing = None
         self._hold, self._trial, self._lost = None, None, False
         self._proven_past = None
         self.gates.restart()
@@ -440,6 +485,7 @@ class Intake:
             self._proven = self._proven or f
             self.jumps += 1
         self.gates.note_jump()
+        self.missing = None
         track.move(frame, slope, shift_um)
         hold.take(slope, shift_um)
         self._forget()
@@ -486,7 +532,7 @@ class Intake:
                 self._proven_past.u_V.extend(() if self._hold is None else self._hold.u_V)
             track.enter(proven)
             self.undone += 1
-        self._hold, self._before, self._proven = None, None, None
+        self._hold, self._before, self._proven, self.missing = None, None, None, None
         self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump)
         self.trials += 1
         self._forget()
@@ -571,6 +617,7 @@ class Intake:
             or track.motion is None
             or track.features != track.served
             or self.holds
+            or self.missing is not None
             or self._control is not None
             or self._proven is not None
             or self._proven_past is not None
@@ -591,7 +638,11 @@ class Intake:
         if self._pasts and len(self._pasts[0].u_V) > hypotheses.MOST_BRIDGED:
             # At rest nothing is checked, and the present place is as good as the past one.
             self._pasts = [*self._pasts[1:], Past.of(self.track)] if self.track.motion else []
-        return self.track.advance(step)
+        advanced = self.track.advance(step)
+        if self.missing is not None and self.track.motion is not None:
+            self.missing.advance(self.track.motion[0])
+            self.track.remember(self.missing.memory)
+        return advanced
 
     def _note_voltage(self, u_V: float) -> None:
         """Note a voltage for the trial and for the place from before unconfirmed jumps."""
@@ -612,6 +663,7 @@ class Intake:
         if track is None or self.jumps == self.undone or track.served == self.base.features:
             return
         track.to_base()
+        self.missing = None
         self._before, self._hold, self._proven, self._proven_past = None, None, None, None
         self.undone += 1
 
@@ -669,6 +721,8 @@ class Intake:
             "look_from": self._look_from,
             "reckoned_seq": self._reckoned_seq,
         }
+        if self.missing is not None:
+            state |= prefixed("missing.", self.missing.state_dict())
         if self._control is not None:
             state |= prefixed("control.", self._control.state_dict())
         return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
@@ -679,6 +733,8 @@ class Intake:
         self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
         pasts = (under(f"past{i}.", state) for i in range(2))
         self._pasts = [Past.from_state(values) for values in pasts if values]
+        missing = under("missing.", state)
+        self.missing = MissingMotion.from_state(missing) if missing else None
         control = under("control.", state)
         self._control = Trial.from_state(control, self.base) if control else None
         self._credit = int(state.get("credit", FIRST_CREDIT))

@@ -27,6 +27,7 @@ from adaptive.online.gates import check_pair, new_counters
 from adaptive.online.glitch_or_jump import level_of
 from adaptive.online.intake import Intake
 from adaptive.online.kernel_window import ResidualWindow
+from adaptive.online.missing_motion import MissingMotion
 from adaptive.online.track import Pair
 from adaptive.types import (
     FloatArray,
@@ -126,6 +127,11 @@ class Judgement:
     def std_V(self) -> float:
         """Standard deviation of the learner's predictions, V: the larger of long and short term."""
         return sqrt(max(self.long_V2, self.short_V2))
+
+    @property
+    def recent_V(self) -> float:
+        """Rms error over the short term, V."""
+        return sqrt(self.short_V2)
 
     @property
     def variance_V2(self) -> float:
@@ -447,13 +453,24 @@ class Parts:
             beta[0] += by_V
         self.delay.shift(by_V)
 
+    @property
+    def missing_V2(self) -> float:
+        """Variance that the motion of missing samples leaves in the voltages, V²; 0 while none is open."""
+        missing = self.intake.missing
+        return 0.0 if missing is None else missing.std_V**2
+
+    @property
+    def variance_V2(self) -> float:
+        """Variance behind the stated uncertainty, V²."""
+        return self.judgement.variance_V2 + self.missing_V2
+
     def model(self) -> LssvmInverse:
         """The learnt model, immutable; the identified one while that predicts better."""
         base = self.intake.base
         j, window, seq = self.judgement, self.window, self.intake.gates.seq
         valid = j.valid and not self.intake.fault
         if j.fallback or self.alone:
-            return replace(base, noise_variance=j.frozen_short_V2, seq=seq, valid=valid)
+            return replace(base, noise_variance=j.frozen_short_V2 + self.missing_V2, seq=seq, valid=valid)
         support, alpha, bias = window.arrays()
         beta = self.filter.beta
         beta[0] += bias
@@ -466,7 +483,7 @@ class Parts:
             widths=np.array(window.hyper.widths),
             gamma=window.hyper.gamma,
             domain=self.domain,
-            noise_variance=j.variance_V2,
+            noise_variance=self.variance_V2,
             kernel_variance=window.kernel_variance,
             beta_covariance=np.empty((0, 0)),
             seq=seq,
@@ -579,6 +596,9 @@ def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
     readings = np.array([y, y])
     reckoning = Reckoning.begin(base, (y, 0.0, 0.0), 0.0, np.zeros(2), readings, base.rest_memory(y))
     reckoning.advance(0.0)
+    gap = MissingMotion.begin(base, base.rest_memory(y), y, y, 0.0, 1.0, 0.0)
+    gap.advance(y)
+    gap.correct((y, 0.0, 0.0), 0.0, 1.0)
     for drifts in (False, True):
         level_of(np.arange(8.0) % 3.0, 1.0, drifts)
     window.with_hyperparameters(window.hyper).newest_error_V(1)
@@ -661,7 +681,7 @@ class Learner:
 
     def _handle(self, sample: Sample) -> str:
         parts, intake = self.parts, self.parts.intake
-        taken = intake.take(sample, self.snapshot, parts.judgement.std_V)
+        taken = intake.take(sample, self.snapshot, parts.judgement.std_V, parts.judgement.recent_V)
         if taken.distrusted:
             self._go_on_without_readings(taken.undone)
         elif taken.undone:
@@ -671,6 +691,8 @@ class Learner:
         moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
         # An ordinary sample neither begins nor ends a trial of the sensor.
         if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
+            self._cache = None
+        if taken.refused == admission.GAP:
             self._cache = None
         outcome = taken.refused
         for step in taken.steps:
@@ -684,12 +706,11 @@ class Learner:
     def teach(self, pair: Pair) -> str:
         """Learn the pair at the smoothed instant, in filter and window, if the gates allow it."""
         c, parts, intake = self.config, self.parts, self.parts.intake
-        gates, track = intake.gates, intake.track
+        track = intake.track
         assert track is not None
-        if admission.settling(c.admission, gates):
-            return admission.SETTLING
-        if not pair.good:
-            return admission.GLITCH
+        waits = self._waits(pair)
+        if waits:
+            return waits
         refused = check_pair(c.admission, pair.u_V, pair.u_before_V, pair.y_um)
         # A saturated sample is not learnt, but it shows where the stage is, and so the error of the model.
         if refused and refused != admission.SATURATED:
@@ -732,6 +753,16 @@ class Learner:
             parts.widen_domain(motion)
         self._cache = None
         return outcome
+
+    def _waits(self, pair: Pair) -> str:
+        """The gate for which the pair is no measure of the model, or ""."""
+        c, intake = self.config, self.parts.intake
+        if intake.missing is not None and intake.recall(pair, self.snapshot, c.filter_every):
+            self._cache = None
+            return admission.GAP
+        if admission.settling(c.admission, intake.gates):
+            return admission.SETTLING
+        return "" if pair.good else admission.GLITCH
 
     def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
         """Check envelope, rails and sensor. Returns the gate that forbids learning, or ""."""
@@ -795,7 +826,7 @@ class Learner:
             return None
         frame = intake.served
         return MovingPart(
-            frame.gain, frame.offset_um, parts.filter.beta, parts.domain.copy(), j.variance_V2, intake.memory_now(),
+            frame.gain, frame.offset_um, parts.filter.beta, parts.domain.copy(), parts.variance_V2, intake.memory_now(),
             parts.window,
         )  # fmt: skip
 

@@ -146,6 +146,11 @@ class Track:
         """Where the smoother expects the next reading."""
         return self.state.x.item(0)
 
+    @property
+    def last_um(self) -> float:
+        """The last reading that was smoothed."""
+        return self.y_um.item((self.state.count - 1) % self.y_um.shape[0])
+
     def copy(self) -> Track:
         """An independent copy."""
         return Track(

@@ -45,7 +45,11 @@ def advice(package: str, extras: tuple[str, ...] = ()) -> str:
     bring = extras or tuple(extra for extra, packages in PACKAGES.items() if package in packages)
     if not bring:
         return ""
-    return f"needs the package {package}, which is not installed here: pip install 'dehyst[{','.join(bring)}]'"
+    extra = f"[{','.join(bring)}]"
+    return (
+        f"needs the package {package}, which is not installed here: pip install 'dehyst{extra}' "
+        f"(from a wheel: pip install 'dehyst-VERSION-py3-none-any.whl{extra}')"
+    )
 
 
 def _is_there(package: str) -> bool:
@@ -73,24 +77,28 @@ dehyst COMMAND --help lists the options of a command. Exit status: 0 done, 1 fai
 class Command(NamedTuple):
     """One command: a module with ``add_arguments(parser)`` and ``run(args) -> int``, its group, one line of help.
 
-    ``extras`` : of the installation, without which it cannot do its work.
+    ``extras`` : of the installation, without which it cannot do its work. ``compiles`` : whether it needs the compiled
+    loops from the start.
     """
 
     module: str
     group: str
     help: str
     extras: tuple[str, ...] = ()
+    compiles: bool = False
 
 
-def _command(module: str, group: str, help_line: str, *extras: str) -> Command:
-    return Command(f"service.cli.commands.{module}", group, help_line, extras)
+def _command(module: str, group: str, help_line: str, *extras: str, compiles: bool = False) -> Command:
+    return Command(f"service.cli.commands.{module}", group, help_line, extras, compiles)
 
 
 #: The commands that need nothing but the service. `lab.cli` adds the experiments.
 COMMANDS: Final[dict[str, Command]] = {
-    "serve": _command("serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning", SERVE),
+    "serve": _command(
+        "serve", SERVING, "serve the inverse models of a stage over zenoh, and keep learning", SERVE, compiles=True
+    ),
     "query": _command("query", SERVING, "ask a running service for voltages"),
-    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh", SERVE),
+    "stage": _command("stage", SERVING, "run a simulated stage as a process on zenoh", SERVE, compiles=True),
     "router": _command("router", SERVING, "forward messages between stages, services and clients on several hosts"),
     "view": _command("view", SERVING, "stream a running service to the Rerun viewer or into an .rrd file", VIEWER),
     "status": _command("status", OPERATING, "show a live table of all axes and instances that serve"),
@@ -108,22 +116,30 @@ COMMANDS: Final[dict[str, Command]] = {
     "access": _command(
         "access", OPERATING, "make the certificates, passwords and access rules for more than one machine"
     ),
-    "identify": _command("identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE),
+    "identify": _command(
+        "identify", IDENTIFICATION, "identify the inverse models of a stage from a recording", SERVE, compiles=True
+    ),
     "look": _command("look", IDENTIFICATION, "show what a file holds, and the command that would use it", LAB),
     "replay": _command(
-        "replay", IDENTIFICATION, "run the learner over a recording offline, with its decisions and errors", SERVE
+        "replay",
+        IDENTIFICATION,
+        "run the learner over a recording offline, with its decisions and errors",
+        SERVE,
+        compiles=True,
     ),
     "diagnose": _command(
         "diagnose",
         IDENTIFICATION,
         "name the effects in a recording that the simulation lacks, and what each explains",
         LAB,
+        compiles=True,
     ),
     "modes": _command(
         "modes",
         IDENTIFICATION,
         "find the modes of a stage in periodic recordings, and how they soften with amplitude",
         LAB,
+        compiles=True,
     ),
     "completion": _command("completion", OTHER, "print the completion script of a shell"),
 }
@@ -151,6 +167,10 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     from service.runtime.logging_setup import set_up_logging
 
     set_up_logging(parsed.log_level)
+    if commands[parsed.command].compiles:
+        from service.warm import at_first_use
+
+        at_first_use()
     try:
         return int(parsed.run(parsed))
     except DehystError as error:

@@ -143,6 +143,13 @@ def split_at(n: int, holdout: float) -> int:
     return split
 
 
+def _fitted_part(name: str, n: int, dt_s: float, most: int) -> slice:
+    """Which of ``n`` samples a baseline is fitted to."""
+    every = max(1, min(-(-n // most), int(_LONGEST_FIT_DT_S / dt_s + 1e-9)))
+    # Bouc-Wen's fit simulates the stage many times, from rest on: of a recording of many minutes the beginning must do.
+    return slice(0, min(n, most * every) if name == "bouc_wen" else n, every)
+
+
 def identify_one(
     name: str, u_V: FloatArray, y_um: FloatArray, dt_s: float, n: int, most: int = FIT_SAMPLES
 ) -> InverseModel:
@@ -151,13 +158,12 @@ def identify_one(
     ``most`` : samples that enter a fit; a longer recording is thinned. Raises what its identification
     raises: InputError on data, NumericsError on arithmetic.
     """
-    every = max(1, min(-(-len(u_V) // most), int(_LONGEST_FIT_DT_S / dt_s + 1e-9)))
-    u_thin, y_thin, dt_thin = u_V[::every], y_um[::every], dt_s * every
+    part = _fitted_part(name, len(u_V), dt_s, most)
+    u_thin, y_thin, dt_thin = u_V[part], y_um[part], dt_s * part.step
     if name == "linear":
         return fit_linear(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     if name == "bouc_wen":
-        # Its fit simulates the stage many times, from rest on: of a recording of many minutes the beginning must do.
-        return fit_bouc_wen(u_thin[:most], y_thin[:most], dt_thin, serve_dt_s=dt_s)[0]
+        return fit_bouc_wen(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     if name == "mpi":
         return fit_mpi(u_thin, y_thin, dt_thin, serve_dt_s=dt_s)[0]
     inputs = {"lssvm_frozen": "two", "lssvm_adaptive": "memory"}
@@ -250,7 +256,9 @@ def identify_all(
             error_V[settle:] = free_run(model, before, scored) - scored.u_V
             error_V[~test.valid] = np.nan
             score = score_of(error_V, gain, range_um)
-            if whole is not None:
+            parts = [_fitted_part(name, len(data), dt_s, most) for data in (train, whole or train)]
+            # Where the training data begin the whole, a model of their beginning alone is that of the whole, too.
+            if whole is not None and (name != "bouc_wen" or not follows or parts[0] != parts[1]):
                 begin(name, "fit again from all")
                 model = identify_one(name, whole.u_V, whole.y_um, dt_s, n, most)
         except (DehystError, np.linalg.LinAlgError) as error:

@@ -249,7 +249,8 @@ def proposed_column(quantity: str, names: list[str], taken: Collection[str]) -> 
         for name in free:
             if name.casefold() == word or (len(word) > 2 and word in name.casefold()):
                 return name
-    return free[0] if free and quantity != "t" else None
+    rest = [name for name in free if name.casefold() not in ("index", *_WORDS.get("t", ()))] or free
+    return rest[0] if rest and quantity != "t" else None
 
 
 class MissingError(InputError):

@@ -29,12 +29,23 @@ _BLOCK_ROWS: Final = 200_000
 _DELIMITERS: Final = ("\t", ";", ",", " ")
 _NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", " ": "blanks"}
 #: Words for a missing value.
-_MISSING: Final = frozenset({"", "na", "n/a", "#n/a", "nan", "-nan", "1.#qnan", "-1.#ind", "null", "none"})
+_MISSING: Final = frozenset({
+    "", "na", "n/a", "#n/a", "nan", "-nan", "1.#qnan", "-1.#ind", "null", "none", "-", "--", "---", "----", "*",
+    "ovrng", "overrange", "over range", "overload", "overflow", "ol", "out of range", "invalid", "error",
+})  # fmt: skip
 #: Words in front of the units and the sample time in preambles of oscilloscopes, in lower case without a colon.
 _X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit")
 _Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit")
 _X_STEP: Final = ("sample interval", "xinc", "x increment", "xincrement", "increment")
-_TIME_OF_DAY: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:\.\d*)?)")
+#: A time of day, also behind a date in any order of day, month and year, which only a midnight would need.
+_TIME_OF_DAY: Final = re.compile(
+    r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)(?: ?([AaPp])[Mm])?"
+)
+#: A number with thousands separated, by its decimal sign.
+_THOUSANDS: Final = {
+    ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+"),
+    ".": re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+"),
+}
 _DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d*)?)?)?")
 
 
@@ -49,6 +60,8 @@ class Layout:
     columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
     units : name -> unit, where the file states it apart from the name.
     dt_s : sample time that the preamble states, s, or None. notes : what was found, for people.
+    thousands : whether the other decimal sign separates thousands. heads : lines of names and units, without blanks,
+    which may come again between the rows.
     """
 
     encoding: str
@@ -62,6 +75,8 @@ class Layout:
     units: dict[str, str] = field(default_factory=dict)
     dt_s: float | None = None
     notes: tuple[str, ...] = ()
+    thousands: bool = False
+    heads: frozenset[str] = frozenset()
 
 
 def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
@@ -158,7 +173,7 @@ def _kind(cell: str, decimal: str) -> str:
     """n: number, e: empty or missing, d: a date or time of day, t: any other text."""
     if cell.casefold() in _MISSING:
         return "e"
-    if not (decimal == "," and "." in cell) and is_number(cell, decimal):
+    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _THOUSANDS[decimal].fullmatch(cell):
         return "n"
     return "d" if _DATE.fullmatch(cell) or _TIME_OF_DAY.fullmatch(cell) else "t"
 
@@ -264,9 +279,16 @@ def _layout(
         notes.append("units from the preamble: " + ", ".join(f"{name} in {unit}" for name, unit in over.items()))
     if dt_s is not None:
         notes.append(f"the preamble states a sample time of {dt_s:g} s")
+    thousands = any(
+        _THOUSANDS[block.decimal].fullmatch(cell)
+        for line in lines[start:]
+        for cell in split_cells(line.strip("\r\n"), block.delimiter)
+    )
+    if thousands:
+        notes.append(f"thousands separated by {'points' if block.decimal == ',' else 'commas'}")
     return Layout(
         encoding, block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
-        (*said, *notes),
+        (*said, *notes), thousands, frozenset(lines[k].strip() for k in above[-2:]),
     )  # fmt: skip
 
 
@@ -301,6 +323,9 @@ def _names_above(
         return scope
     comment = lines[last].lstrip()[:1] in ("#", "%")
     cells = _fit(lines[last], block, columns)
+    if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
+        # As pandas writes its index: the first column has no name.
+        cells[0] = "index"
     if not cells or not all(cells):
         return None, {}, []
     upper = _fit(lines[above[-2]], block, columns) if len(above) > 1 else []
@@ -395,6 +420,9 @@ def _said(
 # --- The rows.
 
 
+_REPEATED: Final = "the line of names comes again between the rows: read on"
+
+
 class _Rows:
     """Collects the columns of a file, block by block, in memory that grows by the size of the file."""
 
@@ -415,7 +443,7 @@ class _Rows:
         """Take the next lines of the file; ``last`` says that there are no more."""
         numbered = self._line
         self._line += len(lines)
-        block = None if self._texts else self._fast(lines)
+        block = None if self._texts or self.layout.thousands else self._fast(lines)
         if block is None:
             block = self._slow(lines, numbered, last)
         n = block.shape[1]
@@ -463,6 +491,10 @@ class _Rows:
         for k, line in enumerate(lines, numbered + 1):
             if _is_comment(line):
                 continue
+            if line.strip() in layout.heads:
+                if _REPEATED not in self.notes:
+                    self.notes.append(_REPEATED)
+                continue
             cells = split_cells(line.strip("\r\n"), layout.delimiter)
             if len(cells) > layout.width and not any(cells[layout.width :]):
                 cells = cells[: layout.width]
@@ -486,7 +518,8 @@ class _Rows:
 
     def _column(self, i: int, cells: list[str]) -> FloatArray:
         comma = self.layout.decimal == ","
-        plain = [cell.replace(",", ".") for cell in cells] if comma else cells
+        plain = [cell.replace("." if comma else ",", "") for cell in cells] if self.layout.thousands else cells
+        plain = [cell.replace(",", ".") for cell in plain] if comma else plain
         try:
             return np.array(plain, dtype=np.float64)
         except ValueError:
@@ -537,4 +570,8 @@ def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
 def _seconds_of_day(cells: list[str]) -> Iterator[float]:
     for cell in cells:
         match = _TIME_OF_DAY.fullmatch(cell)
-        yield 3600.0 * int(match[1]) + 60.0 * int(match[2]) + float(match[3]) if match else np.nan
+        if match is None:
+            yield np.nan
+            continue
+        hour = int(match[1]) if match[4] is None else int(match[1]) % 12 + 12 * (match[4] in "Pp")
+        yield 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", "."))

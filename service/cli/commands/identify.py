@@ -102,7 +102,14 @@ def run(args: argparse.Namespace) -> int:
             f"  long recording: fits and errors use one of {every} samples, one each {dt_s * every:g} s; motion "
             f"faster than {0.1 / (dt_s * every):.0f} Hz is judged more roughly (--fit-samples)"
         )
-    whole = Stretch.of(whole_repaired, every)
+    whole, repairs, samples, sha256 = (
+        Stretch.of(whole_repaired, every),
+        whole_repaired.done,
+        len(recording),
+        recording.sha256,
+    )
+    # A long recording takes a gigabyte, and the fits need as much.
+    del recording, whole_repaired
     if args.test is not None:
         tested = load(args.test, args, args.test_range, test=True)
         if abs(tested.dt_s / dt_s - 1.0) > 1e-3:
@@ -137,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
         axis=args.axis,
         dt_s=dt_s,
         source=args.data.name,
-        source_sha256=recording.sha256,
+        source_sha256=sha256,
         y_min_um=float(whole.motion[:, 0].min()),
         y_max_um=float(whole.motion[:, 0].max()),
         u_min_V=float(whole.u_V.min()),
@@ -160,15 +167,15 @@ def run(args: argparse.Namespace) -> int:
         draw_identification(picture, title, train, test, dt_s * every, results, gain)
     summary: dict[str, Any] = {
         "data": str(args.data),
-        "sha256": recording.sha256,
-        "samples": len(recording),
+        "sha256": sha256,
+        "samples": samples,
         "fitted_from_every": every,
         "dt_s": dt_s,
         "range_um": float(np.ptp(train.motion[:, 0])),
         "gain_um_per_V": gain,
         "judged_on": judged_on,
         "findings": [finding.as_dict() for finding in findings],
-        "repaired": list(whole_repaired.done),
+        "repaired": list(repairs),
         "models": {result.name: result.as_dict() for result in results},
         "out": str(args.out),
         "picture": str(picture) if picture else None,

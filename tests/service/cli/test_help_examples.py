@@ -16,7 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 
 from lab.cli import COMMANDS, main
 from service.cli.main import build_parser
@@ -83,6 +85,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "scope.csv", rows * (1e3, 1.0, 0.1), delimiter=",", header="Time,CH1,CH2", comments="", fmt="%.9g"
     )
     (folder / "trajectory.csv").write_text("y,v,a\n40,0,0\n40.1,100,0\n40.2,100,0\n")
+    for name, shift_s in (("training", 0.0), ("other", 1.0)):
+        table = pyarrow.table({"t_s": t_s * 4.0 + shift_s, "u_V": u_V, "y_um": y_um})
+        parquet.write_table(table, folder / f"{name}.parquet")
     return folder
 
 
@@ -101,10 +106,24 @@ def environment() -> dict[str, str]:
 
 
 def test_identify_runs_as_printed(folder: Path) -> None:
-    for example in examples("identify")[:2]:
+    for example in examples("identify"):
         (folder / "stage.npz").unlink(missing_ok=True)
         assert "models: stage.npz" in run_as_printed(example, folder)
         assert (folder / "stage.npz").stat().st_size > 1000
+
+
+def test_look_runs_as_printed(folder: Path, tmp_path: Path) -> None:
+    """The first example finds two columns in V and asks; the second says which is which."""
+    rows = (folder / "scope.csv").read_text().splitlines()
+    (tmp_path / "scope.csv").write_text("\n".join([rows[0], "ms,V,V", *rows[1:]]))
+    asking, understood = examples("look")
+    done = subprocess.run(
+        [sys.executable, "-m", "lab.cli", *words(asking)],
+        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "--column y=CH2" in done.stdout
+    assert "understood: 2400 samples" in run_as_printed(understood, tmp_path)
 
 
 def test_examples_that_print_run_as_printed(folder: Path) -> None:
@@ -124,6 +143,9 @@ def test_examples_beside_a_service_run_as_printed(folder: Path, serve: Callable[
         for example in examples(name)
     }
     assert "40.0000" in printed["dehyst query 40                              # the voltage for 40 µm at rest"]
+    run_as_printed(examples("rollback")[0].replace("41", "1"), folder, "--endpoint", service.endpoint)
+    run_as_printed(examples("view")[2], folder, "--endpoint", service.endpoint)
+    assert (folder / "run.rrd").stat().st_size > 1000
     once = examples("status")[1]
     assert '"axes"' in run_as_printed(once, folder, "--endpoint", service.endpoint)
 

@@ -13,8 +13,10 @@ import pytest
 from pyarrow import parquet
 
 from adaptive.errors import InputError
+from adaptive.types import FloatArray
 from baselines.prandtl_ishlinskii.model import MpiParameters
 from lab.cli import main
+from service.identification import identifying
 from service.identification.identifying import NAMES, Stretch, free_run, identify_all, motion_of, split_at, thinning
 from service.identification.recording_options import parse_range
 from service.storage.model_file import read_bundle
@@ -236,3 +238,27 @@ def test_a_long_recording_is_thinned_and_served_at_its_own_rate() -> None:
         assert fine.score is not None
         assert coarse.score is not None
         assert coarse.score.rmse_pct < 1.3 * fine.score.rmse_pct + 0.02
+
+
+@pytest.mark.parametrize(("train", "fits"), [(9000, 1), (3000, 2)])
+def test_bouc_wen_is_fitted_once_where_the_beginning_is_all_it_takes(
+    train: int, fits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a long recording it takes the beginning, which is the same without the held-out end and with it."""
+    dt_s, n = 1e-3, 12_000
+    t_s = np.arange(n) * dt_s
+    u_V = 4.0 - 4.0 * np.cos(2 * np.pi * 1.5 * t_s) * np.exp(-0.1 * t_s)
+    y_um = MpiParameters((0.0, 1.0, 2.0), (7.0, 1.5, 1.0), (0.0, 30.0), (1.0, -0.1)).simulate(u_V, dt_s)
+    whole = Stretch.of(Repaired(Recording(t_s, u_V, y_um, dt_s), np.ones(n, dtype=np.bool_), ()))
+    taken: list[int] = []
+
+    def fitted(u: FloatArray, *more: Any, **named: Any) -> Any:
+        taken.append(u.size)
+        return (identifying.fit_linear(u, *more, **named)[0],)
+
+    monkeypatch.setattr(identifying, "fit_bouc_wen", fitted)
+    identify_all(
+        whole.part(0, train), whole.part(train, n), dt_s, follows=True, whole=whole, names=("bouc_wen",), most=1000
+    )  # fmt: skip
+    assert len(taken) == fits
+    assert max(taken) <= 1000

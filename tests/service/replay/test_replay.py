@@ -330,8 +330,8 @@ def test_measured_stack_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("missing", [3, 30, 60])
-def test_a_short_gap_costs_nothing_after_it(model_file: Path, samples: Recording, missing: int) -> None:
-    """The memory goes on over the gap: 60 missing samples used to raise the error for the rest of the recording."""
+def test_a_short_gap_costs_nothing_soon_after_it(model_file: Path, samples: Recording, missing: int) -> None:
+    """60 missing samples used to raise the error for the rest of the recording."""
     keep = np.ones(len(samples), dtype=np.bool_)
     keep[4000 : 4000 + missing] = False
     seq = sequence(samples)
@@ -339,8 +339,35 @@ def test_a_short_gap_costs_nothing_after_it(model_file: Path, samples: Recording
     whole, gapped = replay(samples, axis_of(model_file)), replay(cut, axis_of(model_file))
     assert gapped.t_s.size == whole.t_s.size
     assert np.isnan(gapped.adaptive_V[4003 : 4000 + missing]).all()
-    after = slice(4100 + missing, None)
+    # A gap that is bridged costs nothing. After a longer one the memory is found within a second.
+    after = slice((4100 if missing < 10 else 5000) + missing, None)
     for with_gap, without in ((gapped.adaptive_V, whole.adaptive_V), (gapped.frozen_V, whole.frozen_V)):
         rms = [float(np.sqrt(np.nanmean(error[after] ** 2))) for error in (with_gap, without)]
         assert rms[0] < 1.5 * rms[1]
     assert np.isfinite(gapped.adaptive_V[:4000]).sum() > 3900
+
+
+@pytest.mark.parametrize("missing", [500, 1000])
+def test_after_a_long_gap_the_memory_is_the_learners(model_file: Path, missing: int) -> None:
+    """The replay used to go on along a straight line for good, wherever the stage had turned meanwhile."""
+    stage = Stage(preset("rich", seed=4))
+    u_V = multitone(8.0, DT_S, seed=4)[1]
+    u_V[:500] *= np.linspace(0.0, 1.0, 500)
+    y_um, _ = stage.run(stage.initial_state(), u_V)
+    t_s = np.arange(u_V.size) * DT_S
+    keep = np.ones(u_V.size, dtype=np.bool_)
+    first = 4130 + missing
+    keep[4130:first] = False
+    whole = replay(Recording(t_s, u_V, y_um, DT_S, source="whole"), axis_of(model_file))
+    cut = Recording(t_s[keep], u_V[keep], y_um[keep], DT_S, source="gap", seq=np.flatnonzero(keep))
+    gapped = replay(cut, axis_of(model_file))
+    error, std, usual = np.abs(gapped.adaptive_V), gapped.std_V, np.abs(whole.adaptive_V)
+    # Scored from the first snapshot on that has seen a sample after the gap.
+    scored = np.flatnonzero(np.isfinite(error[first:]))
+    assert scored[0] < 100
+    early = first + scored[scored < 300]
+    assert np.mean(error[early] <= std[early]) > 0.95
+    assert error[early].mean() < 0.005 * np.ptp(u_V)
+    assert error[first + 1000 :].mean() < 1.5 * usual[first + 1000 :].mean()
+    frozen, as_usual = (np.nanmean(np.abs(r.frozen_V[first + 1000 :])) for r in (gapped, whole))
+    assert frozen < 1.5 * as_usual
