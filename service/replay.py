@@ -25,7 +25,8 @@ from adaptive.errors import InputError
 from adaptive.online.gates import GAP
 from adaptive.types import BoolArray, FloatArray, InverseModel
 from service.answers.guard import Limits
-from service.config.settings import AxisConfig, LearnerSettings
+from service.config.learner import LearnerSettings
+from service.config.settings import AxisConfig
 from service.identification.identifying import motion_of
 from service.protocol.errors import FieldError
 from service.protocol.samples import MAX_SEQ, SampleBatch

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run, judge, draw. Returns 0 if the limit held in all scenarios, else 1."""
     from lab.scenarios import draw_overview, table
-    from service.config.settings import read_learner_settings
+    from service.config.learner import read_learner_settings
     from service.storage.output import clear_output
 
     if not 1 <= args.seeds <= 1000:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 from adaptive.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from service.config.learner import LearnerSettings as LearnerSettings
+    from service.config.learner import read_learner_settings as read_learner_settings
     from service.config.schema import Setting as Setting
     from service.config.schema import build_settings as build_settings
     from service.config.settings import AxisConfig as AxisConfig
-    from service.config.settings import LearnerSettings as LearnerSettings
     from service.config.settings import ServeConfig as ServeConfig
     from service.config.settings import parse_config as parse_config
     from service.config.settings import read_config as read_config
-    from service.config.settings import read_learner_settings as read_learner_settings
 
 __getattr__ = lazy_names(__name__)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from adaptive.online.config import LearnerConfig
 from baselines.competition.config import CompetitionConfig
 from service.answers.guard import Limits
 from service.background.settings import RetuningConfig, WatchConfig
@@ -238,38 +237,3 @@ def _with_reports_in(folder: Path, axis: AxisConfig) -> AxisConfig:
     """The axis with its diagnosis' folder of reports taken from the folder of the file."""
     reports = axis.diagnosis.reports
     return replace(axis, diagnosis=replace(axis.diagnosis, reports=str(folder / reports))) if reports else axis
-
-
-# --- Settings of the learner from a file: a service's configuration (one axis of it), or a file of the settings alone.
-
-
-@dataclass(frozen=True, slots=True)
-class LearnerSettings:
-    """``settings`` as in an ``[axis.learner]`` table; ``axis`` where a service's configuration has them."""
-
-    settings: dict[str, Any]
-    axis: AxisConfig | None = None
-
-
-def read_learner_settings(path: Path, axis: str | None = None) -> LearnerSettings:
-    """Read and check a TOML file.
-
-    A file with ``[[axis]]`` tables is a service's configuration: the settings are those of the axis with that name, or
-    of the only axis. Any other file has the settings themselves, at the top or in a table ``[learner]``. Raises
-    InputError naming what is wrong.
-    """
-    text = read_text(path)
-    data = parse_toml(text, str(path))
-    if "axis" in data:
-        axes = parse_config(text, str(path), path.parent).axes
-        named = [entry for entry in axes if axis in (None, entry.name)]
-        if len(named) != 1:
-            got = repr(axis) if axis is not None else f"{len(axes)} axes and no choice"
-            raise FieldError("--axis", got, f"one of {', '.join(entry.name for entry in axes)}")
-        found = LearnerSettings(dict(named[0].learner), named[0])
-    elif axis is not None:
-        raise FieldError("--axis", repr(axis), f"nothing, as {path} has no [[axis]] tables")
-    else:
-        found = LearnerSettings(data.get("learner", {}) if set(data) == {"learner"} else data)
-    build_settings(LearnerConfig, found.settings, f"{path}:")
-    return found

@@ -71,10 +71,9 @@ class FleetCheckpoints:
         learner, (stage, instance) = self._fleet.learner_of(axis), self._names
         if learner.seq < 0:
             return
-        meta = CheckpointMeta(
-            stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, sum(learner.parts.counters.values()), time.time(),
-            instance,
-        )  # fmt: skip
+        unix_s = time.time()
+        samples = sum(learner.parts.counters.values())
+        meta = CheckpointMeta(stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance)
         self._queue.put((axis, meta, learner.state_dict()))
 
     def _run(self) -> None:

@@ -14,7 +14,7 @@ from service.identification.recording_options import add_mapping_arguments, desc
 from service.protocol.errors import FieldError
 
 if TYPE_CHECKING:
-    from service.config.settings import LearnerSettings
+    from service.config.learner import LearnerSettings
 
 EPILOG = """\
 For every block of samples, the model predicts the voltage as a controller would get it (--age s old), then learns the
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, replay, score, write. Returns 0."""
     from adaptive.inverse_model import LssvmInverse
     from service.background.retuner import read_adoptions
-    from service.config.settings import read_learner_settings
+    from service.config.learner import read_learner_settings
     from service.replay import AGE_S, Replayed, axis_config, replay, summary, write_gates
     from service.server.axis_loading import load_axis
     from service.server.learner_supervisor import standing_of

@@ -25,7 +25,8 @@ from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
 from lab.cli import main
 from service.answers.guard import Limits
-from service.config.settings import AxisConfig, read_learner_settings
+from service.config.learner import read_learner_settings
+from service.config.settings import AxisConfig
 from service.protocol.samples import SampleBatch
 from service.replay import Replayed, covered, replay, sequence, summary, write_gates
 from service.server.axis import Axis
