@@ -72,7 +72,7 @@ class FleetCheckpoints:
         if learner.seq < 0:
             return
         unix_s = time.time()
-        samples = sum(learner.parts.counters.values())
+        samples = int(self._fleet.outcomes()[axis].sum())
         meta = CheckpointMeta(stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance)
         self._queue.put((axis, meta, learner.state_dict()))
 
