@@ -41,7 +41,11 @@ def nominal_effects(fit: ModelFit) -> list[Effect]:
     drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
     offset = make("thermal_drift", OFFSET, offset_um=nominal.offset_um(p), **drift)
     if isinstance(nominal, FileStage):
-        return [*nominal.effects(p), offset]
+        found = nominal.effects(p)
+        # A stage file that came from a diagnosis has an offset already, and what is fitted now comes on top of it.
+        before = sum(e.values["offset_um"] for e in found if e.label == OFFSET)
+        total = make("thermal_drift", OFFSET, offset_um=before + nominal.offset_um(p), **drift)
+        return [*(e for e in found if e.label != OFFSET), total]
     if nominal.name == "linear":
         f, z = float(np.exp(p[1])), float(np.exp(p[2]))
         return [

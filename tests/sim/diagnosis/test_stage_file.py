@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from adaptive.types import FloatArray
 from sim.diagnosis.causes.mechanics import peaks
 from sim.diagnosis.causes.slips import find_slips
 from sim.diagnosis.diagnose import diagnose_prepared
+from sim.diagnosis.export import OFFSET, export_stage
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.result import TEST, Diagnosis
 from sim.effects import Chain, effect
@@ -54,6 +56,17 @@ def recording(
 
 def names(diagnosis: Diagnosis) -> list[str]:
     return [cause.name for cause in diagnosis.causes]
+
+
+def test_the_stage_of_a_diagnosis_is_the_nominal_one_of_the_next() -> None:
+    """It has an offset of its own, which what is fitted then adds to."""
+    offset_um = 3.0
+    moved = replace(recording(), y_um=recording().y_um + offset_um)
+    first = export_stage(diagnose_prepared(prepare(moved, nominal=NOMINAL))).config
+    again = export_stage(diagnose_prepared(prepare(replace(moved, y_um=moved.y_um + 1.0), nominal=first))).config
+    for config, expected_um in ((first, offset_um), (again, offset_um + 1.0)):
+        (found,) = [e for e in config.effects if e.label == OFFSET]
+        assert found.values["offset_um"] == pytest.approx(expected_um, abs=0.05)
 
 
 def test_a_stage_file_explains_its_own_stage() -> None:
