@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from service.answers.guard import Limits
@@ -48,6 +49,7 @@ def test_service_and_learner_agree_after_a_gap_and_state_what_they_do_not_know(t
         f'served = "{MODEL}"\nlearn = "{MODEL}"\nu_min_V = -5.0\nu_max_V = 15.0\nslew_V_per_s = 1e6\n',
         encoding="utf-8",
     )
+    threadpool_limits(1)  # as the service does: the last bits depend on it
     local = load_axis("demo", AxisConfig("x", tmp_path / "x.npz", Limits(-5.0, 15.0, 1e6), served=MODEL, learn=MODEL))
     process = ServeProcess(path, free_port)
     try:
