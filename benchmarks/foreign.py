@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from lab.rehearsal.disturbance import CLASSES, SENSOR, draw
+from service.reports.tables import markdown
 
 PRESETS = ("random", "issue")
 #: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.
@@ -218,11 +219,6 @@ def _parts(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
 # ---- tables
 
 
-def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(cells) + " |" for cells in rows)])
-
-
 GOALS_HEAD = ("what is measured", "goal", "these runs")
 
 
@@ -280,7 +276,7 @@ def goals(records: Sequence[Record]) -> str:
         ),
         ("cost of a sample", "≤ 1.1 × before", "not measured by these runs"),
     ]
-    return _markdown(GOALS_HEAD, rows)
+    return markdown(GOALS_HEAD, rows)
 
 
 HEAD = (
@@ -318,7 +314,7 @@ def by_class(records: Sequence[Record]) -> str:
     intact, sensors = _parts(records)
     classes = ((name, [record for record in records if record.get("class") == name]) for name in CLASSES)
     groups = (("**stage intact**", intact), ("**sensor faults**", sensors), ("**all**", list(records)))
-    return _markdown(HEAD, [row(name, part) for name, part in (*classes, *groups) if part])
+    return markdown(HEAD, [row(name, part) for name, part in (*classes, *groups) if part])
 
 
 def table(records: Sequence[Record]) -> str:
@@ -376,7 +372,7 @@ def healthy_table(records: Sequence[Record]) -> str:
     blocks = ", ".join(str(block) for block in sorted({record["block"] for record in records}))
     return "\n".join(
         [
-            _markdown(HEALTHY_HEAD, rows),
+            markdown(HEALTHY_HEAD, rows),
             "",
             f"false troubles by name: {total}; answers know all samples but the last {blocks}",
             *notable,

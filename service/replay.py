@@ -146,7 +146,7 @@ def replay(
             memories = [_carried(model, memory, motion[way], grid.u_V[way]) for model, memory in pairs]
         if part.start < n:
             models = ring[0].model, frozen
-            error_V[:, part], std_V[part], memories = _foretold(models, memories, motion[part], grid.u_V[part])
+            error_V[:, part], std_V[part], memories = _predicted(models, memories, motion[part], grid.u_V[part])
         if part.start < until and not known:
             # Foretold from before the gap: how the stage moved in it was not known.
             error_V[:, part] = np.nan
@@ -210,7 +210,7 @@ def _carried(model: InverseModel, memory: FloatArray, motion: FloatArray, u_V: F
     return model.track(y, v, a, u_V, memory)
 
 
-def _foretold(
+def _predicted(
     models: tuple[InverseModel, InverseModel], memories: list[FloatArray], motion: FloatArray, u_V: FloatArray
 ) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
     """(2, k) errors of two models over (k, 3) points of the motion, (k,) deviations of the first, memories after it."""

@@ -4,7 +4,6 @@ The first gates check the raw sample: finite, in sequence, plausible time step, 
 that passes them advances the smoother. The later gates check the resulting pair of smoothed motion and voltage:
 settled, not saturated, in range, moving. Refused samples change no model.
 
-
 The envelope bounds what is learnt. A model outside of it is not served: the last good model or the identified one stays
 in service.
 """

@@ -31,7 +31,7 @@ from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother, smoother_of
 from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, under
 
-# --- What a intake holds beside its numbers, as flat entries and back.
+# --- What an intake holds beside its numbers, as flat entries and back.
 
 
 def _parts_to_state(
