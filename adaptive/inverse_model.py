@@ -386,12 +386,13 @@ class LssvmInverse:
         """Voltage, V, at one point given as basis (p,) and kernel inputs (d,) of this model's own feature map."""
         return float(mean_of(basis, kernel, self.beta, self._scaled, self.alpha, self._inverse_widths))
 
-    def at_bound(self, y_um: FloatArray, u_V: FloatArray) -> BoolArray:
-        """(n,) whether the voltages, (n,) V, that it gave for (n,) places at rest are held by ``allowed_V``."""
+    def at_bound(
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray, u_V: FloatArray
+    ) -> BoolArray:
+        """(n,) whether the voltages, (n,) V, that ``feedforward`` gave for (n,) points are held by ``allowed_V``."""
         if not self.anchor.size:
-            return np.zeros(y_um.size, dtype=np.bool_)
-        still = np.zeros(y_um.size)
-        basis, _, _ = self.features.run(y_um, still, still, self.rest_memory(float(y_um[0])))
+            return np.zeros(u_V.size, dtype=np.bool_)
+        basis, _, _ = self.features.run(y_um, v_um_per_s, a_um_per_s2, memory)
         held: BoolArray = np.abs(u_V - basis @ self.anchor) >= (1.0 - 1e-9) * self.allowed_V
         return held
 

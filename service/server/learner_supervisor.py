@@ -59,7 +59,8 @@ BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
 POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
 #: Refusals for the values of a sample. A stage at rest, or a sample out of sequence, is no trouble.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
-_PROBES: Final = 9
+#: Places at which a model is looked at, one after the other, as shares of the range.
+_SWEEP: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9, 1.0, 0.8, 0.6, 0.4, 0.2, 0.0])
 #: Models that the watch keeps: the last good one, and two from before, the older and the newer.
 ROLES: Final = ("good", "mark", "next_mark")
 
@@ -207,20 +208,23 @@ class ModelWatch:
         return self.trouble not in POISON
 
     def _sane(self, model: InverseModel, baseline: InverseModel | None) -> bool:
-        """Whether the model at rest is finite over the range and no further from the baseline than drift explains."""
+        """Whether the model is finite over the range and no further from the baseline than drift explains."""
         low, high = self._limits.y_min_um, self._limits.y_max_um
         if not (math.isfinite(low) and math.isfinite(high)):
             low, high = 0.0, 1.0
             baseline = None
-        probes = np.linspace(low, high, _PROBES)
-        u = _at_rest(model, probes)
+        # Up and down over the range: a place at rest is one where a model has never learnt, and may lie at its bound.
+        y = low + (high - low) * _SWEEP
+        u = _along(model, y)
         if not np.isfinite(u).all():
             return False
-        if isinstance(model, LssvmInverse) and np.mean(model.at_bound(probes, u)) > 0.5:
-            return False
+        if isinstance(model, LssvmInverse):
+            still = np.zeros(y.size)
+            if np.mean(model.at_bound(y, still, still, model.rest_memory(float(y[0])), u)) > 0.5:
+                return False
         if baseline is None:
             return True
-        other = _at_rest(baseline, probes)
+        other = _along(baseline, y)
         inside = np.isfinite(other)
         return bool((np.abs(u - other)[inside] <= self.config.insane_share * self._span_V).all())
 
@@ -242,7 +246,8 @@ class ModelWatch:
         return made
 
 
-def _at_rest(model: InverseModel, y_um: FloatArray) -> FloatArray:
+def _along(model: InverseModel, y_um: FloatArray) -> FloatArray:
+    """(n,) V at (n,) places, µm, that a slow motion passes in turn; NaN where the model fails."""
     zero = np.zeros(y_um.size)
     try:
         return model.feedforward(y_um, zero, zero, model.rest_memory(float(y_um[0]))).u_V
