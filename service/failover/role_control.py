@@ -15,7 +15,15 @@ import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
 from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from service.failover.state_transfer import MAX_PAUSE_S, NO_SECRET, PAUSE_S, fetch_state, gives_sign_of_life
+from service.failover.state_transfer import (
+    MAX_PAUSE_S,
+    NO_SECRET,
+    PAUSE_S,
+    confirm_switch,
+    fetch_state,
+    gives_sign_of_life,
+    told_switch,
+)
 from service.operating.server import FREEZE, THAW, Switch
 from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
@@ -147,9 +155,7 @@ class Reachability:
 # --- Role control.
 
 #: Events of the serving instance after which its model no longer follows from the samples alone.
-MODEL_EVENTS: Final = frozenset({"frozen", "thawed", "selected", "rolled_back", "retuning_adopted"})
-#: Of these, those that must hold even if the one that serves dies before its state has come; by event, the verb.
-SWITCHES: Final = {"frozen": FREEZE, "thawed": THAW}
+MODEL_EVENTS: Final = frozenset({"selected", "rolled_back", "retuning_adopted"})
 #: Longest time for the transfer of the state, and pause before the next attempt, s.
 _TRANSFER_S: Final = 3.0
 _TRANSFER_PAUSE_S: Final = 0.3
@@ -211,7 +217,7 @@ class RoleControl:
         self._token: Any = None
         self._epoch = 0
         self._rival_at: float | None = None
-        self._subscribers: list[Any] = []
+        self._entities: list[Any] = []
         self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=True)
         self.settled = threading.Event()
         self.ready = threading.Event()
@@ -221,10 +227,11 @@ class RoleControl:
     def start(self) -> None:
         """Look for other instances and take a role."""
         keys = self.server.keys
-        self._subscribers = [
+        self._entities = [
             self._session.liveliness().declare_subscriber(keys.claim_any, self._on_claim, history=True),
             self._session.declare_subscriber(keys.event, self._on_event),
             self._session.declare_subscriber(keys.status, self._on_status),
+            self._session.declare_queryable(keys.switch, self._on_switch),
         ]
         self._thread.start()
 
@@ -234,9 +241,9 @@ class RoleControl:
         self.claims.changed.set()
         if self._thread.is_alive():
             self._thread.join()
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-        self._subscribers = []
+        for entity in self._entities:
+            entity.undeclare()
+        self._entities = []
         self._drop_claim()
 
     def _on_claim(self, sample: zenoh.Sample) -> None:
@@ -245,10 +252,21 @@ class RoleControl:
     def _on_event(self, sample: zenoh.Sample) -> None:
         event = fields_of(sample.payload.to_bytes())
         if event.get("instance") != self.server.instance and event.get("event") in MODEL_EVENTS:
-            highest = self.claims.highest()
-            if event["event"] in SWITCHES and highest is not None and event.get("instance") == highest.instance:
-                self._switch = SWITCHES[event["event"]], str(event.get("by", ""))[:MAX_WHO]
             self._refetch_state()
+
+    def _on_switch(self, query: zenoh.Query) -> None:
+        """A freeze or thaw of the instance that serves must hold even if that one dies before its state has come."""
+        with query:
+            key, secret, highest = self.server.keys.switch, self.server.secret, self.claims.highest()
+            if self.server.role == PRIMARY or highest is None or (told := told_switch(query, key, secret)) is None:
+                return  # the sender counts those who confirm
+            switch = fields_of(told)
+            verb, by = switch.get("verb"), switch.get("by")
+            if switch.get("instance") != highest.instance or verb not in (FREEZE, THAW) or not isinstance(by, str):
+                return
+            self._switch = verb, by[:MAX_WHO]
+            self._refetch_state()
+            confirm_switch(query, key, secret)
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         """Compare the digest of the served model, published once a second, with the own one of the same sample."""
@@ -368,6 +386,8 @@ class RoleControl:
     def _take_over(self) -> None:
         server = self.server
         self._claim()
+        if self._switch is not None:  # before anybody is answered
+            server.loop.queue.call(self._apply_switch, _CHANGE_S, urgent=True)
         server.serve()
         server.loop.queue.call(self._leave_standby, _CHANGE_S)
         self._outdated = False
@@ -389,16 +409,16 @@ class RoleControl:
 
     def _apply_switch(self) -> None:
         """Freeze or thaw as the one before did last, if that was not yet in a state from it: it was answered."""
-        switch, self._switch = self._switch, None
-        if switch is not None:
-            verb, by = switch
+        if self._switch is not None:
+            verb, by = self._switch
             Switch(verb, by, 0, 0.0).apply(self.server.axis)
 
     def _leave_standby(self) -> None:
         axis = self.server.axis
         # In the first epoch there is no other state to take over: continue from its own.
         source = self.model.take_over(self._restore if self._epoch > 1 else lambda _: "")
-        self._apply_switch()
+        self._apply_switch()  # once more: another state may have been restored
+        self._switch = None
         self.server.loop.set_gate(None)
         if self._epoch > 1:
             model = f"not synced: it continues from {source}" if source else "with the model of the one before"

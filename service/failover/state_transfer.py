@@ -99,6 +99,37 @@ def fetch_state(
     return None
 
 
+# --- A freeze or thaw, which each standby must hold before it is answered.
+
+
+def tell_standbys(
+    session: zenoh.Session, key: str, switch: bytes, timeout_s: float, secret: PeerSecret = NO_SECRET
+) -> int:
+    """Count of the standbys that hold ``switch`` (JSON) within ``timeout_s``; 0 at once where there is none."""
+    nonce = new_nonce()
+    replies = session.get(
+        f"{key}?nonce={nonce};proof={secret.sign('switch', key, nonce, switch)}",
+        payload=switch,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
+    said = (reply.ok.payload.to_bytes().decode("ascii", "replace") for reply in replies if reply.ok is not None)
+    return sum(secret.proves(text, "held", key, nonce) for text in said)
+
+
+def told_switch(query: zenoh.Query, key: str, secret: PeerSecret = NO_SECRET) -> bytes | None:
+    """The switch in a query of `tell_standbys`; None if it does not prove that an instance of this service asks."""
+    payload = b"" if query.payload is None else query.payload.to_bytes()
+    nonce, proof = (str(query.parameters.get(name) or "") for name in ("nonce", "proof"))
+    return payload if secret.proves(proof, "switch", key, nonce, payload) else None
+
+
+def confirm_switch(query: zenoh.Query, key: str, secret: PeerSecret = NO_SECRET) -> None:
+    """Answer a query of `tell_standbys`: this standby holds the switch."""
+    query.reply(key, secret.sign("held", key, str(query.parameters.get("nonce") or "")).encode())
+
+
 # --- Whether an instance answers.
 
 

@@ -135,6 +135,7 @@ class OperationsServer:
     keys, instance : of the axis. verbs : the commands. journal : keeps a record of them.
     note : notes an event: name, detail. role : present role of this instance; only a primary takes commands.
     samples : count of all samples when the last command was applied.
+    tell : tells the standbys of a freeze or thaw, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     """
 
@@ -147,6 +148,7 @@ class OperationsServer:
         note: Callable[[str, str], None],
         role: Callable[[], str] = lambda: "primary",
         samples: Callable[[], int] = lambda: 0,
+        tell: Callable[[str, str], int] = lambda _verb, _who: 0,
         settle: Callable[[], bool] = lambda: False,
     ) -> None:
         self._keys = keys
@@ -156,6 +158,7 @@ class OperationsServer:
         self._note = note
         self._role = role
         self._samples = samples
+        self._tell = tell
         self._settle = settle
         #: Requests refused before they were read, which the thread writes to the journal: (payload, reason).
         self._turned_away: deque[tuple[bytes, str]] = deque(maxlen=_WAITING)
@@ -200,6 +203,7 @@ class OperationsServer:
             raise
         self._counts["done"] += 1
         journaled = self._write(request, seq=seq)
+        standbys = self._tell(request.verb, request.who) if request.verb in (FREEZE, THAW) else 0
         settled = request.verb not in self._verbs.background and self._settle()
         answer = {
             "schema": SCHEMA,
@@ -211,6 +215,7 @@ class OperationsServer:
             "instance": self._instance,
             "seq": seq,
             "durable": journaled or settled,
+            "standbys": standbys,
             "result": result,
         }
         return to_json(answer)

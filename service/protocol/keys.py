@@ -108,6 +108,11 @@ class Keys:
         return f"{self.base}/state"
 
     @property
+    def switch(self) -> str:
+        """Query of the instance that serves, which its standbys answer: the newest freeze or thaw, JSON."""
+        return f"{self.base}/switch"
+
+    @property
     def claim_any(self) -> str:
         """Matches the claims of all instances that serve this axis."""
         return f"{self.base}/claim/*/*/**"

@@ -12,10 +12,11 @@ import zenoh
 
 from service.answers.answering import trust_by_age
 from service.background.retuner import Retuner
-from service.failover.state_transfer import NO_SECRET
+from service.failover.state_transfer import NO_SECRET, tell_standbys
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
+from service.protocol.container import to_json
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
 from service.security.peers import PeerSecret
@@ -34,8 +35,8 @@ STANDBY: Final = "standby"
 HEALTH_S: Final = 1.0
 #: Longest time for which the answer to an operator waits for the checkpoint of the outcome, s.
 _WRITTEN_S: Final = 1.0
-#: Longest time for which it waits for the thread that publishes, s.
-_TOLD_S: Final = 0.2
+#: Longest time for which it waits for the standbys to hold a freeze or thaw, s.
+_TOLD_S: Final = 1.0
 
 
 class AxisServer:
@@ -221,18 +222,13 @@ class AxisServer:
             self.axis.note,
             lambda: self.role,
             samples=lambda: self._operated_at,
-            settle=self._settle,
+            tell=self._tell_standbys,
+            settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
         )
 
-    def _settle(self) -> bool:
-        """After a command: publish its event, which the standby reads, and wait for its checkpoint; then answer."""
-        # With a timeout: a change of the role holds this lock while it waits for the thread that calls this.
-        if self._changing.acquire(timeout=_TOLD_S):
-            try:
-                self._publications.publish_events()
-            finally:
-                self._changing.release()
-        return self.checkpoints.wait_written(_WRITTEN_S)
+    def _tell_standbys(self, verb: str, by: str) -> int:
+        switch = to_json({"instance": self.instance, "verb": verb, "by": by})
+        return tell_standbys(self._session, self.keys.switch, switch, _TOLD_S, self.secret)
 
     # ---- the publishing thread
 

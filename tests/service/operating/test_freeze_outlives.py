@@ -14,7 +14,7 @@ import zenoh
 
 from service.client.client import Client
 from service.operating.remote import operate
-from service.runtime.session import open_client
+from service.runtime.session import open_client, wait_followed
 from service.security.peers import OWN_SECRET
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually, samples
@@ -28,8 +28,11 @@ def folders(tmp_path: Path, kept: str) -> str:
 
 
 def teach(session: zenoh.Session, client: Client, first: int, n: int) -> None:
+    publisher = session.declare_publisher(client.keys.sample, congestion_control=zenoh.CongestionControl.BLOCK)
+    # A new session sends nothing to a subscriber that it has not heard of yet.
+    assert wait_followed(publisher, 5.0)
     for start in range(first, first + n, 20):
-        session.put(client.keys.sample, samples(start, 20), congestion_control=zenoh.CongestionControl.BLOCK)
+        publisher.put(samples(start, 20))
     eventually(lambda: client.status()["seq"] >= first + n - 1)
 
 
@@ -105,8 +108,9 @@ def test_a_standby_that_takes_over_within_20_ms_of_the_answer_is_frozen(tmp_path
             Stage(endpoints),
         ):
             eventually(lambda: client.status()["samples"]["learnt"] > 300)
-            operate(session, client.keys, "freeze", "alice")
+            answer = operate(session, client.keys, "freeze", "alice")
             processes[0].kill()
+            assert answer["standbys"] == 1
             status = eventually(lambda: (s := client.status())["instance"] == processes[1].ready["instance"] and s)
             assert status["frozen"] is True
             eventually(lambda: client.status()["seq"] > status["seq"] + 300)
