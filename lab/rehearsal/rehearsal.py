@@ -153,7 +153,7 @@ def run_event(
 def run_healthy(
     plant_factory: PlantFactory, known: IdentifiedPlant, config: RehearsalConfig, duration_s: float, seed: int
 ) -> HealthyOutcome:
-    """The learning loop alone, for ``duration_s`` (at least 4 s), in which nothing happens. Raises as `rehearse`
+    """The learning loop alone, for ``duration_s`` (at least 5 s), in which nothing happens. Raises as `rehearse`
     does."""
     event = Event("none", "none", HEALTHY_AT_S)
     course = _Course.prepared(plant_factory, known, config, event, duration_s, seed)

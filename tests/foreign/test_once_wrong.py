@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.foreign import LARGE_S, NAMED_S, run_one
+from lab.rehearsal import RehearsalConfig, identify, run_healthy
+from tests.foreign.plants import random_plant
 
 
 @pytest.mark.parametrize(
@@ -29,6 +31,15 @@ def test_no_large_error_and_no_trouble_with_an_intact_stage(event: str, seed: in
     assert "failed" not in record
     assert record["troubles"] == []
     assert record["adaptive"]["large_s"] <= LARGE_S
+
+
+def test_a_right_model_that_lies_at_its_bound_on_one_branch_is_served() -> None:
+    """A Duhem stage that never rests: ``model_bad`` from 0.4 s on, while a model was looked at going up only."""
+    factory = random_plant(90_000_004)
+    low_V, high_V = factory.traits.excite_V
+    config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=20, snapshot_every=20)
+    run = run_healthy(factory, identify(factory, config), config, 5.0, 90_000_004)
+    assert run.troubles == ()
 
 
 @pytest.mark.parametrize(
