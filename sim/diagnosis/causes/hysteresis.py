@@ -87,13 +87,16 @@ class HysteresisShape(CauseModel):
         return np.asarray(out[-u_V.size :])
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
-        """Height of the additional loop over the full swing, and the sum of the play weights."""
+        """Height of the additional loop at mid-swing, and the sum of the play weights.
+
+        Both branches of a play of radius r are 2 r apart there, but no further than what it moves by.
+        """
         if self.variant == "restoring":
             stops = self.radii_um(data) / data.range_um
             return {"force_share": (float(stops @ p), stops), "stiffness_share": (float(p.sum()), np.ones(p.size))}
         row, whole = np.zeros(p.size), np.zeros(p.size)
         radii_V = self.radii_V(data)
-        row[: radii_V.size] = 2.0 * np.minimum(radii_V, 0.5 * data.swing_V)
+        row[: radii_V.size] = 2.0 * np.clip(0.5 * data.swing_V - radii_V, 0.0, radii_V)
         whole[: radii_V.size] = 1.0
         return {"width_um": (float(row @ p), row), "weight_um_per_V": (float(whole @ p), whole)}
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
+from sim.diagnosis.causes.hysteresis import HysteresisShape
 from sim.diagnosis.causes.motion import friction
 from sim.diagnosis.causes.reading import resample
 from sim.diagnosis.model.calibration import calibrate
@@ -205,3 +206,15 @@ def test_what_cannot_be_diagnosed_is_refused(make: object, said: str) -> None:
     u, y = make(u, simulate(chain, u, DT))  # type: ignore[operator]
     with pytest.raises(InputError, match=said):
         prepare(Recording(t_s=np.arange(u.size) * DT, u_V=u, y_um=y, dt_s=DT))
+
+
+def test_the_reported_height_of_a_loop_is_that_of_its_branches() -> None:
+    """At mid-swing of a triangle, from 0 to 10 V; plays of more than half the swing move on the first rise alone."""
+    u = 5.0 * (1.0 - np.cos(np.pi * np.linspace(0.0, 4.0, 4001)))
+    data = FitData(DT, u, 10.0 * u)
+    shape = HysteresisShape()
+    p = np.random.default_rng(3).normal(size=shape.radii_V(data).size)
+    y = shape.static(u, u, u, p, p, data)
+    assert y is not None
+    down, up = 1500, 2500  # the middle of the last two branches: both at 5 V
+    assert shape.reported(p, data)["width_um"][0] == pytest.approx(y[down] - y[up], abs=1e-6)
