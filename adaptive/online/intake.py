@@ -26,7 +26,7 @@ from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slo
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
-from adaptive.online.sensor_trust import CONFIRMED, Following, Outcome, Trial
+from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother, smoother_of
 from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, under
@@ -694,6 +694,12 @@ class Intake:
             self.following.count_again()
             self._pasts = [*self._pasts[-1:], Past.of(track)]
         return fault
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether the readings do not move with the voltage at present: it is too early to say that the sensor sticks,
+        and what they show is not learnt meanwhile."""
+        return self._judges and self.following.still >= DOUBTED_STEPS
 
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""

@@ -742,12 +742,15 @@ class Learner:
                 return refused
             if self._frozen:
                 return admission.FROZEN
+            if intake.stands_still:
+                return admission.UNTRUSTED
             if not parts.follow(self._basis, target, pair.u_V, weight, rest):
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:
             return refused
-        if window_due and not rest and not self._frozen and parts.judgement.valid and not intake.on_probation:
+        learns = not (rest or self._frozen or intake.on_probation or intake.stands_still)
+        if window_due and learns and parts.judgement.valid:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
             parts.widen_domain(motion)

@@ -14,7 +14,8 @@ advances the hysteresis memory. The readings y are compared with the dead-reckon
 
 - Share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
 - Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. Another slope: ``sensor_gain``. No
-  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it.
+  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it; from then
+  on the readings are trusted again once they could be over a window more.
 - A stage at rest only shows whether the reading is the same as before.
 
 Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
@@ -56,8 +57,9 @@ FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
 #: The stage itself drifts if p - u changes at a rate whose standard deviation is below this share of its mean; a step
 #: follows if p differs from u by no more than this share. Forgetting factor of the rate for each step.
 STEADY, FORGET_DRIFT = 0.35, 0.5
-#: A reading stands still if p moves by less than this share of the step of u; number of such steps for a fault.
-STEP_STILL, STILL_STEPS = 0.2, 4
+#: A reading stands still if p moves by less than this share of the step of u; numbers of such steps from which nothing
+#: is learnt, and for a fault.
+STEP_STILL, DOUBTED_STEPS, STILL_STEPS = 0.2, 2, 4
 #: Good steps in a row after which all readings so far count as confirmed.
 CONFIRMED = 10
 
@@ -259,6 +261,8 @@ class Trial:
     obeyed : evaluations in a row in which p followed the applied voltage.
     followed : evaluations in a row in which the readings followed the dead-reckoned position.
     agreed : evaluations in a row, of those, with the same ``slope`` and ``shift_um``.
+    returned : evaluations in a row in which the readings of a reported fault could be trusted again. One window is not
+    enough: those of another stage move like this one's now and then.
     open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
     """
 
@@ -277,6 +281,7 @@ class Trial:
     obeyed: int = 0
     followed: int = 0
     agreed: int = 0
+    returned: int = 0
     slope: float = 1.0
     shift_um: float = 0.0
     open_slope: float = 0.0
@@ -314,7 +319,9 @@ class Trial:
         self.looked = self.since
         last = np.arange(self.count - size, self.count) % VALUES
         u, y, x, p = self.window[:, last]
-        return self._evaluate(u, y, x, p, full, now)
+        decision = self._evaluate(u, y, x, p, full, now)
+        self.returned = self.returned + 1 if self.fault and decision.outcome is not Outcome.OPEN else 0
+        return OPEN if self.fault and self.returned <= LOOKS else decision
 
     def _evaluate(
         self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, full: bool, now: Circumstances
@@ -447,8 +454,8 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # Older states have no entries for reverted jumps.
-        values = {"open_slope": 0.0, "open_shift_um": 0.0} | values
+        # Older states have no entries for reverted jumps and for the return of a reported fault.
+        values = {"open_slope": 0.0, "open_shift_um": 0.0, "returned": 0} | values
         numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
         return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
@@ -456,7 +463,7 @@ class Trial:
 
 _NUMBERS = {
     "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
-    "obeyed": int, "followed": int, "agreed": int, "slope": float, "shift_um": float,
+    "obeyed": int, "followed": int, "agreed": int, "returned": int, "slope": float, "shift_um": float,
     "open_slope": float, "open_shift_um": float,
 }  # fmt: skip
 

@@ -51,6 +51,10 @@ def test_a_right_model_that_lies_at_its_bound_on_one_branch_is_served() -> None:
         ("sensor_gain", 70_000_407),
         # The readings of another stage seem to confirm a jump that was taken back.
         ("foreign", 60_600_239),
+        # They move like this stage's for one window, two seconds after they were named.
+        ("foreign", 80_000_339),
+        # Nothing that a reading shows that may stand still is learnt.
+        ("stuck_noise", 80_000_096),
     ],
 )
 def test_a_sensor_fault_is_named_and_costs_no_more_than_the_frozen_model(event: str, seed: int) -> None:

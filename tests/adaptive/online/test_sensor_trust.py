@@ -899,9 +899,9 @@ def test_what_was_learnt_and_where_the_stage_is_stay_known(
     learner, twin = Learner.from_state(before_sticking[at]), Learner.from_state(before_sticking[at])
     before = learner.counters()
     feed_readings(learner, u, y, at, at + n)
-    # A reading that has stood still for longer than 0.1 s has to follow the drive for 0.15 s before it is trusted.
-    feed_readings(learner, u, clean, at + n, at + n + 300)
-    feed_readings(twin, u, clean, at, at + n + 300)
+    # A reading that has stood still for longer than 0.1 s has to follow the drive for 0.3 s before it is trusted.
+    feed_readings(learner, u, clean, at + n, at + n + 600)
+    feed_readings(twin, u, clean, at, at + n + 600)
     after = learner.counters()
     assert [after[name] - before[name] for name in ("jumps", "rollbacks")] == [0, 0]
     assert learner.trouble == ""
