@@ -116,6 +116,17 @@ def test_flat_tops() -> None:
     base = healthy()
     clipped = replace(base, y_um=np.minimum(base.y_um, 70.0))
     assert kinds(clipped) == {"clipped": "warning"}
+    # However much of it is lost.
+    half = replace(base, y_um=np.minimum(base.y_um, float(np.median(base.y_um))))
+    assert kinds(half) == {"clipped": "warning"}
+    # A coarse reading that moves in steps, and a stage that rests at its highest place, are not clipped.
+    coarse = replace(base, y_um=np.round(base.y_um / 10.0) * 10.0)
+    assert "clipped" not in kinds(coarse)
+    rests = base.t_s > 0.5 * base.t_s[-1]
+    resting = replace(
+        base, u_V=np.where(rests, base.u_V.max(), base.u_V), y_um=np.where(rests, base.y_um.max(), base.y_um)
+    )
+    assert kinds(resting).get("clipped") != "warning"
     limited = replace(base, u_V=np.minimum(base.u_V, 7.0))
     assert kinds(limited) == {"clipped": "note"}
 
