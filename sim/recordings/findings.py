@@ -30,6 +30,8 @@ FLAT_RUN = 5
 #: Share of repeated values from which on a sensor counts as coarse or at rest; change of the voltage within a run of
 #: one reading, as a share of its span, that shows a limit of the sensor.
 OFTEN, DRIVEN_SHARE = 0.3, 0.02
+#: How much longer than elsewhere a reading must repeat at its limit.
+LONGER = 2
 #: Sine of the mean lead of the displacement above which the columns may be exchanged. Loops of stages have -0.05 to
 #: -0.3; a stage without hysteresis has 0.
 LARGEST_LEAD = 0.02
@@ -196,12 +198,16 @@ def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Find
     noisy = len(same) > 0 and float(np.mean(same)) < OFTEN
     top, bottom = float(np.max(known)), float(np.min(known))
     # But where it repeats only its extremes, while the voltage moves, they are its limits, however often.
-    within = same[(known[1:] != top) & (known[1:] != bottom)]
-    limited = len(within) > 0 and float(np.mean(within)) < OFTEN
+    inside = (known[1:] != top) & (known[1:] != bottom)
+    limited = bool(inside.any()) and float(np.mean(same[inside])) < OFTEN
+    # Where the stage turns slowly, a reading of finite resolution repeats at any place: a limit lasts longer.
+    elsewhere = runs(same & inside)
+    usual = 1 + int(np.max(elsewhere[:, 1] - elsewhere[:, 0], initial=0))
     command = name in ("u_V", "u2_V", "u3_V")
     for which, level in (("top", top), ("bottom", bottom)):
         flat = runs(values == level)
-        long = flat[(flat[:, 1] - flat[:, 0]) >= FLAT_RUN] if len(flat) else flat
+        least = FLAT_RUN if command else max(FLAT_RUN, LONGER * usual)
+        long = flat[(flat[:, 1] - flat[:, 0]) >= least] if len(flat) else flat
         if not len(long) or not (command or noisy or (limited and _driven(recording.u_V, long))):
             continue
         count = int(np.sum(long[:, 1] - long[:, 0]))
