@@ -118,6 +118,11 @@ class Reckoning:
         return float(self.numbers[_V])
 
     @property
+    def u_V(self) -> float:
+        """Voltage there, V."""
+        return float(self.numbers[_U])
+
+    @property
     def std_um(self) -> float:
         """One standard deviation of the place, µm: it grows with the way gone, and by what the band cut off.
 

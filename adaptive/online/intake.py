@@ -564,11 +564,16 @@ class Intake:
                 return Taken(admission.UNTRUSTED, renamed=trial.fault != fault)
             away_um = sample.y_um - trial.reckoning.y_um
             self.jumps += 1
+        before = track.served
         track.enter(frame)
         self.gates.note_glitch()
         taken = self._restart(sample, admission.SETTLING)
         track.remember(trial.reckoning.memory)
-        return taken._replace(jump_um=away_um, renamed=True)
+        first = decision.outcome is Outcome.CHANGED
+        if first:
+            # Readings of another stage may have moved alike for a while: this jump is open until motion confirms it.
+            self._proven, self._proven_past = before, Past.reckoned(trial.reckoning)
+        return taken._replace(jump_um=away_um, renamed=True, first=first)
 
     def reckon_by(self, model: LssvmInverse) -> None:
         """``model`` is served while readings are on trial: reckon the place with the same model.

@@ -211,7 +211,9 @@ OPEN_SLOPE = 0.15
 #: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
-ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
+#: What is left of position and readings beside straight lines in time must not differ, if the position's is this
+#: multiple of the noise of a reading.
+ALIKE, PLAIN, PLAIN_SLOPE, BENDS_SIGMA = (0.5, 2.5), 0.98, 0.12, 2.0
 #: A drift of the zero beside the motion is accepted after half a window, if position and voltages explain this share of
 #: what is left beside the drift, both slopes are known with this standard deviation, and lie within this factor of 1.
 BESIDE, BESIDE_STD, BESIDE_SLOPE = 0.9, 0.1, 1.4
@@ -264,6 +266,7 @@ class Trial:
     returned : evaluations in a row in which the readings of a reported fault could be trusted again. One window is not
     enough: those of another stage move like this one's now and then.
     open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
+    bent : 1 if readings that seemed shifted have bent otherwise than the position: they may be of another stage.
     """
 
     reckoning: Reckoning
@@ -286,6 +289,7 @@ class Trial:
     shift_um: float = 0.0
     open_slope: float = 0.0
     open_shift_um: float = 0.0
+    bent: int = 0
 
     @classmethod
     def begin(
@@ -348,9 +352,12 @@ class Trial:
         zero_moved = follows and not in_place and ALIKE[0] <= by_model_um / off_um <= ALIKE[1]
         slope_error = max(abs(s.slope - 1.0), abs(voltages.slope - 1.0))
         usual = zero_moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
-        if usual and min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE:
+        plain = min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE
+        if usual and plain and not self.bent:
             # A clear shift of usual size, without a fault so far, needs only half a window.
-            return Decision(Outcome.CHANGED, 1.0, off_um)
+            self.bent = int(bends_otherwise(x, y, now.noise_um))
+            if not self.bent:
+                return Decision(Outcome.CHANGED, 1.0, off_um)
         drifted_um = 0.0 if self.fault or follows else self._drifted_um(u, y, x, p, now)
         if drifted_um:
             return Decision(Outcome.CHANGED, 1.0, drifted_um)
@@ -454,8 +461,8 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # Older states have no entries for reverted jumps and for the return of a reported fault.
-        values = {"open_slope": 0.0, "open_shift_um": 0.0, "returned": 0} | values
+        # Older states have no entries for reverted jumps, for bends, and for the return of a reported fault.
+        values = {"open_slope": 0.0, "open_shift_um": 0.0, "bent": 0, "returned": 0} | values
         numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
         return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
@@ -464,7 +471,7 @@ class Trial:
 _NUMBERS = {
     "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
     "obeyed": int, "followed": int, "agreed": int, "returned": int, "slope": float, "shift_um": float,
-    "open_slope": float, "open_shift_um": float,
+    "open_slope": float, "open_shift_um": float, "bent": int,
 }  # fmt: skip
 
 
@@ -473,17 +480,31 @@ def beside_drift(x: FloatArray, y: FloatArray, noise: float) -> tuple[float, flo
 
     Zeros if the motion does not explain the rest, with a slope near 1. ``noise`` : standard deviation of a value y.
     """
-    n = x.size
-    t = np.linspace(-1.0, 0.0, n)
+    s, std = _of_bends(x, y)
+    known = std <= BESIDE_STD and s.swing > SWING_SIGMA * noise
+    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
+        return 0.0, 0.0
+    off = slope_of(np.linspace(-1.0, 0.0, x.size), y - x)
+    return off.slope, off.constant
+
+
+def bends_otherwise(x: FloatArray, y: FloatArray, noise: float) -> bool:
+    """Whether (n,) values ``y`` bend in time, and not as the motion ``x`` does. ``noise`` : deviation of a value y.
+
+    Over a short time two motions of the same speed are alike; what is left beside their straight lines tells them
+    apart.
+    """
+    s, std = _of_bends(x, y)
+    return s.swing > BENDS_SIGMA * noise and abs(s.slope - 1.0) > PLAIN_SLOPE + 4.0 * std
+
+
+def _of_bends(x: FloatArray, y: FloatArray) -> tuple[Slope, float]:
+    """The line of (n,) values ``y`` over ``x``, both less their straight lines in time, and the slope's deviation."""
+    t = np.linspace(-1.0, 0.0, x.size)
     over_x, over_y = slope_of(t, x), slope_of(t, y)
     dx, dy = x - over_x.slope * t - over_x.constant, y - over_y.slope * t - over_y.constant
     s = slope_of(dx, dy)
-    left = dy - s.slope * dx
-    known = s.std * correlated(left) <= BESIDE_STD and s.swing > SWING_SIGMA * noise
-    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
-        return 0.0, 0.0
-    off = slope_of(t, y - x)
-    return off.slope, off.constant
+    return s, s.std * correlated(dy - s.slope * dx)
 
 
 def _fault(s: Slope, spread: float, unit: str = "um") -> tuple[str, str]:

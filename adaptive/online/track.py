@@ -10,6 +10,7 @@ import numpy as np
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap, advance_both
 from adaptive.inverse_model import track_memory
+from adaptive.online.dead_reckoning import Reckoning
 from adaptive.smoothing import FixedLagSmoother, SmootherState
 from adaptive.types import BoolArray, FloatArray, StateDict, joined, under
 
@@ -79,6 +80,13 @@ class Past:
     @classmethod
     def of(cls, track: Track) -> Past:
         return cls(*track.since_motion(), track.memory.copy(), [])
+
+    @classmethod
+    def reckoned(cls, reckoning: Reckoning) -> Past:
+        """The place where ``reckoning`` is now."""
+        place_um, u_V = np.array([reckoning.y_um]), np.array([reckoning.u_V])
+        motion = (reckoning.y_um, reckoning.v_um_per_s, 0.0)
+        return cls(motion, reckoning.u_V, u_V, place_um, reckoning.memory.copy(), [])
 
     def state_dict(self) -> StateDict:
         values = {"motion": self.motion, "u_before_V": self.u_before_V, "lag_V": self.lag_V, "lag_um": self.lag_um,

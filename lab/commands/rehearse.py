@@ -32,7 +32,7 @@ OURS = ("rehearsal.json", "rehearsal.md", "rehearsal.png")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("--plant", required=True, metavar="FILE.py:NAME", help="the simulated stage")
     add("--rate", type=float, metavar="HZ", help="samples a second, Hz, where the plant has no dt_s")

@@ -31,7 +31,7 @@ error may be at most 1.1 times that of the frozen model plus three noise floors;
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add_shared(parser, out={"required": True, "help": "folder for table, JSON and pictures"})
     add("--seeds", type=int, default=2, metavar="N", help="scenarios of each kind, seeds 1 to N (2)")

@@ -12,6 +12,9 @@ from typing import Any, Final
 from service.protocol.errors import FieldError
 from service.protocol.keys import check_name
 
+#: The note below examples that name files.
+EXAMPLE_FILES: Final = "'dehyst stage --examples DIR' makes a folder with the files that these examples name.\n"
+
 _SHARED: Final[dict[str, dict[str, Any]]] = {
     "stage": {"default": "demo", "metavar": "NAME", "help": "stage on the wire (%(default)s)"},
     "axis": {"default": "x", "metavar": "NAME", "help": "axis of the stage (%(default)s)"},
@@ -83,10 +86,10 @@ def check_selection(args: argparse.Namespace) -> None:
             check_name(option, given)
 
 
-def add_epilog(parser: argparse.ArgumentParser, text: str) -> None:
-    """Show ``text``, line by line as it is, below the options."""
+def add_epilog(parser: argparse.ArgumentParser, text: str, files: bool = False) -> None:
+    """Show ``text``, line by line as it is, below the options. ``files`` : its examples name files."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = text
+    parser.epilog = text + ("\n" + EXAMPLE_FILES if files else "")
 
 
 def progress_printer(quiet: bool) -> Callable[[str], None]:

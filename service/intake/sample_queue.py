@@ -211,14 +211,18 @@ class SampleQueue:
 
 # --- Thins samples by a stated factor where a stage sends more than the learner can handle.
 #
-# Whole stretches of 50 ms are handled and whole ones are left out. Over such a gap the hysteresis memory goes on
-# without loss, while single samples left out everywhere would leave the smoother nothing to work with.
+# Whole stretches are handled and whole ones are left out: single samples left out everywhere would leave the smoother
+# nothing to work with. After each gap the smoother begins anew and the hysteresis memory has to be found again, so the
+# stretches are as long as the age of what is learnt and the queue allow (docs/measurements/learner.md).
 
-#: Length of a stretch, s, and its fewest samples.
-_STRETCH_S: Final = 0.05
-_LEAST_SAMPLES: Final = 100
-#: Shares of the queue above which the factor is raised, and below which it may be lowered.
-_HIGH, _LOW = 0.5, 0.05
+#: Longest and shortest stretch, s, and its fewest samples; most time left out between two, s; most of the queue that
+#: one fills.
+_LONGEST_S, _SHORTEST_S, _LEAST_SAMPLES = 0.4, 0.05, 100
+_LEFT_OUT_S, _OF_QUEUE = 1.0, 0.2
+#: Shares of the queue above which the factor is raised, and below which it may be lowered: a stretch fills less.
+_HIGH, _LOW = 0.5, 0.25
+#: Share of the queue above which the factor is raised sooner, and after which time, s: the next stretch needs room.
+_FULL, _SOON_S = 0.7, 0.1
 #: Time for which the queue fills before the factor is raised, s; calm time before it is lowered, s, and the longest
 #: one: each vain trial doubles it.
 _RAISE_S, _CALM_S, _LONGEST_CALM_S = 0.5, 10.0, 600.0
@@ -242,7 +246,7 @@ class Thinner:
     def __init__(self, dt_s: float, capacity: int) -> None:
         self.factor = 1
         self.thinned = 0
-        self._length = max(_LEAST_SAMPLES, round(_STRETCH_S / dt_s))
+        self._dt_s, self._capacity = dt_s, capacity
         self._high, self._low = _HIGH * capacity, _LOW * capacity
         #: When the queue became half full, when it was last not empty, and when the factor changed and was lowered.
         self._high_s, self._busy_s, self._changed_s, self._lowered_s = np.inf, -np.inf, -np.inf, -np.inf
@@ -258,11 +262,11 @@ class Thinner:
         elif self._high_s == np.inf:
             self._high_s, self._waiting_then = now_s, waiting
             self._sent_then, self._kept_then = self._sent, self._sent - self.thinned
-        if now_s - self._high_s >= _RAISE_S and self.factor < _MOST:
+        soon = waiting > _FULL * self._capacity
+        if now_s - self._high_s >= (_SOON_S if soon else _RAISE_S) and self.factor < _MOST:
             self._high_s = np.inf
             needed = self._needed(waiting)
-            # While the queue empties the factor is large enough, and a learner that stands still needs another remedy.
-            if waiting < self._waiting_then or not needed:
+            if not needed:
                 return False
             if now_s - self._lowered_s < self._calm_s:
                 self._calm_s = min(2.0 * self._calm_s, _LONGEST_CALM_S)
@@ -274,20 +278,31 @@ class Thinner:
         return False
 
     def _needed(self, waiting: int) -> int:
-        """The factor for which the samples handled while the queue filled would have been enough; 0: none were."""
+        """The factor for which the samples handled while the queue was half full would have been enough; 0: no other.
+
+        The queue itself rises and falls with each stretch, so its samples do not tell whether the factor is enough.
+        """
         sent = self._sent - self._sent_then
         handled = self._sent - self.thinned - self._kept_then - (waiting - self._waiting_then)
-        if handled <= 0:
+        # A learner that stands still needs another remedy.
+        if handled <= 0 or self.factor * handled > sent:
             return 0
         wanted = math.ceil(_RESERVE * sent / handled)
         return min(max(wanted, self.factor + 1), 2 * self.factor + 4, _MOST)
+
+    @property
+    def stretch(self) -> int:
+        """Length of a stretch at the present factor, samples."""
+        longest_s = min(_LONGEST_S, _LEFT_OUT_S / max(self.factor - 1, 1))
+        samples = min(round(max(longest_s, _SHORTEST_S) / self._dt_s), round(_OF_QUEUE * self._capacity))
+        return max(samples, _LEAST_SAMPLES)
 
     def split(self, batch: SampleBatch) -> tuple[SampleBatch | None, SampleBatch | None]:
         """(samples to handle, samples left out); None for none."""
         self._sent += len(batch)
         if self.factor == 1:
             return batch, None
-        kept: BoolArray = (batch.seq // self._length) % self.factor == 0
+        kept: BoolArray = (batch.seq // self.stretch) % self.factor == 0
         count = int(np.count_nonzero(kept))
         self.thinned += len(batch) - count
         if count == len(batch):

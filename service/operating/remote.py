@@ -182,7 +182,7 @@ COLUMNS: Final[tuple[tuple[str, int, Cell], ...]] = (
     ("sample", 10, lambda s: str(s.get("seq"))),
     ("age", 7, lambda s: _age(s.get("sample_age_s"))),
     ("learnt", 9, lambda s: str(_get(s, "samples", "learnt"))),
-    ("lost", 6, lambda s: str(_not_handled(s))),
+    ("missed", 6, lambda s: str(_not_handled(s))),
     ("ckpt", 7, lambda s: _age(_get(s, "checkpoints", "age_s"))),
     ("queries", 9, lambda s: str(_get(s, "queries", "count"))),
     ("p50 us", 7, lambda s: _number(_get(s, "queries", "p50_us"), ".0f")),

@@ -27,6 +27,11 @@ PLAUSIBLE_UM, PLAUSIBLE_V = (0.01, 5000.0), (0.01, 2000.0)
 MOST_NOT_FINITE = 0.2
 #: Run of equal extreme readings of a noisy sensor that counts as clipping.
 FLAT_RUN = 5
+#: Share of repeated values from which on a sensor counts as coarse or at rest; change of the voltage within a run of
+#: one reading, as a share of its span, that shows a limit of the sensor.
+OFTEN, DRIVEN_SHARE = 0.3, 0.02
+#: How much longer than elsewhere a reading must repeat at its limit.
+LONGER = 2
 #: Sine of the mean lead of the displacement above which the columns may be exchanged. Loops of stages have -0.05 to
 #: -0.3; a stage without hysteresis has 0.
 LARGEST_LEAD = 0.02
@@ -187,14 +192,23 @@ def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Find
         return []
     found: list[Finding] = []
     finite = np.isfinite(values)
-    same = np.abs(np.diff(values[finite])) == 0.0
+    known = values[finite]
+    same = np.abs(np.diff(known)) == 0.0
     # A sensor that often repeats a value is coarse or at rest; equal extremes then prove nothing.
-    noisy = len(same) > 0 and float(np.mean(same)) < 0.3
+    noisy = len(same) > 0 and float(np.mean(same)) < OFTEN
+    top, bottom = float(np.max(known)), float(np.min(known))
+    # But where it repeats only its extremes, while the voltage moves, they are its limits, however often.
+    inside = (known[1:] != top) & (known[1:] != bottom)
+    limited = bool(inside.any()) and float(np.mean(same[inside])) < OFTEN
+    # Where the stage turns slowly, a reading of finite resolution repeats at any place: a limit lasts longer.
+    elsewhere = runs(same & inside)
+    usual = 1 + int(np.max(elsewhere[:, 1] - elsewhere[:, 0], initial=0))
     command = name in ("u_V", "u2_V", "u3_V")
-    for which, level in (("top", float(np.max(values[finite]))), ("bottom", float(np.min(values[finite])))):
+    for which, level in (("top", top), ("bottom", bottom)):
         flat = runs(values == level)
-        long = flat[(flat[:, 1] - flat[:, 0]) >= FLAT_RUN] if len(flat) else flat
-        if not len(long) or (not command and not noisy):
+        least = FLAT_RUN if command else max(FLAT_RUN, LONGER * usual)
+        long = flat[(flat[:, 1] - flat[:, 0]) >= least] if len(flat) else flat
+        if not len(long) or not (command or noisy or (limited and _driven(recording.u_V, long))):
             continue
         count = int(np.sum(long[:, 1] - long[:, 0]))
         what = f"{name}: flat {which} at {level:.5g} in {len(long)} places, {count} samples: "
@@ -202,6 +216,13 @@ def _flat_ends(recording: Recording, name: str, values: FloatArray) -> list[Find
         severity: Severity = "note" if command else "warning"
         found.append(Finding("clipped", severity, name, count, _places(recording, long[:, 0]), what))
     return found
+
+
+def _driven(u_V: FloatArray, runs_of: NDArray[np.int64]) -> bool:
+    """Whether the voltage moves in most of the (k, 2) runs: what stands still there is not the stage."""
+    span_V = float(np.nanmax(u_V) - np.nanmin(u_V))
+    moved_V = [float(np.nanmax(u_V[a:b]) - np.nanmin(u_V[a:b])) for a, b in runs_of if np.isfinite(u_V[a:b]).any()]
+    return bool(moved_V) and float(np.median(moved_V)) > DRIVEN_SHARE * span_V
 
 
 def _plausible(recording: Recording, name: str, values: FloatArray) -> list[Finding]:

@@ -28,7 +28,8 @@ EPILOG = """\
 roles:
 {roles}
 
-  dehyst access init --out access --host lab1.example.org --host 192.0.2.10 --stage afm --operator alice
+  dehyst access init --out access --host lab1.example.org --host 192.0.2.10 --stage afm --operator alice \
+      --service service --router r1
   dehyst access add --out access --operator bob --client plotter
   dehyst access remove --out access --name bob
 
@@ -51,7 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     for role in ROLES:
         stage = ", or NAME=STAGE to bind it to one stage" if role == STAGE else ""
-        parser.add_argument(f"--{role}", action="append", default=[], metavar="NAME", help=f"a {role}{stage}")
+        parser.add_argument(
+            f"--{role}", action="append", default=[], metavar="NAME", help=f"{role} of this name{stage}"
+        )
     parser.add_argument("--name", action="append", default=[], metavar="NAME", help="remove: whose access ends")
     parser.add_argument("--days", type=int, default=825, metavar="DAYS", help="validity of certificates, days (825)")
     add_shared(parser, json={"help": "print JSON"})

@@ -8,6 +8,10 @@ from service.cli.main import build_parser
 from service.cli.options import add_epilog
 
 EPILOG = """\
+Make the folders first where they are missing:
+
+  mkdir -p ~/.local/share/bash-completion/completions ~/.zfunc ~/.config/fish/completions
+
   dehyst completion bash > ~/.local/share/bash-completion/completions/dehyst
   dehyst completion zsh > ~/.zfunc/_dehyst                # a folder of $fpath
   dehyst completion fish > ~/.config/fish/completions/dehyst.fish

@@ -19,7 +19,7 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
 
   dehyst diagnose recording.parquet --out out/diagnosis
   dehyst diagnose train.csv --test test.csv --stage mystage.toml --out out/diagnosis
-  dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 5e-4 --out out/diagnosis
+  dehyst diagnose scope.csv --column y=CH2 --scale y=10 --column u=CH1 --unit u=V --dt-s 1e-3 --out out/diagnosis
   dehyst diagnose drive.npy --unit u=V --repeat u --file y=readings.npy --unit y=um --index 'y=*,:' --dt-s 1e-4 \\
       --out out/diagnosis
   dehyst diagnose multisine.npz --nominal linear --range 0:20 --out out/diagnosis --json
@@ -28,7 +28,7 @@ Displacements are in µm, voltages in V, times in s. DATA may be the folder into
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst diagnose``."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "help": "folder for the report"})
     what = parser.add_mutually_exclusive_group()

@@ -36,7 +36,7 @@ the applied one. The error in µm is that voltage error times the mean gain of t
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst identify``."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="DATA", help="the recording: a file, or a folder of segments")
     add_shared(parser, "range", out={"required": True, "metavar": "MODEL.npz", "help": "file for the models"})
     judged = parser.add_mutually_exclusive_group()

@@ -20,6 +20,8 @@ from sim.recordings.reader import read, read_table
 from sim.recordings.table import Table
 
 EPILOG = """\
+Of two columns in V it asks which is which (exit status 1); the second example answers.
+
   dehyst look scope.csv
   dehyst look scope.csv --column u=CH1 --column y=CH2 --scale y=10
 """
@@ -29,7 +31,7 @@ _POINTS = 4000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst look``."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, metavar="FILE", help="a recording: a file, or a folder of segments")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="file for the picture (FILE.look.png, here)")
     add_shared(parser, "no-pictures", "json")

@@ -27,7 +27,7 @@ Writes DIR/report.md with its pictures, and DIR/report.json (schema 1, see docs/
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst modes``."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     parser.add_argument("data", type=Path, nargs="+", metavar="RECORDING", help="recordings to fit, of any amplitudes")
     add_shared(
         parser,

@@ -21,7 +21,7 @@ the service, zenoh's access control decides what an operator may do (docs/access
 _EXAMPLES: Final = {
     "freeze": "  dehyst freeze --axis x --who alice\n",
     "thaw": "  dehyst thaw --axis x --who alice\n",
-    "rollback": "  dehyst checkpoints --axis x\n  dehyst rollback 41 --axis x\n",
+    "rollback": "  dehyst checkpoints --axis x\n  dehyst rollback 41 --axis x    # a number of that list\n",
     "checkpoints": "  dehyst checkpoints --axis x\n",
     "select": "  dehyst select linear --axis x\n  dehyst select auto --axis x\n",
     "retune": "  dehyst retune --axis x\n",

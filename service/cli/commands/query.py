@@ -28,7 +28,7 @@ EPILOG = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command, with units in the help."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("y_um", nargs="*", type=float, help="desired displacements, µm, one sample time apart")
     add(

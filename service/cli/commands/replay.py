@@ -34,7 +34,7 @@ The configuration is that of 'dehyst serve', or the learner's settings alone (do
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of ``dehyst replay``."""
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
     add = parser.add_argument
     add("data", type=Path, metavar="RECORDING", help="the recording: a file, or a folder of segments")
     add("--config", type=Path, required=True, metavar="FILE", help="TOML of 'dehyst serve', or of the learner alone")

@@ -9,7 +9,7 @@ from service.cli.options import add_epilog, add_shared
 
 EPILOG = """\
   dehyst router --listen tcp/127.0.0.1:7450
-  dehyst router --listen tls/192.0.2.10:7447 --zenoh-config access/r1.json5    # from 'dehyst access init'
+  dehyst router --listen tls/0.0.0.0:7447 --zenoh-config access/r1.json5    # see 'dehyst access --help'
 """
 
 

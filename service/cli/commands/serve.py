@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "insecure-beyond-loopback", "duration")
     add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
-    add_epilog(parser, EPILOG)
+    add_epilog(parser, EPILOG, files=True)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ ticks, and per axis the samples published and the commands received, late, missi
 
   dehyst stage --listen tcp/127.0.0.1:7448 --free-run --duration 10
   dehyst stage --endpoint tcp/127.0.0.1:7447 --axis x --twins a,b --change 30:gain_drift.gain=-0.06
+  dehyst stage --examples .              # write the files that the examples of all commands name, and exit
 """
 
 
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (%(default)s)")
     add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
+    add("--examples", type=Path, metavar="DIR", help="write the files that the examples of --help name, and exit")
     add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
     add_shared(parser, "zenoh-config", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
 
@@ -97,6 +99,8 @@ def stage_config(args: argparse.Namespace) -> StageConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Run the stage until its end, Ctrl-C or SIGTERM. Returns 0."""
+    if args.examples is not None:
+        return write_example_files(args.examples)
     from service.runtime.session import open_client, open_service
     from service.security.check import check_reach
     from service.stage_node.node import NodeConfig, StageNode
@@ -142,4 +146,16 @@ def run(args: argparse.Namespace) -> int:
     finally:
         session.close()  # type: ignore[no-untyped-call]
     print(json.dumps(summary), flush=True)
+    return 0
+
+
+def write_example_files(folder: Path) -> int:
+    """Write them and print what is what. Returns 0. Raises InputError where the folder cannot be written to."""
+    from service.stage_node.example_files import write_examples
+
+    try:
+        for name, text in write_examples(folder):
+            print(f"{name:<34}{text}")
+    except OSError as error:
+        raise FieldError("--examples", f"{folder}: {error}", "a folder that can be written to") from error
     return 0

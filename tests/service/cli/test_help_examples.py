@@ -6,6 +6,8 @@ Endpoints are the exception: a free port takes the place of the default one, so 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import json
 import os
 import re
 import shlex
@@ -15,15 +17,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import pyarrow
 import pytest
-from pyarrow import parquet
 
 from lab.cli import COMMANDS, main
 from service.cli.main import build_parser
-from sim.signals.voltages import training_input
-from tests.service.conftest import ServeProcess
+from tests.service.conftest import ServeProcess, unused_port
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -70,24 +68,10 @@ def test_a_mistyped_command_is_answered_with_the_nearest(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files that examples name: recordings of a play operator, in the forms that they say."""
+    """The files that examples name, as one of them writes them into an empty folder."""
     folder = tmp_path_factory.mktemp("examples")
-    t_s, u_V = training_input(0.005, 12.0)
-    y_um = np.empty(u_V.size)
-    play = 0.0
-    for k, u in enumerate(u_V):
-        play = min(max(play, u - 1.0), u + 1.0)
-        y_um[k] = 8.0 * u + 3.0 * play
-    y_um += 0.005 * np.random.default_rng(3).standard_normal(y_um.size)
-    rows = np.column_stack([t_s, u_V, y_um])
-    np.savetxt(folder / "recording.csv", rows, delimiter=",", header="t_s,u_V,y_um", comments="")
-    np.savetxt(
-        folder / "scope.csv", rows * (1e3, 1.0, 0.1), delimiter=",", header="Time,CH1,CH2", comments="", fmt="%.9g"
-    )
-    (folder / "trajectory.csv").write_text("y,v,a\n40,0,0\n40.1,100,0\n40.2,100,0\n")
-    for name, shift_s in (("training", 0.0), ("other", 1.0)):
-        table = pyarrow.table({"t_s": t_s * 4.0 + shift_s, "u_V": u_V, "y_um": y_um})
-        parquet.write_table(table, folder / f"{name}.parquet")
+    (writing,) = [example for example in examples("stage") if "--examples" in example]
+    assert "recording.csv" in run_as_printed(writing, folder)
     return folder
 
 
@@ -105,31 +89,58 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def test_identify_runs_as_printed(folder: Path) -> None:
+def test_no_file_of_the_reader_is_replaced(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (folder / "scope.csv").read_bytes()
+    assert main(["stage", "--examples", str(folder)]) == 2
+    assert "no file is replaced" in capsys.readouterr().err
+    assert (folder / "scope.csv").read_bytes() == before
+
+
+def test_identify_and_replay_run_as_printed(folder: Path) -> None:
     for example in examples("identify"):
         (folder / "stage.npz").unlink(missing_ok=True)
         assert "models: stage.npz" in run_as_printed(example, folder)
         assert (folder / "stage.npz").stat().st_size > 1000
+    for example in examples("replay"):
+        assert "samples scored" in run_as_printed(example, folder)
 
 
-def test_look_runs_as_printed(folder: Path, tmp_path: Path) -> None:
+def test_look_runs_as_printed(folder: Path) -> None:
     """The first example finds two columns in V and asks; the second says which is which."""
-    rows = (folder / "scope.csv").read_text().splitlines()
-    (tmp_path / "scope.csv").write_text("\n".join([rows[0], "ms,V,V", *rows[1:]]))
     asking, understood = examples("look")
     done = subprocess.run(
         [sys.executable, "-m", "lab.cli", *words(asking)],
-        cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=120,
+        cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     assert done.returncode == 1
     assert "--column y=CH2" in done.stdout
-    assert "understood: 2400 samples" in run_as_printed(understood, tmp_path)
+    assert "understood: 12000 samples" in run_as_printed(understood, folder)
+
+
+def test_modes_run_as_printed(folder: Path) -> None:
+    """The files hold modes at 90 and 230 Hz; two amplitudes show that one of them softens."""
+    amplitudes, columns, in_json = (run_as_printed(example, folder, "--no-pictures") for example in examples("modes"))
+    assert "softens by" in amplitudes
+    assert " 90 Hz" in columns
+    assert [round(mode["frequency_hz"][0]) for mode in json.loads(in_json)["modes"]] == [90, 228]
+
+
+def test_a_diagnosis_runs_as_printed(folder: Path) -> None:
+    """The example that reads one period of the drive beside many of readings; each takes 10 to 30 s."""
+    (periods,) = [example for example in examples("diagnose") if "--repeat" in example]
+    assert "report: out/diagnosis/report.md" in run_as_printed(periods, folder)
+
+
+def test_a_plant_that_is_a_function_is_rehearsed_as_printed(folder: Path) -> None:
+    (example,) = [example for example in examples("rehearse") if "mine.py" in example]
+    assert "the stage rings" in run_as_printed(example, folder)
 
 
 def test_examples_that_print_run_as_printed(folder: Path) -> None:
     for name in ("completion", "access"):
         for example in examples(name):
             run_as_printed(example, folder)
+    assert (folder / "access" / "r1.json5").exists()
     assert "[[axis]]" in run_as_printed(examples("serve")[0], folder)
     assert (folder / "access" / "service.json5").exists()
 
@@ -139,32 +150,58 @@ def test_examples_beside_a_service_run_as_printed(folder: Path, serve: Callable[
     service = serve(extra='checkpoints = "checkpoints/{axis}"\ncheckpoint_s = 1.0')
     printed = {
         example: run_as_printed(example, folder, "--endpoint", service.endpoint)
-        for name in ("query", "freeze", "thaw", "checkpoints", "select", "retune")
+        for name in ("query", "freeze", "thaw", "checkpoints", "select", "retune", "ask-diagnosis")
         for example in examples(name)
     }
     assert "40.0000" in printed["dehyst query 40                              # the voltage for 40 µm at rest"]
-    run_as_printed(examples("rollback")[0].replace("41", "1"), folder, "--endpoint", service.endpoint)
+    listing, back = examples("rollback")
+    assert "checkpoint" in run_as_printed(listing, folder, "--endpoint", service.endpoint)
+    assert "rollback from sample" in run_as_printed(back.replace("41", "1"), folder, "--endpoint", service.endpoint)
     run_as_printed(examples("view")[2], folder, "--endpoint", service.endpoint)
     assert (folder / "run.rrd").stat().st_size > 1000
-    once = examples("status")[1]
+    _, once, check = examples("status")
     assert '"axes"' in run_as_printed(once, folder, "--endpoint", service.endpoint)
+    # No samples come: the check says so by its exit status.
+    with pytest.raises(AssertionError, match="demo/x: no samples"):
+        run_as_printed(check, folder, "--endpoint", service.endpoint)
+    for name, port in (("metrics", "9464"), ("epics", "")):
+        example = examples(name)[0].replace(port or "\0", str(unused_port()))
+        if name == "metrics" or importlib.util.find_spec("p4p") is not None:
+            comes_up(example, folder, "--endpoint", service.endpoint)
 
 
-def test_examples_that_serve_come_up_as_printed(folder: Path, free_port: int) -> None:
-    for name in ("router", "stage"):
-        example = examples(name)[0].replace("7450", str(free_port)).replace("7448", str(free_port))
-        process = subprocess.Popen(
-            [sys.executable, "-m", "lab.cli", *words(example)],
-            cwd=folder, env=environment(), stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline().startswith("ready"), example
-            process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0, example
-        finally:
-            process.kill()
-            process.communicate()
+def test_examples_that_serve_come_up_as_printed(folder: Path) -> None:
+    """Routers without and with access control, the stage, and a service with its standby."""
+    for example in examples("access"):
+        run_as_printed(example, folder)
+    for example in (*examples("router"), examples("stage")[0]):
+        comes_up(re.sub("74[0-9]{2}", str(unused_port()), example), folder)
+    if not (folder / "stage.npz").exists():
+        run_as_printed(examples("identify")[0], folder)
+    _, primary, standby = examples("serve")
+    config = folder / "serve.toml"
+    text = config.read_text()
+    for port in ("7447", "7449"):
+        text = text.replace(port, str(unused_port()))
+    config.write_text(text)
+    comes_up(primary, folder, then=lambda: comes_up(standby, folder))
+
+
+def comes_up(example: str, folder: Path, *more: str, then: Callable[[], None] = lambda: None) -> None:
+    """Start an example that serves, until its first line; call ``then``, and end it by Ctrl-C."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lab.cli", *words(example), *more],
+        cwd=folder, env=environment(), stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith(("ready", "metrics at")), example
+        then()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0, example
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_the_plant_of_the_example_is_there() -> None:

@@ -33,7 +33,9 @@ def run(rate_hz: float, learnt_per_s: float, seconds: float, capacity: int = 20_
     return factors, dropped, thinner.thinned
 
 
-@pytest.mark.parametrize(("rate_hz", "learnt", "expected"), [(20_000, 12_400, 2), (1000, 12_400, 1), (20_000, 5500, 4)])
+@pytest.mark.parametrize(
+    ("rate_hz", "learnt", "expected"), [(20_000, 12_400, 2), (1000, 12_400, 1), (20_000, 5500, 4), (20_000, 3500, 6)]
+)
 def test_the_factor_settles_where_the_learner_keeps_up_and_nothing_is_dropped(
     rate_hz: float, learnt: float, expected: int
 ) -> None:
@@ -72,10 +74,10 @@ def test_all_samples_come_again_when_the_stage_is_slower_and_vain_trials_become_
 
 
 def test_whole_stretches_are_handled_and_every_sample_is_in_one_part() -> None:
-    thinner = Thinner(5e-5, 100)
-    thinner.watch(90, 0.0)
+    thinner = Thinner(5e-5, 5000)
+    thinner.watch(4500, 0.0)
     thinner.split(batch(0, 500))
-    thinner.watch(95, 1.0)
+    thinner.watch(4700, 1.0)
     assert thinner.factor == 2
     kept, left = thinner.split(batch(500, 3000))
     assert kept is not None
@@ -83,3 +85,21 @@ def test_whole_stretches_are_handled_and_every_sample_is_in_one_part() -> None:
     assert sorted([*kept.seq.tolist(), *left.seq.tolist()]) == list(range(500, 3500))
     assert kept.seq.tolist() == [*range(500, 1000), *range(2000, 3000)]
     assert thinner.thinned == len(left) == 1500
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "capacity", "factor", "expected"),
+    [
+        (1000, 20_000, 2, 400),  # the longest
+        (1000, 20_000, 6, 200),  # no more than a second is left out
+        (1000, 20_000, 100, 100),  # nor is a stretch too short for the smoother
+        (20_000, 20_000, 2, 4000),  # it fills no more than a fifth of the queue
+        (20_000, 300, 2, 100),
+    ],
+)
+def test_a_stretch_is_as_long_as_the_age_of_what_is_learnt_and_the_queue_allow(
+    rate_hz: float, capacity: int, factor: int, expected: int
+) -> None:
+    thinner = Thinner(1 / rate_hz, capacity)
+    thinner.factor = factor
+    assert thinner.stretch == expected

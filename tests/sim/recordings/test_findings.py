@@ -116,6 +116,24 @@ def test_flat_tops() -> None:
     base = healthy()
     clipped = replace(base, y_um=np.minimum(base.y_um, 70.0))
     assert kinds(clipped) == {"clipped": "warning"}
+    # However much of it is lost.
+    half = replace(base, y_um=np.minimum(base.y_um, float(np.median(base.y_um))))
+    assert kinds(half) == {"clipped": "warning"}
+    # A coarse reading that moves in steps, and a stage that rests at its highest place, are not clipped.
+    coarse = replace(base, y_um=np.round(base.y_um / 10.0) * 10.0)
+    assert "clipped" not in kinds(coarse)
+    # A slow turn of a sensor of finite resolution: ten equal readings at the top, and five to ten at other turns.
+    t_s = 5e-5 * np.arange(40_000)
+    y_um = 45.0 + 30.0 * np.sin(2 * np.pi * t_s) + 10.0 * np.sin(10 * np.pi * t_s)
+    y_um += 1e-3 * np.random.default_rng(2).standard_normal(t_s.size)
+    turning = Recording(t_s, (y_um - 5.0) / 10.0, np.round(y_um / 0.01) * 0.01, 5e-5)
+    assert "clipped" not in kinds(turning)
+    assert kinds(replace(turning, y_um=np.minimum(turning.y_um, 80.0))).get("clipped") == "warning"
+    rests = base.t_s > 0.5 * base.t_s[-1]
+    resting = replace(
+        base, u_V=np.where(rests, base.u_V.max(), base.u_V), y_um=np.where(rests, base.y_um.max(), base.y_um)
+    )
+    assert kinds(resting).get("clipped") != "warning"
     limited = replace(base, u_V=np.minimum(base.u_V, 7.0))
     assert kinds(limited) == {"clipped": "note"}
 

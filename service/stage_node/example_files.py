@@ -1,0 +1,210 @@
+"""The files that the examples of ``--help`` name, made by simulated stages: an empty folder is enough to try them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow
+from pyarrow import parquet
+
+from adaptive.types import FloatArray
+from service.config.reference import example
+from service.protocol.errors import FieldError
+from sim.signals.voltages import generalisation_input, multitone, training_input
+from sim.stage.file import save_stage
+from sim.stage.presets import preset
+from sim.stage.stage import Stage
+
+#: Files and folders that are written.
+NAMES: Final = (
+    "recording.csv", "recording.parquet", "scope.csv", "train.csv", "test.csv", "training.parquet", "other.parquet",
+    "multisine.npz", "drive.npy", "readings.npy", "recordings", "low.npz", "high.npz", "train.npz", "test.npz", "a.csv",
+    "b.csv", "c.csv", "serve.toml", "learner.toml", "mystage.toml", "mine.py", "trajectory.csv",
+)  # fmt: skip
+#: Sample time of the recordings, s. Length of the short ones, and of those of which a range is used, s.
+DT_S: Final = 1e-3
+SHORT_S, LONG_S = 12.0, 41.0
+#: Periods of the drive that readings.npy holds, samples of one, and their sample time, s.
+PERIODS, PERIOD, PERIOD_DT_S = 8, 5000, 1e-4
+#: Where the standby of the examples listens.
+STANDBY: Final = "tcp/127.0.0.1:7449"
+#: Modes of the recordings of ``dehyst modes``: frequency, Hz, damping, share of the frequency that it falls by per volt
+#: rms, and static gain of outputs and drives, µm/V. Noise of a reading, µm.
+MODES: Final = (
+    (90.0, 0.03, 0.0, ((1.0, 0.5, 0.3), (0.2, 0.1, 0.4))),
+    (230.0, 0.02, 0.05, ((0.3, -1.0, 0.2), (-0.6, 2.0, 0.5))),
+)
+NOISE_UM: Final = 1e-3
+
+LEARNER_TOML: Final = """\
+window = 400
+[drift]
+gain_walk = 0.03
+"""
+MINE_PY: Final = '''\
+"""A plant as a function, for ``dehyst rehearse``: a first-order lag with a backlash of 4 V."""
+
+import numpy as np
+
+play_V = y_um = 0.0
+noise = np.random.default_rng(1)
+
+
+def run(u_V):
+    """(true displacement, reading), both (n,) µm, under (n,) voltages."""
+    global play_V, y_um
+    true_um = np.empty(len(u_V))
+    for k, u in enumerate(u_V):
+        true_um[k] = y_um
+        play_V = min(max(play_V, u - 2.0), u + 2.0)
+        y_um += 0.6 * (0.5 * u + 0.1 * play_V - y_um)
+    return true_um, true_um + 0.004 * noise.standard_normal(len(u_V))
+'''
+
+
+def write_examples(folder: Path) -> list[tuple[str, str]]:
+    """Write all files into ``folder``, which is made. Returns (name, description) of each.
+
+    Raises FieldError where one of the files is there already: none is replaced; OSError from the disk.
+    """
+    if there := [name for name in NAMES if (folder / name).exists()]:
+        raise FieldError(
+            "--examples", f"{folder} with {', '.join(there)} in it", "a folder without files of these names",
+            "name a new folder: no file is replaced",
+        )  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    said = [*_of_the_stage(folder), *_periodic(folder)]
+    (folder / "learner.toml").write_text(LEARNER_TOML, encoding="utf-8")
+    (folder / "mine.py").write_text(MINE_PY, encoding="utf-8")
+    save_stage(preset("bouc_wen"), folder / "mystage.toml")
+    (folder / "trajectory.csv").write_text("y,v,a\n40,0,0\n40.1,100,0\n40.2,100,0\n", encoding="utf-8")
+    (folder / "serve.toml").write_text(_configuration(), encoding="utf-8")
+    return [
+        *said,
+        ("serve.toml", "for a service with the stage.npz that 'dehyst identify' writes"),
+        ("learner.toml", "settings of the learner"),
+        ("mystage.toml", "a stage file, to compare a recording with"),
+        ("mine.py", "a plant for 'dehyst rehearse'"),
+        ("trajectory.csv", "points for 'dehyst query'"),
+    ]
+
+
+def _configuration() -> str:
+    """That of ``dehyst serve --example``, for the model of the examples, with recorder, checkpoints and a standby."""
+    text = example().replace('model = "x.npz"', 'model = "stage.npz"')
+    text = text.replace("# standby_listen = []", f"standby_listen = [{STANDBY!r}]".replace("'", '"'))
+    for key in ("recorder", "checkpoints"):
+        text = text.replace(f"# {key} = ", f"{key} = ")
+    return text
+
+
+def _of_the_stage(folder: Path) -> list[tuple[str, str]]:
+    """Recordings of the stage that ``dehyst stage`` simulates, 0 to 8 V, 1 kHz."""
+    made = {
+        "recording": training_input(DT_S, SHORT_S)[1],
+        "train": _motion(SHORT_S, 1),
+        "test": generalisation_input(DT_S, SHORT_S)[1],
+        "training": _motion(LONG_S, 2),
+        "other": _motion(LONG_S, 3),
+        "multisine": _motion(LONG_S, 4),
+    }
+    rows = {name: np.column_stack([np.arange(u_V.size) * DT_S, u_V, _readings(u_V)]) for name, u_V in made.items()}
+    for name in ("recording", "train", "test"):
+        np.savetxt(folder / f"{name}.csv", rows[name], delimiter=",", header="t_s,u_V,y_um", comments="", fmt="%.9g")
+    for name in ("recording", "training", "other"):
+        columns = dict(zip(("t_s", "u_V", "y_um"), rows[name].T, strict=True))
+        parquet.write_table(pyarrow.table(columns), folder / f"{name}.parquet")
+    _, u_V, y_um = rows["multisine"].T
+    np.savez(folder / "multisine.npz", u_V=u_V, y_um=y_um, dt_s=DT_S)
+    scope = rows["recording"] * (1e3, 1.0, 0.1)
+    header = "Time,CH1,CH2\nms,V,V"
+    np.savetxt(folder / "scope.csv", scope, delimiter=",", header=header, comments="", fmt="%.9g")
+    recorded = folder / "recordings" / "x"
+    recorded.mkdir(parents=True, exist_ok=True)
+    t_s, u_V, y_um = rows["test"].T
+    segment = {"seq": np.arange(t_s.size), "t_s": t_s, "u_V": u_V, "y_um": y_um, "reason": ["learnt"] * t_s.size}
+    parquet.write_table(pyarrow.table(segment), recorded / "segment-000001.parquet")
+    period = np.arange(PERIOD) * PERIOD_DT_S
+    drive_V = 4.0 - 3.0 * np.cos(4.0 * np.pi * period) + 0.5 * np.sin(40.0 * np.pi * period)
+    np.save(folder / "drive.npy", drive_V)
+    # The first two periods are the way to the steady state.
+    readings = _readings(np.tile(drive_V, PERIODS + 2), PERIOD_DT_S).reshape(PERIODS + 2, PERIOD)[2:]
+    np.save(folder / "readings.npy", readings)
+    return [
+        ("recording.csv, recording.parquet", "12 s of the simulated stage, 0 to 8 V, 1 kHz"),
+        ("scope.csv", "the same as an oscilloscope shows it: ms, CH1 the drive in V, CH2 the sensor, 10 µm/V"),
+        ("train.csv, test.csv", "two other motions of 12 s"),
+        ("training.parquet, other.parquet", "two of 41 s"),
+        ("multisine.npz", "41 s as arrays"),
+        ("drive.npy, readings.npy", f"one period of a drive, and {PERIODS} of readings, 10 kHz"),
+        ("recordings/x/", "a segment as the recorder of a service writes it"),
+    ]
+
+
+def _motion(duration_s: float, seed: int) -> FloatArray:
+    """(n,) voltages of many tones over the whole drive, 0 to 8 V: a model of part of it is wrong at rest."""
+    u_V = multitone(duration_s, DT_S, seed=seed)[1]
+    whole: FloatArray = 8.0 * (u_V - u_V.min()) / np.ptp(u_V)
+    return whole
+
+
+def _readings(u_V: FloatArray, dt_s: float = DT_S) -> FloatArray:
+    """(n,) readings of the stage, µm, from rest under (n,) voltages."""
+    stage = Stage(preset("rich", seed=4, dt_s=dt_s))
+    readings: FloatArray = stage.run(stage.initial_state(), u_V)[0]
+    return readings
+
+
+def _periodic(folder: Path) -> list[tuple[str, str]]:
+    """Recordings for ``dehyst modes``: periods in steady state, realisations of orthogonal phases."""
+    for name, rms_V, seed in (("low", 0.1, 1), ("high", 0.3, 2)):
+        u_V, y_um = _steady(2, 512, 4, 2, rms_V, seed)
+        np.savez(folder / f"{name}.npz", u=u_V, y_um=y_um, fs_hz=1.0 / DT_S)
+    for name, seed in (("train", 3), ("test", 4)):
+        u_V, y_um = _steady(2, 4096, 2, 2, 0.2, seed)
+        # Here the periods follow one another.
+        one_by_one = [np.concatenate([values[..., 0], values[..., 1]]) for values in (u_V, y_um)]
+        np.savez(folder / f"{name}.npz", u_V=one_by_one[0], y_um=one_by_one[1], dt_s=DT_S)
+    u_V, y_um = _steady(3, 8192, 3, 3, 0.2, 5)
+    for i, name in enumerate("abc"):
+        columns = [np.concatenate([*values[:, :, i].transpose(2, 0, 1)]) for values in (u_V, 1e3 * y_um)]
+        t_s = np.arange(len(columns[0])) * DT_S
+        np.savetxt(
+            folder / f"{name}.csv", np.column_stack([t_s, *columns]), delimiter=",", header="t_s,CH1,CH2,CH3,X,Y",
+            comments="", fmt="%.9g",
+        )  # fmt: skip
+    return [
+        ("low.npz, high.npz", "two drives and two outputs at two amplitudes, for 'dehyst modes'"),
+        ("train.npz, test.npz", "the same with the periods one after another"),
+        ("a.csv, b.csv, c.csv", "three drives and two outputs, a realisation each"),
+    ]
+
+
+def _steady(
+    drives: int, samples: int, realisations: int, periods: int, rms_V: float, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """(samples, drives or 2 outputs, realisations, periods) voltages, V, and readings, µm, of ``MODES``.
+
+    Random phases at all lines below 0.45 of the sample rate; as many realisations as drives are orthogonal.
+    """
+    rng = np.random.default_rng(seed)
+    lines = np.arange(1, round(0.45 * samples))
+    spectrum = np.zeros((samples // 2 + 1, drives, realisations), dtype=np.complex128)
+    turns = np.exp(2j * np.pi * np.outer(np.arange(drives), np.arange(drives)) / drives)
+    for first in range(0, realisations, drives):
+        phases = np.exp(2j * np.pi * rng.random((lines.size, drives)))
+        spectrum[lines, :, first : first + drives] = phases[:, :, np.newaxis] * turns
+    u_V = np.fft.irfft(spectrum, n=samples, axis=0)
+    factor = rms_V / np.sqrt(np.mean(u_V**2))
+    s = 2j * np.pi * np.arange(samples // 2 + 1) / (samples * DT_S)
+    response = np.zeros((s.size, 2, drives), dtype=np.complex128)
+    for hertz, damping, falls, gains in MODES:
+        omega = 2.0 * np.pi * hertz * (1.0 - falls * rms_V)
+        shape = omega**2 / (s**2 + 2.0 * damping * omega * s + omega**2)
+        response += shape[:, np.newaxis, np.newaxis] * np.array(gains)[:, :drives]
+    y_um = np.fft.irfft(response @ (factor * spectrum), n=samples, axis=0)
+    repeated = np.repeat((factor * u_V)[..., np.newaxis], periods, axis=3)
+    noise_um = NOISE_UM * rng.standard_normal((*y_um.shape, periods))
+    return repeated, y_um[..., np.newaxis] + noise_um
