@@ -53,27 +53,22 @@ class Fleet:
             *np.zeros((2, B), dtype=np.bool_), *np.zeros((2, B)),
         )  # fmt: skip
         arrays = [template.parts.window.window_arrays for template in templates]
-        self._windows = self._make_windows(arrays[0])
+        self._windows = self._make_windows(arrays)
         self._apart: dict[int, Learner] = {}
         self._shells: dict[int, Learner] = {}
         self._is_apart = np.zeros(B, dtype=np.bool_)
         self._cache: FleetSnapshot | None = None
-        self._threads.share(B, self._fill_windows, arrays)
         for i in range(B):
             # Before its first sample an axis has no place: the single learner takes that one.
             self._set_apart(i, self._learner(i))
 
-    def _fill_windows(self, first: int, last: int, arrays: list[WindowArrays]) -> None:
-        for i in range(first, last):
-            self._windows.put(i, arrays[i])
-
-    def _make_windows(self, example: WindowArrays) -> CompiledWindows | TorchWindows:
+    def _make_windows(self, starts: Sequence[WindowArrays]) -> CompiledWindows | TorchWindows:
         rows, config = self._state.rows, self.config
         if not config.in_torch:
-            return CompiledWindows(rows, self._c, example, self._threads)
+            return CompiledWindows(rows, self._c, starts, self._threads)
         from adaptive.fleet.in_torch import TorchWindows
 
-        return TorchWindows(rows, self._c, example, config.device)
+        return TorchWindows(rows, self._c, starts, config.device)
 
     # ---- samples in
 
@@ -105,7 +100,12 @@ class Fleet:
             learner = self._apart[axis]
             said = learner.handle(Sample(*(part[axis].item() for part in sample)))
             self._settle(axis, learner, said)
+        self.touch()
         return outcome.copy()
+
+    def touch(self) -> None:
+        """Take the memory of some windows, as each step does for a start; for idle time. Nothing once all have it."""
+        self._windows.touch()
 
     def warm(self) -> None:
         """Load or compile every step, so that no sample waits for the compiler."""

@@ -248,7 +248,7 @@ class FleetService:
             try:
                 item = self._queue.get(timeout=0.1)
             except queue.Empty:
-                item = None
+                item = self._fleet.touch
             if isinstance(item, FleetMessage):
                 before, handled = handled // self.settings.snapshot_every, handled + self._learn(item)
                 if handled // self.settings.snapshot_every > before:

@@ -167,6 +167,27 @@ def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[Ls
     assert min(single.counters()["window_steps"] for single in singles) > 20
 
 
+def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -> None:
+    """Their matrices are copies on write: a step of one axis must not show in another."""
+    config = LearnerConfig(window=60)
+    fleet = Fleet([models[0]] * 80, FleetConfig(config))
+    u, y = samples(700)
+    moving = {3: Learner(models[0], config), 79: Learner(models[0], config)}
+    present = np.isin(np.arange(80), list(moving))
+    for k in range(700):
+        fleet.step(k, k * DT, u[0, k], np.where(np.arange(80) == 3, y[0, k], 1.01 * y[0, k]), present)
+        for axis, single in moving.items():
+            single.handle(Sample(k, k * DT, float(u[0, k]), float(y[0, k] if axis == 3 else 1.01 * y[0, k])))
+    begun, states = Learner(models[0], config).state_dict(), [fleet.export_axis(axis) for axis in (3, 79, 2, 78)]
+    for name in ("window.PR", "window.P", "window.R", "window.V"):
+        for axis, state in zip(moving, states, strict=False):
+            if name in state:
+                np.testing.assert_allclose(state[name], moving[axis].state_dict()[name], atol=1e-9, rtol=1e-9)
+        for state in states[2:]:
+            assert name not in state or np.array_equal(state[name], begun[name])
+    assert min(single.counters()["window_steps"] for single in moving.values()) > 5
+
+
 def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:
     fleet = Fleet(models, FleetConfig(LearnerConfig(window=60)))
     u, y = samples(500)
