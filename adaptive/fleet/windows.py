@@ -111,8 +111,7 @@ def _matrices(start: WindowArrays, count: int) -> Iterator[tuple[FloatArray, Flo
         file.flush()
         for first in range(1, count, each):
             part = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-            for P, R in part.reshape(each, 2, *start.P.shape)[: count - first]:
-                yield P, R
+            yield from ((P, R) for P, R in part.reshape(each, 2, *start.P.shape)[: count - first])
 
 
 class CompiledWindows:
