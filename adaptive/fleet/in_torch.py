@@ -45,8 +45,8 @@ class TorchWindows:
         for axis, start in enumerate(starts):
             self.put(axis, start)
 
-    def touch(self) -> None:
-        """Nothing: the matrices have their memory."""
+    def own(self, axes: Sequence[int]) -> None:
+        """Nothing: the matrices have memory of their own."""
 
     def _to(self, array: Any) -> Tensor:
         return torch.as_tensor(array).to(self._device)

@@ -11,7 +11,6 @@ import mmap
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +25,8 @@ from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_
 
 #: Fewest axes for which a second thread is worth its wake-up, and most whose matrices are copied at once.
 _LEAST_AXES = 16
-#: Most maps of one file. Calls of `CompiledWindows.touch` until all matrices have their memory.
-_MAPS, _TOUCHES = 64, 256
+#: Most maps of one file.
+_MAPS = 64
 
 
 class Threads:
@@ -136,15 +135,16 @@ class CompiledWindows:
             WindowArrays(*pairs[axis], **{name: field[axis] for name, field in self._all.items()}) for axis in range(B)
         ]
         self._handles = np.array([ws.handle_of(view) for view in self._views])
-        self._untouched = chain.from_iterable(view[:2] for view in self._views)
+        # Huge pages, where the system has them, which maps of a file have not. It takes memory as it is written.
+        self._own = np.empty((B, 2, *starts[0].P.shape))
 
-    def touch(self) -> None:
-        """Write to each page of some axes' matrices, the next ones at each call, so that their memory is there.
-
-        Else the first step of all windows would wait for the memory of all.
-        """
-        for matrix in islice(self._untouched, 2 * -(-len(self._views) // _TOUCHES)):
-            matrix.reshape(-1)[:: mmap.PAGESIZE // matrix.itemsize] *= 1.0
+    def own(self, axes: Sequence[int]) -> None:
+        """Move the matrices of ``axes`` to memory of their own; ``arrays`` of before are no longer theirs."""
+        for axis in axes:
+            view, (P, R) = self._views[axis], self._own[axis]
+            P[...], R[...] = view.P, view.R
+            self._views[axis] = view._replace(P=P, R=R)
+            self._handles[axis] = ws.handle_of(self._views[axis])
 
     def arrays(self, axis: int) -> WindowArrays:
         """The solver's state of an axis: views, stepped in place by whoever has them."""

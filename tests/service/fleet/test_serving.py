@@ -246,7 +246,8 @@ def test_damage_is_named() -> None:
     assert wire.decode_fleet(wire.FLEET_QUERY, less).parts["memory"] is None
     for data, field in (
         (whole[:-1], "payload"), (b"\x02" + whole[1:], "version"), (whole[:2] + b"\xff" + whole[3:], "options"),
-        (whole[:4] + bytes(4) + whole[8:], "axes"), (whole[:12] + bytes(4) + whole[16:], "rows"),
+        (whole[:4] + bytes(4) + whole[8:], "n"), (whole[:5] + b"\x20" + whole[6:], "axes"),
+        (whole[:12] + bytes(4) + whole[16:], "rows"),
         (whole[:16] + bytes(4) + whole[20:], "columns"), (less[:16] + b"\x01" + less[17:], "columns"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^{field}: got"):
