@@ -743,6 +743,8 @@ class Learner:
             if self._frozen:
                 return admission.FROZEN
             if not parts.follow(self._basis, target, pair.u_V, weight, rest):
+                # Nothing is learnt, but the stated deviation is of the errors until now.
+                self._cache = None
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:

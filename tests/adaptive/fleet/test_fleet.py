@@ -14,6 +14,7 @@ from adaptive.fleet.state import OUTCOMES
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
+from adaptive.online.gates import AdmissionConfig
 from adaptive.online.kernel_window import WeightConfig
 from adaptive.online.learner import Learner
 from adaptive.types import Sample
@@ -140,6 +141,53 @@ def test_axes_equal_single_learners_while_stages_drift_beside_the_voltage(models
     assert max(map(abs, rates)) > 0.0
     got = [fleet.learner_of(axis).parts.intake.following.drift_V_per_s for axis in range(4)]
     np.testing.assert_allclose(got, rates, rtol=1e-9, atol=1e-9)
+
+
+def test_axes_equal_single_learners_at_a_limit_and_where_the_model_fails(models: list[LssvmInverse]) -> None:
+    """Saturated samples, and stages that change so much that the identified model is served, or an estimate undone."""
+    config = LearnerConfig(window=60, admission=AdmissionConfig(u_min_V=0.0, u_max_V=5.5))
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    u, y = samples(4000)
+    u = np.minimum(u, 5.5)
+    for axis in range(4):
+        stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
+        y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+    # The voltage shows less and less of the motion: what was learnt last is of no use for what comes.
+    wave = np.sin(2.0 * np.pi * 5.0 * np.arange(4000) * DT) * np.clip((np.arange(4000) - 1500) * 1e-3, 0.0, 1.0)
+    y[0] += 3.0 * wave
+    y[1, 2000:2600] = y[1, 2000] + 0.6 * (y[1, 2000:2600] - y[1, 2000])
+    compare(fleet, singles, 0, u, y, 100)
+    total = {name: sum(single.counters()[name] for single in singles) for name in singles[0].counters()}
+    assert [name for name in ("saturated", "fallbacks", "rollbacks") if not total[name]] == [], total
+
+
+def test_a_refused_step_is_the_single_learners_and_costs_no_other_axis(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    u, y = samples(1200)
+    compare(fleet, singles, 0, u[:, :700], y[:, :700], 100)
+    # An inverse that is wrong: the next row's residual shows it.
+    state = singles[1].state_dict()
+    state["window.PR"] = state["window.PR"] * np.where(np.tri(60, 61, dtype=np.bool_), 3.0, 1.0)
+    singles[1] = Learner.from_state(state)
+    fleet.load_axis(1, state)
+    compare(fleet, singles, 700, u[:, 700:], y[:, 700:], 50)
+    refused = [single.counters()["window_ill_conditioned"] for single in singles]
+    assert refused[1] > 0
+    assert refused[0] == refused[2] == refused[3] == 0
+    assert [fleet.counters(axis)["window_ill_conditioned"] for axis in range(4)] == refused
+
+
+def test_axes_with_twelve_inputs_equal_single_learners() -> None:
+    stage = Stage(preset("rich", seed=1))
+    _, u = training_input(DT, 6.0)
+    y, _ = stage.run(stage.initial_state(), u)
+    model = identify_lssvm(u, y, DT, config=IdentifyConfig(tune=False, n=60, gamma=1e3, kernel_plays=10))[0]
+    assert model.features.kernel_size == 12
+    config = LearnerConfig(window=80)
+    fleet, singles = Fleet([model] * 4, FleetConfig(config)), [Learner(model, config) for _ in range(4)]
+    u, y = samples(1000)
+    compare(fleet, singles, 0, u, y, 100)
 
 
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
