@@ -23,7 +23,7 @@ _MOST_WAITING = 3
 
 
 class FleetCheckpoints:
-    """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet``.
+    """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet_0``.
 
     Raises BlockingIOError where another process writes into the folder.
     """
