@@ -42,8 +42,14 @@ class TorchWindows:
         }
         self._slots = torch.arange(example.S.size, device=self._device)
         self._handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
+        first: dict[int, int] = {}
         for axis, start in enumerate(starts):
-            self.put(axis, start)
+            like = first.setdefault(id(start), axis)
+            if like == axis:
+                self.put(axis, start)
+            else:
+                for field in self._all.values():
+                    field[axis] = field[like]
 
     def own(self, axes: Sequence[int]) -> None:
         """Nothing: the matrices have memory of their own."""
