@@ -115,8 +115,10 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
     triangles = axes * args.window * (args.window + 1) / 2 * 8 * 2 / args.learn_every
     solved = naive_s(axes, args.window, args.device) / args.learn_every
     print(f"B = {axes}, N = {args.window}, a window step every {args.learn_every} samples, {args.device}, {form}")
+    ms, first = 1e3, np.array(together[: args.before] or [0.0])
     print(f"  start-up {start_s:.2f} s; window matrices {2 * axes * args.window**2 * 8 / 2**20:.0f} MiB")
-    ms = 1e3
+    print(f"  before        mean {first.mean() * ms:8.2f} ms over the {args.before} samples before, longest "
+          f"{first.max() * ms:.0f} (sample {first.argmax()}); first 256: {first[:256].sum():.1f} s")  # fmt: skip
     print(f"  fleet         mean {steps.mean() * ms:8.2f} ms a sample of all axes, median {np.median(steps) * ms:.2f}, "
           f"p99 {np.percentile(steps, 99) * ms:.2f}; {apart / args.steps:.1f} axes apart on average, "
           f"{0.5 * stepped:.0f} window steps of an axis")  # fmt: skip

@@ -10,6 +10,7 @@ learner holds for each axis, and a refused axis costs the others nothing but the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,12 +26,14 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.learner import Learner
-from adaptive.online.track import Pair
 from adaptive.types import FloatArray, IntArray, Sample, StateDict
 from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED, WindowArrays
 
 if TYPE_CHECKING:
     from adaptive.fleet.in_torch import TorchWindows
+
+#: Samples in which the windows move to memory of their own. A step of one before that writes to its copy on write.
+OWN_WITHIN = 256
 
 
 class Fleet:
@@ -53,27 +56,23 @@ class Fleet:
             *np.zeros((2, B), dtype=np.bool_), *np.zeros((2, B)),
         )  # fmt: skip
         arrays = [template.parts.window.window_arrays for template in templates]
-        self._windows = self._make_windows(arrays[0])
+        self._windows = self._make_windows(arrays)
         self._apart: dict[int, Learner] = {}
         self._shells: dict[int, Learner] = {}
+        self._begun = list(range(B))
         self._is_apart = np.zeros(B, dtype=np.bool_)
         self._cache: FleetSnapshot | None = None
-        self._threads.share(B, self._fill_windows, arrays)
         for i in range(B):
             # Before its first sample an axis has no place: the single learner takes that one.
             self._set_apart(i, self._learner(i))
 
-    def _fill_windows(self, first: int, last: int, arrays: list[WindowArrays]) -> None:
-        for i in range(first, last):
-            self._windows.put(i, arrays[i])
-
-    def _make_windows(self, example: WindowArrays) -> CompiledWindows | TorchWindows:
+    def _make_windows(self, starts: Sequence[WindowArrays]) -> CompiledWindows | TorchWindows:
         rows, config = self._state.rows, self.config
         if not config.in_torch:
-            return CompiledWindows(rows, self._c, example, self._threads)
+            return CompiledWindows(rows, self._c, starts, self._threads)
         from adaptive.fleet.in_torch import TorchWindows
 
-        return TorchWindows(rows, self._c, example, config.device)
+        return TorchWindows(rows, self._c, starts, config.device)
 
     # ---- samples in
 
@@ -105,7 +104,18 @@ class Fleet:
             learner = self._apart[axis]
             said = learner.handle(Sample(*(part[axis].item() for part in sample)))
             self._settle(axis, learner, said)
+        if self._begun:
+            self._own_some()
         return outcome.copy()
+
+    def _own_some(self) -> None:
+        """Give some windows memory of their own. At once for all, a start or a step would wait for gigabytes."""
+        ordinary = (axis for axis in self._begun if not self._is_apart[axis])
+        some = list(islice(ordinary, -(-self.axes // OWN_WITHIN)))
+        self._windows.own(some)
+        for axis in some:
+            self._begun.remove(axis)
+            self._shells.pop(axis, None)
 
     def warm(self) -> None:
         """Load or compile every step, so that no sample waits for the compiler."""
@@ -150,7 +160,10 @@ class Fleet:
         s.counters[counted, w.outcome[counted]] += 1
         for axis in axes[w.outcome[axes] == ODD].tolist():
             learner = self._take_out(axis)
-            outcome = learner.teach(self._pair(axis))
+            track = learner.parts.intake.track
+            pair = track.pair() if track is not None else None
+            assert pair is not None
+            outcome = learner.teach(pair)
             learner.parts.counters[outcome] += 1
             self._settle(axis, learner, outcome)
         for axis in failed.tolist():
@@ -166,15 +179,6 @@ class Fleet:
         status: IntArray = self._windows.learn(axes, step)
         w.outcome[axes] = np.where(status == ACCEPTED, OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS))
         return np.asarray(axes[status == ILL_CONDITIONED])
-
-    def _pair(self, axis: int) -> Pair:
-        """The instant that an axis has come to, for its single learner to learn."""
-        s = self._state.rows
-        slots = s.voltages.shape[1]
-        now = int(s.numbers[axis]["count"]) + 1 - slots
-        u_V, before_V = (s.voltages[axis, k % slots].item() for k in (now, now - 1))
-        y, v, a = s.motion[axis].tolist()
-        return Pair(now, y, v, a, u_V, before_V, True, not s.good[axis].all())
 
     # ---- in and out of the batch
 

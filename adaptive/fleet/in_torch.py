@@ -8,7 +8,7 @@ because batched products do not use a triangle; the update is symmetric to the l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,15 +33,26 @@ class TorchWindows:
 
     shares = False
 
-    def __init__(self, rows: Rows, fixed: Fixed, example: WindowArrays, device: str) -> None:
+    def __init__(self, rows: Rows, fixed: Fixed, starts: Sequence[WindowArrays], device: str) -> None:
         self._rows, self._fixed, self._device = rows, fixed, torch.device(device)
-        B = rows.x.shape[0]
+        B, example = len(starts), starts[0]
         self._all = {
             name: torch.zeros((B, *field.shape), dtype=torch.as_tensor(field).dtype, device=self._device)
             for name, field in example._asdict().items()
         }
         self._slots = torch.arange(example.S.size, device=self._device)
         self._handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
+        first: dict[int, int] = {}
+        for axis, start in enumerate(starts):
+            like = first.setdefault(id(start), axis)
+            if like == axis:
+                self.put(axis, start)
+            else:
+                for field in self._all.values():
+                    field[axis] = field[like]
+
+    def own(self, axes: Sequence[int]) -> None:
+        """Nothing: the matrices have memory of their own."""
 
     def _to(self, array: Any) -> Tensor:
         return torch.as_tensor(array).to(self._device)

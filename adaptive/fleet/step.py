@@ -120,10 +120,7 @@ def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
         return False
     last, first = r.count - 1, r.count + 1 - slots
     x_um = (s.voltages[b, last % slots] - s.voltages[b, first % slots]) / f.slope_V_per_um
-    dy_um = y_um - s.readings[b, (first + 1) % slots]
-    if abs(x_um) <= intake.LAGS_SHARE * f.range_um or intake.LAGS[0] <= dy_um / x_um <= intake.LAGS[1]:
-        return False
-    return bool(abs(x_um) > intake.LAGS_SIGMA * r.gates.innovation2**0.5 * f.range_um)
+    return bool(intake.lags(r.gates, x_um, y_um - s.readings[b, (first + 1) % slots], f.range_um))
 
 
 @compiled

@@ -7,7 +7,9 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import mmap
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -21,8 +23,10 @@ from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
 
-#: Fewest axes for which a second thread is worth its wake-up.
+#: Fewest axes for which a second thread is worth its wake-up, and most whose matrices are copied at once.
 _LEAST_AXES = 16
+#: Most maps of one file.
+_MAPS = 64
 
 
 class Threads:
@@ -91,18 +95,56 @@ def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: f
         window.let_go(arrays_of(handles[b]), s.numbers[b], most, s.born[b], s.own[b])
 
 
+def _matrices(start: WindowArrays, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """P and R of ``count`` windows that begin as ``start``: its own, and copies that take memory as they are written.
+
+    The copies are private maps of one file. It holds some of them, because each map keeps a file open.
+    """
+    yield start.P, start.R
+    if count <= _LEAST_AXES:
+        yield from ((start.P.copy(), start.R.copy()) for _ in range(count - 1))
+        return
+    with tempfile.TemporaryFile() as file:
+        each = -(-count // _MAPS)
+        file.write(np.stack((start.P, start.R)).tobytes() * each)
+        file.flush()
+        for first in range(1, count, each):
+            part = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
+            yield from ((P, R) for P, R in part.reshape(each, 2, *start.P.shape)[: count - first])
+
+
 class CompiledWindows:
     """Windows of B axes, stepped by compiled code. ``axes`` (k,) are numbers of axes, without repeats."""
 
     #: Whether ``arrays`` gives the state itself, not a copy.
     shares = True
 
-    def __init__(self, rows: Rows, fixed: Fixed, example: WindowArrays, threads: Threads) -> None:
-        B = rows.x.shape[0]
+    def __init__(self, rows: Rows, fixed: Fixed, starts: Sequence[WindowArrays], threads: Threads) -> None:
+        """``starts`` : what each window begins as; axes that begin alike have the same one."""
+        B = len(starts)
         self._rows, self._fixed, self._threads = rows, fixed, threads
-        self._all = {name: np.zeros((B, *field.shape), field.dtype) for name, field in example._asdict().items()}
-        self._views = [WindowArrays(**{name: field[b] for name, field in self._all.items()}) for b in range(B)]
+        users: dict[int, list[int]] = {}
+        for axis, start in enumerate(starts):
+            users.setdefault(id(start), []).append(axis)
+        pairs = dict(
+            pair for axes in users.values() for pair in zip(axes, _matrices(starts[axes[0]], len(axes)), strict=True)
+        )
+        small = (name for name in WindowArrays._fields if name not in ("P", "R"))
+        self._all = {name: np.array([getattr(start, name) for start in starts]) for name in small}
+        self._views = [
+            WindowArrays(*pairs[axis], **{name: field[axis] for name, field in self._all.items()}) for axis in range(B)
+        ]
         self._handles = np.array([ws.handle_of(view) for view in self._views])
+        # Huge pages, where the system has them, which maps of a file have not. It takes memory as it is written.
+        self._own = np.empty((B, 2, *starts[0].P.shape))
+
+    def own(self, axes: Sequence[int]) -> None:
+        """Move the matrices of ``axes`` to memory of their own; ``arrays`` of before are no longer theirs."""
+        for axis in axes:
+            view, (P, R) = self._views[axis], self._own[axis]
+            P[...], R[...] = view.P, view.R
+            self._views[axis] = view._replace(P=P, R=R)
+            self._handles[axis] = ws.handle_of(self._views[axis])
 
     def arrays(self, axis: int) -> WindowArrays:
         """The solver's state of an axis: views, stepped in place by whoever has them."""

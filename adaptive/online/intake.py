@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from math import nan
 
+from adaptive.compiled import shared
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
@@ -90,6 +91,14 @@ CLEAN_S = 0.06
 CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 5.0, 0.3, 4
 
 Model = Callable[[], LssvmInverse]
+
+
+@shared
+def lags(gates: AdmissionState, x_um: float, dy_um: float, range_um: float) -> bool:
+    """Whether the reading has moved by ``dy_um`` while the voltage stands for ``x_um``, far beyond the usual error."""
+    if abs(x_um) <= LAGS_SHARE * range_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
+        return False
+    return bool(abs(x_um) > LAGS_SIGMA * gates.innovation2**0.5 * range_um)
 
 
 class Intake:
@@ -352,10 +361,7 @@ class Intake:
         if not self._judges or not self._pasts or self.gates.since_start < self._look_from:
             return False
         du_V, dy_um = track.steps_over_lag(y_um)
-        x_um = du_V / self._slope_V_per_um
-        if abs(x_um) <= self._least_um or LAGS[0] <= dy_um / x_um <= LAGS[1]:
-            return False
-        return bool(abs(x_um) > LAGS_SIGMA * self.gates.innovation2**0.5 * self.range_um)
+        return lags(self.gates, du_V / self._slope_V_per_um, dy_um, self.range_um)
 
     def _lagging(self, track: Track, model: LssvmInverse, y_um: float) -> Hold | None:
         """A hold, if the reading has not moved as the place has by reckoning: where the stage turns it moves little."""

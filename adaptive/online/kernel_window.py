@@ -138,7 +138,12 @@ class ResidualWindow:
     """
 
     def __init__(
-        self, capacity: int, model: LssvmInverse, eviction: Eviction = "nearest", solver: SolverConfig | None = None
+        self,
+        capacity: int,
+        model: LssvmInverse,
+        eviction: Eviction = "nearest",
+        solver: SolverConfig | None = None,
+        arrays: WindowArrays | None = None,
     ) -> None:
         self.eviction: Eviction = eviction
         widths = tuple(float(w) for w in model.widths)
@@ -146,7 +151,7 @@ class ResidualWindow:
         self._config = WindowConfig(capacity, widths, model.gamma, s.form, s.accuracy)
         #: Variance of the kernel part away from samples, V².
         self.kernel_variance = model.kernel_variance
-        self._window = Window(self._config)
+        self._window = Window(self._config, arrays)
         self._healing = Healing(self._window)
         self._born = np.zeros(capacity, dtype=np.int64)
         # The weights that samples came with, before they faded.
@@ -176,10 +181,7 @@ class ResidualWindow:
 
         `restore` with ``arrays=False`` sets what is not in them.
         """
-        made = cls(arrays.S.size, model, eviction, solver)
-        made._window = Window(made._config, arrays)
-        made._healing = Healing(made._window)
-        return made
+        return cls(arrays.S.size, model, eviction, solver, arrays)
 
     def __len__(self) -> int:
         return len(self._window)

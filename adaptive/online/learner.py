@@ -745,6 +745,8 @@ class Learner:
             if intake.stands_still:
                 return admission.UNTRUSTED
             if not parts.follow(self._basis, target, pair.u_V, weight, rest):
+                # Nothing is learnt, but the stated deviation is of the errors until now.
+                self._cache = None
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:

@@ -202,13 +202,19 @@ class Track:
         else:
             self.features.advance(self.motion[0], self.memory)
             self.base.advance(self.motion[0], self.frozen_memory)
-        now = state.count - 1 - self.lag
+        return self.pair(), switched
+
+    def pair(self) -> Pair | None:
+        """What the smoothed instant teaches; None before there is one."""
+        if self.motion is None:
+            return None
+        slots = self.u_V.shape[0]
+        now = self.state.count - 1 - self.lag
         at, before = now % slots, (now - 1) % slots
         # As bytes: numpy's own "all" of so few costs as much as a step of the smoother.
         near_bad = 0 in self.good.tobytes()
         good = not near_bad or bool(self.good[at] and self.good[before])
-        pair = Pair(now, *self.motion, self.u_V.item(at), self.u_V.item(before), good, near_bad)
-        return pair, switched
+        return Pair(now, *self.motion, self.u_V.item(at), self.u_V.item(before), good, near_bad)
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from baselines.competition.config import CompetitionConfig
 from service.answers.guard import Limits
 from service.background.settings import RetuningConfig, WatchConfig
+from service.config.limits import limits_setting
 from service.config.schema import Setting, build_settings, parse_toml, read_text
 from service.fleet.settings import FleetSettings
 from service.protocol.errors import FieldError
@@ -22,19 +23,10 @@ from service.security.peers import OWN_SECRET
 LEARN = "lssvm_adaptive"
 #: Models that compete with the one that learns, where the model file has them.
 COMPETE = ("linear", "mpi", "bouc_wen")
-_LIMITS = Setting(
-    help="limits of what the service sends",
-    inline={
-        "u_min_V": Setting(help="lowest voltage that the service sends", unit="V", example=0.0),
-        "u_max_V": Setting(help="highest voltage that the service sends", unit="V", example=10.0),
-        "slew_V_per_s": Setting(help="fastest change of the voltage", unit="V/s", example=2000.0),
-        "y_min_um": Setting(
-            help="lowest displacement of a trajectory; default: 5 % beyond the identified range",
-            unit="µm",
-            example=-5.0,
-        ),
-        "y_max_um": Setting(help="highest displacement of a trajectory; default: the same", unit="µm", example=95.0),
-    },
+_LIMITS = limits_setting(
+    "limits of what the service sends",
+    "lowest displacement of a trajectory; default: 5 % beyond the identified range",
+    "highest displacement of a trajectory; default: the same",
 )
 _LEARNER = Setting(help="settings of the learner, see docs/learner.md")
 _COMPETITION = Setting(help="how models are compared and exchanged, see docs/learner.md")

@@ -7,9 +7,8 @@ axis takes its next sample whatever its number.
 
 from __future__ import annotations
 
-import queue
-import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from adaptive.errors import DehystError
@@ -19,9 +18,12 @@ from service.storage.checkpoint import SUFFIX, CheckpointMeta, decode_checkpoint
 from service.storage.output import atomic_write
 from service.storage.segments import claim
 
+#: Most copies of states that wait to be written.
+_MOST_WAITING = 3
+
 
 class FleetCheckpoints:
-    """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet``.
+    """Writes the axes of ``fleet`` in turn, each once in ``period_s``, in the thread ``checkpoints-fleet_0``.
 
     Raises BlockingIOError where another process writes into the folder.
     """
@@ -32,10 +34,9 @@ class FleetCheckpoints:
         self._fleet, self._directory, self._names = fleet, directory, (stage, instance)
         self._step_s = period_s / fleet.axes
         self._axis, self._due_s = 0, time.monotonic()
-        self._queue: queue.Queue[tuple[int, CheckpointMeta, StateDict] | None] = queue.Queue(maxsize=2)
+        self._writer = ThreadPoolExecutor(1, "checkpoints-fleet")
+        self._writing: list[Future[None]] = []
         self.counts = {"written": 0, "errors": 0, "restored": 0, "refused": 0}
-        self._thread = threading.Thread(target=self._run, name="checkpoints-fleet", daemon=True)
-        self._thread.start()
 
     def restore(self) -> None:
         """Continue each axis from its file; what does not fit is counted, and its axis begins with its model."""
@@ -53,7 +54,8 @@ class FleetCheckpoints:
 
     def write_due(self) -> None:
         """Copy the axes that are due, in the thread that learns; fewer where the disk is slower."""
-        while time.monotonic() >= self._due_s and not self._queue.full():
+        self._writing = [one for one in self._writing if not one.done()]
+        while time.monotonic() >= self._due_s and len(self._writing) < _MOST_WAITING:
             self._copy(self._axis)
             self._axis = (self._axis + 1) % self._fleet.axes
             self._due_s += self._step_s
@@ -63,8 +65,9 @@ class FleetCheckpoints:
         """Write all axes once more and end the thread."""
         for axis in range(self._fleet.axes):
             self._copy(axis)
-        self._queue.put(None)
-        self._thread.join()
+            # One at a time: a state may be megabytes.
+            wait(self._writing)
+        self._writer.shutdown()
         self._lock.close()
 
     def _copy(self, axis: int) -> None:
@@ -74,17 +77,15 @@ class FleetCheckpoints:
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
         meta = CheckpointMeta(stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance)
-        self._queue.put((axis, meta, learner.state_dict()))
+        self._writing.append(self._writer.submit(self._write, axis, meta, learner.state_dict()))
 
-    def _run(self) -> None:
-        while (item := self._queue.get()) is not None:
-            axis, meta, state = item
-            try:
-                with atomic_write(self._path(axis)) as file:
-                    file.writelines(encode_checkpoint(meta, prefixed("learner.", state)))
-                self.counts["written"] += 1
-            except OSError:
-                self.counts["errors"] += 1
+    def _write(self, axis: int, meta: CheckpointMeta, state: StateDict) -> None:
+        try:
+            with atomic_write(self._path(axis)) as file:
+                file.writelines(encode_checkpoint(meta, prefixed("learner.", state)))
+            self.counts["written"] += 1
+        except OSError:
+            self.counts["errors"] += 1
 
     def _path(self, axis: int) -> Path:
         return self._directory / f"axis-{axis:04d}{SUFFIX}"

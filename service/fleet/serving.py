@@ -29,21 +29,14 @@ from service.config.schema import build_settings
 from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
-from service.fleet.wire import (
-    FLEET_CHANGES,
-    FLEET_QUERY,
-    FLEET_REPLY,
-    FLEET_SAMPLES,
-    REFUSED,
-    FleetMessage,
-    decode_fleet,
-    encode_fleet,
-)
+from service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
 from service.protocol.container import JSON, fields_of, to_json
-from service.protocol.errors import FieldError, error_to_json
+from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
+from service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
 from service.runtime.session import open_service
+from service.server.query_answers import guarded
 from service.storage.model_file import read_bundle
 
 #: Name of a fleet in the keys, in place of an axis.
@@ -163,7 +156,7 @@ class FleetService:
         self._thread.start()
         self._entities = [
             session.declare_subscriber(keys.sample, self._on_samples),
-            session.declare_queryable(keys.feedforward, self._guarded(keys.feedforward, self._feedforward)),
+            session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
             session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
             session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
             # Last, because alive means callable.
@@ -213,32 +206,26 @@ class FleetService:
         if room:
             self._queue.put(batch)
 
-    def _guarded(self, key: str, reply: Callable[[bytes], tuple[bytes, str]]) -> Callable[[zenoh.Query], None]:
-        """A callback that answers or refuses, and never raises."""
+    def _answers(self, key: str, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
+        """A callback that counts and answers the queries to ``key`` by their payload."""
 
-        def on_query(query: zenoh.Query) -> None:
-            with query:
-                self._count(queries=1)
-                try:
-                    payload, encoding = reply(query.payload.to_bytes() if query.payload is not None else b"")
-                    query.reply(key, payload, encoding=encoding)
-                except Exception as error:
-                    self._count(query_errors=1)
-                    query.reply_err(error_to_json(error), encoding=JSON)
+        def counted(query: zenoh.Query) -> bytes:
+            self._count(queries=1)
+            return answer(query.payload.to_bytes() if query.payload is not None else b"")
 
-        return on_query
+        return guarded(key, counted, lambda _: self._count(query_errors=1))
 
-    def _in_turn(self, key: str, reply: Callable[[bytes], tuple[bytes, str]]) -> Callable[[zenoh.Query], None]:
+    def _in_turn(self, key: str, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
         """The same in the thread that learns, because it reads the learners."""
-        guarded = self._guarded(key, reply)
-        return lambda query: self._queue.put(lambda: guarded(query))
+        callback = self._answers(key, answer)
+        return lambda query: self._queue.put(lambda: callback(query))
 
-    def _feedforward(self, payload: bytes) -> tuple[bytes, str]:
+    def _feedforward(self, payload: bytes) -> bytes:
         snapshot, memory, seq = self._newest
         query = decode_fleet(FLEET_QUERY, payload)
         reply, refused = answer(snapshot, memory, self.settings.limits, query, seq)
         self._count(points_refused=refused)
-        return reply, "application/octet-stream"
+        return reply
 
     # ---- the thread that learns
 
@@ -302,17 +289,17 @@ class FleetService:
             raise FieldError("axis", repr(axis), f"an axis from 0 to {self.settings.axes - 1}")
         return axis
 
-    def _model(self, payload: bytes) -> tuple[bytes, str]:
+    def _model(self, payload: bytes) -> bytes:
         axis = self._axis_of(payload)
         if axis is None:
             raise FieldError("axis", "nothing", 'JSON with the number of one axis, {"axis": 0}')
         learner = self._fleet.learner_of(axis)
         model = learner.snapshot()
-        return encode_model(LEARN, model, model.seq, self._fleet.memory()[axis]), "application/octet-stream"
+        return encode_model(LEARN, model, model.seq, self._fleet.memory()[axis])
 
-    def _status_reply(self, payload: bytes) -> tuple[bytes, str]:
+    def _status_reply(self, payload: bytes) -> bytes:
         axis = self._axis_of(payload)
-        return to_json(self.status() if axis is None else self.axis_status(axis)), JSON
+        return to_json(self.status() if axis is None else self.axis_status(axis))
 
     def status(self) -> dict[str, Any]:
         """The summary: counts, and the worst axes first."""

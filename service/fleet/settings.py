@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from service.answers.guard import Limits
+from service.config.limits import limits_setting
 from service.config.schema import Setting
 from service.protocol.errors import FieldError
 
@@ -26,15 +27,10 @@ class FleetSettings:
     ]
     limits: Annotated[
         Limits,
-        Setting(
-            help="limits of what the service sends to each axis",
-            inline={
-                "u_min_V": Setting(help="lowest voltage that the service sends", unit="V", example=0.0),
-                "u_max_V": Setting(help="highest voltage that the service sends", unit="V", example=10.0),
-                "slew_V_per_s": Setting(help="fastest change of the voltage", unit="V/s", example=2000.0),
-                "y_min_um": Setting(help="lowest displacement that is answered", unit="µm"),
-                "y_max_um": Setting(help="highest displacement that is answered", unit="µm"),
-            },
+        limits_setting(
+            "limits of what the service sends to each axis",
+            "lowest displacement that is answered; default: no limit",
+            "highest displacement that is answered; default: no limit",
         ),
     ]
     gains: Annotated[

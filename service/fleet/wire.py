@@ -14,14 +14,18 @@ import numpy as np
 
 from service.fleet.settings import MOST_AXES
 from service.protocol.errors import FieldError
-from service.protocol.samples import VERSION, check_length, check_seq
+from service.protocol.samples import (
+    FLEET_CHANGES,
+    FLEET_QUERY,
+    FLEET_REPLY,
+    FLEET_SAMPLES,
+    HEADER,
+    VERSION,
+    check_header,
+    check_length,
+    check_seq,
+)
 
-FLEET_SAMPLES: Final = 8
-FLEET_QUERY: Final = 9
-FLEET_REPLY: Final = 10
-FLEET_CHANGES: Final = 11
-_NAMES: Final = {FLEET_SAMPLES: "fleet samples", FLEET_QUERY: "fleet query", FLEET_REPLY: "fleet reply",
-                 FLEET_CHANGES: "fleet changes"}  # fmt: skip
 #: What follows the header, in order: name, type, sizes.
 _LAYOUT: Final[dict[int, tuple[tuple[str, str, str], ...]]] = {
     FLEET_SAMPLES: (("seq", "<i8", "k"), ("t_s", "<f8", "k"), ("u_V", "<f8", "kB"), ("y_um", "<f8", "kB")),
@@ -42,8 +46,8 @@ REFUSED: Final = 128
 #: Most values of one matrix.
 MOST_VALUES: Final = 2**22
 
-# version, kind, options, axes B, first axis, rows k, columns m
-_HEAD: Final = struct.Struct("<BBHIIII")
+#: Behind the header of all payloads, whose count is the number of axes B: first axis, rows k, columns m.
+_SIZES: Final = struct.Struct("<III")
 
 
 class FleetMessage(NamedTuple):
@@ -71,23 +75,19 @@ def encode_fleet(kind: int, first: int = 0, **parts: Any) -> bytes:
         if values.ndim != len(letters) or values.shape != expected:
             raise FieldError(name, f"shape {values.shape}", f"({', '.join(letters)}), as of the other parts")
         body.append(values.tobytes())
-    head = _HEAD.pack(VERSION, kind, options, sizes["B"], first, sizes.get("k", 1), sizes.get("m", 0))
-    return head + b"".join(body)
+    head = HEADER.pack(VERSION, kind, options, sizes["B"])
+    return b"".join((head, _SIZES.pack(first, sizes.get("k", 1), sizes.get("m", 0)), *body))
 
 
 def decode_fleet(kind: int, data: bytes) -> FleetMessage:
     """The message in a payload of ``kind``. Raises InputError where it is malformed; values are not checked."""
-    if len(data) < _HEAD.size:
-        raise FieldError("payload", f"{len(data)} bytes", f"at least {_HEAD.size} for the kind '{_NAMES[kind]}'")
-    version, got, options, axes, first, rows, columns = _HEAD.unpack_from(data)
-    allowed = sum(_OPTIONS.values()) if kind == FLEET_QUERY else 0
+    begin = HEADER.size + _SIZES.size
+    options, axes = check_header(data, kind, begin, sum(_OPTIONS.values()) if kind == FLEET_QUERY else 0)
+    first, rows, columns = _SIZES.unpack_from(data, HEADER.size)
     there = _parts_of(kind, options)
     wide = any("m" in letters for _, _, letters in there)
     for name, value, good, expected in (
-        ("version", version, version == VERSION, str(VERSION)),
-        ("kind", got, got == kind, f"{kind} ({_NAMES[kind]})"),
-        ("options", f"0x{options:04x}", not options & ~allowed, f"no bit outside 0x{allowed:04x}"),
-        ("axes", axes, 1 <= axes <= MOST_AXES, f"1 to {MOST_AXES}"),
+        ("axes", axes, axes <= MOST_AXES, f"1 to {MOST_AXES}"),
         ("first", first, first < MOST_AXES, f"an axis below {MOST_AXES}"),
         ("rows", rows, rows >= 1 and rows * axes <= MOST_VALUES, f"1 to {MOST_VALUES} values in all"),
         ("columns", columns, columns * axes <= MOST_VALUES, f"at most {MOST_VALUES} values in all"),
@@ -95,7 +95,7 @@ def decode_fleet(kind: int, data: bytes) -> FleetMessage:
     ):
         if not good:
             raise FieldError(name, value, expected)
-    sizes, at = {"k": rows, "B": axes, "m": columns, "1": 1, "2": 2}, _HEAD.size
+    sizes, at = {"k": rows, "B": axes, "m": columns, "1": 1, "2": 2}, begin
     shapes = [tuple(sizes[letter] for letter in letters) for _, _, letters in there]
     counts = [math.prod(shape) for shape in shapes]
     bytes_of = [count * np.dtype(dtype).itemsize for count, (_, dtype, _) in zip(counts, there, strict=True)]

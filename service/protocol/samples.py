@@ -27,6 +27,10 @@ FEEDFORWARD_QUERY: Final = 4
 FEEDFORWARD_REPLY: Final = 5
 MODEL: Final = 6
 DELTA: Final = 7
+FLEET_SAMPLES: Final = 8
+FLEET_QUERY: Final = 9
+FLEET_REPLY: Final = 10
+FLEET_CHANGES: Final = 11
 KIND_NAMES: Final = {
     SAMPLES: "samples",
     COMMAND: "command",
@@ -35,6 +39,10 @@ KIND_NAMES: Final = {
     FEEDFORWARD_REPLY: "feedforward reply",
     MODEL: "model",
     DELTA: "model delta",
+    FLEET_SAMPLES: "fleet samples",
+    FLEET_QUERY: "fleet query",
+    FLEET_REPLY: "fleet reply",
+    FLEET_CHANGES: "fleet changes",
 }
 
 #: Longest block that is accepted, so that one message cannot use up the memory.

@@ -241,18 +241,35 @@ class QueryAnswers:
     def _guarded(
         self, key: str, answer: Callable[[zenoh.Query], bytes], parameters: tuple[str, ...] = ()
     ) -> Callable[[zenoh.Query], None]:
-        def callback(query: zenoh.Query) -> None:
-            # Leaving the context finishes the query; otherwise the caller waits until its time is over.
-            with query:
-                try:
-                    check_parameters(query.parameters, *parameters)
-                    query.reply(key, answer(query))
-                except Exception as error:
-                    if not isinstance(error, DehystError):
-                        self._axis.note("internal_error", f"{key}: {type(error).__name__}: {error}")
-                    query.reply_err(error_to_json(error), encoding=JSON)
+        def note(error: Exception) -> None:
+            if not isinstance(error, DehystError):
+                self._axis.note("internal_error", f"{key}: {type(error).__name__}: {error}")
 
-        return callback
+        return guarded(key, answer, note, parameters)
+
+
+def guarded(
+    key: str,
+    answer: Callable[[zenoh.Query], bytes],
+    failed: Callable[[Exception], None],
+    parameters: tuple[str, ...] = (),
+) -> Callable[[zenoh.Query], None]:
+    """A callback that replies to each query, and never raises: what ``answer`` raises goes to ``failed`` and back.
+
+    ``parameters`` : those that its selector may have.
+    """
+
+    def callback(query: zenoh.Query) -> None:
+        # Leaving the context finishes the query; otherwise the caller waits until its time is over.
+        with query:
+            try:
+                check_parameters(query.parameters, *parameters)
+                query.reply(key, answer(query))
+            except Exception as error:
+                failed(error)
+                query.reply_err(error_to_json(error), encoding=JSON)
+
+    return callback
 
 
 def check_parameters(parameters: zenoh.Parameters, *known: str) -> None:

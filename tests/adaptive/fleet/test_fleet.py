@@ -14,6 +14,7 @@ from adaptive.fleet.state import OUTCOMES
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
+from adaptive.online.gates import AdmissionConfig
 from adaptive.online.kernel_window import WeightConfig
 from adaptive.online.learner import Learner
 from adaptive.types import Sample
@@ -142,6 +143,53 @@ def test_axes_equal_single_learners_while_stages_drift_beside_the_voltage(models
     np.testing.assert_allclose(got, rates, rtol=1e-9, atol=1e-9)
 
 
+def test_axes_equal_single_learners_at_a_limit_and_where_the_model_fails(models: list[LssvmInverse]) -> None:
+    """Saturated samples, and stages that change so much that the identified model is served, or an estimate undone."""
+    config = LearnerConfig(window=60, admission=AdmissionConfig(u_min_V=0.0, u_max_V=5.5))
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    u, y = samples(4000)
+    u = np.minimum(u, 5.5)
+    for axis in range(4):
+        stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
+        y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+    # The voltage shows less and less of the motion: what was learnt last is of no use for what comes.
+    wave = np.sin(2.0 * np.pi * 5.0 * np.arange(4000) * DT) * np.clip((np.arange(4000) - 1500) * 1e-3, 0.0, 1.0)
+    y[0] += 3.0 * wave
+    y[1, 2000:2600] = y[1, 2000] + 0.6 * (y[1, 2000:2600] - y[1, 2000])
+    compare(fleet, singles, 0, u, y, 100)
+    total = {name: sum(single.counters()[name] for single in singles) for name in singles[0].counters()}
+    assert [name for name in ("saturated", "fallbacks", "rollbacks") if not total[name]] == [], total
+
+
+def test_a_refused_step_is_the_single_learners_and_costs_no_other_axis(models: list[LssvmInverse]) -> None:
+    config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    u, y = samples(1200)
+    compare(fleet, singles, 0, u[:, :700], y[:, :700], 100)
+    # An inverse that is wrong: the next row's residual shows it.
+    state = singles[1].state_dict()
+    state["window.PR"] = state["window.PR"] * np.where(np.tri(60, 61, dtype=np.bool_), 3.0, 1.0)
+    singles[1] = Learner.from_state(state)
+    fleet.load_axis(1, state)
+    compare(fleet, singles, 700, u[:, 700:], y[:, 700:], 50)
+    refused = [single.counters()["window_ill_conditioned"] for single in singles]
+    assert refused[1] > 0
+    assert refused[0] == refused[2] == refused[3] == 0
+    assert [fleet.counters(axis)["window_ill_conditioned"] for axis in range(4)] == refused
+
+
+def test_axes_with_twelve_inputs_equal_single_learners() -> None:
+    stage = Stage(preset("rich", seed=1))
+    _, u = training_input(DT, 6.0)
+    y, _ = stage.run(stage.initial_state(), u)
+    model = identify_lssvm(u, y, DT, config=IdentifyConfig(tune=False, n=60, gamma=1e3, kernel_plays=10))[0]
+    assert model.features.kernel_size == 12
+    config = LearnerConfig(window=80)
+    fleet, singles = Fleet([model] * 4, FleetConfig(config)), [Learner(model, config) for _ in range(4)]
+    u, y = samples(1000)
+    compare(fleet, singles, 0, u, y, 100)
+
+
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInverse], backend: str) -> None:
     config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
@@ -165,6 +213,27 @@ def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[Ls
     u, y = samples(1200)
     compare(fleet, singles, 0, u, y, 100)
     assert min(single.counters()["window_steps"] for single in singles) > 20
+
+
+def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -> None:
+    """Their matrices are copies on write: a step of one axis must not show in another."""
+    config = LearnerConfig(window=60)
+    fleet = Fleet([models[0]] * 80, FleetConfig(config))
+    u, y = samples(700)
+    moving = {3: Learner(models[0], config), 79: Learner(models[0], config)}
+    present = np.isin(np.arange(80), list(moving))
+    for k in range(700):
+        fleet.step(k, k * DT, u[0, k], np.where(np.arange(80) == 3, y[0, k], 1.01 * y[0, k]), present)
+        for axis, single in moving.items():
+            single.handle(Sample(k, k * DT, float(u[0, k]), float(y[0, k] if axis == 3 else 1.01 * y[0, k])))
+    begun, states = Learner(models[0], config).state_dict(), [fleet.export_axis(axis) for axis in (3, 79, 2, 78)]
+    for name in ("window.PR", "window.P", "window.R", "window.V"):
+        for axis, state in zip(moving, states, strict=False):
+            if name in state:
+                np.testing.assert_allclose(state[name], moving[axis].state_dict()[name], atol=1e-9, rtol=1e-9)
+        for state in states[2:]:
+            assert name not in state or np.array_equal(state[name], begun[name])
+    assert min(single.counters()["window_steps"] for single in moving.values()) > 5
 
 
 def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:

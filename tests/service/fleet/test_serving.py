@@ -109,19 +109,25 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         before = status(session)
         assert before["gates"]["learnt"] > 50 * AXES
         assert len(before["worst"]) == 10
-        assert before["worst"][0]["rms_error_pct"] == before["rms_error_pct"]["max"]
+        errors = [one["rms_error_pct"] for one in before["worst"]]
+        assert errors == sorted(errors, reverse=True)
+        assert errors[0] == before["rms_error_pct"]["max"]
         # Axis 3 is missing, 5 has no reading, the message holds two axes too many; then it comes once more, late.
         seq, t_s, u, y = motion(600, 1)
         u, y = np.pad(u, ((0, 0), (0, 2))), np.pad(y, ((0, 0), (0, 2)))
         u[0, 3] = y[0, 3] = y[0, 5] = np.nan
         bad = samples(seq, t_s, u, y)
-        for payload in (bad, bad, b"\x01\x08", b"\x01\x08" + bytes(40)):
+        early = samples(*motion(400, 5), first=0)
+        for payload in (bad, bad, early, b"\x01\x08", b"\x01\x08" + bytes(40)):
             send(session, payload)
         eventually(lambda: status(session)["samples"]["malformed"] == 2)
-        after = eventually(lambda: (now := status(session))["samples"]["received"] == 602 and now)
+        after = eventually(lambda: (now := status(session))["samples"]["received"] == 607 and now)
         assert after["samples"]["missing"] == 2
         assert after["samples"]["unknown_axes"] == 4
         assert after["gates"]["duplicate"] == AXES - 2
+        # Batches out of order are refused for each of their axes, and counted.
+        assert after["gates"]["out_of_order"] == 5 * AXES
+        assert status(session, axis=3)["gates"]["out_of_order"] == 5
         assert after["gates"]["not_finite"] == 2
         # What is refused of one axis costs the others nothing. Now half of the axes a message, and one actuator dead.
         for first in range(601, 1801, 20):
@@ -130,7 +136,7 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
             send(session, samples(seq, t_s, u[:, :32], y[:, :32]))
             send(session, samples(seq, t_s, u[:, 32:], y[:, 32:], first=32))
             eventually(lambda: status(session)["samples"]["waiting"] < 500)
-        eventually(lambda: status(session)["samples"]["received"] == 602 + 2400)
+        eventually(lambda: status(session)["samples"]["received"] == 607 + 2400)
         now = eventually(lambda: (now := status(session))["seq"] >= 1799 and now)
         assert (now["samples"]["missing"], now["samples"]["dropped"]) == (2, 0)
         assert (now["worst"][0]["axis"], now["worst"][0]["trouble"]) == (20, "sensor_stuck")
@@ -246,7 +252,8 @@ def test_damage_is_named() -> None:
     assert wire.decode_fleet(wire.FLEET_QUERY, less).parts["memory"] is None
     for data, field in (
         (whole[:-1], "payload"), (b"\x02" + whole[1:], "version"), (whole[:2] + b"\xff" + whole[3:], "options"),
-        (whole[:4] + bytes(4) + whole[8:], "axes"), (whole[:12] + bytes(4) + whole[16:], "rows"),
+        (whole[:4] + bytes(4) + whole[8:], "n"), (whole[:5] + b"\x20" + whole[6:], "axes"),
+        (whole[:12] + bytes(4) + whole[16:], "rows"),
         (whole[:16] + bytes(4) + whole[20:], "columns"), (less[:16] + b"\x01" + less[17:], "columns"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^{field}: got"):
@@ -282,6 +289,14 @@ def test_a_configuration_names_what_does_not_fit(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             parse_config(text, "f", tmp_path)
+
+
+def test_a_service_without_a_fleet_imports_neither_torch_nor_fleet() -> None:
+    code = (
+        "import sys, service.server.process, service.cli.commands.serve, service.config.settings\n"
+        "sys.exit(bool({'torch', 'adaptive.fleet.fleet', 'service.fleet.serving'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0
 
 
 def test_without_torch_the_extra_is_named(tmp_path: Path) -> None:
