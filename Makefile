@@ -64,7 +64,7 @@ test-processes: .setup-test
 # Its lines are kept to the end, or they would mingle with those of the others.
 test-computing: .setup-test
 	@mkdir -p out
-	@nice -n 10 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not alone" \
+	@nice -n 10 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" \
 	    $(addprefix --ignore=,$(PROCESSES)) > out/test-computing.txt 2>&1; ended=$$?; cat out/test-computing.txt; exit $$ended
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
