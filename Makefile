@@ -4,32 +4,27 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
-# Tests that only compute, which may share all cores.
-PURE   := tests/test_house.py tests/docs tests/vectors tests/adaptive tests/baselines tests/sim tests/foreign tests/golden \
-          tests/hidden tests/lab/reproduce tests/lab/test_scenarios.py tests/lab/rehearsal \
-          tests/benchmarks/test_house_bench.py \
-          tests/lab/demo/test_mirror.py \
-          $(addprefix tests/lab/soak/,test_judge.py test_schedule.py test_sensor_faults.py test_voltages.py) \
-          $(addprefix tests/service/,answers cli config identification intake replay reports test_warm.py \
-          background/test_diagnosing_parts.py background/test_retuning_worker.py failover/test_standby_model.py \
-          protocol/test_payloads.py runtime/test_logging_setup.py \
-          server/test_axis.py server/test_competing.py server/test_deltas.py server/test_health.py \
-          server/test_long_queries.py server/test_model_watch.py \
-          storage/test_stored_files.py viewer/test_scene.py)
-# Tests of real processes that judge no times: two at a time, the longest first. The rest measures times, alone.
-PAIRS  := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py) \
-          $(addprefix tests/service/,failover/test_restart.py failover/test_standby.py \
-          viewer/test_sink.py viewer/test_live.py operating security server/test_process.py server/test_gap_live.py storage/test_recorder.py \
-          stage_node fleet adapters client/test_fair.py client/test_thin.py)
+# Tests of real processes, which mostly wait: two at a time, the longest first. Whatever is not listed here only computes,
+# and uses what they leave of the cores, at low priority. What judges times is marked "alone", and runs so at the end.
+PROCESSES := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py test_demo.py) \
+          tests/service/failover tests/service/protocol/test_fuzz.py \
+          $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py test_restart_bench.py) \
+          $(addprefix tests/service/,viewer/test_sink.py viewer/test_live.py operating security \
+          server/test_process.py server/test_gap_live.py storage/test_recorder.py storage/test_folders.py \
+          stage_node fleet adapters client protocol/test_protocol_page.py background/test_priority.py \
+          runtime/test_memory.py runtime/test_stopping.py) \
+          $(addprefix tests/lab/soak/,test_prober.py test_stalls.py)
 COMPILE = uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
           --no-emit-index-url --extra build --extra serve --extra viewer --extra lab
 
 # One BLAS thread: two make a 1 ms solve stall for 65 ms now and then (docs/architecture.md).
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
+# Each of the hundreds of processes that tests start would compile what it imports once more.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup setup-test demo test test-clients wheel-check check docs bench foreign fuzz blind blind-foreign \
-        vectors requirements clean
+.PHONY: help setup setup-test demo test test-processes test-computing test-clients wheel-check check docs bench foreign \
+        fuzz blind blind-foreign vectors requirements clean
 help: ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
@@ -60,9 +55,17 @@ demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
 test: ## lint, types, import contract, and all tests
 	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
 	@$(MAKE) --no-print-directory -j2 setup-test check
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(PURE)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PAIRS)
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(PURE) $(PAIRS))
+	@$(MAKE) --no-print-directory -j2 test-processes test-computing
+	$(BIN)/python -m pytest -m alone $$(grep -rl --include='test_*.py' mark.alone tests)
+
+test-processes: .setup-test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not alone" $(PROCESSES)
+
+# Its lines are kept to the end, or they would mingle with those of the others.
+test-computing: .setup-test
+	@mkdir -p out
+	@nice -n 10 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" \
+	    $(addprefix --ignore=,$(PROCESSES)) > out/test-computing.txt 2>&1; ended=$$?; cat out/test-computing.txt; exit $$ended
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
 	@sh clients/test.sh

@@ -49,6 +49,7 @@ import threading
 import tokenize
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType, SimpleNamespace
@@ -100,6 +101,11 @@ class Module:
         """True for an `__init__`."""
         return self.path.name == "__init__.py"
 
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of the tree: walking it costs more than most measures do."""
+        return list(ast.walk(self.tree))
+
 
 def modules_of(root: Path, packages: Sequence[str] = PACKAGES) -> dict[str, Module]:
     """All modules of the packages under ``root``, by dotted name."""
@@ -117,7 +123,7 @@ def modules_of(root: Path, packages: Sequence[str] = PACKAGES) -> dict[str, Modu
 def code_lines(module: Module) -> int:
     """Lines of code, without blank lines, comments and docstrings."""
     spans = []
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             first = node.body[0] if ast.get_docstring(node, clean=False) is not None else None
             if first is not None:
@@ -133,7 +139,7 @@ def code_lines(module: Module) -> int:
 
 def imports_of(module: Module, known: dict[str, Module]) -> Iterator[tuple[str, str]]:
     """(imported module, imported name or "") for each import of a product module, wherever it is written."""
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 if alias.name in known:
@@ -256,10 +262,10 @@ def _dotted(node: ast.expr) -> str:
     return ".".join(reversed([*parts, node.id if isinstance(node, ast.Name) else ""]))
 
 
-def declared_in(tree: ast.Module) -> set[str]:
+def declared_in(nodes: Sequence[ast.AST]) -> set[str]:
     """Attributes of the classes of a file: names in class bodies, and what methods set on `self`."""
     found = set[str]()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ClassDef):
             found |= {p.target.id for p in node.body if isinstance(p, ast.AnnAssign) and isinstance(p.target, ast.Name)}
             found |= {
@@ -282,7 +288,7 @@ def static_measures(root: Path, packages: Sequence[str] = PACKAGES) -> dict[str,
         size["all lines"][name] = sum(len(m.text.splitlines()) for m in own)
         size["files"][name] = len(own)
     folders: dict[str, int] = {}
-    dynamic = [Dynamic(m.path, declared_in(m.tree)) for m in known.values()]
+    dynamic = [Dynamic(m.path, declared_in(m.nodes)) for m in known.values()]
     for module, visitor in zip(known.values(), dynamic, strict=True):
         visitor.visit(module.tree)
         folder = module.path.parent.as_posix()

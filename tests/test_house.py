@@ -56,6 +56,16 @@ def test_nothing_frozen_is_changed(measures: dict[str, Any]) -> None:
     assert not measures["frozen changed"]
 
 
+def test_this_checkout_has_sane_numbers_and_all_that_is_traced(measures: dict[str, Any]) -> None:
+    known = house.modules_of(ROOT)
+    files, code = measures["files"], measures["code lines"]
+    assert files["total"] > 100
+    assert files["total"] == sum(n for name, n in files.items() if name != "total") == len(known)
+    assert 10_000 < code["total"] < measures["all lines"]["total"]
+    assert set(files) <= {*house.PACKAGES, "total"}
+    assert set(house.places(known)) == set(house.NAMES), "the traced measures need these names"
+
+
 def test_every_name_that_a_package_offers_can_be_imported() -> None:
     """A wrong module behind a name that is loaded on first use would fail only there."""
     missing = []

@@ -28,6 +28,7 @@ def started(*module: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.e2e
+@pytest.mark.alone
 def test_a_slow_subscriber_holds_nobody_up() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
     children = [started("lab.cli", "router", "--listen", endpoint)]

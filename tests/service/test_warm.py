@@ -1,9 +1,7 @@
-"""Compiling: done at set-up, never while somebody waits for an answer."""
+"""Compiling: done at set-up. That nothing is compiled under faults is looked at in ``tests/e2e/test_soak.py``."""
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from importlib.util import cache_from_source
 from pathlib import Path
@@ -11,35 +9,6 @@ from pathlib import Path
 import pytest
 
 from service.warm import GROUPS, PACKAGES, at_first_use, make_bytecode
-
-# Of all kinds of fault that reach a learner. A process of its own: in this one, other tests have compiled already.
-_SOAK = """
-import sys
-from numba.core import event
-from lab.cli import main
-
-class Compiled(event.Listener):
-    def on_start(self, event):
-        print("compiled:", event.data["dispatcher"].py_func.__qualname__, file=sys.stderr)
-    def on_end(self, event):
-        pass
-
-event.register("numba:compile", Compiled())
-sys.exit(main(["soak", "--fast", "--seed", "2", "--duration", "60s", "--out", sys.argv[1]]))
-"""
-
-
-def test_nothing_is_compiled_under_faults(tmp_path: Path) -> None:
-    """Ten seconds of compiling in the thread that learns are what the first jump of a new installation led to."""
-    run = subprocess.run(
-        [sys.executable, "-c", _SOAK, str(tmp_path)], capture_output=True, text=True, timeout=300, check=False
-    )
-    late = [line for line in run.stderr.splitlines() if line.startswith("compiled:")]
-    assert late == []
-    assert run.returncode == 0, run.stdout[-2000:]
-    faults = json.loads((tmp_path / "soak.json").read_text(encoding="utf-8"))["faults"]
-    doubted = {"freeze", "spike", "stuck_noisy", "sensor_gain", "sign", "other_stage"}
-    assert doubted & {kind for kind, told in faults.items() if told["count"]}
 
 
 def test_bytecode_is_made_of_every_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,7 @@ def ask_for(prober: Prober, time_s: float) -> None:
         prober.echo(b"12345")
 
 
+@pytest.mark.alone
 def test_answers_slower_than_the_next_question_end_the_silence() -> None:
     """Each takes half as long again as an answer is waited for: given up at that time there would never be one."""
     with probing(Slow((1.5 * AGAIN_S, a_point(50.0)))) as prober:
@@ -71,6 +72,7 @@ def test_answers_slower_than_the_next_question_end_the_silence() -> None:
     assert len(told["echo_us"]) >= 4
 
 
+@pytest.mark.alone
 def test_a_lost_answer_costs_no_more_than_asking_again() -> None:
     answers = Slow((8 * AGAIN_S, NoReplyError("lost")), (0.0, a_point(50.0)))
     with probing(answers) as prober:
@@ -85,6 +87,7 @@ def test_a_lost_answer_costs_no_more_than_asking_again() -> None:
     assert prober.counts["error"] == "lost"
 
 
+@pytest.mark.alone
 def test_a_silence_is_told_while_it_lasts_and_no_more_are_asked_than_there_are_ways() -> None:
     answers = Slow((6 * AGAIN_S, NoReplyError("silent")))
     with probing(answers, ways=2) as prober:

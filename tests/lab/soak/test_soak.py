@@ -198,6 +198,7 @@ def test_a_malformed_fault_names_its_field(payload: bytes, named: str) -> None:
         decode_fault(payload)
 
 
+@pytest.mark.alone
 def test_the_processors_share_of_others_is_what_nobody_of_ones_own_took() -> None:
     others = OtherLoad()
     assert others.share({1: 0.0}) is None, "a moment ago"

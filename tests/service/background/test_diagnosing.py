@@ -37,6 +37,9 @@ from sim.stage.stage import Stage
 from tests.online_models import PlainModel
 from tests.service.background.test_diagnosing_parts import DT_S, batch
 
+#: The jobs run at the lowest priority: beside other work they would not be done in time.
+pytestmark = pytest.mark.alone
+
 QUICK = WatchConfig(history_s=8.0, reference_s=4.0, recent_s=3.0, collect_s=2.0, cooldown_s=5.0, timeout_s=60.0)
 
 

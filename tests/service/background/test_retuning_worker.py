@@ -51,6 +51,7 @@ def order(search: RetuneConfig, torch: bool = False) -> dict[str, Any]:
 # ---- the process
 
 
+@pytest.mark.alone
 def test_the_working_process_has_the_lowest_priority_and_one_thread() -> None:
     own = os.getpriority(os.PRIO_PROCESS, 0)
     job = start_job(order(RetuneConfig(starts=8, rows=300)), pack("before", window_data(300)), 120.0)

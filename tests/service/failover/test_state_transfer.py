@@ -182,6 +182,7 @@ def test_a_part_that_is_missing_is_noticed(endpoint: str, lost: int | None, ende
             query.drop()
 
 
+@pytest.mark.alone
 def test_who_reads_slowly_makes_nobody_wait(endpoint: str) -> None:
     """Samples and answers pass while a standby stands still, again and again, with the state half read."""
     stop = threading.Event()

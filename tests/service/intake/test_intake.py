@@ -132,6 +132,7 @@ def slowed(axis: Any, per_sample_s: float) -> list[int]:
     return sizes
 
 
+@pytest.mark.alone
 def test_a_command_does_not_wait_for_the_samples_that_wait(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models, queue_samples=20_000)
     sizes = slowed(axis, 4e-4)

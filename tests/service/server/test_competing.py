@@ -231,6 +231,7 @@ def prequential_mV(axis: Axis, recorded: tuple[np.ndarray, np.ndarray], start: i
     return 1e3 * float(np.sqrt(np.mean(np.square(errors_V))))
 
 
+@pytest.mark.alone
 def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_same(
     bundle: Bundle, rippled: tuple[np.ndarray, np.ndarray], retuner: Retuner, tmp_path: Path
 ) -> None:
@@ -263,6 +264,7 @@ def test_kernels_far_too_wide_are_tuned_predict_better_and_a_replay_does_the_sam
         np.testing.assert_array_equal(value, again.newest.models["lssvm_adaptive"].state_dict()[key])
 
 
+@pytest.mark.alone
 def test_a_bad_proposal_is_found_out_by_its_trial(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -324,6 +326,7 @@ OPEN = {"better": False, "open": True, "fresh": 0, "before_V": 1.0, "after_V": 0
 
 
 @pytest.mark.parametrize("retuner", [{"fresh": 20}], indirect=True)
+@pytest.mark.alone
 def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -341,6 +344,7 @@ def test_what_is_open_is_tried_again_with_twice_the_samples_and_not_for_ever(
 
 
 @pytest.mark.parametrize("retuner", [{"timeout_s": 0.05}], indirect=True)
+@pytest.mark.alone
 def test_what_takes_too_long_is_ended_and_counted(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
@@ -356,6 +360,7 @@ def test_what_takes_too_long_is_ended_and_counted(
 
 
 @pytest.mark.parametrize("retuner", [{"period_s": 1.0}], indirect=True)
+@pytest.mark.alone
 def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
@@ -368,6 +373,7 @@ def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     assert retuner.status()["started"] == 1
 
 
+@pytest.mark.alone
 def test_a_frozen_learner_is_left_alone(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
 ) -> None:
@@ -397,6 +403,7 @@ def test_the_serving_process_needs_no_torch_and_the_worker_does_without() -> Non
     assert "torch is not installed" in run.stdout
 
 
+@pytest.mark.alone
 def test_a_worker_that_dies_says_why() -> None:
     job = start_job({"kind": "nonsense"}, {}, 60.0)
     until = time.monotonic() + 60.0

@@ -230,11 +230,11 @@ def test_parameters_change_without_compiling_anew() -> None:
 
     chain = effect("bouc_wen") + effect("creep") + effect("resonance")
     simulate(chain, STAIRS, 1e-3)
-    # loading machine code takes tens of ms, compiling more than that
-    start = time.perf_counter()
+    # Loading machine code takes tens of ms, compiling more than that; of the processor, whatever else has it meanwhile.
+    start = time.process_time()
     for gain in np.linspace(0.0, 0.05, 20):
         simulate(chain, STAIRS, 1e-3, params={"creep.gain_per_decade": gain})
-    assert (time.perf_counter() - start) / 20 < 0.02
+    assert (time.process_time() - start) / 20 < 0.02
 
 
 def test_chains_travel_between_processes_and_are_hashable() -> None:
