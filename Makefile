@@ -4,8 +4,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= out/demo
 SEED   ?= 0
-# Tests of real processes, which mostly wait: two at a time, the longest first. Whatever is not listed here only computes,
-# and uses what they leave of the cores, at low priority. What judges times is marked "alone", and runs so at the end.
+# Tests of real processes: two at a time, the longest first. Whatever is not listed here only computes. What judges times
+# is marked "alone", and runs so at the end.
 PROCESSES := $(addprefix tests/e2e/,test_soak.py test_falls_back.py test_scale.py test_tutorial.py test_demo.py) \
           tests/service/failover tests/service/protocol/test_fuzz.py \
           $(addprefix tests/benchmarks/,test_fuzz_bench.py test_latency_bench.py test_restart_bench.py) \
@@ -55,17 +55,16 @@ demo: setup ## watch a stage lose its hysteresis, drift, and be caught again
 test: ## lint, types, import contract, and all tests
 	@# What is compiled at set-up leaves a core idle, on which the checkers run meanwhile.
 	@$(MAKE) --no-print-directory -j2 setup-test check
-	@$(MAKE) --no-print-directory -j2 test-processes test-computing
+	@$(MAKE) --no-print-directory test-computing
+	@$(MAKE) --no-print-directory test-processes
 	$(BIN)/python -m pytest -m alone $$(grep -rl --include='test_*.py' mark.alone tests)
 
 test-processes: .setup-test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not alone" $(PROCESSES)
 
-# Its lines are kept to the end, or they would mingle with those of the others.
 test-computing: .setup-test
-	@mkdir -p out
-	@nice -n 10 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" \
-	    $(addprefix --ignore=,$(PROCESSES)) > out/test-computing.txt 2>&1; ended=$$?; cat out/test-computing.txt; exit $$ended
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not alone" \
+	    $(addprefix --ignore=,$(PROCESSES))
 
 test-clients: ## build and test the clients in Rust and C (needs cargo; without it says so)
 	@sh clients/test.sh

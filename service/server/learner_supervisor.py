@@ -215,7 +215,7 @@ class ModelWatch:
             baseline = None
         # Up and down over the range: a place at rest is one where a model has never learnt, and may lie at its bound.
         y = low + (high - low) * _SWEEP
-        u = _along(model, y)
+        u = voltages_along(model, y)
         if not np.isfinite(u).all():
             return False
         if isinstance(model, LssvmInverse):
@@ -224,7 +224,7 @@ class ModelWatch:
                 return False
         if baseline is None:
             return True
-        other = _along(baseline, y)
+        other = voltages_along(baseline, y)
         inside = np.isfinite(other)
         return bool((np.abs(u - other)[inside] <= self.config.insane_share * self._span_V).all())
 
@@ -246,7 +246,7 @@ class ModelWatch:
         return made
 
 
-def _along(model: InverseModel, y_um: FloatArray) -> FloatArray:
+def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
     """(n,) V at (n,) places, µm, that a slow motion passes in turn; NaN where the model fails."""
     zero = np.zeros(y_um.size)
     try:

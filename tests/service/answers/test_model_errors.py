@@ -12,7 +12,7 @@ import pytest
 from service.answers import fallback
 from service.answers.fallback import Rules, answer_safely
 from service.answers.guard import Limits
-from service.server.learner_supervisor import _at_rest
+from service.server.learner_supervisor import voltages_along
 from tests.service.conftest import make_models
 
 
@@ -40,7 +40,7 @@ def test_the_words_of_a_models_error_are_logged_once(broken: Any, caplog: pytest
         for _ in range(3):
             answer = answer_safely(broken, np.zeros(1), (one, one, one), math.nan, Rules(limits), None)
             assert np.isfinite(answer.u_V).all()
-        assert np.isnan(_at_rest(broken, np.linspace(0.0, 1.0, 3))).all()
+        assert np.isnan(voltages_along(broken, np.linspace(0.0, 1.0, 3))).all()
     (record,) = caplog.records
     assert "Broken raised ZeroDivisionError: the width is zero" in record.getMessage()
     assert record.exc_info is not None
@@ -52,5 +52,5 @@ def test_another_error_is_logged_too_and_a_sound_model_logs_nothing(
     with caplog.at_level(logging.ERROR, "dehyst.model"):
         fallback.log_model_error(broken, ValueError("one"))
         fallback.log_model_error(broken, TypeError("other"))
-        _at_rest(make_models()["linear"], np.linspace(0.0, 1.0, 3))
+        voltages_along(make_models()["linear"], np.linspace(0.0, 1.0, 3))
     assert len(caplog.records) == 2

@@ -11,6 +11,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -172,6 +173,7 @@ def test_examples_beside_a_service_run_as_printed(folder: Path, serve: Callable[
 
 def test_examples_that_serve_come_up_as_printed(folder: Path) -> None:
     """Routers without and with access control, the stage, and a service with its standby."""
+    shutil.rmtree(folder / "access", ignore_errors=True)  # of another test of this file
     for example in examples("access"):
         run_as_printed(example, folder)
     for example in (*examples("router"), examples("stage")[0]):

@@ -99,6 +99,8 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
         try:
             for _ in range(50):
                 feed.send(BATCH)
+            # An event is placed by the times of the samples that have come.
+            wait_for(lambda: len(basket.of(Diagnostics)) == 50)
             feed.say("event", {"seq": 500, "event": "drift", "detail": "gain 0.94"})
             feed.say("status", {"stage": "demo"})
             feed.say("sample", b"nonsense")
