@@ -14,8 +14,8 @@ advances the hysteresis memory. The readings y are compared with the dead-reckon
 
 - Share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
 - Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. Another slope: ``sensor_gain``. No
-  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it; from then
-  on the readings are trusted again once they could be over a window more.
+  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it. After that
+  the readings must be right for one more window before they are trusted again.
 - A stage at rest only shows whether the reading is the same as before.
 
 Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
@@ -211,8 +211,8 @@ OPEN_SLOPE = 0.15
 #: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
-#: What is left of position and readings beside straight lines in time must not differ, if the position's is this
-#: multiple of the noise of a reading.
+#: Straight lines in time are taken off position and readings, and what is left must agree. It is compared where that of
+#: the position is at least this multiple of the noise of a reading.
 ALIKE, PLAIN, PLAIN_SLOPE, BENDS_SIGMA = (0.5, 2.5), 0.98, 0.12, 2.0
 #: A drift of the zero beside the motion is accepted after half a window, if position and voltages explain this share of
 #: what is left beside the drift, both slopes are known with this standard deviation, and lie within this factor of 1.
@@ -263,8 +263,8 @@ class Trial:
     obeyed : evaluations in a row in which p followed the applied voltage.
     followed : evaluations in a row in which the readings followed the dead-reckoned position.
     agreed : evaluations in a row, of those, with the same ``slope`` and ``shift_um``.
-    returned : evaluations in a row in which the readings of a reported fault could be trusted again. One window is not
-    enough: those of another stage move like this one's now and then.
+    returned : evaluations in a row, after a reported fault, that found the readings right. One window is not enough:
+    readings of another stage move like this one's now and then.
     open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
     bent : 1 if readings that seemed shifted have bent otherwise than the position: they may be of another stage.
     """

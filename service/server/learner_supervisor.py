@@ -213,7 +213,7 @@ class ModelWatch:
         if not (math.isfinite(low) and math.isfinite(high)):
             low, high = 0.0, 1.0
             baseline = None
-        # Up and down over the range: a place at rest is one where a model has never learnt, and may lie at its bound.
+        # Up and down over the range: on one branch alone a right model may be at its bound in most places.
         y = low + (high - low) * _SWEEP
         u = voltages_along(model, y)
         if not np.isfinite(u).all():
