@@ -218,7 +218,9 @@ class RoleControl:
         self._epoch = 0
         self._rival_at: float | None = None
         self._entities: list[Any] = []
-        self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=True)
+        # Not a daemon: zenoh's callback threads inherit this from the thread that declares them, here the one that
+        # makes the axis serve. A daemon among them that returns from zenoh while the interpreter ends aborts it.
+        self._thread = threading.Thread(target=self._run, name=f"role-{server.keys.axis}", daemon=False)
         self.settled = threading.Event()
         self.ready = threading.Event()
         server.set_synced(False)
