@@ -23,6 +23,7 @@ from service.protocol.errors import NoReplyError
 from service.protocol.query import encode_query
 from service.runtime.session import open_client
 from service.storage.model_file import BundleMeta, write_bundle
+from tests.service.conftest import write_config
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
@@ -191,6 +192,21 @@ def test_the_serving_process_imports_no_torch_and_no_plots() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert ended.stdout.strip() == "[]"
+
+
+def test_a_stop_waits_for_zenohs_callback_threads(tmp_path: Path, free_port: int) -> None:
+    """A daemon among them that returns while the interpreter ends aborts the process after a clean stop."""
+    code = (
+        "import sys, threading; from pathlib import Path;"
+        "from service.config.settings import read_config; from service.server.process import Service\n"
+        "with Service(read_config(Path(sys.argv[1]))):\n"
+        "    print([t.daemon for t in threading.enumerate() if 'pyo3' in t.name])"
+    )
+    command = [sys.executable, "-c", code, str(write_config(tmp_path, free_port))]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    daemons = json.loads(ended.stdout.lower())
+    assert len(daemons) >= 6  # samples, feedforward, model, status, state, operate
+    assert not any(daemons)
 
 
 def test_a_client_is_told_of_a_service_that_is_killed(serve: Callable[..., Any]) -> None:
