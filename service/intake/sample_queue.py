@@ -252,9 +252,12 @@ class Thinner:
         self._high_s, self._busy_s, self._changed_s, self._lowered_s = np.inf, -np.inf, -np.inf, -np.inf
         self._waiting_then = self._sent = self._sent_then = self._kept_then = 0
         self._calm_s = _CALM_S
+        #: Samples for which the queue has room, and the number of the stretch whose rest is left out for lack of it.
+        self._room, self._ended = capacity, -1
 
     def watch(self, waiting: int, now_s: float) -> bool:
         """Adapt the factor to the ``waiting`` samples at ``now_s`` (any monotonic clock); whether it has changed."""
+        self._room = self._capacity - waiting
         if waiting > self._low:
             self._busy_s = now_s
         if waiting <= self._high:
@@ -263,7 +266,9 @@ class Thinner:
             self._high_s, self._waiting_then = now_s, waiting
             self._sent_then, self._kept_then = self._sent, self._sent - self.thinned
         soon = waiting > _FULL * self._capacity
-        if now_s - self._high_s >= (_SOON_S if soon else _RAISE_S) and self.factor < _MOST:
+        # At high rates the queue is full before that: it has grown by as much as there is room left.
+        at_once = self._high_s < now_s and waiting - self._waiting_then >= self._room
+        if (at_once or now_s - self._high_s >= (_SOON_S if soon else _RAISE_S)) and self.factor < _MOST:
             self._high_s = np.inf
             needed = self._needed(waiting)
             if not needed:
@@ -298,12 +303,16 @@ class Thinner:
         return max(samples, _LEAST_SAMPLES)
 
     def split(self, batch: SampleBatch) -> tuple[SampleBatch | None, SampleBatch | None]:
-        """(samples to handle, samples left out); None for none."""
+        """(samples to handle, samples left out); None for none. A stretch ends early where the queue is full."""
         self._sent += len(batch)
         if self.factor == 1:
             return batch, None
-        kept: BoolArray = (batch.seq // self.stretch) % self.factor == 0
+        stretch = batch.seq // self.stretch
+        kept: BoolArray = (stretch % self.factor == 0) & (stretch != self._ended)
         count = int(np.count_nonzero(kept))
+        if count > self._room:
+            self._ended = int(stretch[kept][-1])
+            kept, count = np.zeros_like(kept), 0
         self.thinned += len(batch) - count
         if count == len(batch):
             return batch, None

@@ -46,6 +46,34 @@ def test_the_factor_settles_where_the_learner_keeps_up_and_nothing_is_dropped(
     assert factors[len(factors) // 2] >= expected
 
 
+@pytest.mark.parametrize(("rate_hz", "learnt"), [(100_000, 12_400), (100_000, 3500), (200_000, 12_400)])
+def test_a_queue_that_is_full_within_the_first_fraction_of_a_second_drops_nothing(
+    rate_hz: float, learnt: float
+) -> None:
+    factors, dropped, thinned = run(rate_hz, learnt, 20.0)
+    assert dropped == 0
+    assert 0 < thinned < 20 * rate_hz
+    assert rate_hz / learnt < factors[-1] < 1.5 * rate_hz / learnt + 1
+
+
+def test_a_stretch_for_which_there_is_no_room_ends_and_the_next_one_begins_whole() -> None:
+    thinner = Thinner(1e-3, 1000)
+    thinner.factor = 2  # of 200 samples
+    thinner.watch(850, 0.0)
+    assert thinner.split(batch(0, 100))[1] is None
+    thinner.watch(950, 0.1)
+    kept, left = thinner.split(batch(100, 60))
+    assert kept is None
+    assert left is not None
+    thinner.watch(600, 0.2)
+    assert thinner.split(batch(160, 40))[0] is None  # a part of a stretch gives the smoother nothing
+    kept, left = thinner.split(batch(200, 400))
+    assert kept is not None
+    assert left is not None
+    assert kept.seq.tolist() == list(range(400, 600))
+    assert thinner.thinned == 60 + 40 + 200
+
+
 def test_a_burst_that_is_soon_over_is_not_thinned() -> None:
     thinner = Thinner(1e-3, 1000)
     assert not thinner.watch(900, 0.0)
@@ -79,6 +107,7 @@ def test_whole_stretches_are_handled_and_every_sample_is_in_one_part() -> None:
     thinner.split(batch(0, 500))
     thinner.watch(4700, 1.0)
     assert thinner.factor == 2
+    thinner.watch(1000, 1.1)
     kept, left = thinner.split(batch(500, 3000))
     assert kept is not None
     assert left is not None
