@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from adaptive.compiled import shared
+from adaptive.compiled import dot, shared
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
@@ -206,7 +206,7 @@ LEFT_S = 1.0
 #: The identified model may be served after this time on trial, s, if its own recent rms error is below this share of
 #: the span for each second on trial, and below this share in all. The last estimate was exact when readings were last
 #: trusted; it loses value with time.
-ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.05
+ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.02
 
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
@@ -231,6 +231,30 @@ def _mark(values: StateDict) -> Mark:
 def time_outside(left_s: float, outside: bool, step_s: float) -> float:
     """Time outside the envelope, or inside where negative, s, after one more check."""
     return max(left_s, 0.0) + step_s if outside else max(min(left_s, 0.0) - step_s, -LEFT_S)
+
+
+def swing_of(model: LssvmInverse) -> FloatArray:
+    """(p,) basis at three quarters of the range less that at one quarter, each reached from rest in one stroke."""
+    features = model.features
+    basis, kernel = np.empty((2, features.basis_size)), np.empty(features.kernel_size)
+    for row, share in zip(basis, (0.25, 0.75), strict=True):
+        y_um = features.offset_um + features.gain * (
+            features.y_min_um + share * (features.y_max_um - features.y_min_um)
+        )
+        features.fill(y_um, 0.0, 0.0, features.rest_memory(y_um), row, kernel)
+    swing: FloatArray = basis[1] - basis[0]
+    return swing
+
+
+@shared
+def learnt_gain(swing: FloatArray, identified: FloatArray, beta: FloatArray, frame: float) -> float:
+    """Gain of the learnt linear part (p,) over that of the ``identified`` one; 0 where it has none or another sign.
+
+    ``swing`` : (p,) basis at a high place less that at a low one. ``frame`` : gain of the frame over that identified.
+    """
+    p = swing.size
+    learnt_V, identified_V = dot(swing, beta, p), dot(swing, identified, p)
+    return frame * identified_V / learnt_V if learnt_V * identified_V > 0.0 else 0.0
 
 
 @shared
@@ -294,6 +318,7 @@ class Parts:
         if allowed_V is None:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.allowed_V = allowed_V
+        self.swing = swing_of(base) if base.features.linear else np.empty(0)
         self.rail_s = 0.0
         self.railed = False
         self.left_s = 0.0
@@ -383,6 +408,15 @@ class Parts:
                 self.begin_again()
         else:
             self.left = self.left and self.left_s > -LEFT_S
+
+    @property
+    def gain_is_possible(self) -> bool:
+        """Whether a stage can have the gain that was learnt: motion is slow to show it where it is small."""
+        if not self.swing.size:
+            return True
+        base, served = self.intake.base, self.intake.served
+        gain = learnt_gain(self.swing, base.beta, self.filter.beta, served.gain / base.features.gain)
+        return self.config.envelope.gain_allows(gain)
 
     def watch_trial(self) -> bool:
         """Update ``alone`` after a sample; returns whether it has changed."""
@@ -774,7 +808,7 @@ class Learner:
         parts, intake = self.parts, self.parts.intake
         parts.watch_shape(pair.u_V - target_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
         parts.watch_rail(saturated)
-        if saturated or not intake.follow(pair, frozen_V, parts.check_s):
+        if saturated or (not intake.follow(pair, frozen_V, parts.check_s) and parts.gain_is_possible):
             if intake.confirmed:
                 parts.confirm()
             return ""

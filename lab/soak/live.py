@@ -34,6 +34,7 @@ from lab.soak.verdict.observations import (
     flatten_status,
     judge_sensor_fault,
     query_second,
+    stage_gain,
 )
 from lab.testbed.shifted_clock import write_offset
 from service.operating.remote import operate
@@ -498,7 +499,8 @@ class _Watch:
         record.unjudged += self._actions.unjudged
         if FAULT_KINDS[record.kind].sensor:
             monitor = self._monitor
-            judge_sensor_fault(record, monitor.track, monitor.named(record.begin_seq), monitor.track.newest)
+            gain = stage_gain(self._observed.faults, record.begin_s)
+            judge_sensor_fault(record, monitor.track, monitor.named(record.begin_seq), monitor.track.newest, gain)
 
     def close(self) -> None:
         """Undo the faults that are under way, and end the thread."""

@@ -32,6 +32,7 @@ from lab.soak.verdict.observations import (
     assess_recovery,
     flatten_status,
     judge_sensor_fault,
+    stage_gain,
     troubles_since,
 )
 from lab.soak.verdict.outcome import SECONDS, report, soak_summary, write_seconds, write_summary
@@ -78,9 +79,9 @@ def run_fast(
                 under_way.remove((end_s, record))
                 if FAULT_KINDS[record.kind].sensor:
                     take_events(turn, observed)
-                    judge_sensor_fault(
-                        record, turn.track, troubles_since(observed.events, record.begin_seq), turn.k - 1
-                    )
+                    gain = stage_gain(observed.faults, record.begin_s)
+                    named = troubles_since(observed.events, record.begin_seq)
+                    judge_sensor_fault(record, turn.track, named, turn.k - 1, gain)
         turn.step()
         if turn.second_is_over():
             observed.counters.append((turn.now_s, "service", Counters(flatten_status(turn.status()))))

@@ -144,10 +144,12 @@ MOVES_PER_S: Final = 0.02
 
 @dataclass(slots=True)
 class ErrorPart:
-    """The error of a short time: when it began, the sum of |error|, µm, over so many samples, and held voltages."""
+    """The error of a short time: when it began, the sums of |error| and of the way wanted from the low end, µm, over so
+    many samples, and held voltages."""
 
     t_s: float
     sum_um: float = 0.0
+    way_um: float = 0.0
     judged: int = 0
     held: int = 0
 
@@ -261,6 +263,7 @@ class SampleTracker:
         part = self.parts[-1]
         part.judged += error.size
         part.sum_um += float(error.sum())
+        part.way_um += float((self._wanted[seq % _RING] - self.control.low_um)[known].sum())
         part.held += self._held(seq, batch.u_V)
 
     def _held(self, seq: NDArray[np.int64], u_V: FloatArray) -> int:
@@ -281,18 +284,22 @@ class SampleTracker:
             np.count_nonzero(steps > MOVES_PER_S * self.control.range_um * self.control.dt_s)
         )
 
-    def worst_half_second_pct(self, begin_s: float, end_s: float) -> float:
-        """The largest mean |error| over half a second in that time, percent of the range.
+    def worst_half_second_pct(self, begin_s: float, end_s: float, gain: float = 1.0) -> tuple[float, float]:
+        """(largest mean |error| over half a second in that time, that of the frozen model), percent of the range.
 
-        Parts in which the stage had no voltage in time say nothing about the model. NaN if there are no others.
+        ``gain`` : of the stage over that when it was identified. The frozen model is off by its change times the way
+        from where the stage rests, which is no shorter than that from the low end of the reference. Parts in which the
+        stage had no voltage in time say nothing about the model. NaN if there are no others.
         """
         parts = [part for part in self.parts if begin_s <= part.t_s and part.t_s + PART_S <= end_s]
-        worst = math.nan
+        worst = frozen = math.nan
         for one, other in pairwise(parts):
             judged = one.judged + other.judged
             if judged and not (one.held or other.held):
-                worst = np.fmax(worst, 100.0 * (one.sum_um + other.sum_um) / judged / self.control.range_um)
-        return float(worst)
+                share = 100.0 / judged / self.control.range_um
+                worst = np.fmax(worst, share * (one.sum_um + other.sum_um))
+                frozen = np.fmax(frozen, share * abs(gain - 1.0) * (one.way_um + other.way_um))
+        return float(worst), float(frozen)
 
     def _second(self) -> SampleSecond:
         """The present second. A second without samples keeps the last sample number of the one before."""
@@ -655,19 +662,25 @@ def troubles_since(events: Sequence[Mapping[str, Any]], first: int) -> list[tupl
     return found[::-1]
 
 
-#: A sensor fault must have its name after so much motion, s, and the mean error over any half second must stay below
-#: this, percent of the range.
+#: A sensor fault must have its name after so much motion, s. The mean error over any half second must stay below this,
+#: percent of the range, or this multiple of the worst of the frozen model.
 NAMED_S: Final = 0.5
 SENSOR_PCT: Final = 1.0
+OF_FROZEN: Final = 1.5
 #: Troubles that name a sensor or its samples.
 _NAMES: Final = SENSOR_FAULTS | {SENSOR_FROZEN, SAMPLES_POISONED}
 
 
+def stage_gain(faults: Sequence[FaultRecord], at_s: float) -> float:
+    """Gain of the stage at ``at_s`` over that when it was identified, by the faults that changed it."""
+    return 1.0 + next((f.value for f in reversed(faults) if f.kind == "gain" and f.begin_s < at_s), 0.0)
+
+
 def judge_sensor_fault(
-    fault: FaultRecord, track: SampleTracker, troubles: Sequence[tuple[int, str]], last_seq: int
+    fault: FaultRecord, track: SampleTracker, troubles: Sequence[tuple[int, str]], last_seq: int, gain: float = 1.0
 ) -> None:
     """Note in ``fault``, whose readings were wrong up to sample ``last_seq``, whether it was named in time and how
-    large the error became. ``troubles``: (sample number, name) since it began."""
+    large the error became. ``troubles``: (sample number, name) since it began. ``gain``: see `stage_gain`."""
     dt_s = track.control.dt_s
     moved_s = track.moved_s(fault.begin_seq, last_seq)
     named = next((seq for seq, name in troubles if name in _NAMES and seq <= last_seq), None)
@@ -679,11 +692,12 @@ def judge_sensor_fault(
         fault.breaches.append(f"not named within {moved_s:.2f} s of motion")
     elif fault.named_s > NAMED_S + track.control.block * dt_s:
         fault.breaches.append(f"named after {fault.named_s:.2f} s of motion, allowed {NAMED_S:g} s")
-    fault.error_pct = track.worst_half_second_pct(fault.begin_s, fault.end_s)
+    fault.error_pct, frozen_pct = track.worst_half_second_pct(fault.begin_s, fault.end_s, gain)
+    allowed_pct = max(SENSOR_PCT, OF_FROZEN * frozen_pct)
     if math.isnan(fault.error_pct):
         fault.unjudged.append("error: no half second in which every voltage came in time")
-    elif fault.error_pct > SENSOR_PCT:
-        fault.breaches.append(f"error {fault.error_pct:.2f} % of range over half a second, allowed {SENSOR_PCT:g} %")
+    elif fault.error_pct > allowed_pct:
+        fault.breaches.append(f"error {fault.error_pct:.2f} % of range over half a second, allowed {allowed_pct:.3g} %")
 
 
 # --- Observes a soak from outside the service: samples, references, commands, events and statuses.

@@ -409,7 +409,7 @@ def test_a_voltage_at_a_limit_for_less_than_a_tenth_of_a_second_decides_nothing(
     assert parts.events["begun_again"] == 1
 
 
-@pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6), doubled])
+@pytest.mark.parametrize("spoil", [shifted(0.6), shifted(-0.6)])
 def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
     model: LssvmInverse, all_strokes: Recording, warm: StateDict, spoil: Callable[[Learner], None]
 ) -> None:
@@ -427,6 +427,26 @@ def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
     assert 700 < told.count(MODEL_LEFT_ENVELOPE) < 1300
     assert set(told[1300:]) == {""}
     assert learner.counters()["begun_again"] == 1
+    assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
+
+
+def test_a_learnt_gain_that_no_stage_has_is_taken_back_at_once(
+    model: LssvmInverse, all_strokes: Recording, warm: StateDict
+) -> None:
+    """Not after the 0.1 s for which the voltage may be far off: where the stage moves little it never is."""
+    learner = Learner.from_state(warm)
+    learner.freeze()  # or it would find its way by itself, slowly
+    before = learner.parts.filter.beta.copy()
+    doubled(learner)
+    assert not learner.parts.gain_is_possible
+    feed(learner, all_strokes, AT, AT + 10)
+    assert learner.counters()["distrusts"] == 1
+    assert np.allclose(learner.parts.filter.beta, before, rtol=0.0, atol=0.01 * model.span_V)
+    # The readings are those of the stage: the trial that has begun ends well.
+    learner.thaw()
+    feed(learner, all_strokes, AT + 10, AT + 1000)
+    assert learner.trouble == ""
+    assert learner.counters()["begun_again"] == 0
     assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
 
 

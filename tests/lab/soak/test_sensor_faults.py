@@ -12,7 +12,7 @@ import pytest
 from lab.soak.controller import STRAY, ControlTask, SoakReference
 from lab.soak.fault_plan import FAULT_KINDS, PlannedFault, make_plan
 from lab.soak.live import FaultActions
-from lab.soak.verdict.observations import FaultRecord, SampleTracker, judge_sensor_fault, troubles_since
+from lab.soak.verdict.observations import FaultRecord, SampleTracker, judge_sensor_fault, stage_gain, troubles_since
 from service.protocol.samples import MAX_SEQ, SampleBatch
 from service.stage_node.faults import Fault, Injector
 from tests.lab.soak.soaked import broken, healthy, verdict
@@ -104,10 +104,20 @@ class Run:
             u_V = np.full(20, 1.5 if held else 1.0)
             self.track.take_sound(SampleBatch(seq, seq * CONTROL.dt_s, u_V, y_um + bad))
 
-    def judged(self, *troubles: tuple[int, str]) -> FaultRecord:
+    def judged(self, *troubles: tuple[int, str], gain: float = 1.0) -> FaultRecord:
         fault = FaultRecord("sign", 2.0, 5.0, begin_seq=2000)
-        judge_sensor_fault(fault, self.track, troubles, 4999)
+        judge_sensor_fault(fault, self.track, troubles, 4999, gain)
         return fault
+
+
+def test_a_stage_that_has_changed_may_be_off_as_the_frozen_model_is() -> None:
+    run = Run(2.0)  # 2.6 % of the range
+    named = (2200, "sensor_sign")
+    assert "allowed 1 %" in run.judged(named).breaches[0]
+    assert "allowed 1 %" in run.judged(named, gain=0.995).breaches[0]
+    assert run.judged(named, gain=0.95).breaches == []
+    faults = [FaultRecord("gain", 3.0, value=-0.05), FaultRecord("sign", 4.0), FaultRecord("gain", 9.0, value=0.0)]
+    assert [stage_gain(faults, at_s) for at_s in (2.0, 4.0, 10.0)] == [1.0, 0.95, 1.0]
 
 
 def test_a_fault_that_is_named_in_time_and_costs_little_breaks_nothing() -> None:
