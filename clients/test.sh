@@ -45,7 +45,10 @@ cd zenoh
 cargo build --release --quiet
 zenoh="${CARGO_TARGET_DIR:-target}/release"
 # shellcheck disable=SC2086
-"$compiler" $flags -I../include c/controller.c -o "$zenoh/controller" -L"$zenoh" -ldehyst_zenoh -lm -Wl,-rpath,'$ORIGIN'
+for program in controller deadlines; do
+    "$compiler" $flags -I../include "c/$program.c" -o "$zenoh/$program" -L"$zenoh" -ldehyst_zenoh -lm \
+        -Wl,-rpath,'$ORIGIN'
+done
 DEHYST_ZENOH_LIBRARY="$(cd "$zenoh" && pwd)/libdehyst_zenoh.so"
 export DEHYST_ZENOH_LIBRARY
 cd ../../..

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import struct
 import subprocess
@@ -105,6 +106,24 @@ def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
     done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("1000 points, 0 refused")
+
+
+def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint: str) -> None:
+    """``python -m benchmarks.native_loop`` compares the two; how many are missed, only a quiet machine can tell."""
+    program = Path(LIBRARY).parent / "deadlines"
+    if not program.exists():
+        pytest.skip("c/deadlines.c is not built: clients/test.sh does")
+    for model in ([], [endpoint, "demo", "x", "", "45", "20"]):
+        done = subprocess.run([program, "0.5", "2000", *model], capture_output=True, text=True, timeout=30, check=False)
+        assert done.returncode == 0, done.stderr
+        told = json.loads(done.stdout)
+        assert told["turns"] == 1000
+        assert told["refused"] == 0
+        assert (told["models"] > 0) == bool(model)
+        assert told["point_us"] == sorted(told["point_us"])
+    done = subprocess.run([program, "0.5"], capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 2
+    assert done.stdout.startswith("usage")
 
 
 def test_where_nobody_serves_the_error_says_what_to_check(native: ctypes.CDLL, endpoint: str) -> None:

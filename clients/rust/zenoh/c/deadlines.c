@@ -1,0 +1,77 @@
+/* A loop at a steady rate that asks the followed model for one point each turn, and the same loop without it. Prints one
+ * line of JSON: turns whose work was done only after the next turn was due, and the time of a point.
+ * Usage: deadlines SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]; without an endpoint the loop is bare. */
+#include "dehyst_zenoh.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+#define PI 3.14159265358979323846
+
+static double since_us(struct timespec from, struct timespec to) {
+    return 1e6 * (double)(to.tv_sec - from.tv_sec) + 1e-3 * (double)(to.tv_nsec - from.tv_nsec);
+}
+
+static int ascending(const void *a, const void *b) {
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+int main(int argc, char **argv) {
+    double lasts_s = argc > 1 ? atof(argv[1]) : 0.0, rate_Hz = argc > 2 ? atof(argv[2]) : 0.0;
+    long turns = lround(lasts_s * rate_Hz);
+    double *point_us = turns > 0 ? malloc((size_t)turns * sizeof *point_us) : NULL;
+    double *late_us = turns > 0 ? malloc((size_t)turns * sizeof *late_us) : NULL;
+    if ((argc != 3 && argc != 9) || !point_us || !late_us) {
+        printf("usage: deadlines SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
+        return 2;
+    }
+    dehyst *stage = NULL;
+    double centre_um = 0.0, swing_um = 0.0, w = 4.0 * PI, period_us = 1e6 / rate_Hz;
+    if (argc == 9) {
+        if (dehyst_open(argv[3], argv[4], argv[5], argv[6], 5.0, &stage)) {
+            fprintf(stderr, "%s\n", dehyst_error());
+            return 1;
+        }
+        centre_um = atof(argv[7]), swing_um = atof(argv[8]);
+    }
+    long missed = 0, refused = 0;
+    struct timespec due, start, end;
+    clock_gettime(CLOCK_MONOTONIC, &due);
+    for (long i = 0; i < turns; i++) {
+        due.tv_nsec += lround(1e3 * period_us);
+        while (due.tv_nsec >= 1000000000L)
+            due.tv_nsec -= 1000000000L, due.tv_sec++;
+        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+        double t_s = (double)i / rate_Hz;
+        clock_gettime(CLOCK_MONOTONIC, &start);
+        if (stage) {
+            dehyst_answer answer;
+            refused += dehyst_point(stage, centre_um + swing_um * sin(w * t_s), swing_um * w * cos(w * t_s),
+                                    -swing_um * w * w * sin(w * t_s), &answer) != 0;
+        }
+        clock_gettime(CLOCK_MONOTONIC, &end);
+        point_us[i] = since_us(start, end);
+        late_us[i] = since_us(due, end);
+        missed += late_us[i] > period_us;
+    }
+    unsigned long long models = 0;
+    if (stage) {
+        dehyst_report_t report;
+        dehyst_report(stage, &report);
+        models = report.received;
+        dehyst_close(stage);
+    }
+    qsort(point_us, (size_t)turns, sizeof *point_us, ascending);
+    qsort(late_us, (size_t)turns, sizeof *late_us, ascending);
+    size_t p99 = (size_t)turns * 99 / 100, p999 = (size_t)turns * 999 / 1000;
+    printf("{\"turns\": %ld, \"missed\": %ld, \"refused\": %ld, \"models\": %llu, \"point_us\": [%.2f, %.2f, %.2f], "
+           "\"done_after_us\": [%.1f, %.1f, %.1f]}\n",
+           turns, missed, refused, models, point_us[turns / 2], point_us[p99], point_us[p999], late_us[turns / 2],
+           late_us[p99], late_us[p999]);
+    free(point_us);
+    free(late_us);
+    return refused ? 1 : 0;
+}
