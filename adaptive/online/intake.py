@@ -619,6 +619,12 @@ class Intake:
         return self._control is not None
 
     @property
+    def begins(self) -> bool:
+        """Whether the next sample cannot teach anything, because the smoother has just started."""
+        smooths = self.track is not None and self.track.motion is not None
+        return not smooths and self.gates.since_start < self._admission.settle
+
+    @property
     def ordinary(self) -> bool:
         """Whether nothing is under way: readings are smoothed and trusted, and no jump is open."""
         track = self.track
