@@ -23,10 +23,9 @@ from adaptive.fleet.fleet import Fleet
 from adaptive.fleet.snapshot import FleetSnapshot
 from adaptive.fleet.state import OUTCOMES
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
 from adaptive.types import BoolArray, FloatArray
 from service.answers.guard import Limits, limit
-from service.config.schema import build_settings
+from service.config.learner import learner_config
 from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
@@ -60,10 +59,7 @@ def load_fleet(settings: FleetSettings) -> Fleet:
         f = models[0].features
         gains = settings.gains or (1.0,) * settings.axes
         models = [replace(models[0], features=replace(f, gain=gain * f.gain)) for gain in gains]
-    limits, given = settings.limits, settings.learner.get("admission", {})
-    if isinstance(given, dict):
-        given = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **given}
-    learner = build_settings(LearnerConfig, {**settings.learner, "admission": given}, "fleet.learner")
+    learner = learner_config(settings.learner, settings.limits, "fleet.learner")
     try:
         fleet = Fleet(models, FleetConfig(learner, settings.device, threads=settings.threads))
     except ImportError as error:
