@@ -27,8 +27,6 @@ from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict
 
 #: Results of a sample, by their number in a fleet.
 OUTCOMES: Final = (LEARNT, PASSED, *REASONS)
-#: Parts of a past place, in the order of `adaptive.online.track.Past`.
-PAST: Final = ("motion", "u_before_V", "lag_V", "lag_um", "memory")
 #: Estimates of the filter that an ordinary step keeps, by their row; see `adaptive.online.learner.Parts`.
 MARKS: Final = ("mark", "next_mark", "confirmed0", "confirmed1")
 
@@ -86,9 +84,10 @@ class Rows(NamedTuple):
 
     numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
     dead band of the frame that is served. marks, mark_covariances : (B, 4, ...), see ``MARKS``. delay : (B, D + 2, p)
-    ring of past estimates; one more than is looked at, so that the last can be taken back. past_... : (B, 2, ...) known
-    places of the stage, the older one first; past_from : voltages written before each; past_voltages : ring of all
-    voltages. counters : (B, OUTCOMES).
+    ring of past estimates; one more than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
+    places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
+    `adaptive.online.track.Past`; past_from : voltages written before each; past_voltages : ring of all voltages.
+    counters : (B, OUTCOMES).
     """
 
     numbers: Any
@@ -112,11 +111,7 @@ class Rows(NamedTuple):
     point: FloatArray
     born: IntArray
     own: FloatArray
-    past_motion: FloatArray
-    past_u_before_V: FloatArray
-    past_lag_V: FloatArray
-    past_lag_um: FloatArray
-    past_memory: FloatArray
+    pasts: FloatArray
     past_voltages: FloatArray
     past_from: IntArray
     counters: IntArray
@@ -197,7 +192,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
 def _ordinary(model: LssvmInverse, config: LearnerConfig) -> StateDict:
     """The state of a learner that has just got all that an ordinary one has."""
     learner, f = Learner(model, config), model.features
-    for k in range(learner.parts.intake.smoother.config.lag + 2):
+    # Not one more: with the next one a control trial may begin, which is none of what every one has.
+    for k in range(learner.parts.intake.smoother.config.lag + 1):
         learner.handle(Sample(k, k * model.dt_s, 0.0, 0.5 * (f.y_min_um + f.y_max_um)))
     # A state that was read has its kinds of numbers, whatever was given.
     return Learner.from_state(learner.state_dict()).parts.state_dict(arrays=False) | {"frozen": False}
@@ -208,14 +204,12 @@ class FleetState:
 
     def __init__(self, bases: Sequence[LssvmInverse], config: LearnerConfig, delay_steps: int) -> None:
         B, state = len(bases), _ordinary(bases[0], config)
-        p, marks, voltages = state["filter.beta"].size, len(MARKS), state["front.track.u_V"]
-        past = {"motion": np.zeros(3), "u_before_V": np.zeros(()), "lag_V": voltages[2:], "lag_um": voltages[2:],
-                "memory": state["front.track.memory"]}  # fmt: skip
+        p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
         likes = {name: state[path] for name, path in _ARRAYS.items()} | {
             "frames": np.zeros(3), "marks": np.zeros((marks, p)), "mark_covariances": np.zeros((marks, p, p)),
             "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2),
             "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
-            **{f"past_{name}": np.stack([past[name]] * 2) for name in PAST},
+            "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
         }  # fmt: skip
         numbers = {n: v for n, v in _numbers(state).items() if n not in _ALIASES and not n.startswith("counters.")}
         rows = {name: np.zeros((B, *like.shape), like.dtype) for name, like in likes.items()}
@@ -227,7 +221,9 @@ class FleetState:
         self._fields |= {f"counters.{name}": s.counters[:, i] for i, name in enumerate(OUTCOMES)}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j], f"{mark}.covariance": s.mark_covariances[:, j]}
-        self._pasts = [{f"front.past{j}.{name}": getattr(s, f"past_{name}")[:, j] for name in PAST} for j in range(2)]
+        parts = {"motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
+                 "memory": slice(4 + 2 * lag, None)}  # fmt: skip
+        self._pasts = [{f"front.past{j}.{name}": s.pasts[:, j, part] for name, part in parts.items()} for j in (0, 1)]
         self._rest: list[StateDict] = [{} for _ in range(B)]
 
     def load(self, axis: int, state: StateDict) -> None:

@@ -96,21 +96,16 @@ def _map(c: Fixed, b: int, frames: FloatArray) -> FeatureArrays:
 @compiled
 def _remember_place(s: Rows, b: int, keep: bool) -> None:
     """The present place becomes the newest known one: after the last, or with ``keep`` in its stead."""
-    r, slots = s.numbers[b], s.voltages.shape[1]
+    r, slots, lag = s.numbers[b], s.voltages.shape[1], s.voltages.shape[1] - 2
     at = r.past_count - 1 if keep else min(r.past_count, 1)
     if r.past_count == 2:
-        for part in (s.past_motion[b], s.past_lag_V[b], s.past_lag_um[b], s.past_memory[b]):
-            part[0] = part[1]
-        s.past_u_before_V[b, 0] = s.past_u_before_V[b, 1]
-        s.past_from[b, 0] = s.past_from[b, 1]
-    s.past_motion[b, at], s.past_memory[b, at] = s.motion[b], s.memory[b]
-    first = r.front.track.smoother.count - slots + 2
-    s.past_u_before_V[b, at] = s.voltages[b, (first - 1) % slots]
-    for i in range(slots - 2):
-        past = (first + i) % slots
-        s.past_lag_V[b, at, i], s.past_lag_um[b, at, i] = s.voltages[b, past], s.readings[b, past]
-    s.past_from[b, at] = r.past_written
-    r["past_count"] = at + 1
+        s.pasts[b, 0], s.past_from[b, 0] = s.pasts[b, 1], s.past_from[b, 1]
+    past, first = s.pasts[b, at], r.front.track.smoother.count - lag
+    past[:3], past[3], past[4 + 2 * lag :] = s.motion[b], s.voltages[b, (first - 1) % slots], s.memory[b]
+    for i in range(lag):
+        slot = (first + i) % slots
+        past[4 + i], past[4 + lag + i] = s.voltages[b, slot], s.readings[b, slot]
+    s.past_from[b, at], r["past_count"] = r.past_written, at + 1
 
 
 @compiled
