@@ -221,8 +221,10 @@ class FleetState:
         self._fields |= {f"counters.{name}": s.counters[:, i] for i, name in enumerate(OUTCOMES)}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j], f"{mark}.covariance": s.mark_covariances[:, j]}
-        parts = {"motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
-                 "memory": slice(4 + 2 * lag, None)}  # fmt: skip
+        parts: dict[str, Any] = {
+            "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
+            "memory": slice(4 + 2 * lag, None),
+        }  # fmt: skip
         self._pasts = [{f"front.past{j}.{name}": s.pasts[:, j, part] for name, part in parts.items()} for j in (0, 1)]
         self._rest: list[StateDict] = [{} for _ in range(B)]
 
