@@ -101,11 +101,14 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
     for k in range(args.before + args.steps):
         if k == args.before:
             stepped = -sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
-        together.append(timed(lambda k=k: fleet.step(k, k * DT_S, u[k], gains * y[k]), args.device))  # type: ignore[misc]
+        readings = gains * y[k]
+        if args.lost and k >= args.before:
+            readings[7 * k % axes] = np.nan
+        together.append(timed(lambda k=k, y=readings: fleet.step(k, k * DT_S, u[k], y), args.device))  # type: ignore[misc]
         apart += len(fleet.apart) if k >= args.before else 0
         begin = time.perf_counter()
-        for gain, single in zip(gains, singles, strict=False):
-            single.handle(Sample(k, k * DT_S, float(u[k]), float(gain * y[k])))
+        for reading, single in zip(readings, singles, strict=False):
+            single.handle(Sample(k, k * DT_S, float(u[k]), float(reading)))
         alone.append((time.perf_counter() - begin) * axes / len(singles))
     stepped += sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
     steps, loops = np.array(together[args.before :]), np.array(alone[args.before :])
@@ -144,6 +147,7 @@ def main() -> None:
     parser.add_argument(
         "--before", type=int, default=700, help="samples before the measured; windows learn from 600 on"
     )
+    parser.add_argument("--lost", action="store_true", help="in each measured sample one axis, in turn, has no reading")
     parser.add_argument("--steps", type=int, default=200, help="measured samples")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

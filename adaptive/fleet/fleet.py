@@ -32,8 +32,8 @@ from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED, WindowArrays
 if TYPE_CHECKING:
     from adaptive.fleet.in_torch import TorchWindows
 
-#: Samples in which the windows move to memory of their own. A step of one before that writes to its copy on write.
-OWN_WITHIN = 256
+#: Samples within which the matrices of all windows are written.
+WRITTEN_WITHIN = 256
 
 
 class Fleet:
@@ -48,7 +48,7 @@ class Fleet:
         made = [Learner(models[numbers.index(i)], config.learner) for i in range(max(numbers) + 1)]
         templates = [made[number] for number in numbers]
         self._c = c = fixed_of(models, config.learner, templates)
-        self._state = FleetState(c, config.learner.window, templates[0].parts.delay.steps)
+        self._state = FleetState(models, config.learner, templates[0].parts.delay.steps)
         self._threads = Threads(config.threads)
         B, p = c.beta.shape
         self._work = Work(
@@ -59,8 +59,6 @@ class Fleet:
         self._windows = self._make_windows(arrays)
         self._apart: dict[int, Learner] = {}
         self._shells: dict[int, Learner] = {}
-        self._begun = list(range(B))
-        self._is_apart = np.zeros(B, dtype=np.bool_)
         self._cache: FleetSnapshot | None = None
         for i in range(B):
             # Before its first sample an axis has no place: the single learner takes that one.
@@ -92,8 +90,9 @@ class Fleet:
         sample = [self._given("seq", seq, np.int64), *(self._given(name, value, np.float64) for name, value in numbers)]
         outcome = self._work.outcome
         outcome[:] = NO_SAMPLE
-        apart = [axis for axis in self._apart if taken[axis]]
-        inside = np.flatnonzero(taken & ~self._is_apart)
+        apart, together = [axis for axis in self._apart if taken[axis]], taken.copy()
+        together[list(self._apart)] = False
+        inside = np.flatnonzero(together)
         if inside.size:
             self._step_together(inside, Samples._make([*sample, self._may_check(inside)]))
             doubtful = np.flatnonzero(outcome == DOUBT).tolist()
@@ -102,20 +101,12 @@ class Fleet:
             apart += doubtful
         for axis in apart:
             learner = self._apart[axis]
+            if not learner.parts.intake.begins:
+                self._windows.write([axis])
             said = learner.handle(Sample(*(part[axis].item() for part in sample)))
             self._settle(axis, learner, said)
-        if self._begun:
-            self._own_some()
+        self._windows.write(list(islice(self._windows.unwritten, -(-self.axes // WRITTEN_WITHIN))))
         return outcome.copy()
-
-    def _own_some(self) -> None:
-        """Give some windows memory of their own. At once for all, a start or a step would wait for gigabytes."""
-        ordinary = (axis for axis in self._begun if not self._is_apart[axis])
-        some = list(islice(ordinary, -(-self.axes // OWN_WITHIN)))
-        self._windows.own(some)
-        for axis in some:
-            self._begun.remove(axis)
-            self._shells.pop(axis, None)
 
     def warm(self) -> None:
         """Load or compile every step, so that no sample waits for the compiler."""
@@ -137,7 +128,7 @@ class Fleet:
     def _may_check(self, inside: IntArray) -> Any:
         """(B,) axes whose control trial may begin: as many as the configuration allows, the longest waiting first."""
         may = np.zeros(self.axes, dtype=np.bool_)
-        waits = self._state.rows.numbers["until_control"]
+        waits = self._state.rows.numbers["front"]["until_control"]
         due = inside[waits[inside] <= 1]
         if due.size:
             room = self.config.checks - sum(one.parts.intake.controls for one in self._apart.values())
@@ -192,14 +183,11 @@ class Fleet:
 
     def _set_apart(self, axis: int, learner: Learner) -> Learner:
         self._apart[axis] = learner
-        self._is_apart[axis] = True
         self._cache = None
         return learner
 
     def _take_out(self, axis: int) -> Learner:
-        learner = self._learner(axis)
-        learner.resume(self._state.read(axis), arrays=False)
-        return self._set_apart(axis, learner)
+        return self._set_apart(axis, self.learner_of(axis))
 
     def _settle(self, axis: int, learner: Learner, outcome: str) -> None:
         """Note what a single learner said to a sample, and take it back into the batch where it is ordinary."""
@@ -212,7 +200,6 @@ class Fleet:
             if arrays is not self._windows.arrays(axis):
                 del self._shells[axis]
             self._state.load(axis, learner.parts.state_dict(arrays=False) | {"frozen": learner.frozen})
-            self._is_apart[axis] = False
 
     def export_axis(self, axis: int) -> StateDict:
         """The whole state of an axis, as of ``Learner.state_dict``."""
@@ -270,6 +257,7 @@ class Fleet:
 
     def learner_of(self, axis: int) -> Learner:
         """An axis as a single learner, to look into: its own where it is apart, else a copy."""
+        self._windows.write([axis])
         if axis in self._apart:
             return self._apart[axis]
         learner = self._learner(axis)

@@ -8,8 +8,8 @@ because batched products do not use a triangle; the update is symmetric to the l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -24,14 +24,12 @@ from adaptive.window import arrays as ws
 from adaptive.window.arrays import ACCEPTED, WindowArrays
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return torch.bmm(matrix, vector[:, :, None])[:, :, 0]
-
-
 class TorchWindows:
     """Windows of B axes. See `adaptive.fleet.windows.CompiledWindows`."""
 
     shares = False
+    #: All matrices are written from the start; see `CompiledWindows.unwritten`.
+    unwritten: Final[dict[int, WindowArrays]] = {}
 
     def __init__(self, rows: Rows, fixed: Fixed, starts: Sequence[WindowArrays], device: str) -> None:
         self._rows, self._fixed, self._device = rows, fixed, torch.device(device)
@@ -42,17 +40,11 @@ class TorchWindows:
         }
         self._slots = torch.arange(example.S.size, device=self._device)
         self._handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
-        first: dict[int, int] = {}
-        for axis, start in enumerate(starts):
-            like = first.setdefault(id(start), axis)
-            if like == axis:
-                self.put(axis, start)
-            else:
-                for field in self._all.values():
-                    field[axis] = field[like]
+        for start in {id(start): start for start in starts}.values():
+            self.put([axis for axis, other in enumerate(starts) if other is start], start)
 
-    def own(self, axes: Sequence[int]) -> None:
-        """Nothing: the matrices have memory of their own."""
+    def write(self, axes: Iterable[int]) -> None:
+        """Nothing: the matrices are written."""
 
     def _to(self, array: Any) -> Tensor:
         return torch.as_tensor(array).to(self._device)
@@ -61,15 +53,15 @@ class TorchWindows:
         """A copy of the solver's state of an axis."""
         return WindowArrays(**{name: field[axis].cpu().numpy().copy() for name, field in self._all.items()})
 
-    def put(self, axis: int, arrays: WindowArrays) -> None:
-        """Take over the state of a solver, its pending change applied."""
+    def put(self, axes: int | list[int], arrays: WindowArrays) -> None:
+        """Take over the state of a solver for one axis or several, its pending change applied."""
         for name, field in self._all.items():
-            field[axis] = self._to(getattr(arrays, name))
-        P, V, C = self._all["P"][axis], self._all["V"][axis], self._all["C"][axis]
-        lower = torch.tril(P)
-        lower += torch.outer(V[ws.PLUS], V[ws.PLUS]).tril() - torch.outer(V[ws.MINUS], V[ws.MINUS]).tril()
-        P.copy_(lower + lower.tril(-1).T)
-        V[ws.PLUS], V[ws.MINUS], C[ws.PENDING], C[ws.UNDO] = 0.0, 0.0, 0, ws.UNDO_NOTHING
+            field[axes] = self._to(getattr(arrays, name))
+        plus, minus = (self._to(arrays.V[row]) for row in (ws.PLUS, ws.MINUS))
+        lower = (self._to(arrays.P) + (torch.outer(plus, plus) - torch.outer(minus, minus))).tril()
+        self._all["P"][axes] = lower + lower.tril(-1).T
+        self._all["V"][axes, ws.PLUS] = self._all["V"][axes, ws.MINUS] = 0.0
+        self._all["C"][axes, ws.PENDING], self._all["C"][axes, ws.UNDO] = 0, ws.UNDO_NOTHING
 
     def samples(self) -> dict[str, FloatArray]:
         """The windows' arrays that models are made of, by name; copies."""
@@ -91,7 +83,7 @@ class TorchWindows:
 
     def learn(self, axes: IntArray, step: Step) -> IntArray:
         """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
-        s, at, points = self._rows, self._to(axes), self._to(step.points)
+        s, at, points, turns = self._rows, self._to(axes), self._to(step.points), self._rows.numbers["window"]
         column, count = self._column(at, points), self._all["C"][at, ws.COUNT]
         value, nearest = torch.where(self._slots < count[:, None], column, -1.0).max(1)
         room = (count < self._slots.numel()) & (value < SAME)
@@ -103,12 +95,12 @@ class TorchWindows:
         good = self._exchange(at, slots, points, targets, weights, column, True)
         status = np.full(axes.size, ACCEPTED)
         done, slot = axes[good], slots.cpu().numpy()[good]
-        s.numbers["clock"][done] += 1
-        s.born[done, slot], s.own[done, slot] = s.numbers["clock"][done], step.weights[good]
+        turns["clock"][done] += 1
+        s.born[done, slot], s.own[done, slot] = turns["clock"][done], step.weights[good]
         half_life_s = float(self._fixed.config["weights"]["half_life_s"][0])
         if half_life_s > 0.0 and done.size:
-            slot = s.numbers["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
-            share = 0.5 ** ((s.numbers["clock"][done] - s.born[done, slot]) * step.step_s / half_life_s)
+            slot = turns["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
+            share = 0.5 ** ((turns["clock"][done] - s.born[done, slot]) * step.step_s / half_life_s)
             faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, LEAST_FADED))
             self._alone(done[~faded], windows.fade, s, self._fixed, step.step_s)
         rest = ~good
@@ -120,7 +112,7 @@ class TorchWindows:
 
     def let_go(self, axes: IntArray, most: float) -> None:
         """`ResidualWindow.let_go` of each axis."""
-        s, r, slots = self._rows, self._rows.numbers, np.arange(self._rows.born.shape[1])
+        s, r, slots = self._rows, self._rows.numbers["window"], np.arange(self._rows.born.shape[1])
         old = (s.born[axes] <= r["changed"][axes, None]) & (s.own[axes] > most) & (slots >= r["next"][axes, None])
         old &= slots < self._all["C"][self._to(axes), ws.COUNT].cpu().numpy()[:, None]
         found, slot = old.any(1), old.argmax(1)
@@ -169,19 +161,20 @@ class TorchWindows:
         fresh = slot >= count
         pkk = torch.where(fresh, 1.0, p[k, slot])
         p = torch.where(fresh[:, None], 0.0, p)
-        q = _times(P, b) - p * ((p * b).sum(1) / pkk)[:, None]
+        q = torch.bmm(P, b[:, :, None])[:, :, 0] - p * ((p * b).sum(1) / pkk)[:, None]
         q[k, slot] = 0.0
         s = 1.0 + noise - (b * q).sum(1)
         good = (x.abs() <= ws.MOST).all(1) & (y.abs() <= ws.MOST) & (pkk > 0.0) & (s > ws.SCHUR_SHARE * noise)
         good &= (precision >= ws.LEAST_PRECISION) & (precision <= ws.MOST_PRECISION)
         good &= torch.isfinite((p * p).sum(1) / pkk + (q * q).sum(1) / s)
         q[k, slot] = -1.0
-        Y, S, SY = V[:, ws.Y].clone(), A["S"][axes], V[:, ws.SY]
-        Y[k, slot] = y
+        V[k, ws.Y, slot], V[k, ws.W, slot] = y, w
+        Y, ones = V[:, ws.Y], (self._slots < grown[:, None]).to(V.dtype)
         # P times 1 and P times y after the exchange, in O(N).
-        ones = (self._slots < grown[:, None]).to(Y.dtype)
-        S = _moved(S, ones, p, q, pkk, s, k, slot)
-        SY = _moved(SY, Y, p, q, pkk, s, k, slot)
+        before = torch.stack((A["S"][axes], V[:, ws.SY]))
+        sums = before - p * (before[:, k, slot] / pkk)[:, :, None]
+        sums[:, k, slot] = 0.0
+        S, SY = sums + q * ((q * torch.stack((ones, Y))).sum(2) / s)[:, :, None]
         gram = S.sum(1)
         beta = torch.where(gram > 0.0, SY.sum(1) / gram, 0.0)
         alpha = SY - beta[:, None] * S
@@ -201,33 +194,20 @@ class TorchWindows:
         minus = torch.where(good[:, None], p / pkk.sqrt()[:, None], 0.0)
         plus = torch.where(good[:, None], q / s.sqrt()[:, None], 0.0)
         P.baddbmm_(torch.stack((-minus, plus), 2), torch.stack((minus, plus), 1))
+        rotated, worst = cursor + 1 >= grown, torch.maximum(F[:, ws.ROUND_WORST], error)
+        F[:, ws.LAST_WORST] = torch.where(rotated, worst, F[:, ws.LAST_WORST])
+        F[:, ws.ROUND_WORST], F[:, ws.RESIDUAL] = torch.where(rotated, 0.0, worst), error
+        F[:, ws.BETA], F[:, ws.GRAM] = beta, gram.sqrt()
+        C[:, ws.COUNT], C[:, ws.CURSOR] = grown, torch.where(rotated, 0, cursor + 1)
+        C[:, ws.STEPS] += int(counted)
+        C[:, ws.ROUNDS] += rotated
+        V[:, ws.SY], V[:, ws.ALPHA] = SY, alpha
         done = good.nonzero()[:, 0]
-        at, slot, cursor, grown = axes[done], slot[done], cursor[done] + 1, grown[done]
-        line = -(q / s[:, None])[done]
+        at, slot, line = axes[done], slot[done], -(q / s[:, None])[done]
         P[done, slot], P[done, :, slot] = line, line
         if not whole:
             A["P"][at] = P[done]
-        rotated = cursor >= grown
-        worst = torch.maximum(F[done, ws.ROUND_WORST], error[done])
-        for index, value in (
-            (ws.RESIDUAL, error[done]), (ws.LAST_WORST, torch.where(rotated, worst, F[done, ws.LAST_WORST])),
-            (ws.ROUND_WORST, torch.where(rotated, 0.0, worst)), (ws.BETA, beta[done]), (ws.GRAM, gram[done].sqrt()),
-        ):  # fmt: skip
-            A["F"][at, index] = value
-        A["C"][at, ws.COUNT], A["C"][at, ws.CURSOR] = grown, torch.where(rotated, 0, cursor)
-        A["C"][at, ws.STEPS] += int(counted)
-        A["C"][at, ws.ROUNDS] += rotated
-        A["V"][at, ws.Y], A["V"][at, ws.SY], A["V"][at, ws.ALPHA], A["S"][at] = Y[done], SY[done], alpha[done], S[done]
-        A["V"][at, ws.W, slot], A["X"][at, :, slot] = w[done], x[done]
-        A["scaled"][at, :, slot] = x[done] * A["inverse_widths"][at]
+        A["F"][at], A["C"][at], A["V"][at], A["S"][at] = F[done], C[done], V[done], S[done]
+        A["X"][at, :, slot], A["scaled"][at, :, slot] = x[done], x[done] * A["inverse_widths"][at]
         A["R"][at, slot], A["R"][at, :, slot] = row[done], row[done]
         return good.cpu().numpy()
-
-
-def _moved(
-    sums: Tensor, values: Tensor, p: Tensor, q: Tensor, pkk: Tensor, s: Tensor, k: Tensor, slot: Tensor
-) -> Tensor:
-    """P times ``values`` after the exchange, from ``sums`` = P times them before."""
-    new = sums - p * (sums[k, slot] / pkk)[:, None]
-    new[k, slot] = 0.0
-    return new + q * ((q * values).sum(1) / s)[:, None]

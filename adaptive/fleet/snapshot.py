@@ -11,7 +11,7 @@ from adaptive.compiled import compiled
 from adaptive.errors import InputError
 from adaptive.fleet.state import Fixed, Rows
 from adaptive.fleet.windows import Threads
-from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed
+from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed, unpacked
 from adaptive.types import BoolArray, FloatArray, IntArray
 from adaptive.window.arrays import ALPHA, BETA, COUNT, GAMMA
 
@@ -88,37 +88,28 @@ class _Windows(NamedTuple):
 
 @compiled
 def _pack(
-    lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray
-) -> None:
-    """The learnt models of all axes in the layout of `LssvmInverse.packed`."""
-    p, d, m = s.beta.shape[1], w.scaled.shape[1], c.features
+    lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray,
+    linear: FloatArray,
+) -> None:  # fmt: skip
+    """The learnt models of all axes in the layout of `LssvmInverse.packed`, with ``linear`` as of `FleetSnapshot`."""
     for b in range(lo, hi):
         out, r, f, n = packed[b], s.numbers[b], c.axis[b], w.C[b, COUNT]
         j, span, bounded = r.judgement, s.domain[b, 1::2] - s.domain[b, ::2], f.allowed_V > 0.0
         counts[b] = c.sizes[f.model]
         counts[b, 5], counts[b, 6], counts[b, 9] = n, 0, bounded
-        out[0:3] = s.frames[b]
+        m, beta, inverse_widths, alpha, scaled, at = unpacked(out, counts[b])
+        m.frame[:], m.scale[:] = s.frames[b], c.features.scale[b]
+        m.thresholds[:], m.arcs[:], m.retain[:] = c.features.thresholds[b], c.features.arcs[b], c.features.retain[b]
         out[3] = max(j.long_V2, j.short_V2) + j.doubt_V2
-        out[4], out[5], out[6] = r.kernel_variance, 1.0 / (1.0 + 1.0 / w.F[b, GAMMA]), f.allowed_V
+        out[4], out[5], out[6] = r.window.kernel_variance, 1.0 / (1.0 + 1.0 / w.F[b, GAMMA]), f.allowed_V
         out[7:13:2] = s.domain[b, ::2] - margin * span
         out[8:13:2] = s.domain[b, 1::2] + margin * span
-        out[13:17] = m.scale[b]
-        at = 17
-        for part in (m.thresholds[b], m.arcs[b], m.retain[b], s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]):
-            out[at : at + part.size] = part
-            at += part.size
-        out[_constant(c)] += w.F[b, BETA]
-        for i in range(d):
-            out[at : at + n] = w.scaled[b, i, :n]
-            at += n
+        beta[:], inverse_widths[:], alpha[:] = s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]
+        beta[0] += w.F[b, BETA]
+        scaled[:] = w.scaled[b, :, :n]
         if bounded:
-            out[at : at + p] = c.beta[b]
-
-
-@compiled
-def _constant(c: Fixed) -> int:
-    """Place of the linear part in a packed model."""
-    return int(17 + c.sizes[0, 0] + c.sizes[0, 1] + c.sizes[0, 2])
+            out[at : at + beta.size] = c.beta[b]
+        linear[b, 0], linear[b, 1], linear[b, 2:] = r.front.track.served.gain, s.frames[b, 0], beta
 
 
 def snapshot_of(
@@ -128,13 +119,11 @@ def snapshot_of(
     """Copies of what is served now; ``apart`` : models of the axes that are not in the batch."""
     B, p = s.beta.shape
     d, most = windows["scaled"].shape[1:]
-    at = _constant(c)
-    length = max(at + 2 * p + d + (1 + d) * most, c.models.shape[1])
+    length = max(17 + int(c.sizes[0, :3].sum()) + 2 * p + d + (1 + d) * most, c.models.shape[1])
     packed, counts = np.empty((B, length)), np.empty((B, c.sizes.shape[1]), dtype=np.int64)
-    parts = _Windows(*(windows[name] for name in _Windows._fields))  # type: ignore[arg-type]
-    threads.share(B, _pack, s, c, parts, DOMAIN_MARGIN, packed, counts)
-    seq, valid = s.numbers["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
-    linear = np.column_stack((s.numbers["gain"], s.numbers["offset_um"], packed[:, at : at + p]))
+    linear, parts = np.empty((B, 2 + p)), _Windows(*(windows[name] for name in _Windows._fields))  # type: ignore[arg-type]
+    threads.share(B, _pack, s, c, parts, DOMAIN_MARGIN, packed, counts, linear)
+    seq, valid = s.numbers["front"]["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
     fallen = [axis for axis in np.flatnonzero(s.numbers["judgement"]["fallback"]).tolist() if axis not in apart]
     for axis, model in (apart | {axis: bases[axis] for axis in fallen}).items():
         row, sizes = model.packed

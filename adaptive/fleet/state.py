@@ -8,7 +8,9 @@ Numbers are in records that have the names of the single learner's dataclasses, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,41 +20,17 @@ from adaptive.features import FeatureArrays
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
-from adaptive.online.drift import DriftState, RestCreep
-from adaptive.online.gates import LEARNT, PASSED, REASONS, AdmissionState
+from adaptive.online.gates import LEARNT, PASSED, REASONS
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.learner import MARK_S, Judgement, Learner
-from adaptive.online.sensor_trust import Following
-from adaptive.types import BoolArray, FloatArray, IntArray, StateDict
+from adaptive.online.learner import MARK_S, Learner
+from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict
 
 #: Results of a sample, by their number in a fleet.
 OUTCOMES: Final = (LEARNT, PASSED, *REASONS)
-#: Parts of a past place, in the order of `adaptive.online.track.Past`.
-PAST: Final = ("motion", "u_before_V", "lag_V", "lag_um", "memory")
 #: Estimates of the filter that an ordinary step keeps, by their row; see `adaptive.online.learner.Parts`.
 MARKS: Final = ("mark", "next_mark", "confirmed0", "confirmed1")
 
-#: Records by their path in a learner's state.
-_GROUPS: Final[dict[str, tuple[str, Any]]] = {
-    "gates": ("front.gates", AdmissionState()),
-    "following": ("front.following", Following()),
-    "judgement": ("judgement", Judgement(0.0, 0.0, 0.0, 0.0)),
-    "rest": ("rest", RestCreep()),
-    "filter": ("filter", DriftState()),
-}
-#: Single numbers by their path, and their kinds.
-_NUMBERS: Final[dict[str, tuple[str, type]]] = {
-    "count": ("front.track.smoother.count", int),
-    "gain": ("front.track.served.gain", float),
-    "offset_um": ("front.track.served.offset_um", float),
-    **{name: (f"front.{name}", int) for name in ("calm", "credit", "until_control", "look_from")},
-    **{name: (f"window.{name}", int) for name in ("clock", "changed", "next")},
-    "kernel_variance": ("window.kernel_variance", float),
-    "fallbacks": ("events.fallbacks", int),
-    **{name: (name, float) for name in ("rail_s", "left_s")},
-    "frozen": ("frozen", bool),
-}
-#: Arrays by their path.
+#: Arrays by their name in a learner's state.
 _ARRAYS: Final = {
     "x": "front.track.smoother.x", "ring": "front.track.smoother.ring", "voltages": "front.track.u_V",
     "readings": "front.track.y_um", "good": "front.track.good", "motion": "front.track.motion",
@@ -60,52 +38,56 @@ _ARRAYS: Final = {
     "covariance": "filter.covariance", "domain": "domain", "point": "point", "born": "window.born",
     "own": "window.own_weights", "mark_ages": "mark_ages", "confirmed_ages": "confirmed_ages",
 }  # fmt: skip
+#: Numbers of an ordinary learner that are the same as others.
+_ALIASES: Final = {
+    "front.reckoned_seq": "front.gates.seq", "front.track.features.gain": "front.track.served.gain",
+    "front.track.features.offset_um": "front.track.served.offset_um",
+}  # fmt: skip
+#: Numbers beside those of a learner. confirmed : whether the last check has confirmed that the readings follow the
+#: drive. The others: see `Rows`.
+_OWN: Final[StateDict] = {"delay_count": 0, "past_count": 0, "past_written": 0, "confirmed": False}
 
 
-def _kinds(values: dict[str, Any]) -> np.dtype[Any]:
-    """The record that holds the numbers of nested ``values``."""
-    fields: list[tuple[str, Any]] = []
-    for name, value in values.items():
-        if isinstance(value, dict):
-            fields.append((name, _kinds(value)))
-        elif isinstance(value, bool | int | float):
-            fields.append((name, type(value)))
-    return np.dtype(fields, align=True)
+def _numbers(state: StateDict) -> StateDict:
+    return {name: value for name, value in state.items() if isinstance(value, bool | int | float)}
 
 
-def _fill(record: Any, values: dict[str, Any]) -> None:
-    """Write nested ``values`` into an array of one record."""
-    for name in record.dtype.names:
-        value = values[name]
-        if isinstance(value, dict):
-            _fill(record[name], value)
+def _at(records: Any, name: str) -> Any:
+    """The field of records that a flat name stands for; a view."""
+    return reduce(getitem, name.split("."), records)
+
+
+def _record(numbers: StateDict) -> np.dtype[Any]:
+    """The record that holds flat numbers, nested by their names."""
+    fields: dict[str, Any] = {}
+    for name, value in numbers.items():
+        group, _, rest = name.partition(".")
+        if rest:
+            fields.setdefault(group, {})[rest] = value
         else:
-            record[name] = value
+            fields[name] = type(value)
+    kinds = [(name, _record(kind) if isinstance(kind, dict) else kind) for name, kind in fields.items()]
+    return np.dtype(kinds, align=True)
 
 
-#: confirmed : whether the last check has confirmed that the readings follow the drive. The others: see `Rows`.
-_OWN: Final = {"delay_count": 0, "past_count": 0, "past_written": 0, "confirmed": False}
-_ROW: Final = _kinds(
-    {group: asdict(example) for group, (_, example) in _GROUPS.items()}
-    | {name: kind() for name, (_, kind) in _NUMBERS.items()}
-    | _OWN
-)
-_STEPS: Final = {"dt_s": 0.0, "step_s": 0.0, "check_s": 0.0, "check_every": 0, "mark_every": 0}
-_CONFIG: Final = _kinds(asdict(LearnerConfig()) | _STEPS)
-_AXIS: Final = _kinds(
-    dict.fromkeys(
-        ("middle_um", "range_um", "span_V", "drive_V", "slope_V_per_um", "allowed_V", "a_scale"), 0.0
-    ) | {"model": 0, "tells": False}
-)  # fmt: skip
+def _records(rows: Sequence[StateDict], like: StateDict) -> Any:
+    """A record for each of ``rows``, flat numbers, of the names and kinds of ``like``."""
+    kinds = _numbers(like)
+    records = np.zeros(len(rows), _record(kinds))
+    for name in kinds:
+        _at(records, name)[:] = [row[name] for row in rows]
+    return records
 
 
 class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
-    frames : (B, 3) offset, 1/gain and dead band of the frame that is served. marks, mark_covariances : (B, 4, ...), see
-    ``MARKS``. delay : (B, D + 2, p) ring of past estimates; one more than is looked at, so that the last can be taken
-    back. past_... : (B, 2, ...) known places of the stage, the older one first; past_from : voltages written before
-    each; past_voltages : ring of all voltages. counters : (B, OUTCOMES).
+    numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
+    dead band of the frame that is served. marks, mark_covariances : (B, 4, ...), see ``MARKS``. delay : (B, D + 2, p)
+    ring of past estimates; one more than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
+    places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
+    `adaptive.online.track.Past`; past_from : voltages written before each; past_voltages : ring of all voltages.
+    counters : (B, OUTCOMES).
     """
 
     numbers: Any
@@ -129,11 +111,7 @@ class Rows(NamedTuple):
     point: FloatArray
     born: IntArray
     own: FloatArray
-    past_motion: FloatArray
-    past_u_before_V: FloatArray
-    past_lag_V: FloatArray
-    past_lag_um: FloatArray
-    past_memory: FloatArray
+    pasts: FloatArray
     past_voltages: FloatArray
     past_from: IntArray
     counters: IntArray
@@ -180,21 +158,21 @@ def check_alike(bases: Sequence[LssvmInverse]) -> None:
 
 def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Sequence[Learner]) -> Fixed:
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
-    parts, step_s, dt_s = templates[0].parts, templates[0].parts.filter.step_s, bases[0].dt_s
-    settings = np.zeros(1, _CONFIG)
-    steps = {"dt_s": dt_s, "step_s": step_s, "check_s": parts.check_s, "check_every": parts.check_every,
+    parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
+    steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
              "mark_every": max(1, round(MARK_S / step_s))}  # fmt: skip
-    _fill(settings, asdict(config) | {"admission": asdict(config.admission.at(dt_s))} | steps)
-    axis, numbers = np.zeros(len(bases), _AXIS), distinct(bases)
-    for row, base, template, number in zip(axis, bases, templates, numbers, strict=True):
+    settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
+    axes, numbers, shape = [], distinct(bases), config.envelope.shape
+    for base, template, number in zip(bases, templates, numbers, strict=True):
         f = base.features
         # The identified kernel part is allowed on top of the linear one, which depends on the frame.
-        reach_V = template.parts.allowed_V - config.envelope.shape * drive_V(template.base)
-        row["middle_um"], row["range_um"] = 0.5 * (f.y_max_um + f.y_min_um), f.y_max_um - f.y_min_um
-        row["span_V"], row["drive_V"] = base.span_V, drive_V(base)
-        row["slope_V_per_um"], row["tells"] = mean_slope(base), answers(base)
-        row["allowed_V"] = config.envelope.shape * drive_V(base) + reach_V if f.linear else 0.0
-        row["a_scale"], row["model"] = f.a_scale_um_per_s2, number
+        reach_V = template.parts.allowed_V - shape * drive_V(template.base)
+        axes.append({
+            "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
+            "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
+            "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0, "a_scale": f.a_scale_um_per_s2,
+            "model": number,
+        })  # fmt: skip
     models = [bases[numbers.index(number)].packed for number in range(max(numbers) + 1)]
     packed = np.zeros((len(models), max(row.size for row, _ in models)))
     for row, (model, _) in zip(packed, models, strict=True):
@@ -202,65 +180,68 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     walks, bursts = zip(*(template.parts.filter.variances for template in templates), strict=True)
     smoother = parts.intake.smoother
     return Fixed(
-        settings, axis, FeatureArrays(*map(np.array, zip(*(base.features.arrays for base in bases), strict=True))),
+        _records([settings], LearnerConfig().state_dict() | steps),
+        _records(axes, dict.fromkeys(axes[0], 0.0) | {"tells": False, "model": 0}),
+        FeatureArrays(*map(np.array, zip(*(base.features.arrays for base in bases), strict=True))),
         np.array([base.beta for base in bases]), np.array(walks), np.array(bursts), packed,
         np.array([sizes for _, sizes in models]),
         *map(np.array, (smoother.transition, smoother.gain, smoother.lag_gains, smoother.scale)),
     )  # fmt: skip
 
 
+def _ordinary(model: LssvmInverse, config: LearnerConfig) -> StateDict:
+    """The state of a learner that has just got all that an ordinary one has."""
+    learner, f = Learner(model, config), model.features
+    # Not one more: with the next one a control trial may begin, which is none of what every one has.
+    for k in range(learner.parts.intake.smoother.config.lag + 1):
+        learner.handle(Sample(k, k * model.dt_s, 0.0, 0.5 * (f.y_min_um + f.y_max_um)))
+    # A state that was read has its kinds of numbers, whatever was given.
+    return Learner.from_state(learner.state_dict()).parts.state_dict(arrays=False) | {"frozen": False}
+
+
 class FleetState:
     """The rows of all axes, and what else belongs to each."""
 
-    def __init__(self, c: Fixed, window: int, delay_steps: int) -> None:
-        B, p = c.beta.shape
-        slots, order = c.lag_gains.shape[0] + 1, c.gain.size
-        K, A, M, _, d = c.sizes[0, :5].tolist()
-        m, lag, marks = K + A + M + (A > 0), slots - 2, len(MARKS)
-        floats: dict[str, tuple[int, ...]] = {
-            "x": (order,), "ring": (lag + 1, 4), "voltages": (slots,), "readings": (slots,), "motion": (3,),
-            "memory": (m,), "frozen_memory": (m,), "frames": (3,), "beta": (p,), "covariance": (p, p),
-            "marks": (marks, p), "mark_covariances": (marks, p, p), "delay": (delay_steps + 2, p), "domain": (6,),
-            "point": (d,), "own": (window,), "past_motion": (2, 3), "past_u_before_V": (2,), "past_lag_V": (2, lag),
-            "past_lag_um": (2, lag), "past_memory": (2, m), "past_voltages": (MOST_BRIDGED + 2,),
+    def __init__(self, bases: Sequence[LssvmInverse], config: LearnerConfig, delay_steps: int) -> None:
+        B, state = len(bases), _ordinary(bases[0], config)
+        p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
+        likes = {name: state[path] for name, path in _ARRAYS.items()} | {
+            "frames": np.zeros(3), "marks": np.zeros((marks, p)), "mark_covariances": np.zeros((marks, p, p)),
+            "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2),
+            "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
+            "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
         }  # fmt: skip
-        integers: dict[str, tuple[int, ...]] = {
-            "born": (window,), "past_from": (2,), "mark_ages": (2,), "confirmed_ages": (2,),
-            "counters": (len(OUTCOMES),),
+        numbers = {n: v for n, v in _numbers(state).items() if n not in _ALIASES and not n.startswith("counters.")}
+        rows = {name: np.zeros((B, *like.shape), like.dtype) for name, like in likes.items()}
+        self.rows = s = Rows(np.zeros(B, _record(numbers | _OWN)), **rows)
+        #: Where the entries of a learner's state are, (B, ...) each; and those of its past places.
+        self._fields = {name: _at(s.numbers, name) for name in numbers}
+        self._fields |= {alias: self._fields[name] for alias, name in _ALIASES.items()}
+        self._fields |= {path: getattr(s, name) for name, path in _ARRAYS.items()}
+        self._fields |= {f"counters.{name}": s.counters[:, i] for i, name in enumerate(OUTCOMES)}
+        for j, mark in enumerate(MARKS):
+            self._fields |= {f"{mark}.beta": s.marks[:, j], f"{mark}.covariance": s.mark_covariances[:, j]}
+        parts: dict[str, Any] = {
+            "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
+            "memory": slice(4 + 2 * lag, None),
         }  # fmt: skip
-        self.rows = Rows(
-            numbers=np.zeros(B, _ROW), good=np.zeros((B, slots), dtype=np.bool_),
-            **{name: np.zeros((B, *shape)) for name, shape in floats.items()},
-            **{name: np.zeros((B, *shape), dtype=np.int64) for name, shape in integers.items()},
-        )  # fmt: skip
-        self._dead_um = c.features.frame[:, 2]
+        self._pasts = [{f"front.past{j}.{name}": s.pasts[:, j, part] for name, part in parts.items()} for j in (0, 1)]
         self._rest: list[StateDict] = [{} for _ in range(B)]
 
     def load(self, axis: int, state: StateDict) -> None:
         """Take the state of an ordinary learner, without the arrays of its window. Raises KeyError, ValueError."""
         rest, s = dict(state), self.rows
-        row = s.numbers[axis : axis + 1]
-        for group, (path, _) in _GROUPS.items():
-            for name in row.dtype[group].names or ():
-                row[group][name] = rest.pop(f"{path}.{name}")
-        for name, (path, _) in _NUMBERS.items():
-            row[name] = rest.pop(path)
-        for name, path in _ARRAYS.items():
-            _write(getattr(s, name), axis, rest.pop(path))
-        s.counters[axis] = [rest.pop(f"counters.{name}") for name in OUTCOMES]
-        s.frames[axis] = row["offset_um"][0], 1.0 / row["gain"][0], self._dead_um[axis]
-        for j, mark in enumerate(MARKS):
-            _write(s.marks[axis], j, rest.pop(f"{mark}.beta"))
-            _write(s.mark_covariances[axis], j, rest.pop(f"{mark}.covariance"))
+        row, served = s.numbers[axis], s.numbers["front"]["track"]["served"][axis]
+        _take(self._fields, axis, rest)
+        s.frames[axis] = served["offset_um"], 1.0 / served["gain"], served["dead_um"]
         delay = np.asarray(rest.pop("delay"), dtype=np.float64).reshape(-1, s.beta.shape[1])
         s.delay[axis, : len(delay)] = delay
-        pasts = sorted({name.split(".")[1] for name in rest if name.startswith("front.past")})
-        voltages = [np.asarray(rest.pop(f"front.{past}.u_V")) for past in pasts]
+        pasts = [j for j in range(2) if f"front.past{j}.u_V" in rest]
+        voltages = [np.asarray(rest.pop(f"front.past{j}.u_V")) for j in pasts]
         row["delay_count"], row["past_count"], row["confirmed"] = len(delay), len(pasts), False
         row["past_written"] = voltages[0].size if pasts else 0
-        for j, past in enumerate(pasts):
-            for name in PAST:
-                _write(getattr(s, f"past_{name}")[axis], j, rest.pop(f"front.{past}.{name}"))
+        for j in pasts:
+            _take(self._pasts[j], axis, rest)
             s.past_from[axis, j] = voltages[0].size - voltages[j].size
         if pasts:
             s.past_voltages[axis, : voltages[0].size] = voltages[0]
@@ -268,30 +249,26 @@ class FleetState:
 
     def read(self, axis: int) -> StateDict:
         """Inverse of ``load``."""
-        state, s = dict(self._rest[axis]), self.rows
-        row = s.numbers[axis]
-        for group, (path, _) in _GROUPS.items():
-            state |= {f"{path}.{name}": row[group][name].item() for name in row[group].dtype.names}
-        state |= {path: row[name].item() for name, (path, _) in _NUMBERS.items()}
-        state |= {path: getattr(s, name)[axis].copy() for name, path in _ARRAYS.items()}
-        state |= {f"counters.{name}": int(n) for name, n in zip(OUTCOMES, s.counters[axis], strict=True)}
-        for j, mark in enumerate(MARKS):
-            state[f"{mark}.beta"] = s.marks[axis, j].copy()
-            state[f"{mark}.covariance"] = s.mark_covariances[axis, j].copy()
-        state["front.reckoned_seq"] = state["front.gates.seq"]  # an ordinary sample has a reading
-        for name in ("gain", "offset_um"):
-            state[f"front.track.features.{name}"] = state[f"front.track.served.{name}"]
+        s, row = self.rows, self.rows.numbers[axis]
+        state = self._rest[axis] | _given(self._fields, axis)
         kept, taken = s.delay.shape[1] - 1, int(row["delay_count"])
         state["delay"] = s.delay[axis, np.arange(max(taken - kept, 0), taken) % (kept + 1)]
         ring, written = s.past_voltages[axis], int(row["past_written"])
         for j in range(int(row["past_count"])):
-            state |= {f"front.past{j}.{name}": getattr(s, f"past_{name}")[axis, j].copy() for name in PAST}
+            state |= _given(self._pasts[j], axis)
             state[f"front.past{j}.u_V"] = ring[np.arange(s.past_from[axis, j], written) % ring.size]
         return state
 
 
-def _write(rows: Any, at: int, value: object) -> None:
-    given = np.asarray(value)
-    if given.shape != rows[at].shape:
-        raise ValueError(f"got shape {given.shape}, expected {rows[at].shape}")
-    rows[at] = given
+def _take(fields: StateDict, axis: int, state: StateDict) -> None:
+    """Move the entries of ``state`` to where they are in the rows."""
+    for name, field in fields.items():
+        given = np.asarray(state.pop(name))
+        if given.shape != field.shape[1:]:
+            raise ValueError(f"{name}: got shape {given.shape}, expected {field.shape[1:]}")
+        field[axis] = given
+
+
+def _given(fields: StateDict, axis: int) -> StateDict:
+    """Inverse of `_take`: copies."""
+    return {name: field[axis].item() if field.ndim == 1 else field[axis].copy() for name, field in fields.items()}

@@ -96,38 +96,34 @@ def _map(c: Fixed, b: int, frames: FloatArray) -> FeatureArrays:
 @compiled
 def _remember_place(s: Rows, b: int, keep: bool) -> None:
     """The present place becomes the newest known one: after the last, or with ``keep`` in its stead."""
-    r, slots = s.numbers[b], s.voltages.shape[1]
+    r, slots, lag = s.numbers[b], s.voltages.shape[1], s.voltages.shape[1] - 2
     at = r.past_count - 1 if keep else min(r.past_count, 1)
     if r.past_count == 2:
-        for part in (s.past_motion[b], s.past_lag_V[b], s.past_lag_um[b], s.past_memory[b]):
-            part[0] = part[1]
-        s.past_u_before_V[b, 0] = s.past_u_before_V[b, 1]
-        s.past_from[b, 0] = s.past_from[b, 1]
-    s.past_motion[b, at], s.past_memory[b, at] = s.motion[b], s.memory[b]
-    s.past_u_before_V[b, at] = s.voltages[b, (r.count - slots + 1) % slots]
-    for i in range(slots - 2):
-        past = (r.count - slots + 2 + i) % slots
-        s.past_lag_V[b, at, i], s.past_lag_um[b, at, i] = s.voltages[b, past], s.readings[b, past]
-    s.past_from[b, at] = r.past_written
-    r["past_count"] = at + 1
+        s.pasts[b, 0], s.past_from[b, 0] = s.pasts[b, 1], s.past_from[b, 1]
+    past, first = s.pasts[b, at], r.front.track.smoother.count - lag
+    past[:3], past[3], past[4 + 2 * lag :] = s.motion[b], s.voltages[b, (first - 1) % slots], s.memory[b]
+    for i in range(lag):
+        slot = (first + i) % slots
+        past[4 + i], past[4 + lag + i] = s.voltages[b, slot], s.readings[b, slot]
+    s.past_from[b, at], r["past_count"] = r.past_written, at + 1
 
 
 @compiled
 def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
     """`Intake._lags`: whether the reading has not moved with the voltage, by a rough measure."""
-    r, f, slots = s.numbers[b], c.axis[b], s.voltages.shape[1]
-    if not (f.tells and r.credit > 0) or r.past_count == 0 or r.gates.since_start < r.look_from:
+    r, front, f, slots = s.numbers[b], s.numbers[b].front, c.axis[b], s.voltages.shape[1]
+    if not (f.tells and front.credit > 0) or r.past_count == 0 or front.gates.since_start < front.look_from:
         return False
-    last, first = r.count - 1, r.count + 1 - slots
+    last, first = front.track.smoother.count - 1, front.track.smoother.count + 1 - slots
     x_um = (s.voltages[b, last % slots] - s.voltages[b, first % slots]) / f.slope_V_per_um
-    return bool(intake.lags(r.gates, x_um, y_um - s.readings[b, (first + 1) % slots], f.range_um))
+    return bool(intake.lags(front.gates, x_um, y_um - s.readings[b, (first + 1) % slots], f.range_um))
 
 
 @compiled
 def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
     """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
-    r, f, a = s.numbers[b], c.axis[b], c.config[0].admission
-    g, dt_s = r.gates, c.config[0].dt_s
+    front, f, a = s.numbers[b].front, c.axis[b], c.config[0].admission
+    g, dt_s = front.gates, c.config[0].dt_s
     refused = gates.check_sample(a, g, sample, dt_s)
     if refused == "" and abs(sample.y_um - f.middle_um) > intake.FAR_OUT * f.range_um:
         refused = gates.OUT_OF_RANGE
@@ -147,25 +143,26 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
     if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
         return DOUBT
     gates.watch_innovation(a, g, innovation)
-    r["until_control"] -= 1
-    return DOUBT if known and f.tells and r.until_control <= 0 and control else TEACHES
+    front["until_control"] -= 1
+    return DOUBT if known and f.tells and front.until_control <= 0 and control else TEACHES
 
 
 @compiled
 def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
     """`Intake.advance`: one step of the smoother, and of the hysteresis memory in both frames."""
     r, slots = s.numbers[b], s.voltages.shape[1]
-    _note_step(r.gates)
-    r["calm"] += 1
+    front, smoother = r.front, r.front.track.smoother
+    _note_step(front.gates)
+    front["calm"] += 1
     s.past_voltages[b, r.past_written % s.past_voltages.shape[1]] = u_V
     r["past_written"] += 1
     if r.past_count > 0 and r.past_written - s.past_from[b, 0] > MOST_BRIDGED:
         # At rest nothing is checked, and the present place is as good as the past one.
         _remember_place(s, b, True)
-    slot, motion = r.count % slots, s.motion[b]
+    slot, motion = smoother.count % slots, s.motion[b]
     s.readings[b, slot], s.voltages[b, slot], s.good[b, slot] = y_um, u_V, True
-    smooth_one(y_um, r.count, s.x[b], s.ring[b], c.transition, c.gain, c.lag_gains, motion)
-    r["count"] += 1
+    smooth_one(y_um, smoother.count, s.x[b], s.ring[b], c.transition, c.gain, c.lag_gains, motion)
+    smoother["count"] += 1
     for i in range(3):
         motion[i] *= c.output_scale[i]
     advance(motion[0], s.memory[b], _map(c, b, s.frames))
@@ -176,7 +173,7 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
 def _instant(s: Rows, b: int) -> tuple[int, int, bool, bool]:
     """The smoothed instant: its number and slot, whether its readings are good, and whether others nearby are not."""
     slots = s.voltages.shape[1]
-    now = s.numbers[b].count + 1 - slots
+    now = s.numbers[b].front.track.smoother.count + 1 - slots
     clean = True
     for i in range(slots):
         clean = clean and s.good[b, i]
@@ -199,7 +196,7 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, given: Samples, w:
         now, at, good, _ = _instant(s, b)
         motion = s.motion[b]
         refused = gates.check_pair(config.admission, s.voltages[b, at], s.voltages[b, (now - 1) % slots], motion[0])
-        if gates.settling(config.admission, s.numbers[b].gates):
+        if gates.settling(config.admission, s.numbers[b].front.gates):
             refused = gates.SETTLING
         elif not good:
             refused = gates.GLITCH
@@ -224,7 +221,8 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         w.kept[b] = r
         w.lets_go[b] = w.learns[b] = False
         w.outcome[b] = _SATURATED if saturated else _number_of(gates.PASSED)
-        rests = gates.at_rest(config.admission, r.gates, motion[0], r.count, f.range_um, config.dt_s)
+        served, count = r.front.track.served, r.front.track.smoother.count
+        rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
         w.weights[b] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
         if now % config.filter_every == 0:
             target = u - kernel_V[k]
@@ -252,12 +250,12 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
                 w.outcome[b] = _OUTLIER
                 continue
             if said == "burst":
-                r["changed"], r["next"] = r.clock, 0
-            w.lets_go[b] = r.judgement.valid and r.next != NOWHERE
+                r.window["changed"], r.window["next"] = r.window.clock, 0
+            w.lets_go[b] = r.judgement.valid and r.window.next != NOWHERE
             if rests:
                 shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
-                r["offset_um"] += shift_um
-                s.frames[b, 0] = r.offset_um
+                served["offset_um"] += shift_um
+                s.frames[b, 0] = served.offset_um
             else:
                 _leave_rest(r.rest)
             w.outcome[b] = _UNEXCITED if rests else _LEARNT
@@ -284,7 +282,7 @@ def _finds_fault(
     _judge(j, target - served_V, u - frozen_V, config.step_s)
     _is_valid(j, config.valid_enter * span_V, config.valid_leave * span_V)
     before = j.fallback
-    r["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
+    r.events["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
     fault = j.fallen_s > learner.ROLLBACK_S
     confirms = places = False
     if checks:
@@ -296,10 +294,10 @@ def _finds_fault(
         fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
         if not saturated:
             r["confirmed"] = False
-            if f.tells and r.credit > 0:
+            if f.tells and r.front.credit > 0:
                 fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
-                fault = _follow(r.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
-                r["confirmed"] = r.following.good >= CONFIRMED or r.past_count == 0
+                fault = _follow(r.front.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
+                r["confirmed"] = r.front.following.good >= CONFIRMED or r.past_count == 0
             places = r.confirmed
         confirms = r.confirmed
     if fault:
@@ -312,7 +310,7 @@ def _finds_fault(
         s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
         s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
     if places:
-        _count_again(r.following)
+        _count_again(r.front.following)
         _remember_place(s, b, False)
     return False
 
@@ -340,6 +338,6 @@ def memory_now(s: Rows, c: Fixed, frozen: BoolArray, out: FloatArray) -> None:
     readings = np.empty(lag)
     for b in range(out.shape[0]):
         for i in range(lag):
-            readings[i] = s.readings[b, (s.numbers[b].count - lag + i) % slots]
+            readings[i] = s.readings[b, (s.numbers[b].front.track.smoother.count - lag + i) % slots]
         out[b] = s.frozen_memory[b] if frozen[b] else s.memory[b]
         track_memory(readings, out[b], _map(c, b, c.features.frame if frozen[b] else s.frames))

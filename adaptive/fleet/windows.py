@@ -7,9 +7,7 @@ number.
 
 from __future__ import annotations
 
-import mmap
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -23,10 +21,8 @@ from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import COUNT, ILL_CONDITIONED, WindowArrays, arrays_of
 
-#: Fewest axes for which a second thread is worth its wake-up, and most whose matrices are copied at once.
+#: Fewest axes for which a second thread is worth its wake-up.
 _LEAST_AXES = 16
-#: Most maps of one file.
-_MAPS = 64
 
 
 class Threads:
@@ -71,7 +67,7 @@ def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed
     """`ResidualWindow.learn` and ``fade`` of each axis."""
     for k in range(lo, hi):
         b = axes[k]
-        A, r = arrays_of(handles[b]), s.numbers[b]
+        A, r = arrays_of(handles[b]), s.numbers[b].window
         empty = A.C[COUNT] == 0
         status = window.learn(A, r, step.points[k], step.targets[k], step.weights[k], s.born[b], s.own[b], step.fifo)
         # An empty window has nothing that a new factorisation could mend.
@@ -84,7 +80,7 @@ def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed,
     """`ResidualWindow.fade` of each axis."""
     for k in range(lo, hi):
         b = axes[k]
-        window.fade(arrays_of(handles[b]), s.numbers[b], c.config[0].weights, step_s, s.born[b], s.own[b])
+        window.fade(arrays_of(handles[b]), s.numbers[b].window, c.config[0].weights, step_s, s.born[b], s.own[b])
 
 
 @compiled
@@ -92,25 +88,7 @@ def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: f
     """`ResidualWindow.let_go` of each axis."""
     for k in range(lo, hi):
         b = axes[k]
-        window.let_go(arrays_of(handles[b]), s.numbers[b], most, s.born[b], s.own[b])
-
-
-def _matrices(start: WindowArrays, count: int) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """P and R of ``count`` windows that begin as ``start``: its own, and copies that take memory as they are written.
-
-    The copies are private maps of one file. It holds some of them, because each map keeps a file open.
-    """
-    yield start.P, start.R
-    if count <= _LEAST_AXES:
-        yield from ((start.P.copy(), start.R.copy()) for _ in range(count - 1))
-        return
-    with tempfile.TemporaryFile() as file:
-        each = -(-count // _MAPS)
-        file.write(np.stack((start.P, start.R)).tobytes() * each)
-        file.flush()
-        for first in range(1, count, each):
-            part = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-            yield from ((P, R) for P, R in part.reshape(each, 2, *start.P.shape)[: count - first])
+        window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b], s.own[b])
 
 
 class CompiledWindows:
@@ -120,39 +98,34 @@ class CompiledWindows:
     shares = True
 
     def __init__(self, rows: Rows, fixed: Fixed, starts: Sequence[WindowArrays], threads: Threads) -> None:
-        """``starts`` : what each window begins as; axes that begin alike have the same one."""
-        B = len(starts)
+        """``starts`` : what each window begins as."""
         self._rows, self._fixed, self._threads = rows, fixed, threads
-        users: dict[int, list[int]] = {}
-        for axis, start in enumerate(starts):
-            users.setdefault(id(start), []).append(axis)
-        pairs = dict(
-            pair for axes in users.values() for pair in zip(axes, _matrices(starts[axes[0]], len(axes)), strict=True)
-        )
+        #: What windows begin as whose matrices are not written yet. It would take seconds to write all of them at once.
+        self.unwritten = dict(enumerate(starts))
         small = (name for name in WindowArrays._fields if name not in ("P", "R"))
         self._all = {name: np.array([getattr(start, name) for start in starts]) for name in small}
+        # It takes memory as it is written.
+        matrices = np.empty((len(starts), 2, *starts[0].P.shape))
         self._views = [
-            WindowArrays(*pairs[axis], **{name: field[axis] for name, field in self._all.items()}) for axis in range(B)
+            WindowArrays(*pair, **{name: field[axis] for name, field in self._all.items()})
+            for axis, pair in enumerate(matrices)
         ]
         self._handles = np.array([ws.handle_of(view) for view in self._views])
-        # Huge pages, where the system has them, which maps of a file have not. It takes memory as it is written.
-        self._own = np.empty((B, 2, *starts[0].P.shape))
 
-    def own(self, axes: Sequence[int]) -> None:
-        """Move the matrices of ``axes`` to memory of their own; ``arrays`` of before are no longer theirs."""
-        for axis in axes:
-            view, (P, R) = self._views[axis], self._own[axis]
-            P[...], R[...] = view.P, view.R
-            self._views[axis] = view._replace(P=P, R=R)
-            self._handles[axis] = ws.handle_of(self._views[axis])
+    def write(self, axes: Iterable[int]) -> None:
+        """Write the matrices that the windows of ``axes`` begin with, where they are not yet. No step before that."""
+        for axis in self.unwritten.keys() & axes:
+            start = self.unwritten.pop(axis)
+            self._views[axis].P[...], self._views[axis].R[...] = start.P, start.R
 
     def arrays(self, axis: int) -> WindowArrays:
-        """The solver's state of an axis: views, stepped in place by whoever has them."""
+        """The solver's state of an axis: views, stepped in place by whoever has them, after `write`."""
         return self._views[axis]
 
     def put(self, axis: int, arrays: WindowArrays) -> None:
         """Take over the state of a solver; nothing where it is the axis' own."""
         if arrays is not self._views[axis]:
+            self.unwritten.pop(axis, None)
             ws.take_over(self._views[axis], arrays)
 
     def samples(self) -> dict[str, FloatArray]:
@@ -167,10 +140,12 @@ class CompiledWindows:
 
     def learn(self, axes: IntArray, step: Step) -> IntArray:
         """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
+        self.write(axes.tolist())
         out = np.empty(axes.size, dtype=np.int64)
         self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, step, out)
         return out
 
     def let_go(self, axes: IntArray, most: float) -> None:
         """`ResidualWindow.let_go` of each axis."""
+        self.write(axes.tolist())
         self._threads.share(axes.size, let_go, self._handles, axes, self._rows, most)

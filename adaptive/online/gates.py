@@ -10,7 +10,7 @@ in service.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import isfinite
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap
-from adaptive.types import Sample, StateDict
+from adaptive.types import Sample, StateDict, numbers_of
 
 # --- Gates.
 
@@ -173,11 +173,11 @@ class AdmissionState:
         self.since_jump = 0
 
     def state_dict(self) -> StateDict:
-        return asdict(self)
+        return numbers_of(self)
 
     @classmethod
     def from_state(cls, values: StateDict) -> AdmissionState:
-        kinds = {name: type(value) for name, value in asdict(cls()).items()}
+        kinds = {name: type(value) for name, value in numbers_of(cls()).items()}
         return cls(**{name: kind(values[name]) for name, kind in kinds.items()})
 
 

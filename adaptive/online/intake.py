@@ -30,7 +30,7 @@ from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
 from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother, smoother_of
-from adaptive.types import FloatArray, Sample, StateDict, joined, prefixed, under
+from adaptive.types import FloatArray, Sample, StateDict, joined, parted, prefixed
 
 # --- What an intake holds beside its numbers, as flat entries and back.
 
@@ -52,21 +52,21 @@ def _parts_to_state(
 
 
 def _parts_of(
-    smoother: FixedLagSmoother, model: LssvmInverse, state: StateDict
+    smoother: FixedLagSmoother, model: LssvmInverse, parts: dict[str, StateDict]
 ) -> tuple[AdmissionState, Track | None, Hold | None, Trial | None, FeatureMap | None, Following]:
     """Inverse of ``_parts_to_state``; ``model`` is the identified one.
 
     Raises KeyError, TypeError, ValueError or InputError where it does not fit.
     """
-    gates = AdmissionState.from_state(under("gates.", state))
-    track, hold, trial, before = (under(f"{name}.", state) for name in ("track", "hold", "trial", "before"))
+    gates = AdmissionState.from_state(parts["gates"])
+    track, hold, trial, before = (parts[name] for name in ("track", "hold", "trial", "before"))
     return (
         gates,
         Track.from_state(smoother, model.features, track) if track else None,
         Hold.from_state(hold) if hold else None,
         Trial.from_state(trial, model) if trial else None,
         FeatureMap.from_state(before) if before else None,
-        Following.from_state(under("following.", state)),
+        Following.from_state(parts["following"]),
     )
 
 
@@ -619,6 +619,12 @@ class Intake:
         return self._control is not None
 
     @property
+    def begins(self) -> bool:
+        """Whether the next sample cannot teach anything, because the smoother has just started."""
+        smooths = self.track is not None and self.track.motion is not None
+        return not smooths and self.gates.since_start < self._admission.settle
+
+    @property
     def ordinary(self) -> bool:
         """Whether nothing is under way: readings are smoothed and trusted, and no jump is open."""
         track = self.track
@@ -746,21 +752,21 @@ class Intake:
 
     def restore(self, state: StateDict) -> None:
         """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        parts = _parts_of(self.smoother, self.base, state)
-        self.gates, self.track, self._hold, self._trial, self._before, self.following = parts
-        pasts = (under(f"past{i}.", state) for i in range(2))
-        self._pasts = [Past.from_state(values) for values in pasts if values]
-        missing = under("missing.", state)
+        parts = parted(state)
+        made = _parts_of(self.smoother, self.base, parts)
+        self.gates, self.track, self._hold, self._trial, self._before, self.following = made
+        self._pasts = [Past.from_state(values) for values in (parts["past0"], parts["past1"]) if values]
+        missing = parts["missing"]
         self.missing = MissingMotion.from_state(missing) if missing else None
-        control = under("control.", state)
+        control = parts["control"]
         self._control = Trial.from_state(control, self.base) if control else None
         self._credit = int(state.get("credit", FIRST_CREDIT))
         self._until_control = int(state.get("until_control", 0))
         self._look_from = int(state.get("look_from", 0))
         self._reckoned_seq = int(state.get("reckoned_seq", self.gates.seq))
-        proven = under("proven.", state)
+        proven = parts["proven"]
         self._proven = FeatureMap.from_state(proven) if proven else None
-        past = under("proven_past.", state)
+        past = parts["proven_past"]
         self._proven_past = Past.from_state(past) if past else None
         self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
         self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
-from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, prefixed, under
+from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, numbers_of, prefixed, under
 from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import Status, WindowArrays
@@ -316,7 +316,7 @@ class ResidualWindow:
         own = {
             "born": self._born.copy(),
             "own_weights": self._own.copy(),
-            **asdict(self._turn),
+            **numbers_of(self._turn),
             "kernel_variance": self.kernel_variance,
         }
         hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}

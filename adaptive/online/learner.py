@@ -9,7 +9,7 @@ so that a change is learnt once and the old samples of the window stay valid.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 from typing import Any
 
@@ -39,6 +39,8 @@ from adaptive.types import (
     StateDict,
     WindowData,
     joined,
+    numbers_of,
+    parted,
     prefixed,
     under,
 )
@@ -139,7 +141,7 @@ class Judgement:
         return max(self.long_V2, self.short_V2) + self.doubt_V2
 
     def state_dict(self) -> StateDict:
-        return asdict(self)
+        return numbers_of(self)
 
     @classmethod
     def from_state(cls, values: StateDict) -> Judgement:
@@ -592,14 +594,15 @@ class Parts:
 
     def restore(self, state: StateDict, arrays: bool = True) -> None:
         """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        self.intake.restore(under("front.", state))
-        kept_filter = under("filter.", state)
-        self.filter = DriftFilter.from_state(self.config.drift, self.filter.step_s, self.filter.span_V, kept_filter)
-        self.window.restore(under("window.", state), arrays)
-        self.rest = RestCreep.from_state(under("rest.", state))
-        self.judgement = Judgement.from_state(under("judgement.", state))
-        self.counters |= {key: int(value) for key, value in under("counters.", state).items()}
-        self.events |= {key: int(value) for key, value in under("events.", state).items()}
+        parts = parted(state)
+        self.intake.restore(parts["front"])
+        f = self.filter
+        self.filter = DriftFilter.from_state(self.config.drift, f.step_s, f.span_V, parts["filter"])
+        self.window.restore(parts["window"], arrays)
+        self.rest = RestCreep.from_state(parts["rest"])
+        self.judgement = Judgement.from_state(parts["judgement"])
+        self.counters |= {key: int(value) for key, value in parts["counters"].items()}
+        self.events |= {key: int(value) for key, value in parts["events"].items()}
         self.domain = np.array(state["domain"], dtype=np.float64)
         self.point = np.array(state["point"], dtype=np.float64)
         self.rail_s, self.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
@@ -609,10 +612,10 @@ class Parts:
         self.delay = Delay(self.delay.steps)
         self.delay.restore(np.asarray(state["delay"], dtype=np.float64))
         names = ("mark", "next_mark", "jump_mark")
-        self.mark, self.next_mark, self.jump_mark = (_mark(under(f"{name}.", state)) for name in names)
-        proven = under("proven_mark.", state)
+        self.mark, self.next_mark, self.jump_mark = (_mark(parts[name]) for name in names)
+        proven = parts["proven_mark"]
         self.proven_mark = _mark(proven) if proven else self.jump_mark
-        kept = [under(f"confirmed{i}.", state) for i in range(2)]
+        kept = [parts["confirmed0"], parts["confirmed1"]]
         self.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (self.mark, self.next_mark)
 
 

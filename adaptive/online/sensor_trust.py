@@ -26,7 +26,7 @@ even if they contradict dead reckoning.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ from adaptive.compiled import shared
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, correlated, slope_of, tolerance_um
-from adaptive.types import FloatArray, StateDict, prefixed, under
+from adaptive.types import FloatArray, StateDict, numbers_of, prefixed, under
 
 # --- The check that always runs.
 
@@ -151,7 +151,7 @@ class Following:
         return fault or self.still >= STILL_STEPS
 
     def state_dict(self) -> StateDict:
-        return asdict(self)
+        return numbers_of(self)
 
     @classmethod
     def from_state(cls, values: StateDict) -> Following:
@@ -160,7 +160,7 @@ class Following:
             return cls()
         # States of before there was a drift have no entries for it.
         values = {"drift_V_per_s": 0.0, "drift2": 0.0} | values
-        return cls(**{name: type(value)(values[name]) for name, value in asdict(cls()).items()})
+        return cls(**{name: type(value)(values[name]) for name, value in numbers_of(cls()).items()})
 
 
 @shared

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptive.online.config import LearnerConfig
+from service.answers.guard import Limits
 from service.config.schema import build_settings, parse_toml, read_text
 from service.config.settings import AxisConfig, parse_config
 from service.protocol.errors import FieldError
@@ -21,6 +22,17 @@ class LearnerSettings:
 
     settings: dict[str, Any]
     axis: AxisConfig | None = None
+
+
+def learner_config(settings: dict[str, Any], limits: Limits, where: str) -> LearnerConfig:
+    """The learner's configuration by the table ``where``. Raises InputError on an unknown setting.
+
+    The learner takes a voltage at its limit for saturated; it is told the limits unless the settings do.
+    """
+    gates = settings.get("admission", {})
+    if isinstance(gates, dict):
+        gates = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **gates}
+    return build_settings(LearnerConfig, {**settings, "admission": gates}, where)
 
 
 def read_learner_settings(path: Path, axis: str | None = None) -> LearnerSettings:

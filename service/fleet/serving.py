@@ -8,6 +8,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Final
 
@@ -22,10 +23,9 @@ from adaptive.fleet.fleet import Fleet
 from adaptive.fleet.snapshot import FleetSnapshot
 from adaptive.fleet.state import OUTCOMES
 from adaptive.inverse_model import LssvmInverse
-from adaptive.online.config import LearnerConfig
 from adaptive.types import BoolArray, FloatArray
 from service.answers.guard import Limits, limit
-from service.config.schema import build_settings
+from service.config.learner import learner_config
 from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
@@ -42,7 +42,7 @@ from service.storage.model_file import read_bundle
 #: Name of a fleet in the keys, in place of an axis.
 NAME: Final = "fleet"
 _COUNTED: Final = ("received", "dropped", "malformed", "missing", "unknown_axes", "queries", "query_errors",
-                   "points_refused")  # fmt: skip
+                   "points_refused", "waiting")  # fmt: skip
 #: Axes that the summary lists, worst first; time between two statuses, s.
 _WORST, _STATUS_S = 10, 1.0
 
@@ -59,10 +59,7 @@ def load_fleet(settings: FleetSettings) -> Fleet:
         f = models[0].features
         gains = settings.gains or (1.0,) * settings.axes
         models = [replace(models[0], features=replace(f, gain=gain * f.gain)) for gain in gains]
-    limits, given = settings.limits, settings.learner.get("admission", {})
-    if isinstance(given, dict):
-        given = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **given}
-    learner = build_settings(LearnerConfig, {**settings.learner, "admission": given}, "fleet.learner")
+    learner = learner_config(settings.learner, settings.limits, "fleet.learner")
     try:
         fleet = Fleet(models, FleetConfig(learner, settings.device, threads=settings.threads))
     except ImportError as error:
@@ -139,44 +136,42 @@ class FleetService:
         self._newest = self._fleet.snapshot(), self._fleet.memory(), -1
         self._published = self._newest[0].linear
         self._queue: queue.Queue[FleetMessage | Callable[[], None]] = queue.Queue()
-        self._waiting = 0
         self._counts = dict.fromkeys(_COUNTED, 0)
         self._counting = threading.Lock()
         self._stopping = threading.Event()
-        self._session: zenoh.Session | None = None
-        self._entities: list[Any] = []
-        self._publisher: Any = None
-        self._thread = threading.Thread(target=self._run, name="learn-fleet")
+        self._ending = ExitStack()
 
     def __enter__(self) -> FleetService:
-        config = self.config
-        self._session = session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
-        keys = self.keys
-        self._publisher = session.declare_publisher(keys.model)
-        self._thread.start()
-        self._entities = [
-            session.declare_subscriber(keys.sample, self._on_samples),
-            session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
-            session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
-            session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
-            # Last, because alive means callable.
-            session.liveliness().declare_token(keys.alive(self.instance)),
-        ]
+        config, keys = self.config, self.keys
+        with ExitStack() as ending:
+            session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
+            ending.callback(session.close)
+            publisher = session.declare_publisher(keys.model)
+            ending.callback(publisher.undeclare)
+            if self._checkpoints is not None:
+                ending.callback(self._checkpoints.close)
+            thread = threading.Thread(target=self._run, args=(session, publisher), name="learn-fleet")
+            thread.start()
+            ending.callback(self._stop, thread)
+            for entity in (
+                session.declare_subscriber(keys.sample, self._on_samples),
+                session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
+                session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
+                session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
+                # Last, because alive means callable.
+                session.liveliness().declare_token(keys.alive(self.instance)),
+            ):
+                ending.callback(entity.undeclare)
+            self._ending = ending.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for entity in reversed(self._entities):
-            entity.undeclare()
+        self._ending.close()
+
+    def _stop(self, thread: threading.Thread) -> None:
         self._stopping.set()
         self._queue.put(lambda: None)
-        if self._thread.is_alive():
-            self._thread.join()
-        if self._checkpoints is not None:
-            self._checkpoints.close()
-        if self._publisher is not None:
-            self._publisher.undeclare()
-        if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]
+        thread.join()
 
     def ready(self) -> dict[str, Any]:
         """Fields of the line that `dehyst serve` prints when it is ready."""
@@ -200,9 +195,9 @@ class FleetService:
             self._count(malformed=1)
             return
         with self._counting:
-            room = self._waiting + batch.rows <= self.settings.queue_samples
+            room = self._counts["waiting"] + batch.rows <= self.settings.queue_samples
             self._counts["received" if room else "dropped"] += batch.rows
-            self._waiting += batch.rows if room else 0
+            self._counts["waiting"] += batch.rows if room else 0
         if room:
             self._queue.put(batch)
 
@@ -229,7 +224,7 @@ class FleetService:
 
     # ---- the thread that learns
 
-    def _run(self) -> None:
+    def _run(self, session: zenoh.Session, publisher: Any) -> None:
         handled, told_s, changed_s = 0, 0.0, 0.0
         while not self._stopping.is_set():
             try:
@@ -245,12 +240,12 @@ class FleetService:
             elif item is not None:
                 item()
             now_s = time.monotonic()
-            if self._session is not None and now_s - told_s >= _STATUS_S:
+            if now_s - told_s >= _STATUS_S:
                 told_s = now_s
-                self._session.put(self.keys.status, to_json(self.status()), encoding=JSON)
-            if self._publisher is not None and now_s - changed_s >= 1.0 / self.settings.model_hz:
+                session.put(self.keys.status, to_json(self.status()), encoding=JSON)
+            if now_s - changed_s >= 1.0 / self.settings.model_hz:
                 changed_s = now_s
-                self._publish_changes()
+                self._publish_changes(publisher)
 
     def _learn(self, batch: FleetMessage) -> int:
         """Take all samples of a message; returns their number."""
@@ -262,14 +257,12 @@ class FleetService:
         present = ~(np.isnan(u) & np.isnan(y))
         for i in range(k):
             self._fleet.step(p["seq"][i], p["t_s"][i], u[i], y[i], present[i])
-        self._count(missing=int((~present[:, here]).sum()), unknown_axes=k * (batch.axes - known))
-        with self._counting:
-            self._waiting -= k
+        self._count(missing=int((~present[:, here]).sum()), unknown_axes=k * (batch.axes - known), waiting=-k)
         return k
 
-    def _publish_changes(self) -> None:
+    def _publish_changes(self, publisher: Any) -> None:
         """Send the linear parts and frames that have changed since the last time, to those that follow."""
-        if not self._publisher.matching_status.matching:
+        if not publisher.matching_status.matching:
             return
         snapshot, _, seq = self._newest
         now = snapshot.linear
@@ -278,7 +271,7 @@ class FleetService:
         if axes.size:
             frames, beta = now[axes, :2], now[axes, 2:]
             changes = encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, frames=frames, beta=beta)
-            self._publisher.put(changes)
+            publisher.put(changes)
 
     def _axis_of(self, payload: bytes) -> int | None:
         """The axis that a request names; None for none. Raises InputError."""
@@ -308,7 +301,7 @@ class FleetService:
         # An axis in trouble is worse than any that learns.
         order = sorted(range(fleet.axes), key=lambda axis: (axis not in troubles, -errors[axis]))
         with self._counting:
-            counts = {**self._counts, "waiting": self._waiting}
+            counts = dict(self._counts)
         return {
             "role": "primary", "instance": self.instance, "stage": self.config.stage, "axes": fleet.axes,
             "seq": self._newest[2], "samples": counts,

@@ -16,7 +16,6 @@ from adaptive.types import InverseModel, OnlineModel, Sample
 from baselines.competition.competition import Competition
 from service.answers import guard
 from service.answers.guard import Limits
-from service.config.schema import build_settings
 from service.config.settings import COMPETE, AxisConfig
 from service.protocol.errors import FieldError
 from service.server.axis import Axis
@@ -35,17 +34,12 @@ LearnerFactory = Callable[[InverseModel, dict[str, Any], Limits], OnlineModel]
 
 def make_learner(model: InverseModel, settings: dict[str, Any], limits: Limits) -> OnlineModel:
     """The learner of this project, started from ``model``. Raises InputError on an unknown setting."""
-    from adaptive.online.config import LearnerConfig
     from adaptive.online.learner import Learner
+    from service.config.learner import learner_config
 
     if not isinstance(model, LssvmInverse):
         raise FieldError("learn", f"{model.name!r}, a {type(model).__name__}", "an LSSVM model of the file, or none")
-    # The learner takes a voltage at its limit for saturated; it is told the limits unless the settings do.
-    gates = settings.get("admission", {})
-    if isinstance(gates, dict):
-        gates = {"u_min_V": limits.u_min_V, "u_max_V": limits.u_max_V, **gates}
-    config = build_settings(LearnerConfig, {**settings, "admission": gates}, "learner")
-    learner: OnlineModel = Learner.from_model(model, config)
+    learner: OnlineModel = Learner.from_model(model, learner_config(settings, limits, "learner"))
     return learner
 
 

@@ -215,18 +215,21 @@ def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[Ls
     assert min(single.counters()["window_steps"] for single in singles) > 20
 
 
-def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -> None:
-    """Their matrices are copies on write: a step of one axis must not show in another."""
-    config = LearnerConfig(window=60)
-    fleet = Fleet([models[0]] * 80, FleetConfig(config))
+@pytest.mark.parametrize("settle", [0, 50])
+def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse], settle: int) -> None:
+    """Their matrices are written one after the other, and in any case before a step of the axis needs them."""
+    config = LearnerConfig(window=60, admission=AdmissionConfig(settle=settle))
+    # One control trial at a time: one of the axes has its first step within the batch. With ``settle`` 0 a trial can
+    # begin as soon as an axis has a place.
+    fleet = Fleet([models[0]] * 900, FleetConfig(config, checks=1))
     u, y = samples(700)
-    moving = {3: Learner(models[0], config), 79: Learner(models[0], config)}
-    present = np.isin(np.arange(80), list(moving))
+    moving = {3: Learner(models[0], config), 899: Learner(models[0], config)}
+    present = np.isin(np.arange(900), list(moving))
     for k in range(700):
-        fleet.step(k, k * DT, u[0, k], np.where(np.arange(80) == 3, y[0, k], 1.01 * y[0, k]), present)
+        fleet.step(k, k * DT, u[0, k], np.where(np.arange(900) == 3, y[0, k], 1.01 * y[0, k]), present)
         for axis, single in moving.items():
             single.handle(Sample(k, k * DT, float(u[0, k]), float(y[0, k] if axis == 3 else 1.01 * y[0, k])))
-    begun, states = Learner(models[0], config).state_dict(), [fleet.export_axis(axis) for axis in (3, 79, 2, 78)]
+    begun, states = Learner(models[0], config).state_dict(), [fleet.export_axis(axis) for axis in (3, 899, 2, 898)]
     for name in ("window.PR", "window.P", "window.R", "window.V"):
         for axis, state in zip(moving, states, strict=False):
             if name in state:
@@ -234,6 +237,21 @@ def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse]) -
         for state in states[2:]:
             assert name not in state or np.array_equal(state[name], begun[name])
     assert min(single.counters()["window_steps"] for single in moving.values()) > 5
+
+
+@pytest.mark.parametrize("settle", [0, 50])
+def test_a_sample_teaches_nothing_while_the_smoother_begins(models: list[LssvmInverse], settle: int) -> None:
+    """Until then the matrices of a window need not be written."""
+    learner = Learner(models[0], LearnerConfig(window=60, admission=AdmissionConfig(settle=settle)))
+    u, y = samples(700)
+    begun = []
+    for k in range(100):
+        begun.append(learner.parts.intake.begins)
+        learner.handle(Sample(k, k * DT, float(u[0, 300 + k]), float(y[0, 300 + k])))
+        if begun[-1]:
+            assert learner.counters()["filter_updates"] == learner.counters()["window_steps"] == 0
+    assert begun[0] is (settle > 0)
+    assert begun[-1] is False
 
 
 def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse]) -> None:
