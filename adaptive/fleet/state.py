@@ -22,7 +22,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
 from adaptive.online.gates import LEARNT, PASSED, REASONS
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.learner import MARK_S, Learner
+from adaptive.online.learner import MARK_S, Learner, swing_of
 from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict
 
 #: Results of a sample, by their number in a fleet.
@@ -119,13 +119,14 @@ class Rows(NamedTuple):
 
 class Fixed(NamedTuple):
     """What does not change. config : one record. axis (B,) : a record for each axis. features (B, ...) : of the
-    identified models. beta, walks, bursts (B, p) : of them and their filters. models, sizes (M, ...) : M distinct
-    identified models as `LssvmInverse.packed` has them. The others are the smoother's."""
+    identified models. beta, walks, bursts (B, p) : of them and their filters; swing (B, p) : see `swing_of`. models,
+    sizes (M, ...) : M distinct identified models as `LssvmInverse.packed` has them. The others are the smoother's."""
 
     config: Any
     axis: Any
     features: FeatureArrays
     beta: FloatArray
+    swing: FloatArray
     walks: FloatArray
     bursts: FloatArray
     models: FloatArray
@@ -171,7 +172,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
             "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
             "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0, "a_scale": f.a_scale_um_per_s2,
-            "model": number,
+            "model": number, "frame_gain": f.gain,
         })  # fmt: skip
     models = [bases[numbers.index(number)].packed for number in range(max(numbers) + 1)]
     packed = np.zeros((len(models), max(row.size for row, _ in models)))
@@ -183,8 +184,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         _records([settings], LearnerConfig().state_dict() | steps),
         _records(axes, dict.fromkeys(axes[0], 0.0) | {"tells": False, "model": 0}),
         FeatureArrays(*map(np.array, zip(*(base.features.arrays for base in bases), strict=True))),
-        np.array([base.beta for base in bases]), np.array(walks), np.array(bursts), packed,
-        np.array([sizes for _, sizes in models]),
+        np.array([base.beta for base in bases]), np.array([swing_of(base) for base in bases]),
+        np.array(walks), np.array(bursts), packed, np.array([sizes for _, sizes in models]),
         *map(np.array, (smoother.transition, smoother.gain, smoother.lag_gains, smoother.scale)),
     )  # fmt: skip
 
