@@ -129,11 +129,15 @@ class CompiledWindows:
         pairs = dict(
             pair for axes in users.values() for pair in zip(axes, _matrices(starts[axes[0]], len(axes)), strict=True)
         )
-        small = (name for name in WindowArrays._fields if name not in ("P", "R"))
+        small = (name for name in WindowArrays._fields if name not in ("P", "R", "kept"))
         self._all = {name: np.array([getattr(start, name) for start in starts]) for name in small}
+        # Takes memory as it is written: in the inverse form, never.
+        self._all["kept"] = np.zeros((B, starts[0].kept.size))
         self._views = [
             WindowArrays(*pairs[axis], **{name: field[axis] for name, field in self._all.items()}) for axis in range(B)
         ]
+        for view in self._views:
+            ws.forget_kept(view)
         self._handles = np.array([ws.handle_of(view) for view in self._views])
         # Huge pages, where the system has them, which maps of a file have not. It takes memory as it is written.
         self._own = np.empty((B, 2, *starts[0].P.shape))
