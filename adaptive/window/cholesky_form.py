@@ -95,9 +95,31 @@ def _backward_columns(A: WindowArrays, n: int, b: FloatArray) -> None:
 
 @compiled_reassociating
 def _shorten_columns(A: WindowArrays, n: int, place: int, b: FloatArray) -> None:
-    """The columns before ``place`` lose that row, gain the new one, and take part in b <- L^-1 b."""
+    """The columns before ``place`` lose that row, gain the new one, and take part in b <- L^-1 b; four at a time."""
     P, order = A.P, A.order
-    for k in range(place):
+    k = 0
+    while k + 3 < place:
+        c0, c1, c2, c3 = P[order[k]], P[order[k + 1]], P[order[k + 2]], P[order[k + 3]]
+        t0 = b[k] / c0[0]
+        t1 = (b[k + 1] - c0[1] * t0) / c1[0]
+        t2 = (b[k + 2] - c0[2] * t0 - c1[1] * t1) / c2[0]
+        t3 = (b[k + 3] - c0[3] * t0 - c1[2] * t1 - c2[1] * t2) / c3[0]
+        b[k], b[k + 1], b[k + 2], b[k + 3] = t0, t1, t2, t3
+        before = place - k
+        a0, a1, a2, a3 = c0[4:before], c1[3 : before - 1], c2[2 : before - 2], c3[1 : before - 3]
+        rest = b[k + 4 : place]
+        for i in range(rest.shape[0]):
+            rest[i] -= a0[i] * t0 + a1[i] * t1 + a2[i] * t2 + a3[i] * t3
+        a0, a1 = c0[before : n - k], c1[before - 1 : n - k - 1]
+        a2, a3 = c2[before - 2 : n - k - 2], c3[before - 3 : n - k - 3]
+        rest = b[place : n - 1]
+        for i in range(rest.shape[0]):
+            e0, e1, e2, e3 = a0[i + 1], a1[i + 1], a2[i + 1], a3[i + 1]
+            a0[i], a1[i], a2[i], a3[i] = e0, e1, e2, e3
+            rest[i] -= e0 * t0 + e1 * t1 + e2 * t2 + e3 * t3
+        c0[n - 1 - k], c1[n - 2 - k], c2[n - 3 - k], c3[n - 4 - k] = t0, t1, t2, t3
+        k += 4
+    while k < place:
         c = P[order[k]]
         t = b[k] / c[0]
         b[k] = t
@@ -106,10 +128,11 @@ def _shorten_columns(A: WindowArrays, n: int, place: int, b: FloatArray) -> None
             rest[i] -= a[i] * t
         a, rest = c[place - k : n - k], b[place : n - 1]
         for i in range(rest.shape[0]):
-            value = a[i + 1]
-            a[i] = value
-            rest[i] -= value * t
+            e = a[i + 1]
+            a[i] = e
+            rest[i] -= e * t
         c[n - 1 - k] = t
+        k += 1
 
 
 @compiled_reassociating
