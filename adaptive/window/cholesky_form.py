@@ -2,7 +2,8 @@
 
 The sample that leaves is a rank-1 *update* of the factor behind it, a chain of rotations, which is stable. The new
 sample goes to the end of the factor, by one forward solve. T = L^-1 [1 y] (S and SY) goes through the same rotations.
-The error of alpha grows with cond(R), not with its square as in the inverse form, for about twice the time.
+The error of alpha grows with cond(R), not with its square as in the inverse form, for one and a half to two times the
+time.
 
 *Positions* are the order of the factor; ``order`` holds the slot at each position. The slot of a sample does not
 influence the numerics.

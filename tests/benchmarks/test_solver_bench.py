@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import run
+from benchmarks import run, solver, two_builds
 from benchmarks.drift import bench_drift
 from benchmarks.kalman_reference import bench_kalman
 from benchmarks.peers import bench_peers
@@ -64,6 +66,21 @@ def test_peers_learn_the_same_stream(report: dict[str, object]) -> None:
     peers = report["peers"]
     assert peers.keys() >= {"krls", "sklearn_krr"}  # type: ignore[attr-defined]
     assert all(np.isfinite(row["rmse"]) for row in peers.values())  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("anywhere", [False, True])
+def test_two_builds_are_timed_in_turns(anywhere: bool, tmp_path: Path) -> None:
+    """This checkout as the other one: its modules are its own, and those of this build stay what they are."""
+    other = two_builds.solver_of(Path(two_builds.__file__).parents[1])
+    assert other is not solver
+    assert other.Window is not solver.Window
+    assert sys.modules["benchmarks.solver"] is solver
+    lines = two_builds.compare({"other": other, "this": solver}, 20, 25, anywhere)
+    names = [f"{form}, {build}" for build in ("other", "this") for form in two_builds.FORMS]
+    assert [line.split(" | ")[1] for line in lines] == [*names, "dsymv"]
+    assert all(float(value) > 0.0 for line in lines for value in line.strip("| ").split(" | ")[2:])
+    with pytest.raises(SystemExit, match="expected the folder of a checkout"):
+        two_builds.solver_of(tmp_path)
 
 
 def test_drift_is_looked_at_in_every_form(report: dict[str, object]) -> None:
