@@ -73,7 +73,7 @@ def test_two_builds_are_timed_in_turns(anywhere: bool, tmp_path: Path) -> None:
     """This checkout as the other one: its modules are its own, and those of this build stay what they are."""
     other = two_builds.solver_of(Path(two_builds.__file__).parents[1])
     assert other is not solver
-    assert other.Window is not solver.Window
+    assert other.make_window is not solver.make_window
     assert sys.modules["benchmarks.solver"] is solver
     lines = two_builds.compare({"other": other, "this": solver}, 20, 25, anywhere)
     names = [f"{form}, {build}" for build in ("other", "this") for form in two_builds.FORMS]
