@@ -37,6 +37,7 @@ class TorchWindows:
         self._all = {
             name: torch.zeros((B, *field.shape), dtype=torch.as_tensor(field).dtype, device=self._device)
             for name, field in example._asdict().items()
+            if name != "kept"  # which the inverse form does not have
         }
         self._slots = torch.arange(example.S.size, device=self._device)
         self._handles = np.zeros((B, ws.handle_of(example).size), dtype=np.int64)
@@ -51,7 +52,8 @@ class TorchWindows:
 
     def arrays(self, axis: int) -> WindowArrays:
         """A copy of the solver's state of an axis."""
-        return WindowArrays(**{name: field[axis].cpu().numpy().copy() for name, field in self._all.items()})
+        fields = {name: field[axis].cpu().numpy().copy() for name, field in self._all.items()}
+        return WindowArrays(**fields, kept=np.zeros(ws.kept_size(fields["S"].size)))
 
     def put(self, axes: int | list[int], arrays: WindowArrays) -> None:
         """Take over the state of a solver for one axis or several, its pending change applied."""

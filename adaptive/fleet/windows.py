@@ -102,14 +102,17 @@ class CompiledWindows:
         self._rows, self._fixed, self._threads = rows, fixed, threads
         #: What windows begin as whose matrices are not written yet. It would take seconds to write all of them at once.
         self.unwritten = dict(enumerate(starts))
-        small = (name for name in WindowArrays._fields if name not in ("P", "R"))
+        small = (name for name in WindowArrays._fields if name not in ("P", "R", "kept"))
         self._all = {name: np.array([getattr(start, name) for start in starts]) for name in small}
-        # It takes memory as it is written.
+        # They take memory as they are written: ``kept``, in the inverse form, never.
+        self._all["kept"] = np.zeros((len(starts), starts[0].kept.size))
         matrices = np.empty((len(starts), 2, *starts[0].P.shape))
         self._views = [
             WindowArrays(*pair, **{name: field[axis] for name, field in self._all.items()})
             for axis, pair in enumerate(matrices)
         ]
+        for view in self._views:
+            ws.forget_kept(view)
         self._handles = np.array([ws.handle_of(view) for view in self._views])
 
     def write(self, axes: Iterable[int]) -> None:

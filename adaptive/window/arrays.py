@@ -25,13 +25,14 @@ class WindowArrays(NamedTuple):
     """State of a window. R is the kernel matrix of (2.27) with the noise variances, P its inverse.
 
     P : (N, N). Inverse form: the lower triangle is R^-1 *before* the pending rank-2 term P - m m' + q q' (rows MINUS
-        and PLUS of V). Cholesky form: L with R = L L', in the order of ``order``, in the upper or the lower triangle
-        (LOWER); the other one keeps L as it was before the last replacement, with its diagonal in row PK of V.
+        and PLUS of V). Cholesky form: L with R = L L', in the order of ``order``; L[i, j] is P[order[j], i - j].
     R : (N, N) Omega + diag(1/(gamma w)), both triangles.
     X : (d, N) features.  scaled : (d, N) features divided by their widths.  inverse_widths : (d,).
     S : (N,) P 1; in the Cholesky form L^-1 1, by position.
     V : (ROWS, N) vectors.  U : (UNDO_ROWS, max(N, 1 + d)) what a refused step restores.  F : floats.  C : counters.
     order : (N,) slot at each position of the factor (Cholesky form).  point : (d,) scratch.
+    kept : what a refused step of the Cholesky form begins at, see there: (N (N + 1)/2,) the factor as it was some steps
+        ago, then KEPT_STEPS times (N + 1,). No part of the state: where LOGGED is 0 it holds nothing.
     """
 
     P: FloatArray
@@ -46,6 +47,7 @@ class WindowArrays(NamedTuple):
     C: IntArray
     order: IntArray
     point: FloatArray
+    kept: FloatArray
 
 
 # Rows of V. Y: targets. W: noise weights. ALPHA: dual weights. SY: P y (Cholesky form: L^-1 y, by position). MINUS,
@@ -62,8 +64,8 @@ UNDO_ROWS = 5
 GAMMA, RESIDUAL, ROUND_WORST, LAST_WORST, UNDO_Y, UNDO_W, TOLERANCE, BETA, GRAM = range(9)
 FLOATS = 9
 
-# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE: position in the factor of the sample that
-# was replaced. CARRIED: number of steps for which the Cholesky form still updates DIAGONAL; 0 where it is not valid.
+# Elements of C. UNDO: kind of the step that can be taken back. UNDO_PLACE: not used now, has its place in states.
+# CARRIED: number of steps for which the Cholesky form still updates DIAGONAL; 0 where it is not valid.
 (
     COUNT,
     FORM,
@@ -83,8 +85,10 @@ FLOATS = 9
     CARRIED,
 ) = range(16)
 COUNTERS = 16
-#: In the Cholesky form, which has no pending term: 1 where the factor is in the lower triangle of P.
-LOWER = PENDING
+#: In the Cholesky form, which has no pending term: replacements since the factor was copied to ``kept``; 0 without one.
+LOGGED = PENDING
+#: So many replacements share a copy of the factor. A refused step makes all but the last of them once more.
+KEPT_STEPS = 16
 
 #: The counters that add up over a window's life.
 EVENTS = slice(STEPS, UNDO_PLACE)
@@ -150,18 +154,35 @@ def allocate(capacity: int, widths: FloatArray, gamma: float, tolerance: float, 
         C=C,
         order=np.arange(capacity, dtype=np.int64),
         point=np.zeros(dimension),
+        kept=np.zeros(kept_size(capacity)),
     )
+
+
+def kept_size(capacity: int) -> int:
+    """Elements of ``kept``. Fresh zeros take no memory before they are written: in the inverse form, never."""
+    return capacity * (capacity + 1) // 2 + KEPT_STEPS * (capacity + 1)
+
+
+def forget_kept(arrays: WindowArrays) -> None:
+    """Give up the copy of the factor in ``kept``: the next replacement makes one. No result depends on this."""
+    if arrays.C[FORM] == CHOLESKY_FORM:
+        arrays.C[LOGGED] = 0
 
 
 def duplicate(arrays: WindowArrays) -> WindowArrays:
     """An independent copy of the whole state."""
-    return WindowArrays(**{name: field.copy() for name, field in arrays._asdict().items()})
+    fields = {name: field.copy() for name, field in arrays._asdict().items() if name != "kept"}
+    copied = WindowArrays(**fields, kept=np.zeros(arrays.kept.size))
+    forget_kept(copied)
+    return copied
 
 
 def take_over(arrays: WindowArrays, source: WindowArrays) -> None:
     """Write the state of ``source``, a window of the same sizes, into ``arrays`` in place."""
-    for field, kept in zip(arrays, source, strict=True):
-        field[...] = kept
+    for name, field, other in zip(arrays._fields, arrays, source, strict=True):
+        if name != "kept":
+            field[...] = other
+    forget_kept(arrays)
 
 
 # --- The handle of a window: one array in place of all of them.
@@ -170,7 +191,7 @@ _FIELDS = len(WindowArrays._fields)
 
 
 def handle_of(arrays: WindowArrays) -> IntArray:
-    """(36,) addresses of all arrays, then two sizes of each. Valid only while these arrays live: keep both together.
+    """(39,) addresses of all arrays, then two sizes of each. Valid only while these arrays live: keep both together.
 
     Raises TypeError where an array is not C-ordered float64 or int64, as `allocate` makes them.
     """
@@ -214,4 +235,5 @@ def arrays_of(h: IntArray) -> WindowArrays:  # pragma: no cover - compiled
     return WindowArrays(
         _matrix(h, 0), _matrix(h, 1), _matrix(h, 2), _matrix(h, 3), _vector(h, 4), _vector(h, 5), _matrix(h, 6),
         _matrix(h, 7), _vector(h, 8), _integers(h, 9), _integers(h, 10), _vector(h, 11),
+        _vector(h, 12),
     )  # fmt: skip

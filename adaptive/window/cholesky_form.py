@@ -2,16 +2,20 @@
 
 The sample that leaves is a rank-1 *update* of the factor behind it, a chain of rotations, which is stable. The new
 sample goes to the end of the factor, by one forward solve. T = L^-1 [1 y] (S and SY) goes through the same rotations.
-The error of alpha grows with cond(R), not with its square as in the inverse form, for about twice the time.
+The error of alpha grows with cond(R), not with its square as in the inverse form, for one and a half to two times the
+time.
 
 *Positions* are the order of the factor; ``order`` holds the slot at each position. The slot of a sample does not
 influence the numerics.
 
-Rotations cannot be reversed to the last bit, so a refused step needs the factor from before it. A replacement therefore
-reads the factor from one triangle of P and writes the new one into the other, in one pass: to take it back is to go
-back to the first triangle. Column j of L is contiguous in both: behind the diagonal in row j of P, or, in the lower
-triangle (C[LOWER] is 1), from the beginning of row N - 1 - j. Its diagonal element is P[j, j] in both, and the one from
-before is in row PK of V.
+Each slot has its column of L in its own row of P, from the diagonal on: L[i, j] is P[order[j], i - j]. Where the sample
+at an earlier position leaves, both its row and its column do, so a column stays where it is in memory, and grows by one
+element at its end. A replacement therefore changes the factor in place, in one pass that also solves for the new row.
+
+Rotations cannot be reversed to the last bit. A refused step therefore begins at a copy of the factor, of at most
+`KEPT_STEPS` replacements ago, and makes those between once more. ``kept`` holds the copy, packed column by column, and
+behind it a record for each replacement since: the right-hand side of its solve, the position that left, and the new
+diagonal element. C[LOGGED] counts them; 0 means that there is no copy.
 """
 
 from __future__ import annotations
@@ -26,158 +30,214 @@ from adaptive.window.arrays import (
     COUNT,
     CURSOR,
     DIAGONAL,
-    LOWER,
+    KEPT_STEPS,
+    LOGGED,
     MINUS,
-    PK,
     PLUS,
     SY,
-    UNDO_PLACE,
-    UNDO_SLOT,
+    TRIAL,
     K,
     WindowArrays,
     Y,
 )
 
-# --- The O(N²) passes over the factor.
-
-
-@compiled_reassociating
-def _place(N: int, lower: bool, k: int) -> int:
-    """Where in the flat P, of N rows, element 0 of column ``k`` of L would be: element i > k is i further on."""
-    return (N - 1 - k) * N - k - 1 if lower else k * N
+# --- The O(N²) passes over the factor. Several columns go together, so that the vectors beside it are read once for all
+# of them. Inner loops run from 0 over slices, so that no index is checked for being negative.
 
 
 @compiled_reassociating
 def _forward_columns(A: WindowArrays, n: int, b: FloatArray) -> None:
     """b <- L^-1 b in place; two columns at a time."""
-    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
-    flat = P.reshape(N * N)
+    P, order = A.P, A.order
     k = 0
     while k + 1 < n:
-        c0, c1 = _place(N, lower, k), _place(N, lower, k + 1)
-        t0 = b[k] / P[k, k]
-        t1 = (b[k + 1] - flat[c0 + k + 1] * t0) / P[k + 1, k + 1]
+        c0, c1 = P[order[k]], P[order[k + 1]]
+        t0 = b[k] / c0[0]
+        t1 = (b[k + 1] - c0[1] * t0) / c1[0]
         b[k] = t0
         b[k + 1] = t1
-        a0, a1, rest = flat[c0 + k + 2 : c0 + n], flat[c1 + k + 2 : c1 + n], b[k + 2 : n]
+        a0, a1, rest = c0[2 : n - k], c1[1 : n - k - 1], b[k + 2 : n]
         for i in range(rest.shape[0]):
             rest[i] -= a0[i] * t0 + a1[i] * t1
         k += 2
     if k < n:
-        b[k] /= P[k, k]
+        b[k] /= P[order[k], 0]
 
 
 @compiled_reassociating
 def _backward_columns(A: WindowArrays, n: int, b: FloatArray) -> None:
     """b <- L'^-1 b in place; four columns of L at a time."""
-    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
-    flat = P.reshape(N * N)
+    P, order = A.P, A.order
     k = n - 1
     while k >= 3:
-        c0, c1 = _place(N, lower, k - 3), _place(N, lower, k - 2)
-        c2, c3 = _place(N, lower, k - 1), _place(N, lower, k)
+        c0, c1, c2, c3 = P[order[k - 3]], P[order[k - 2]], P[order[k - 1]], P[order[k]]
         s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-        a0, a1 = flat[c0 + k + 1 : c0 + n], flat[c1 + k + 1 : c1 + n]
-        a2, a3, rest = flat[c2 + k + 1 : c2 + n], flat[c3 + k + 1 : c3 + n], b[k + 1 : n]
+        a0, a1 = c0[4 : n - k + 3], c1[3 : n - k + 2]
+        a2, a3, rest = c2[2 : n - k + 1], c3[1 : n - k], b[k + 1 : n]
         for i in range(rest.shape[0]):
             x = rest[i]
             s0 += a0[i] * x
             s1 += a1[i] * x
             s2 += a2[i] * x
             s3 += a3[i] * x
-        x3 = (b[k] - s3) / P[k, k]
-        x2 = (b[k - 1] - s2 - flat[c2 + k] * x3) / P[k - 1, k - 1]
-        x1 = (b[k - 2] - s1 - flat[c1 + k - 1] * x2 - flat[c1 + k] * x3) / P[k - 2, k - 2]
-        x0 = b[k - 3] - s0 - flat[c0 + k - 2] * x1 - flat[c0 + k - 1] * x2 - flat[c0 + k] * x3
-        b[k], b[k - 1], b[k - 2], b[k - 3] = x3, x2, x1, x0 / P[k - 3, k - 3]
+        x3 = (b[k] - s3) / c3[0]
+        x2 = (b[k - 1] - s2 - c2[1] * x3) / c2[0]
+        x1 = (b[k - 2] - s1 - c1[1] * x2 - c1[2] * x3) / c1[0]
+        x0 = b[k - 3] - s0 - c0[1] * x1 - c0[2] * x2 - c0[3] * x3
+        b[k], b[k - 1], b[k - 2], b[k - 3] = x3, x2, x1, x0 / c0[0]
         k -= 4
     while k >= 0:
-        c0, s0 = _place(N, lower, k), 0.0
-        for i in range(k + 1, n):
-            s0 += flat[c0 + i] * b[i]
-        b[k] = (b[k] - s0) / P[k, k]
+        c0, s0 = P[order[k]], 0.0
+        for i in range(1, n - k):
+            s0 += c0[i] * b[k + i]
+        b[k] = (b[k] - s0) / c0[0]
         k -= 1
 
 
 @compiled_reassociating
-def _shift_columns(A: WindowArrays, n: int, position: int, b: FloatArray) -> None:
-    """The columns before ``position`` go to the other triangle without that row, and take part in b <- L^-1 b."""
-    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
-    flat = P.reshape(N * N)
-    for k in range(position):
-        c, to = _place(N, lower, k), _place(N, not lower, k)
-        t = b[k] / P[k, k]
+def _shorten_columns(A: WindowArrays, n: int, place: int, b: FloatArray) -> None:
+    """The columns before ``place`` lose that row, gain the new one, and take part in b <- L^-1 b; four at a time."""
+    P, order = A.P, A.order
+    k = 0
+    while k + 3 < place:
+        c0, c1, c2, c3 = P[order[k]], P[order[k + 1]], P[order[k + 2]], P[order[k + 3]]
+        t0 = b[k] / c0[0]
+        t1 = (b[k + 1] - c0[1] * t0) / c1[0]
+        t2 = (b[k + 2] - c0[2] * t0 - c1[1] * t1) / c2[0]
+        t3 = (b[k + 3] - c0[3] * t0 - c1[2] * t1 - c2[1] * t2) / c3[0]
+        b[k], b[k + 1], b[k + 2], b[k + 3] = t0, t1, t2, t3
+        before = place - k
+        a0, a1, a2, a3 = c0[4:before], c1[3 : before - 1], c2[2 : before - 2], c3[1 : before - 3]
+        rest = b[k + 4 : place]
+        for i in range(rest.shape[0]):
+            rest[i] -= a0[i] * t0 + a1[i] * t1 + a2[i] * t2 + a3[i] * t3
+        a0, a1 = c0[before : n - k], c1[before - 1 : n - k - 1]
+        a2, a3 = c2[before - 2 : n - k - 2], c3[before - 3 : n - k - 3]
+        rest = b[place : n - 1]
+        for i in range(rest.shape[0]):
+            e0, e1, e2, e3 = a0[i + 1], a1[i + 1], a2[i + 1], a3[i + 1]
+            a0[i], a1[i], a2[i], a3[i] = e0, e1, e2, e3
+            rest[i] -= e0 * t0 + e1 * t1 + e2 * t2 + e3 * t3
+        c0[n - 1 - k], c1[n - 2 - k], c2[n - 3 - k], c3[n - 4 - k] = t0, t1, t2, t3
+        k += 4
+    while k < place:
+        c = P[order[k]]
+        t = b[k] / c[0]
         b[k] = t
-        old, new, rest = flat[c + k + 1 : c + position], flat[to + k + 1 : to + position], b[k + 1 : position]
+        a, rest = c[1 : place - k], b[k + 1 : place]
         for i in range(rest.shape[0]):
-            value = old[i]
-            new[i] = value
-            rest[i] -= value * t
-        old, new, rest = flat[c + position + 1 : c + n], flat[to + position : to + n - 1], b[position : n - 1]
+            rest[i] -= a[i] * t
+        a, rest = c[place - k : n - k], b[place : n - 1]
         for i in range(rest.shape[0]):
-            value = old[i]
-            new[i] = value
-            rest[i] -= value * t
+            e = a[i + 1]
+            a[i] = e
+            rest[i] -= e * t
+        c[n - 1 - k] = t
+        k += 1
 
 
 @compiled_reassociating
-def _rotate_columns(A: WindowArrays, n: int, position: int, x: FloatArray, b: FloatArray) -> None:
-    """The columns behind ``position`` take in the rank-1 term x x' by rotations, which T goes through too.
+def _rotation(diagonal: float, x: float) -> tuple[float, float, float]:
+    """Length, cosine and sine of the rotation that takes (diagonal, x) to (length, 0)."""
+    length = np.sqrt(diagonal * diagonal + x * x)
+    return length, diagonal / length, x / length
 
-    The new columns go to the other triangle, one place further to the front, and take part in b <- L^-1 b. Two columns
-    at a time. ``x`` is used up.
+
+@compiled_reassociating
+def _rotate_columns(A: WindowArrays, n: int, place: int, x: FloatArray, b: FloatArray) -> None:
+    """The columns behind ``place`` take in the rank-1 term x x' by rotations, which T goes through too.
+
+    They gain the new row, and take part in b <- L^-1 b. Four columns at a time. ``x`` is used up.
     """
-    P, N, lower = A.P, A.P.shape[0], A.C[LOWER] != 0
-    flat, S, sy = P.reshape(N * N), A.S, A.V[SY]
-    tau, tau_y = S[position], sy[position]
-    k = position + 1
-    while k < n:
-        c0, to0 = _place(N, lower, k), _place(N, not lower, k - 1)
-        diagonal0 = P[k, k]
-        r0 = np.sqrt(diagonal0 * diagonal0 + x[k] * x[k])
-        cosine0, sine0 = diagonal0 / r0, x[k] / r0
-        P[k - 1, k - 1] = r0
+    P, order, S, sy = A.P, A.order, A.S, A.V[SY]
+    tau, tau_y = S[place], sy[place]
+    k = place + 1
+    while k + 3 < n:
+        a0, a1, a2, a3 = P[order[k]], P[order[k + 1]], P[order[k + 2]], P[order[k + 3]]
+        r0, cosine0, sine0 = _rotation(a0[0], x[k])
         t0 = b[k - 1] / r0
-        b[k - 1] = t0
-        value = S[k]
-        S[k - 1] = cosine0 * value + sine0 * tau
-        tau = cosine0 * tau - sine0 * value
-        value = sy[k]
-        sy[k - 1] = cosine0 * value + sine0 * tau_y
-        tau_y = cosine0 * tau_y - sine0 * value
-        if k + 1 == n:
-            return
-        c1, to1 = _place(N, lower, k + 1), _place(N, not lower, k)
-        before, other = flat[c0 + k + 1], x[k + 1]
-        after = cosine0 * before + sine0 * other
-        other = cosine0 * other - sine0 * before
-        flat[to0 + k] = after
-        diagonal1 = P[k + 1, k + 1]
-        r1 = np.sqrt(diagonal1 * diagonal1 + other * other)
-        cosine1, sine1 = diagonal1 / r1, other / r1
-        P[k, k] = r1
-        t1 = (b[k] - after * t0) / r1
-        b[k] = t1
-        value = S[k + 1]
-        S[k] = cosine1 * value + sine1 * tau
-        tau = cosine1 * tau - sine1 * value
-        value = sy[k + 1]
-        sy[k] = cosine1 * value + sine1 * tau_y
-        tau_y = cosine1 * tau_y - sine1 * value
-        old0, old1 = flat[c0 + k + 2 : c0 + n], flat[c1 + k + 2 : c1 + n]
-        new0, new1 = flat[to0 + k + 1 : to0 + n - 1], flat[to1 + k + 1 : to1 + n - 1]
-        xs, rest = x[k + 2 : n], b[k + 1 : n - 1]
+        f01 = cosine0 * a0[1] + sine0 * x[k + 1]
+        f02 = cosine0 * a0[2] + sine0 * x[k + 2]
+        f03 = cosine0 * a0[3] + sine0 * x[k + 3]
+        x1 = cosine0 * x[k + 1] - sine0 * a0[1]
+        x2 = cosine0 * x[k + 2] - sine0 * a0[2]
+        x3 = cosine0 * x[k + 3] - sine0 * a0[3]
+        r1, cosine1, sine1 = _rotation(a1[0], x1)
+        t1 = (b[k] - f01 * t0) / r1
+        f12 = cosine1 * a1[1] + sine1 * x2
+        f13 = cosine1 * a1[2] + sine1 * x3
+        x2 = cosine1 * x2 - sine1 * a1[1]
+        x3 = cosine1 * x3 - sine1 * a1[2]
+        r2, cosine2, sine2 = _rotation(a2[0], x2)
+        t2 = (b[k + 1] - f02 * t0 - f12 * t1) / r2
+        f23 = cosine2 * a2[1] + sine2 * x3
+        x3 = cosine2 * x3 - sine2 * a2[1]
+        r3, cosine3, sine3 = _rotation(a3[0], x3)
+        t3 = (b[k + 2] - f03 * t0 - f13 * t1 - f23 * t2) / r3
+        a0[0], a0[1], a0[2], a0[3] = r0, f01, f02, f03
+        a1[0], a1[1], a1[2] = r1, f12, f13
+        a2[0], a2[1], a3[0] = r2, f23, r3
+        b[k - 1], b[k], b[k + 1], b[k + 2] = t0, t1, t2, t3
+        e0, e1, e2, e3 = a0[4 : n - k], a1[3 : n - k - 1], a2[2 : n - k - 2], a3[1 : n - k - 3]
+        xs, rest = x[k + 4 : n], b[k + 3 : n - 1]
         for i in range(rest.shape[0]):
-            before, other = old0[i], xs[i]
-            first = cosine0 * before + sine0 * other
+            before, other = e0[i], xs[i]
+            after = cosine0 * before + sine0 * other
             other = cosine0 * other - sine0 * before
-            before = old1[i]
-            second = cosine1 * before + sine1 * other
-            xs[i] = cosine1 * other - sine1 * before
-            new0[i] = first
-            new1[i] = second
-            rest[i] -= first * t0 + second * t1
-        k += 2
+            e0[i] = after
+            total = after * t0
+            before = e1[i]
+            after = cosine1 * before + sine1 * other
+            other = cosine1 * other - sine1 * before
+            e1[i] = after
+            total += after * t1
+            before = e2[i]
+            after = cosine2 * before + sine2 * other
+            other = cosine2 * other - sine2 * before
+            e2[i] = after
+            total += after * t2
+            before = e3[i]
+            after = cosine3 * before + sine3 * other
+            xs[i] = cosine3 * other - sine3 * before
+            e3[i] = after
+            rest[i] -= total + after * t3
+        a0[n - k], a1[n - k - 1], a2[n - k - 2], a3[n - k - 3] = t0, t1, t2, t3
+        tau, tau_y = _rotate_targets(S, sy, k, cosine0, sine0, tau, tau_y)
+        tau, tau_y = _rotate_targets(S, sy, k + 1, cosine1, sine1, tau, tau_y)
+        tau, tau_y = _rotate_targets(S, sy, k + 2, cosine2, sine2, tau, tau_y)
+        tau, tau_y = _rotate_targets(S, sy, k + 3, cosine3, sine3, tau, tau_y)
+        k += 4
+    while k < n:
+        cosine0, sine0 = _rotate_column(P[order[k]], n - k, x[k:n], b[k - 1 : n - 1])
+        tau, tau_y = _rotate_targets(S, sy, k, cosine0, sine0, tau, tau_y)
+        k += 1
+
+
+@compiled_reassociating
+def _rotate_column(a: FloatArray, rows: int, x: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """One column ``a`` of ``rows`` elements, as above; ``x`` and ``b`` begin at it. Returns cosine and sine."""
+    length, cosine, sine = _rotation(a[0], x[0])
+    t = b[0] / length
+    a[0], b[0] = length, t
+    for i in range(1, rows):
+        before, other = a[i], x[i]
+        after = cosine * before + sine * other
+        x[i] = cosine * other - sine * before
+        a[i] = after
+        b[i] -= after * t
+    a[rows] = t
+    return cosine, sine
+
+
+@compiled_reassociating
+def _rotate_targets(
+    S: FloatArray, sy: FloatArray, k: int, cosine: float, sine: float, tau: float, tau_y: float
+) -> tuple[float, float]:
+    """Element k of T, one position further to the front, after its rotation with ``tau``; returns what goes on."""
+    s, t = S[k], sy[k]
+    S[k - 1] = cosine * s + sine * tau
+    sy[k - 1] = cosine * t + sine * tau_y
+    return cosine * tau - sine * s, cosine * tau_y - sine * t
 
 
 # --- The factor.
@@ -212,49 +272,139 @@ def backward(A: WindowArrays, b: FloatArray) -> None:
 
 
 @compiled_reassociating
-def delete(A: WindowArrays, position: int, b: FloatArray) -> None:
-    """Take the sample at ``position`` out of the factor, and b <- L^-1 b with the new factor in the same pass.
+def _exchange(A: WindowArrays, place: int, b: FloatArray) -> None:
+    """The sample at ``place`` leaves the factor, and b <- L^-1 b with the new one becomes its last row.
 
-    ``b`` is by position without the one that leaves. COUNT is one less afterwards; `restore_factor` takes it back.
+    ``b`` is by position without the one that leaves. Its slot goes to the end of ``order``; the diagonal element of
+    the new sample is still missing.
     """
-    n, N, x = A.C[COUNT], A.P.shape[0], A.V[PLUS]
-    flat, column = A.P.reshape(N * N), _place(N, A.C[LOWER] != 0, position)
-    for i in range(position + 1, n):
-        x[i] = flat[column + i]
-    for i in range(n):
-        A.V[PK, i] = A.P[i, i]
-    _shift_columns(A, n, position, b)
-    _rotate_columns(A, n, position, x, b)
-    for k in range(position + 1, n):
-        A.order[k - 1] = A.order[k]
-    A.C[LOWER] = 1 - A.C[LOWER]
+    n, x, order = A.C[COUNT], A.V[PLUS], A.order
+    slot = order[place]
+    own = A.P[slot]
+    for i in range(place + 1, n):
+        x[i] = own[i - place]
+    _shorten_columns(A, n, place, b)
+    _rotate_columns(A, n, place, x, b)
+    for k in range(place + 1, n):
+        order[k - 1] = order[k]
+    order[n - 1] = slot
+
+
+@compiled_reassociating
+def delete(A: WindowArrays, place: int, b: FloatArray) -> None:
+    """Take the sample at ``place`` out of the factor, and b <- L^-1 b with the new factor in the same pass.
+
+    ``b`` is by position without the one that leaves, and becomes the row of the sample that `add` puts in its slot.
+    COUNT is one less afterwards; `restore_factor` takes it back.
+    """
+    n, N = A.C[COUNT], A.P.shape[0]
+    if A.C[LOGGED] == 0 or A.C[LOGGED] == KEPT_STEPS:
+        _keep(A)
+        A.C[LOGGED] = 0
+    record = _record(A, A.C[LOGGED])
+    for i in range(n - 1):
+        record[i] = b[i]
+    record[N - 1] = place
+    A.C[LOGGED] += 1
+    _exchange(A, place, b)
     A.C[COUNT] = n - 1
 
 
 @compiled_reassociating
 def add(A: WindowArrays, slot: int, half: FloatArray, diagonal: float) -> None:
-    """Put the sample of ``slot``, already written, at the end; ``half`` is L^-1 of its column. COUNT is one more."""
-    n, N, lower = A.C[COUNT], A.P.shape[0], A.C[LOWER] != 0
-    flat = A.P.reshape(N * N)
-    for k in range(n):
-        flat[_place(N, lower, k) + n] = half[k]
-    A.P[n, n] = diagonal
+    """The sample of ``slot``, already written, is the last one; ``half`` is its row of L. COUNT is one more."""
+    n = A.C[COUNT]
+    A.P[slot, 0] = diagonal
     A.S[n] = (1.0 - dot(half, A.S, n)) / diagonal
     A.V[SY, n] = (A.V[Y, slot] - dot(half, A.V[SY], n)) / diagonal
     A.order[n] = slot
     A.C[COUNT] = n + 1
+    if A.C[LOGGED] > 0:
+        _record(A, A.C[LOGGED] - 1)[A.P.shape[0]] = diagonal
+
+
+@compiled_reassociating
+def append_row(A: WindowArrays, half: FloatArray) -> None:
+    """Write ``half``, L^-1 of a new sample's column, as the next row of L; `add` follows. No copy is kept of this."""
+    n = A.C[COUNT]
+    for k in range(n):
+        A.P[A.order[k], n - k] = half[k]
+    A.C[LOGGED] = 0
+
+
+# --- The factor of before: a copy, and a record of each replacement since.
+
+
+@compiled_reassociating
+def _keep(A: WindowArrays) -> None:
+    """Copy the factor, packed column by column."""
+    n, at = A.C[COUNT], 0
+    for k in range(n):
+        a, to = A.P[A.order[k]], A.kept[at : at + n - k]
+        for i in range(to.shape[0]):
+            to[i] = a[i]
+        at += n - k
+
+
+@compiled_reassociating
+def _record(A: WindowArrays, i: int) -> FloatArray:
+    """(N + 1,) of replacement i since the copy: n - 1 elements of b, at N - 1 the position, at N the diagonal."""
+    N = A.P.shape[0]
+    first = N * (N + 1) // 2 + i * (N + 1)
+    record: FloatArray = A.kept[first : first + N + 1]
+    return record
 
 
 @compiled_reassociating
 def restore_factor(A: WindowArrays) -> None:
-    """The factor and its order as `delete` found them, to the last bit. COUNT is what it was then."""
-    n, place = A.C[COUNT], A.C[UNDO_PLACE]
-    A.C[LOWER] = 1 - A.C[LOWER]
-    for i in range(n):
-        A.P[i, i] = A.V[PK, i]
-    for r in range(n - 1 - place):
-        A.order[n - 1 - r] = A.order[n - 2 - r]
-    A.order[place] = A.C[UNDO_SLOT]
+    """The factor and its order as `delete` found them, to the last bit. COUNT is what it was then.
+
+    S and SY are spoilt. The next replacement begins with a new copy, so that it can be taken back at once.
+    """
+    n, N, order, b, steps = A.C[COUNT], A.P.shape[0], A.order, A.V[TRIAL], A.C[LOGGED] - 1
+    for back in range(steps + 1):
+        place = int(_record(A, steps - back)[N - 1])
+        slot = order[n - 1]
+        for r in range(n - 1 - place):
+            order[n - 1 - r] = order[n - 2 - r]
+        order[place] = slot
+    at = 0
+    for k in range(n):
+        a, kept = A.P[order[k]], A.kept[at : at + n - k]
+        for i in range(kept.shape[0]):
+            a[i] = kept[i]
+        at += n - k
+    for step in range(steps):
+        record = _record(A, step)
+        for i in range(n - 1):
+            b[i] = record[i]
+        _exchange(A, int(record[N - 1]), b)
+        A.P[order[n - 1], 0] = record[N]
+    A.C[LOGGED] = 0
+
+
+# --- The factor as a matrix.
+
+
+@compiled_reassociating
+def take_upper(A: WindowArrays, upper: FloatArray) -> None:
+    """The factor from the upper triangle of ``upper`` (N, N), L' by position."""
+    n = A.C[COUNT]
+    for k in range(n):
+        row, a = upper[k], A.P[A.order[k]]
+        for i in range(n - k):
+            a[i] = row[k + i]
+    A.C[LOGGED] = 0
+
+
+@compiled_reassociating
+def write_upper(A: WindowArrays, upper: FloatArray) -> None:
+    """The factor into the upper triangle of ``upper`` (N, N), L' by position."""
+    n = A.C[COUNT]
+    for k in range(n):
+        row, a = upper[k], A.P[A.order[k]]
+        for i in range(n - k):
+            row[k + i] = a[i]
 
 
 # --- The diagonal of R^-1 for leave-one-out, (Pc)_ii. From the factor alone it takes O(N³). Once known it follows a
@@ -270,17 +420,16 @@ def restore_factor(A: WindowArrays) -> None:
 @compiled_reassociating
 def _half_column(A: WindowArrays, place: int, t: FloatArray) -> float:
     """t <- L^-1 e_place, by position: zero above ``place``. Returns its square, the diagonal element of R^-1."""
-    n, N, lower, total = A.C[COUNT], A.P.shape[0], A.C[LOWER] != 0, 0.0
-    flat = A.P.reshape(N * N)
+    n, total = A.C[COUNT], 0.0
     for i in range(n):
         t[i] = 0.0
     t[place] = 1.0
     for k in range(place, n):
-        column = _place(N, lower, k)
-        half = t[k] / A.P[k, k]
+        column = A.P[A.order[k]]
+        half = t[k] / column[0]
         t[k] = half
         total += half * half
-        a, rest = flat[column + k + 1 : column + n], t[k + 1 : n]
+        a, rest = column[1 : n - k], t[k + 1 : n]
         for i in range(rest.shape[0]):
             rest[i] -= a[i] * half
     return total

@@ -67,7 +67,6 @@ from adaptive.window.arrays import (
     UNDO_ALPHA,
     UNDO_APPEND,
     UNDO_NOTHING,
-    UNDO_PLACE,
     UNDO_POINT,
     UNDO_R,
     UNDO_REPLACE,
@@ -372,7 +371,6 @@ def _replace_cholesky(A: WindowArrays, slot: int, x: FloatArray, y: float, w: fl
     column, half = A.V[COLUMN], A.V[TRIAL]
     place = cholesky.position_of(A, slot)
     _keep_for_undo(A, slot, UNDO_REPLACE)
-    A.C[UNDO_PLACE] = place
     cholesky.before_leaving(A, place)
     for i in range(place):
         half[i] = column[A.order[i]]
@@ -417,6 +415,7 @@ def _append_cholesky(A: WindowArrays, x: FloatArray, y: float, w: float) -> int:
         return ILL_CONDITIONED
     _keep_for_undo(A, n, UNDO_APPEND)
     _write_sample(A, n, x, y, w)
+    cholesky.append_row(A, half)
     cholesky.add(A, n, half, np.sqrt(s))
     if not finish(A):
         take_back(A)

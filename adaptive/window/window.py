@@ -17,7 +17,7 @@ from adaptive import kernels, lapack, lssvm
 from adaptive.errors import InputError, NumericsError
 from adaptive.types import FloatArray, StateDict
 from adaptive.window import arrays as ws
-from adaptive.window import steps
+from adaptive.window import cholesky_form, steps
 from adaptive.window.arrays import Status, WindowArrays
 
 # --- Configuration.
@@ -259,9 +259,11 @@ class Window:
             lapack.cholesky_lower(P, n)
             lapack.inverse_from_cholesky(P, n)
         before = ws.duplicate(A)
-        A.P[:] = P
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
             A.order[:n] = np.arange(n)
+            cholesky_form.take_upper(A, P)
+        else:
+            A.P[:] = P
         A.V[ws.MINUS], A.V[ws.PLUS] = 0.0, 0.0
         A.C[ws.PENDING], A.C[ws.UNDO], A.C[ws.CARRIED] = 0, ws.UNDO_NOTHING, 0
         if not steps.resum(A):
@@ -336,11 +338,14 @@ class Window:
     def state_dict(self) -> StateDict:
         """All arrays under flat names; `from_state` continues from them with the same result to the last bit."""
         A, n = self._arrays, self.config.capacity
+        saved = {name: getattr(A, name).copy() for name in _SAVED}
+        if A.C[ws.FORM] == ws.CHOLESKY_FORM:
+            saved["C"][ws.LOGGED] = 0
         # A window once had further linear coefficients beside the bias. Its file format, with a row for each of them
         # and entries without content, stays readable both ways.
         return {
             **_matrices(A),
-            **{name: getattr(A, name).copy() for name in _SAVED},
+            **saved,
             "F": A.F[: ws.GRAM].copy(),
             "S": A.S[None].copy(),
             "beta": A.F[[ws.BETA]],
@@ -377,18 +382,32 @@ class Window:
         A.F[: ws.BETA] = state["F"][: ws.BETA]
         A.S[:], A.F[ws.BETA], A.F[ws.GRAM] = state["S"][0], state["beta"][0], state["G"][0, 0]
         A.C[ws.UNDO] = ws.UNDO_NOTHING
+        if A.C[ws.FORM] == ws.CHOLESKY_FORM:
+            cholesky_form.take_upper(A, _upper_factor(A.P.copy(), A.C[ws.LOGGED] != 0))
         return window
+
+
+def _upper_factor(P: FloatArray, lower: bool) -> FloatArray:
+    """L' of a state. States of an older version may have it in the lower triangle: column j from row N - 1 - j on."""
+    if lower:
+        n = len(P)
+        old = P.copy()
+        for k in range(n - 1):
+            P[k, k + 1 :] = old[n - 1 - k, : n - 1 - k]
+    return P
 
 
 def _matrices(A: ws.WindowArrays) -> StateDict:
     """P and R of a state.
 
     In the inverse form the lower triangle of P holds all of it, and R is symmetric: ``PR`` (N, N + 1) is the lower
-    triangle of P, and beside it the upper one of R. The Cholesky form needs all of P. States of older versions hold
-    both matrices in either form.
+    triangle of P, and beside it the upper one of R. In the Cholesky form the upper triangle of ``P`` is L' by position.
+    States of older versions hold both matrices in either form.
     """
     if A.C[ws.FORM] == ws.CHOLESKY_FORM:
-        return {"P": A.P.copy(), "R": A.R.copy()}
+        upper = np.zeros_like(A.P)
+        cholesky_form.write_upper(A, upper)
+        return {"P": upper, "R": A.R.copy()}
     n = A.P.shape[0]
     packed = np.empty((n, n + 1))
     below = np.tri(n, dtype=np.bool_)

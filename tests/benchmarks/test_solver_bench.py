@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import run
+from benchmarks import run, solver, two_builds
 from benchmarks.drift import bench_drift
 from benchmarks.kalman_reference import bench_kalman
 from benchmarks.peers import bench_peers
@@ -21,13 +23,12 @@ WINDOW_KEYS = {
     "update_p99_over_median",
     "dsymv_us",
     "memory_pass_us",
-    "cholesky_update_us",
     "loo_us",
     "cholesky_loo_us",
     "refit_over_update",
     *(
         f"{name}_{figure}"
-        for name in ("update", "predict", "refit")
+        for name in ("update", "cholesky_update", "predict", "refit")
         for figure in ("us", "p99_us", "over_dsymv", "over_memory_pass")
     ),
 }
@@ -49,7 +50,7 @@ def check_window(row: dict[str, float]) -> None:
     """Every key is there, and each figure is of what its name says."""
     assert row.keys() >= WINDOW_KEYS
     assert all(value > 0 for value in row.values())
-    for name in ("update", "predict", "refit"):
+    for name in ("update", "cholesky_update", "predict", "refit"):
         assert row[f"{name}_over_dsymv"] == pytest.approx(row[f"{name}_us"] / row["dsymv_us"])
         assert row[f"{name}_over_memory_pass"] == pytest.approx(row[f"{name}_us"] / row["memory_pass_us"])
         assert row[f"{name}_p99_us"] >= row[f"{name}_us"]
@@ -65,6 +66,24 @@ def test_peers_learn_the_same_stream(report: dict[str, object]) -> None:
     peers = report["peers"]
     assert peers.keys() >= {"krls", "sklearn_krr"}  # type: ignore[attr-defined]
     assert all(np.isfinite(row["rmse"]) for row in peers.values())  # type: ignore[attr-defined]
+
+
+def test_another_checkouts_modules_are_its_own_and_those_of_this_build_stay(tmp_path: Path) -> None:
+    other = two_builds.solver_of(Path(two_builds.__file__).parents[1])
+    assert other is not solver
+    assert other.make_window is not solver.make_window
+    assert sys.modules["benchmarks.solver"] is solver
+    with pytest.raises(SystemExit, match="expected the folder of a checkout"):
+        two_builds.solver_of(tmp_path)
+
+
+@pytest.mark.parametrize("anywhere", [False, True])
+def test_two_builds_are_timed_in_turns(anywhere: bool) -> None:
+    # A second build would be compiled for a minute.
+    lines = two_builds.compare({"other": solver, "this": solver}, 20, 25, anywhere)
+    names = [f"{form}, {build}" for build in ("other", "this") for form in two_builds.FORMS]
+    assert [line.split(" | ")[1] for line in lines] == [*names, "dsymv"]
+    assert all(float(value) > 0.0 for line in lines for value in line.strip("| ").split(" | ")[2:])
 
 
 def test_drift_is_looked_at_in_every_form(report: dict[str, object]) -> None:

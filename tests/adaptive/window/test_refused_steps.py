@@ -239,12 +239,9 @@ def test_a_refinement_that_leaves_the_finite_refuses_the_step(form: Form) -> Non
 
 
 def triangle(window: Window) -> FloatArray:
-    """The elements of the factor of a window of `HELD` samples, column by column of L."""
-    A, last = window.arrays, window.config.capacity - 1
-    columns = [
-        A.P[last - k, : HELD - 1 - k] if A.C[ws.LOWER] else A.P[k, k + 1 : HELD] for k in range(HELD)
-    ]  # fmt: skip
-    return np.concatenate([*columns, np.diagonal(A.P)[:HELD]])
+    """The elements of the factor of a window, column by column of L."""
+    A, n = window.arrays, len(window)
+    return np.concatenate([A.P[A.order[k], : n - k] for k in range(n)])
 
 
 @forms

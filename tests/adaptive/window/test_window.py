@@ -247,14 +247,20 @@ def test_singular_samples_leave_the_window_as_it_was() -> None:
     assert_exact(window)
 
 
-@forms
-def test_a_state_of_an_older_version_goes_on(form: Form) -> None:
-    """Without the diagonal and the position of the sample that was replaced, and with both matrices whole."""
+@pytest.mark.parametrize(("form", "lower"), [("inverse", False), ("cholesky", False), ("cholesky", True)])
+def test_a_state_of_an_older_version_goes_on(form: Form, lower: bool) -> None:
+    """Without the diagonal and the last counters, both matrices whole, and the factor in either triangle of P."""
     window, rng = filled(form), np.random.default_rng(6)
     window.replace(1, *sample(rng))
     state = window.state_dict()
     state.pop("PR", None)
-    state |= {"P": window.arrays.P.copy(), "R": window.arrays.R.copy()}
+    P = state["P"] if "P" in state else window.arrays.P.copy()
+    if lower:
+        upper, P = P, np.diag(np.diag(P))
+        for j in range(CAPACITY - 1):
+            P[CAPACITY - 1 - j, : CAPACITY - 1 - j] = upper[j, j + 1 :]
+        state["C"][ws.LOGGED] = 1
+    state |= {"P": P, "R": window.arrays.R.copy()}
     state |= {"V": state["V"][: ws.DIAGONAL], "C": state["C"][: ws.UNDO_PLACE]}
     again = Window.from_state(window.config, state)
     point = sample(rng)
