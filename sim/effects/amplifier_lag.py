@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 from adaptive.types import FloatArray
 from sim import pictures
@@ -14,10 +14,6 @@ from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.lags import lag_ends
 from sim.fitting.stage_model import CauseModel, Guess, single_guesses
 from sim.readings.response_lags import second_lag
-
-if TYPE_CHECKING:
-    pass
-
 
 # Its step in the simulation.
 
@@ -34,6 +30,11 @@ def derive_amplifier_lag(values: Mapping[str, float], context: Context) -> Seque
     # the input is the held level of the converter; later effects take the output's shape from Context.hold_per_s
     a, _, b = first_order(values["tau_s"], context.dt_s, float("inf"))
     return a, b
+
+
+def hold_of_later_effects(values: Mapping[str, float], context: Context) -> Context:
+    tau_s = values["tau_s"]
+    return replace(context, hold_per_s=min(context.hold_per_s, 1.0 / tau_s)) if tau_s > 0.0 else context
 
 
 # Its form in a diagnosis.
@@ -73,6 +74,7 @@ AMPLIFIER_LAG = Kind(
     derive=derive_amplifier_lag,
     rest=lambda values, context: (0.0,),
     block=run_amplifier_lag,
+    shares=hold_of_later_effects,
     signature="small-signal roll-off of first order, the same at every amplitude",
     mistaken_for=("sensor_lag", "delay"),
     tells_apart="a monitor of the voltage; a delay loses no gain",

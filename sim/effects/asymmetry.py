@@ -7,7 +7,7 @@ of the stage change, below it neither.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,6 @@ from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.hysteresis_loops import asymmetric
 from sim.fitting.stage_model import CauseModel
 from sim.readings.cycles import mirrored_branches
-
-if TYPE_CHECKING:
-    pass
-
 
 # Its step in the simulation.
 

@@ -223,6 +223,8 @@ class Kind:
         the values, so that parameters can change while the stage runs.
     block : the compiled step; None where the effect acts through the coefficients of others.
     signature, mistaken_for, tells_apart, source : for people and reports.
+    shares : (values, context) -> the context of all effects of the chain, where this one changes it for the others.
+    needs : names of effects of which one must be in the chain.
     cause : how a diagnosis finds it; None for what every stage has, which a diagnosis never names.
     """
 
@@ -236,6 +238,8 @@ class Kind:
     rest: Derive = _no_state
     mistaken_for: tuple[str, ...] = ()
     tells_apart: str = ""
+    shares: Callable[[Mapping[str, float], Context], Context] | None = None
+    needs: tuple[str, ...] = ()
     cause: Cause | None = None
 
     def __repr__(self) -> str:

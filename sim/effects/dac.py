@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sim.effects.base import Context, Kind, Parameter, Place, block
-
-if TYPE_CHECKING:
-    pass
 
 
 @block

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from adaptive.compiled import compiled
 from sim.effects.base import Context, Kind, Parameter, Place, block
-
-if TYPE_CHECKING:
-    pass
 
 
 @compiled

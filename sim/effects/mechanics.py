@@ -16,14 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from baselines.bouc_wen.step import hysteresis_step
 from sim.effects.base import Context, Kind, Parameter, Place, block
 from sim.effects.holds import second_order
-
-if TYPE_CHECKING:
-    pass
 
 
 @block

@@ -1,25 +1,29 @@
 """A payload on the stage: the known mode moves to ``f0 sqrt(m/(m+M))``, the DC gain does not.
 
-In the simulation it multiplies the mass of the modes in the same chain; a chain without any is refused.
+In the simulation it multiplies the mass of `resonance` and `mechanics` in the same chain; a chain without either is
+refused.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from adaptive.types import FloatArray
 from sim import pictures
-from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place
+from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
 from sim.fitting.dynamics import Dynamics
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess
 
-if TYPE_CHECKING:
-    pass
+# Its step in the simulation: that of the modes, with more mass.
+
+
+def mass_of_modes(values: Mapping[str, float], context: Context) -> Context:
+    return replace(context, payload_ratio=context.payload_ratio + values["payload_ratio"])
 
 
 # Its form in a diagnosis.
@@ -97,6 +101,8 @@ PAYLOAD_CHANGE = Kind(
     parameters=(Parameter("payload_ratio", "1", 0.0, 20.0, 1.0, "added mass relative to the moved mass"),),
     derive=lambda values, context: (),
     block=None,
+    shares=mass_of_modes,
+    needs=("resonance", "mechanics"),
     signature="the known mode moves, the DC gain does not",
     mistaken_for=("resonance",),
     tells_apart="a change of stiffness moves the DC gain too",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from adaptive.types import FloatArray
 from sim import pictures
@@ -14,10 +14,6 @@ from sim.fitting.dynamics import Dynamics
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess, single_guesses
 from sim.readings.response_lags import second_lag
-
-if TYPE_CHECKING:
-    pass
-
 
 # Its step in the simulation.
 

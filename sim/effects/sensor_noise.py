@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sim.effects.base import Kind, Parameter, Place, block
 from sim.effects.counter_noise import normal
-
-if TYPE_CHECKING:
-    pass
 
 
 @block

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,6 @@ from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, 
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel
 from sim.readings.cycles import mirrored_branches
-
-if TYPE_CHECKING:
-    pass
-
 
 # Its step in the simulation.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,6 @@ from sim import pictures
 from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess
-
-if TYPE_CHECKING:
-    pass
-
 
 # Its step in the simulation.
 
