@@ -31,9 +31,9 @@ class Drift(CauseModel):
 def spline(p: FloatArray, data: FitData) -> FloatArray:
     """(n,) cubic spline in time through 0 at the start and the values ``p`` at equal spans."""
 
-    from scipy.interpolate import CubicSpline  # a simulated stage does not wait for it
-
     def basis() -> FloatArray:
+        from scipy.interpolate import CubicSpline  # a simulated stage does not wait for it
+
         knots = np.arange(p.size + 1) * (data.duration_s / p.size)
         return np.ascontiguousarray(CubicSpline(knots, np.eye(p.size + 1)[:, 1:])(data.t_s).T)
 
