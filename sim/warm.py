@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.diagnosis.causes.drive import lag_ends, slew_ends
-from sim.diagnosis.causes.motion import friction, slow_poles
-from sim.diagnosis.causes.reading import resample
-from sim.diagnosis.causes.slips import best_slip_move, date_slips, find_slips
-from sim.diagnosis.model.dynamics import Dynamics, ForceLoop, ForceStops, respond
-from sim.diagnosis.model.hysteresis_loops import (
+from sim.effects import EFFECTS, Chain, simulate
+from sim.effects.slew_limit import slew_ends
+from sim.effects.stick_slip import friction
+from sim.effects.timing import best_slip_move, date_slips, find_slips, resample
+from sim.fitting.dynamics import Dynamics, ForceLoop, ForceStops, respond
+from sim.fitting.hysteresis_loops import (
     asymmetric,
     bouc_wen_loop,
     bouc_wen_paced,
@@ -17,7 +17,7 @@ from sim.diagnosis.model.hysteresis_loops import (
     grown_plays,
     plays_nested,
 )
-from sim.effects import EFFECTS, Chain, simulate
+from sim.fitting.lags import lag_ends, slow_poles
 from sim.stage.presets import PRESETS
 from sim.stage.stage import Stage
 

@@ -13,7 +13,7 @@ from lab.rehearsal.disturbance import SENSOR, Event
 from lab.rehearsal.loop import LoopRecord
 from service.answers.guard import Limits
 from service.reports.tables import json_form
-from sim.recordings.repair import runs
+from sim.masks import runs
 
 #: Window of the worst mean error, s; error that must not last, percent of the range.
 WINDOW_S: Final = 0.5

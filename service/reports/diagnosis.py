@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from adaptive.errors import InputError
-from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, picture
 from service.reports.diagnosis_page import Source, length, page, picture_name
 from service.reports.plot_style import figure, label, legend, line, save
 from service.viewer import colours
 from service.viewer.colours import AFTER, BEFORE, DRIVE, NOISE_BAND
 from sim.diagnosis.export import export_stage
-from sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause
+from sim.diagnosis.result import SCHEMAS, Diagnosis, NamedCause, picture
+from sim.pictures import MEASURED, WITH, WITHOUT
 from sim.stage.file import save_stage
 
 __all__ = ["Source", "draw_cause", "draw_residual", "write_report"]
@@ -82,7 +82,7 @@ def draw_residual(path: Path, diagnosis: Diagnosis, title: str) -> None:
 
 def draw_cause(path: Path, cause: NamedCause, diagnosis: Diagnosis) -> None:
     """The picture of one cause: the residual without it and with it."""
-    shown = picture(cause, diagnosis.extended.model.data)
+    shown = picture(cause, diagnosis.extended.model.data, diagnosis.catalogue)
     drawn, grid = figure(1, 1, (8.0, 3.6), cause.name.replace("_", " "))
     axis = grid[0, 0]
     named: set[str] = set()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sim.diagnosis.export import ExportedStage
 from sim.diagnosis.result import TEST, Diagnosis, NamedCause
-from sim.effects import EFFECTS
+from sim.effects import Kind
 
 #: Units by the suffix of a number's name.
 _UNITS = {
@@ -68,7 +68,7 @@ def page(diagnosis: Diagnosis, exported: ExportedStage, source: Source, *, viewe
         lines += [*_causes(d), ""]
     lines += ["![residual before and after](residual.png)", ""]
     for place, cause in enumerate(d.causes):
-        lines += _section(place, cause)
+        lines += _section(place, cause, d.catalogue.kind(cause.name))
     if d.verdict in ("unexplained", "partly") or d.left:
         lines += _left(d)
     lines += _limits(d)
@@ -233,8 +233,7 @@ def _sight(cause: NamedCause) -> str:
     return {True: "seen", False: "not seen", None: "not excited"}[cause.witness.seen]
 
 
-def _section(place: int, cause: NamedCause) -> list[str]:
-    kind = EFFECTS.get(cause.name)
+def _section(place: int, cause: NamedCause, kind: Kind) -> list[str]:
     lines = [f"## {place + 1}. {spaced(cause.name)}", "", f"![{cause.name}]({picture_name(place, cause)})", ""]
     numbers = []
     for name, value in list(cause.parameters.items())[:MOST_NUMBERS]:
@@ -249,11 +248,10 @@ def _section(place: int, cause: NamedCause) -> list[str]:
             None: f"This recording does not excite a direct test of it: {cause.witness.words}. Only the fit names it.",
         }
         lines.append(told[cause.witness.seen])
-    if kind is not None:
-        lines.append(f"Its signature: {kind.signature}.")
-        if kind.mistaken_for:
-            others = ", ".join(spaced(n) for n in kind.mistaken_for)
-            lines.append(f"Easily mistaken for {others}; {kind.tells_apart}.")
+    lines.append(f"Its signature: {kind.signature}.")
+    if kind.mistaken_for:
+        others = ", ".join(spaced(n) for n in kind.mistaken_for)
+        lines.append(f"Easily mistaken for {others}; {kind.tells_apart}.")
     if cause.alternatives:
         lines.append(f"**This recording cannot tell it from {', '.join(spaced(a) for a in cause.alternatives)}.**")
     return [*lines, ""]

@@ -14,13 +14,13 @@ import rerun.blueprint as rrb
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, Curve, Picture, picture
 from service.reports.diagnosis_page import spaced
 from service.reports.plot_style import envelope
 from service.viewer.colours import AFTER, BEFORE, rgb
 from service.viewer.layout import BOUNDS, HEIGHT, WIDTH, Plane, grown
 from service.viewer.style import FRAME, LABEL, WHITE, Colour
-from sim.diagnosis.result import Diagnosis
+from sim.diagnosis.result import Diagnosis, picture
+from sim.pictures import MEASURED, WITH, WITHOUT, Curve, Picture
 
 APPLICATION, TIMELINE = "dehyst-diagnosis", "t_s"
 COLOURS: dict[str, Colour] = {MEASURED: WHITE, WITHOUT: rgb(BEFORE), WITH: rgb(AFTER)}
@@ -53,7 +53,7 @@ def write_viewer(path: Path, diagnosis: Diagnosis, title: str, page: str) -> Non
         _Trace("residual/nominal", "nominal stage", COLOURS[WITHOUT], scale * d.nominal.residual_um),
         _Trace("residual/extended", "extended stage", COLOURS[WITH], scale * d.extended.residual_um),
     ]
-    pictures = {f"cause/{i + 1}_{c.name}": picture(c, data) for i, c in enumerate(d.causes)}
+    pictures = {f"cause/{i + 1}_{c.name}": picture(c, data, d.catalogue) for i, c in enumerate(d.causes)}
     tabs = [
         _plane_view(f"{i + 1}. {spaced(c.name)}", p) for i, (c, p) in enumerate(zip(d.causes, pictures, strict=True))
     ]

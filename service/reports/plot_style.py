@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
+from sim.pictures import MOST_POINTS, envelope
 
-#: Points of a line beyond which it is thinned for drawing.
-MOST_POINTS = 4000
+__all__ = ["MOST_POINTS", "envelope", "figure", "label", "legend", "line", "save", "thinned"]
 
 
 def figure(rows: int, columns: int, size: tuple[float, float], title: str = "", **options: Any) -> tuple[Any, Any]:
@@ -38,16 +38,6 @@ def save(drawn: Any, path: Path) -> Path:
     drawn.align_ylabels()
     drawn.savefig(path)
     return path
-
-
-def envelope(t: FloatArray, values: FloatArray, most: int = MOST_POINTS) -> tuple[FloatArray, FloatArray]:
-    """A line over time, ``t`` and ``values`` (n,), thinned to the extremes of equal stretches: no peak is lost."""
-    if values.size <= most:
-        return t, values
-    width = -(-values.size // (most // 2))
-    starts = np.arange(0, values.size, width)
-    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    return np.repeat(t[starts], 2), np.column_stack([low, high]).ravel()
 
 
 def thinned(*columns: FloatArray) -> list[FloatArray]:

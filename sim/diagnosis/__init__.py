@@ -13,10 +13,10 @@
 
 from sim.diagnosis.diagnose import Options, diagnose, diagnose_prepared
 from sim.diagnosis.export import ExportedStage, export_stage
-from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.prepare import Prepared, prepare
 from sim.diagnosis.result import Diagnosis, NamedCause
 from sim.diagnosis.search.search import Thresholds
+from sim.fitting.fit_data import FitData
 
 __all__ = [
     "Diagnosis",

@@ -9,19 +9,25 @@ from scipy import stats
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray
-from sim.diagnosis.causes.catalogue import NAMES, same_set
-from sim.diagnosis.model.calibration import (
-    ModelFit,
+from sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from sim.diagnosis.next_experiment import Rival, next_experiment
+from sim.diagnosis.nominal import (
     begins_at_rest,
-    calibrate,
     calibrate_nominal,
     fit_on_other_recording,
-    with_new_columns,
     with_nominal_kind,
     with_other_axis,
 )
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.readings import (
+from sim.diagnosis.prepare import Prepared
+from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
+from sim.diagnosis.search.held_out import HeldOut, split
+from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
+from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
+from sim.diagnosis.witnesses import witnesses
+from sim.fitting.calibration import calibrate, with_new_columns
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import ModelFit
+from sim.readings.noise import (
     ConverterGrid,
     NoiseFloor,
     converter_grid,
@@ -29,13 +35,8 @@ from sim.diagnosis.model.readings import (
     recording_defects,
     repeated_readings,
 )
-from sim.diagnosis.next_experiment import Rival, next_experiment
-from sim.diagnosis.prepare import Prepared
-from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
-from sim.diagnosis.search.held_out import HeldOut, split
-from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
-from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
-from sim.diagnosis.witnesses import Readings, Sight, witnesses
+from sim.readings.readings import Readings
+from sim.readings.sight import Sight
 from sim.stage.config import StageConfig
 
 
@@ -45,11 +46,13 @@ def _silent(stage: str, share: float) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """How to diagnose. ``nominal``: "bouc_wen" (the chapter's stage), "linear", or the stage of a stage file."""
+    """How to diagnose. ``nominal``: "bouc_wen" (the chapter's stage), "linear", or the stage of a stage file;
+    ``catalogue``: the effects that may be named."""
 
     nominal: str | StageConfig = "bouc_wen"
     seed: int = 0
     thresholds: Thresholds = field(default_factory=Thresholds)
+    catalogue: Catalogue = CATALOGUE
 
 
 def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_wen") -> BoolArray:
@@ -83,10 +86,15 @@ def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
 
 
 def diagnose_prepared(
-    prepared: Prepared, *, seed: int = 0, thresholds: Thresholds | None = None, progress: Progress = _silent
+    prepared: Prepared,
+    *,
+    seed: int = 0,
+    thresholds: Thresholds | None = None,
+    progress: Progress = _silent,
+    catalogue: Catalogue = CATALOGUE,
 ) -> Diagnosis:
     """Diagnose what `prepare` returned, with its nominal stage and its test recording."""
-    options = Options(prepared.nominal, seed, thresholds or Thresholds())
+    options = Options(prepared.nominal, seed, thresholds or Thresholds(), catalogue)
     return diagnose(prepared.data, prepared.mask, options, progress, prepared.notes, prepared.dropped, prepared.test)
 
 
@@ -136,16 +144,17 @@ def diagnose(
         progress,
         coarse,
         readings,
-        witnesses(readings),
+        witnesses(readings, options.catalogue),
+        options.catalogue,
     )
     held_nominal = search.held(nominal)
     extended, held, steps = search.run(nominal)
     progress("removing each cause once more", 0.85)
-    extended, held, found = review(search, *search.with_refitted_slips(extended, held), {s.name: s for s in steps})
-    extended, held = search.with_refitted_slips(extended, held)
+    extended, held, found = review(search, *search.fitted_again(extended, held), {s.name: s for s in steps})
+    extended, held = search.fitted_again(extended, held)
     n = int(mask.sum())
-    causes = named(search, nominal, extended, held, found)
-    causes += quantisation(grid, coarse, floor, extended, n)
+    causes = named(search, extended, held, found)
+    causes += in_readings(options.catalogue, grid, coarse, floor, extended, n)
     causes = tuple(sorted(causes, key=lambda c: -c.heldout_gain))
     progress("fitting a black box", 0.92)
     on_test: tuple[ModelFit, ModelFit] | None = None
@@ -169,7 +178,7 @@ def diagnose(
     partial: tuple[str, ...] = ()
     if verdict == "unexplained" and causes:
         partial, causes = tuple(c.name for c in causes), ()
-    missing = not_excited(search, nominal, extended, floor)
+    missing = not_excited(search, floor)
     progress("simulating the next experiment", 0.95)
     is_named = verdict in ("effects", "partly")
     open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if is_named]
@@ -183,7 +192,7 @@ def diagnose(
         floor_source=floor.source,
         causes=causes,
         not_excited=missing,
-        next_experiment=next_experiment(open_, missing, extended, floor.sigma_um),
+        next_experiment=next_experiment(open_, missing, extended, floor.sigma_um, options.catalogue),
         nominal=nominal,
         extended=extended,
         notes=notes,
@@ -195,6 +204,7 @@ def diagnose(
         defects=recording_defects(doubles, floor.sigma_um, grid.step_um, dropped, data.n),
         left=where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um),
         on_test=on_test,
+        catalogue=options.catalogue,
     )
 
 
@@ -203,19 +213,14 @@ def rms_um(fit: ModelFit, mask: BoolArray) -> float:
     return float(np.sqrt(np.mean(np.square(fit.residual_um[mask]))))
 
 
-def named(
-    search: Search, nominal: ModelFit, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]
-) -> tuple[NamedCause, ...]:
+def named(search: Search, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]) -> tuple[NamedCause, ...]:
     """The accepted causes with their numbers, and the share of the error that each removed when it was added."""
     causes = []
     for i, one in enumerate(found):
         values, spans = numbers(extended, i, search)
-        also = one.alternatives
-        if one.name == "resonance" and nominal.model.nominal.name != "linear":
-            # The nominal stage has no such mode: it may be the stage's own, or a known one moved by a payload.
-            also = (*also, "payload_change")
+        also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data))
         # One voltage and one sensor show the sum of these: the other one of a set is always possible.
-        also = (*also, *sorted(same_set({one.name}) - {one.name, *also}))
+        also = (*also, *sorted(search.catalogue.same_set({one.name}) - {one.name, *also}))
         own = 1.0 - held.sse_um2 / one.held_without.sse_um2
         # A single cause's share is measured best by removing it from the final model.
         share = own if len(found) == 1 else one.step.gain
@@ -322,30 +327,26 @@ def verdict_of(
     return "unexplained" if structured and nominal_um > 1.1 * ceiling_um else "adequate"
 
 
-def not_excited(search: Search, nominal: ModelFit, extended: ModelFit, floor: NoiseFloor) -> tuple[str, ...]:
+def not_excited(search: Search, floor: NoiseFloor) -> tuple[str, ...]:
     """Names of the causes that, at their usual size, would change this recording by less than five standard errors."""
     seen = {
-        search.causes[look.index].name: True
-        for look in search.first_looks
-        if look.size_um2 > (5.0 * floor.sigma_um) ** 2
+        search.causes[look.index].name for look in search.first_looks if look.size_um2 > (5.0 * floor.sigma_um) ** 2
     }
-    seen.setdefault("quantisation", True)
-    return tuple(name for name in NAMES if not seen.get(name, False))
+    return tuple(name for name, cause in search.catalogue.causes.items() if cause.forms and name not in seen)
 
 
-def quantisation(
-    grid: ConverterGrid, coarse: bool, floor: NoiseFloor, extended: ModelFit, n: int
+def in_readings(
+    catalogue: Catalogue, grid: ConverterGrid, coarse: bool, floor: NoiseFloor, extended: ModelFit, n: int
 ) -> tuple[NamedCause, ...]:
-    """Quantisation, where the grid is far coarser than the noise, or makes a fifth of what is left above it."""
-    if grid.step_um <= 0.0:
-        return ()
-    own = grid.step_um**2 / 12.0
-    share = own / max(extended.sse_um2 / n, own)
-    if not coarse and (grid.step_um <= 1.2 * floor.sigma_um or share <= 0.2):
-        return ()
-    step = grid.step_um
-    rounding = 1e-3 * step
-    values, spans = {"step_um": step}, {"step_um": (step - rounding, step + rounding)}
-    seen = Sight("quantisation", True, f"all readings lie on a grid of {1e3 * step:.4g} nm ({grid.levels} levels)")
-    flat = extended.residual_um
-    return (NamedCause("quantisation", (), values, spans, share, 0.001, flat, flat, -1, seen),)
+    """The causes that the readings show without a fit, such as a coarse grid. ``n``: number of samples that count."""
+    flat, out = extended.residual_um, list[NamedCause]()
+    for name, cause in catalogue.causes.items():
+        if cause.in_readings is None:
+            continue
+        found = cause.in_readings.find(grid, coarse, floor.sigma_um, extended.sse_um2 / n)
+        if found is not None:
+            sight = Sight(True, found.words)
+            out.append(
+                NamedCause(name, (), found.parameters, found.intervals, found.share, 0.001, flat, flat, -1, sight)
+            )
+    return tuple(out)

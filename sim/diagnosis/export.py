@@ -11,26 +11,17 @@ from typing import Any
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.hysteresis import RestoringForceLoop
-from sim.diagnosis.model.calibration import DampingRule, ModelFit, damped_step
-from sim.diagnosis.model.fit_data import ActsOn, FitData
-from sim.diagnosis.model.nominal import BoucWenStage, FileStage, LinearStage, loop_numbers
-from sim.diagnosis.model.stage_model import CauseModel, StageModel
+from sim.diagnosis.nominal import BoucWenStage, FileStage, LinearStage
 from sim.diagnosis.result import Diagnosis
-from sim.effects import EFFECTS, Chain, Effect, effect, simulate
+from sim.effects import EFFECTS, Chain, Effect, simulate
+from sim.fitting.calibration import DampingRule, damped_step
+from sim.fitting.fit_data import ActsOn, FitData
+from sim.fitting.hysteresis_loops import loop_numbers
+from sim.fitting.stage_model import ModelFit, StageModel
 from sim.stage.config import StageConfig
 
 #: Label of the effect that carries the sensor's offset.
 OFFSET = "sensor_offset"
-
-
-def _clip(name: str, **values: float) -> dict[str, float]:
-    kind = EFFECTS[name]
-    return {key: float(np.clip(v, kind.parameter(key).low, kind.parameter(key).high)) for key, v in values.items()}
-
-
-def make(name: str, label: str = "", **values: float) -> Effect:
-    return effect(name, label=label, **_clip(name, **values))
 
 
 def nominal_effects(fit: ModelFit) -> list[Effect]:
@@ -39,125 +30,28 @@ def nominal_effects(fit: ModelFit) -> list[Effect]:
     nominal = fit.model.nominal
     # The offset comes after the mechanics: before them it would cause a transient from zero.
     drift = {"amplitude_um": 0.0, "ramp_um_per_min": 0.0, "walk_um_per_sqrt_min": 0.0}
-    offset = make("thermal_drift", OFFSET, offset_um=nominal.offset_um(p), **drift)
+    offset = EFFECTS["thermal_drift"].clipped(OFFSET, offset_um=nominal.offset_um(p), **drift)
     if isinstance(nominal, FileStage):
         found = nominal.effects(p)
         # A stage file that came from a diagnosis has an offset already, and what is fitted now comes on top of it.
         before = sum(e.values["offset_um"] for e in found if e.label == OFFSET)
-        total = make("thermal_drift", OFFSET, offset_um=before + nominal.offset_um(p), **drift)
+        total = EFFECTS["thermal_drift"].clipped(OFFSET, offset_um=before + nominal.offset_um(p), **drift)
         return [*(e for e in found if e.label != OFFSET), total]
     if nominal.name == "linear":
         f, z = float(np.exp(p[1])), float(np.exp(p[2]))
         return [
-            make("linear_actuator", gain_um_per_V=float(p[0])),
+            EFFECTS["linear_actuator"].clipped(gain_um_per_V=float(p[0])),
             offset,
-            make("resonance", label="nominal_mode", frequency_Hz=f, damping_ratio=z),
+            EFFECTS["resonance"].clipped("nominal_mode", frequency_Hz=f, damping_ratio=z),
         ]
     slope, beta, gamma = loop_numbers(p)
     d = float(p[0])
     k = EFFECTS["mechanics"].parameter("stiffness_N_per_m").default
     return [
-        make("bouc_wen", d_um_per_V=d, alpha=slope / d, beta_per_V=beta, gamma_per_V=gamma),
+        EFFECTS["bouc_wen"].clipped(d_um_per_V=d, alpha=slope / d, beta_per_V=beta, gamma_per_V=gamma),
         offset,
-        make("mechanics", damping_N_s_per_m=float(p[4]) * k, stiffness_N_per_m=k),
+        EFFECTS["mechanics"].clipped(damping_N_s_per_m=float(p[4]) * k, stiffness_N_per_m=k),
     ]
-
-
-def cause_effects(cause: CauseModel, p: FloatArray, data: FitData) -> tuple[list[Effect], bool]:
-    """One fitted cause as effects of the library, and whether their numbers must still be fitted."""
-    v = {name: value for name, (value, _) in cause.reported(p, data).items()}
-    swing, duration = data.swing_V, data.duration_s
-    match cause.name:
-        case "amplifier_lag" | "sensor_lag":
-            return [make(cause.name, tau_s=v["tau_s"])], False
-        case "slew_limit":
-            return [make("slew_limit", rate_V_per_s=v["slew_V_per_s"])], False
-        case "saturation":
-            return [make("saturation", high_V=v["u_max_V"], low_V=min(v["u_min_V"], 0.0) - 1e-3 * swing)], False
-        case "delay":
-            return [make("delay", delay_s=v["tau_s"])], False
-        case "resonance":
-            return [make("resonance", frequency_Hz=v["f0_hz"], damping_ratio=v["damping"])], False
-        case "payload_change":
-            return [make("payload_change", payload_ratio=v["payload_ratio"])], False
-        case "creep":
-            return [make("creep", gain_per_decade=v["gain_per_decade"])], True
-        case "cross_talk":
-            if cause.variant == "modes":
-                return [], False
-            return [make("cross_talk", static=v["static"], rate_s=v["rate_s"])], False
-        case "mains_hum":
-            phase = float(np.arctan2(p[2], p[1]) / (2.0 * np.pi))
-            return [
-                make(
-                    "mains_hum",
-                    amplitude_um=v["amplitude_um"],
-                    frequency_Hz=v["frequency_hz"],
-                    phase_cycles=phase,
-                    third_share=float(np.hypot(*p[-2:]) / max(v["amplitude_um"], 1e-12)) if p.size >= 7 else 0.0,
-                )
-            ], False
-        case "timing":
-            return [make("timing", repeat_probability=0.0, slow_ppm=max(0.0, -v["clock_ppm"]))], False
-        case "stick_slip":
-            return [make("stick_slip", width_um=v["width_um"], sliding_share=v["sliding_share"])], False
-        case "thermal_drift":
-            ramp = 60.0 * float(p[-1]) / duration if cause.variant != "temperature" else 0.0
-            tau = 0.3 * duration
-            return [make("thermal_drift", amplitude_um=1e-3, tau_s=tau, ramp_um_per_min=ramp)], True
-        case "gain_drift":
-            ramp = 60.0 * float(p[-1]) / duration if cause.variant != "temperature" else 0.0
-            tau = 0.3 * duration
-            return [make("gain_drift", ramp_per_min=ramp, amplitude=1e-4, tau_s=tau)], True
-        case "sensor_nonlinearity":
-            return [make("sensor_nonlinearity", square=v["quadratic"], cubic=v["cubic"], range_um=data.range_um)], True
-        case "asymmetry":
-            slope = v["bend"] * data.range_um / swing
-            where = data.u_low_V
-            return [
-                make(
-                    "asymmetry",
-                    "asymmetry",
-                    slope_um_per_V=slope,
-                    dead_zone_V=where + 0.35 * swing,
-                    threshold_V=0.02 * swing,
-                ),
-                make(
-                    "asymmetry",
-                    "asymmetry_2",
-                    slope_um_per_V=0.1 * slope,
-                    dead_zone_V=where + 0.65 * swing,
-                    threshold_V=0.15 * swing,
-                ),
-            ], True
-        case "rate_dependence":
-            return [
-                make(
-                    "rate_dependence",
-                    growth_per_decade=0.1,
-                    corner_V_per_s=v["corner_V_per_s"],
-                    width_um=0.1 * data.range_um,
-                    largest_V=0.35 * swing,
-                )
-            ], True
-        case "hysteresis_shape":
-            width = 0.05 * data.range_um
-            return [
-                make("hysteresis_shape", "hysteresis_shape", width_um=width, largest_V=0.5 * swing, fading=1.0),
-                make(
-                    "hysteresis_shape", "hysteresis_shape_2", width_um=0.2 * width, largest_V=0.15 * swing, fading=1.0
-                ),
-            ], True
-    return [], False
-
-
-def in_force(e: Effect, cause: RestoringForceLoop, p: FloatArray, data: FitData) -> Effect:
-    """A mode of the nominal stage with ``cause`` in its restoring force; any other effect unchanged."""
-    if e.name != "resonance":
-        return e
-    v = {name: value for name, (value, _) in cause.reported(p, data).items()}
-    mode = {name: e.values[name] for name in ("frequency_Hz", "damping_ratio")}
-    return make("mechanical_hysteresis", e.label, **mode, **v)
 
 
 #: A chain, its free run (n,), and the error of that run without the samples that settle.
@@ -190,19 +84,24 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
     for i, cause in enumerate(fit.model.causes):
         if not any(c.index == i for c in diagnosis.causes):
             continue
-        if isinstance(cause, RestoringForceLoop):
-            effects = [in_force(e, cause, fit.model.parameters_of(fit.p, i), data) for e in effects]
-            named.append(cause.name)
-            continue
-        mine, wants = cause_effects(cause, fit.model.parameters_of(fit.p, i), data)
-        if not mine:
-            missing.append(cause.name)
-        mine = [_apart(e, effects) for e in mine]
-        effects += mine
         named.append(cause.name)
-        if wants:
-            loose |= {e.label for e in mine}
-    step = next((c.parameters["step_um"] for c in diagnosis.causes if c.name == "quantisation"), 0.0)
+        mine = diagnosis.catalogue.causes[cause.name].in_library(cause, fit.model.parameters_of(fit.p, i), data)
+        if mine is None:
+            missing.append(cause.name)
+            continue
+        if mine.changed is not None:
+            effects = [mine.changed(e) for e in effects]
+        added = [_apart(e, effects) for e in mine.effects]
+        effects += added
+        if mine.refit:
+            loose |= {e.label for e in added}
+    extras, extras_um2 = list[Effect](), 0.0
+    for c in diagnosis.causes:
+        without_fit = diagnosis.catalogue.causes[c.name].in_readings
+        if without_fit is not None:
+            more, noise_um2 = without_fit.effects(c.parameters)
+            extras += more
+            extras_um2 += noise_um2
     clean = Chain(tuple(effects))
     target, skip = _target(fit), _settling(fit)
     fitted, after = clean, _rms((_free_run(clean, data) - target)[skip:])
@@ -214,12 +113,8 @@ def export_stage(diagnosis: Diagnosis, name: str = "diagnosed", seed: int = 0) -
         # The library has the effect at another place of the chain, so the export is worse with it than without.
         fitted, left_out = plain, tuple(dict.fromkeys(named))
         after = _rms((_free_run(plain, data) - target)[skip:])
-    extras: list[Effect] = [make("sensor_noise", rms_um=_noise(diagnosis, step))]
-    if step > 0.0:
-        extras.append(make("quantisation", step_um=step))
-    repeat = next((c.parameters.get("repeat_probability", 0.0) for c in diagnosis.causes if c.name == "timing"), 0.0)
-    if repeat > 0.0 and "timing" not in fitted:
-        extras.append(make("timing", repeat_probability=repeat))
+    noise_um = float(np.sqrt(max(diagnosis.noise_floor_um**2 - extras_um2, 0.0)))
+    extras.insert(0, EFFECTS["sensor_noise"].clipped(rms_um=noise_um))
     margin = 0.05 * data.swing_V
     config = StageConfig(
         name,
@@ -238,7 +133,7 @@ def _apart(e: Effect, others: list[Effect]) -> Effect:
     if e.label not in taken:
         return e
     number = next(k for k in range(2, len(taken) + 3) if f"{e.label}_{k}" not in taken)
-    return effect(e.name, label=f"{e.label}_{number}", **e.values)
+    return e.kind(label=f"{e.label}_{number}", **e.values)
 
 
 def _settling(fit: ModelFit) -> int:
@@ -248,10 +143,6 @@ def _settling(fit: ModelFit) -> int:
     free_memory = isinstance(nominal, BoucWenStage) and nominal.free_memory
     at_rest = abs(float(u[0])) < 1e-3 * fit.model.data.swing_V and not free_memory
     return 0 if at_rest else fit.model.data.n // 5
-
-
-def _noise(diagnosis: Diagnosis, step_um: float) -> float:
-    return float(np.sqrt(max(diagnosis.noise_floor_um**2 - step_um**2 / 12.0, 0.0)))
 
 
 def _rms(values: FloatArray) -> float:

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.catalogue import CAUSE_MODELS
-from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.stage_model import StageModel
+from sim.diagnosis.catalogue import Catalogue
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 
 #: Resolution of a voltage monitor relative to the swing.
 MONITOR_NOISE = 2e-4
@@ -75,8 +74,13 @@ def _at(model: StageModel, p: FloatArray, experiment: Experiment) -> FloatArray:
     return StageModel(data, model.nominal, model.causes).simulate(p).reading_um
 
 
-def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
-    """What to record next, as a sentence with the simulated difference; None if nothing is open."""
+def next_experiment(
+    rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit, sigma_um: float, catalogue: Catalogue
+) -> str | None:
+    """What to record next, as a sentence with the simulated difference; None if nothing is open.
+
+    ``missing``: names of the causes that the recording does not excite.
+    """
     data = fit.model.data
     if rivals:
         rival = rivals[0]
@@ -102,7 +106,7 @@ def next_experiment(rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit
             f"{best}: simulated, {rival.name} and {rival.other} then differ by {size * 1e3:.3g} nm rms "
             f"({size / sigma_um:.2g} times the noise), against {here * 1e3:.2g} nm in this record"
         )
-    return _excite(missing, fit, sigma_um)
+    return _excite([f for f in catalogue.forms if f.name in missing], fit, sigma_um)
 
 
 def _apart(a: FloatArray, b: FloatArray) -> float:
@@ -111,16 +115,16 @@ def _apart(a: FloatArray, b: FloatArray) -> float:
     return float(np.std(d))
 
 
-def _excite(missing: tuple[str, ...], fit: ModelFit, sigma_um: float) -> str | None:
+def _excite(missing: list[CauseModel], fit: ModelFit, sigma_um: float) -> str | None:
     """The drive that shows most of the causes that this recording does not excite, as a sentence."""
-    wanted = [f for f in CAUSE_MODELS if f.name in missing and f.name != "payload_change"]
+    wanted = [f for f in missing if f.shown_by_a_drive]
     best: tuple[str, list[str]] = ("", [])
     for experiment in experiments(fit.model.data):
         base = _at(fit.model, fit.p, experiment)
         names: list[str] = []
         for cause in wanted:
             data = fit.model.data
-            crossing = cause.name == "cross_talk" and bool(np.any(experiment.u2_V))
+            crossing = cause.of_other_axis and bool(np.any(experiment.u2_V))
             if cause.missing(data) and not crossing:
                 continue
             model = fit.model.with_cause(cause)

@@ -8,8 +8,8 @@ import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.calibration import NAMED
-from sim.diagnosis.model.fit_data import FitData
+from sim.diagnosis.nominal import NAMED
+from sim.fitting.fit_data import FitData
 from sim.recordings import Finding, Recording, check, repaired, require_usable
 from sim.stage.config import StageConfig
 

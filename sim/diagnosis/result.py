@@ -7,9 +7,12 @@ from typing import Any
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.readings import Defect
-from sim.diagnosis.witnesses.readings import Sight
+from sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import ModelFit
+from sim.pictures import Picture, over_time
+from sim.readings.noise import Defect
+from sim.readings.sight import Sight
 
 #: Schemas of report.json. 1 has no verdict "partly", no witnesses, no ceiling and no defects.
 SCHEMAS = (1, 2)
@@ -74,6 +77,8 @@ class Diagnosis:
     left: tuple[str, ...] = ()
     #: Both models on the test recording, if there is one.
     on_test: tuple[ModelFit, ModelFit] | None = field(default=None, repr=False)
+    #: The effects that could be named.
+    catalogue: Catalogue = field(default=CATALOGUE, repr=False)
 
     @property
     def shown(self) -> tuple[ModelFit, ModelFit]:
@@ -120,3 +125,10 @@ class Diagnosis:
         out["left"] = list(self.left)
         out["tried_not_named"] = list(self.partial)
         return out
+
+
+def picture(cause: NamedCause, data: FitData, catalogue: Catalogue = CATALOGUE) -> Picture:
+    """The picture that shows this cause best; the residual over time if that cannot be drawn."""
+    made = catalogue.causes[cause.name].picture(cause, data) or over_time(cause, data)
+    assert made is not None, "a residual over time can always be drawn"
+    return made

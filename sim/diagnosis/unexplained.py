@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
 from baselines.prandtl_ishlinskii.operators import play_run
-from sim.diagnosis.causes.drive import lag_ends
-from sim.diagnosis.causes.motion import slow_poles
-from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.parallel import side_by_side
 from sim.diagnosis.search.held_out import Split
+from sim.fitting.lags import lag_ends, slow_poles
+from sim.fitting.parallel import side_by_side
+from sim.fitting.stage_model import ModelFit
 
 IntArray = NDArray[np.int64]
 

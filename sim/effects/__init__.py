@@ -1,8 +1,8 @@
-"""Library of the effects that a simulated stage is composed of; each module holds those of one part of the chain.
+"""Library of the effects that a simulated stage is composed of and that a diagnosis may name, one file each.
 
 ``effect("creep", gain_per_decade=0.012)`` makes an effect with parameter values, ``a + b`` makes a chain, and
-``simulate`` runs it over voltages. ``EFFECTS`` holds all kinds by name. To add one, define a `Kind` in the module of
-its part or in a new one; see ``docs/effects.md``.
+``simulate`` runs it over voltages. ``EFFECTS`` holds all kinds by name, ``CAUSES`` those that a diagnosis may name. To
+add one, define a `Kind` in a new file; see ``docs/effects.md``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pkgutil
 from types import MappingProxyType
 
 from adaptive.errors import InputError
-from sim.effects.base import Block, Chain, Context, Effect, Kind, Parameter, Place, block
+from sim.effects.base import Block, Cause, Chain, Context, Effect, Kind, Parameter, Place, block
 from sim.effects.simulation import Plan, plan, simulate
 
 
@@ -43,6 +43,7 @@ __all__ = [
     "CAUSES",
     "EFFECTS",
     "Block",
+    "Cause",
     "Chain",
     "Context",
     "Effect",

@@ -33,7 +33,6 @@ LINEAR_ACTUATOR = Kind(
     block=run_linear_actuator,
     signature="a straight line",
     source="d of Table 2.1: 1.1351e-5 m/V",
-    cause=False,
 )
 
 
@@ -72,7 +71,6 @@ BOUC_WEN = Kind(
     block=run_bouc_wen,
     signature="symmetric loops without nonlocal memory, the same at every rate",
     source="identified values of Table 2.1",
-    cause=False,
 )
 
 
@@ -165,5 +163,4 @@ GENERALISED_PLAY = Kind(
     signature="loops that widen with amplitude and rate, rising and falling branches of different shape",
     source="shape after the generalised Prandtl-Ishlinskii literature; loop widths of the catalogue (10 to 15 % of a "
     "full stroke, 2 % small-signal); growth with the rate as in Fig. 2.3",
-    cause=False,
 )

@@ -14,12 +14,22 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
+import numpy as np
 from numba import types
 
 from adaptive.errors import InputError
+from adaptive.types import FloatArray
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import CauseModel
+from sim.pictures import Draw, over_time
+from sim.readings.sight import Sight
+
+if TYPE_CHECKING:
+    from sim.readings.noise import ConverterGrid
+    from sim.readings.readings import Readings
 
 _types: Any = types
 _cfunc: Any = numba.cfunc
@@ -135,6 +145,70 @@ def _kind_named(name: str) -> Kind:
     return kind
 
 
+@dataclass(frozen=True)
+class InLibrary:
+    """A fitted cause as effects of the library.
+
+    ``refit``: form and effect differ, so the numbers of the effects are still to be fitted to the form.
+    ``changed``: what becomes of each effect of the nominal stage, where the cause sits inside one of them.
+    """
+
+    effects: tuple[Effect, ...] = ()
+    refit: bool = False
+    changed: Callable[[Effect], Effect] | None = None
+
+
+@dataclass(frozen=True)
+class FoundInReadings:
+    """A cause that the readings show without a fit: its numbers, their intervals, the share (of the squared error that
+    is left) that it makes, and what was seen."""
+
+    parameters: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    share: float
+    words: str
+
+
+@dataclass(frozen=True)
+class InReadings:
+    """An effect that no form is fitted for.
+
+    ``find``: (grid of the readings, whether it is far coarser than the noise, noise floor in µm, mean squared error in
+    µm² that is left). ``effects``: its numbers as effects of the library, and their part of the noise, µm².
+    """
+
+    find: Callable[[ConverterGrid, bool, float, float], FoundInReadings | None]
+    effects: Callable[[dict[str, float]], tuple[tuple[Effect, ...], float]]
+
+
+def _not_in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    return None
+
+
+@dataclass(frozen=True)
+class Cause:
+    """How a diagnosis finds and shows an effect, and what becomes of its numbers.
+
+    Attributes
+    ----------
+    sign : what must be seen in the readings; empty where there is no direct test.
+    forms : the forms that are fitted; several are variants of one cause.
+    tests : its direct tests, which use no fit. What sees it counts before what does not.
+    in_library : (form, fitted parameters, data) -> effects of the library; None where the library has no equal.
+    picture : draws it.
+    same_as : causes that one voltage and one sensor cannot tell from it; either side may say so.
+    in_readings : for an effect that is found without a fit.
+    """
+
+    sign: str = ""
+    forms: tuple[CauseModel, ...] = ()
+    tests: tuple[Callable[[Readings], Sight], ...] = ()
+    in_library: Callable[[CauseModel, FloatArray, FitData], InLibrary | None] = _not_in_library
+    picture: Draw = over_time
+    same_as: tuple[str, ...] = ()
+    in_readings: InReadings | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """One effect of the library, independent of the values of its parameters.
@@ -149,7 +223,9 @@ class Kind:
         the values, so that parameters can change while the stage runs.
     block : the compiled step; None where the effect acts through the coefficients of others.
     signature, mistaken_for, tells_apart, source : for people and reports.
-    cause : True for a cause that a diagnosis may name; False for what every stage has.
+    shares : (values, context) -> the context of all effects of the chain, where this one changes it for the others.
+    needs : names of effects of which one must be in the chain.
+    cause : how a diagnosis finds it; None for what every stage has, which a diagnosis never names.
     """
 
     name: str
@@ -162,7 +238,9 @@ class Kind:
     rest: Derive = _no_state
     mistaken_for: tuple[str, ...] = ()
     tells_apart: str = ""
-    cause: bool = True
+    shares: Callable[[Mapping[str, float], Context], Context] | None = None
+    needs: tuple[str, ...] = ()
+    cause: Cause | None = None
 
     def __repr__(self) -> str:
         return f"Kind({self.name!r})"
@@ -185,6 +263,12 @@ class Kind:
             self.parameter(name, label)
         full = tuple(p.check(values.get(p.name, p.default), label) for p in self.parameters)
         return Effect(self, full, label)
+
+    def clipped(self, label: str = "", **values: float) -> Effect:
+        """The effect with these values, each moved into its range. Raises InputError on names."""
+        ranges = {name: self.parameter(name, label) for name in values}
+        inside = {name: float(np.clip(v, ranges[name].low, ranges[name].high)) for name, v in values.items()}
+        return self(label=label, **inside)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,16 @@
-"""The mechanics: modes, their payload, hysteresis of the restoring force, and friction."""
+"""The mechanics that a stage has: the chapter's, and a mode with hysteresis in its restoring force.
+
+The chapter's mechanics are the left side of (2.1): mass, damping and stiffness as Table 2.1 gives them. They are stiff
+and overdamped (poles at 396 and 3.2e6 rad/s) and are stepped in closed form.
+
+The mode with hysteresis is a mechanical Bouc-Wen oscillator:
+
+    y'' + 2 zeta w y' + w² (y + share Z) = w² x,      Z' = y' - (beta |y'| Z + gamma y' |Z|)
+
+Z obeys (2.2) with n = 1 and the displacement in place of the voltage; it is exact over a sub-step in which y is
+monotone. The linear part is exact for a force that is linear within a sub-step; the force is predicted and corrected
+once.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +21,6 @@ from typing import Any
 from baselines.bouc_wen.step import hysteresis_step
 from sim.effects.base import Context, Kind, Parameter, Place, block
 from sim.effects.holds import second_order
-
-# --- mechanics ---
-# The chapter's mechanics, the left side of (2.1): mass, damping and stiffness as Table 2.1 gives them.
-#
-# They are stiff and overdamped (poles at 396 and 3.2e6 rad/s) and are stepped in closed form.
 
 
 @block
@@ -47,47 +54,8 @@ MECHANICS = Kind(
     block=run_mode,
     signature="with the chapter's values a lag of 2.5 ms",
     source="identified values of Table 2.1",
-    cause=False,
 )
 
-
-# --- resonance ---
-# A lightly damped mode of the stage's mechanics, with the mass of a payload.
-
-
-def derive_resonance(values: Mapping[str, float], context: Context) -> Sequence[float]:
-    # a payload adds mass; spring and dashpot, and so the DC gain, stay
-    mass = (1.0 + values["payload_ratio"]) * (1.0 + context.payload_ratio)
-    omega = 2.0 * math.pi * values["frequency_Hz"] / math.sqrt(mass)
-    return second_order(omega, values["damping_ratio"] / math.sqrt(mass), context.dt_s, context.hold_per_s)
-
-
-RESONANCE = Kind(
-    name="resonance",
-    place=Place.MECHANICS,
-    parameters=(
-        Parameter("frequency_Hz", "Hz", 5.0, 1e5, 400.0, "undamped frequency without payload"),
-        Parameter("damping_ratio", "1", 0.001, 100.0, 0.03, "damping ratio without payload"),
-        Parameter("payload_ratio", "1", 0.0, 20.0, 0.0, "mass of the payload relative to the moved mass"),
-    ),
-    derive=derive_resonance,
-    rest=lambda values, context: (0.0, 0.0, 0.0),
-    block=run_mode,
-    signature="ringing after steps; a peak and -180° in the response",
-    mistaken_for=("mains_hum", "payload_change"),
-    tells_apart="hum is a fixed line that is there without excitation",
-    source="300 to 500 Hz, damping 0.01 to 0.05 for a 100 µm flexure stage (common knowledge of the field)",
-)
-
-
-# --- mechanical_hysteresis ---
-# A mode with hysteresis in its restoring force, as in the mechanical Bouc-Wen oscillator.
-#
-#     y'' + 2 zeta w y' + w² (y + share Z) = w² x,      Z' = y' - (beta |y'| Z + gamma y' |Z|)
-#
-# Z obeys (2.2) with n = 1 and the displacement in place of the voltage; it is exact over a sub-step in which y is
-# monotone. The linear part is exact for a force that is linear within a sub-step; the force is predicted and corrected
-# once.
 
 #: Sub-steps of a sample.
 SUBSTEPS = 8
@@ -145,60 +113,4 @@ MECHANICAL_HYSTERESIS = Kind(
     block=run_mechanical_hysteresis,
     signature="a resonance whose frequency falls and whose damping changes with the amplitude",
     source="Noël, Schoukens, 'Hysteretic benchmark with a dynamic nonlinearity', 2016",
-    cause=False,
-)
-
-
-# --- payload_change ---
-# A payload on the stage: the known mode moves to ``f0 sqrt(m/(m+M))``, the DC gain does not.
-#
-# It multiplies the mass of `resonance` or `mechanics` in the same chain; a chain without either is refused.
-
-PAYLOAD_CHANGE = Kind(
-    name="payload_change",
-    place=Place.MECHANICS,
-    parameters=(Parameter("payload_ratio", "1", 0.0, 20.0, 1.0, "added mass relative to the moved mass"),),
-    derive=lambda values, context: (),
-    block=None,
-    signature="the known mode moves, the DC gain does not",
-    mistaken_for=("resonance",),
-    tells_apart="a change of stiffness moves the DC gain too",
-    source="-30 % of f0 when the mass doubles: f0 sqrt(m/(m+M))",
-)
-
-
-# --- stick_slip ---
-# Stick-slip: friction in the guidance holds the displacement until the pull exceeds it.
-
-
-@block
-def run_stick_slip(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
-    """p: half-width µm, share still stuck. s: where it sticks µm, 1 while slipping."""
-    for k in range(n):
-        away = x[k] - s[0]
-        # sliding ends when the pull no longer exceeds sliding friction
-        if s[1] * away <= p[0] * p[1]:
-            s[1] = 0.0
-        # it sticks until the pull exceeds static friction, then jumps and slides
-        if s[1] == 0.0 and abs(away) > p[0]:
-            s[1] = 1.0 if away > 0.0 else -1.0
-        if s[1] != 0.0:
-            s[0] = x[k] - s[1] * p[0] * p[1]
-        x[k] = s[0]
-
-
-STICK_SLIP = Kind(
-    name="stick_slip",
-    place=Place.FRICTION,
-    parameters=(
-        Parameter("width_um", "µm", 0.0, 5.0, 0.03, "half-width of the flat part after a reversal"),
-        Parameter("sliding_share", "1", 0.0, 1.0, 0.5, "sliding friction as a share of static friction; 1: no jump"),
-    ),
-    derive=lambda values, context: (values["width_um"], values["sliding_share"]),
-    rest=lambda values, context: (0.0, 0.0),
-    block=run_stick_slip,
-    signature="flat after each reversal, then a jump; constant width at all amplitudes",
-    mistaken_for=("hysteresis_shape", "quantisation"),
-    tells_apart="the loop of piezoelectric hysteresis shrinks with the amplitude",
-    source="about 0 in flexures, tens of nm in loose ones (common knowledge of the field)",
 )

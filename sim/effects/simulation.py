@@ -92,17 +92,17 @@ def run_chain(
 
 
 def _contexts(chain: Chain, dt_s: float, seed: int, axis: int) -> list[Context]:
-    """The context of each effect. Raises InputError where a payload has no mode to act on."""
+    """The context of each effect. Raises InputError where an effect lacks what it acts on."""
     names = {e.name for e in chain}
-    if "payload_change" in names and not names & {"resonance", "mechanics"}:
-        raise InputError("effects: payload_change got no mode to move, expected resonance or mechanics in the chain")
-    hold, payload = np.inf, 0.0
+    start = Context(dt_s)
     for effect in chain:
-        if effect.name == "amplifier_lag" and effect.values["tau_s"] > 0.0:
-            hold = min(hold, 1.0 / effect.values["tau_s"])
-        if effect.name == "payload_change":
-            payload += effect.values["payload_ratio"]
-    start = Context(dt_s, 0, float(hold), payload)
+        kind = effect.kind
+        if kind.needs and not names.intersection(kind.needs):
+            raise InputError(
+                f"effects: {effect.label} got nothing to act on, expected {' or '.join(kind.needs)} in the chain"
+            )
+        if kind.shares is not None:
+            start = kind.shares(effect.values, start)
     return [dataclasses.replace(start, seed=stream(seed, axis, e.label)) for e in chain]
 
 

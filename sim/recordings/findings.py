@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
+from sim.masks import runs
 from sim.recordings.recording import Recording
-from sim.recordings.repair import dropout_mask, repeat_mask, runs
+from sim.recordings.repair import dropout_mask, repeat_mask
 
 Severity = Literal["note", "warning", "refusal"]
 

@@ -6,21 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
+from sim.masks import runs
 from sim.recordings.recording import OPTIONAL, Recording
 
 #: Longest gap that is filled, samples. A longer one ends the usable stretch, because hysteresis remembers what happened
 #: in it.
 LONGEST_FILL = 50
-
-
-def runs(mask: BoolArray) -> NDArray[np.int64]:
-    """(k, 2) start and stop (exclusive) of each run of True in ``mask`` (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return edges.reshape(-1, 2)
 
 
 def dropout_mask(values: FloatArray) -> BoolArray:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.readings import monitor_noise_V
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import ModelFit
+from sim.readings.noise import monitor_noise_V
 
 IntArray = NDArray[np.int64]
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.model.calibration import ModelFit
-from sim.diagnosis.model.fit_data import ActsOn
-from sim.diagnosis.model.stage_model import StageModel
 from sim.diagnosis.search.held_out import Split, unit_columns
+from sim.fitting.fit_data import ActsOn
+from sim.fitting.stage_model import ModelFit, StageModel
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from sim.diagnosis.causes.catalogue import CAUSE_MODELS, same_set
-from sim.diagnosis.causes.hysteresis import HysteresisShape, RestoringForceLoop, refined_model
-from sim.diagnosis.causes.mechanics import Modes
-from sim.diagnosis.causes.slips import Slips, find_slips, fit_slips, refit_slips
-from sim.diagnosis.model.calibration import ModelFit, calibrate, clipped_to_bounds, evaluate, with_new_columns
-from sim.diagnosis.model.readings import has_spectral_line
-from sim.diagnosis.model.stage_model import CauseModel, StageModel
-from sim.diagnosis.parallel import side_by_side
+from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
-from sim.diagnosis.witnesses.other import slips_are_borne_out
-from sim.diagnosis.witnesses.readings import Readings, Sight
+from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_new_columns
+from sim.fitting.parallel import side_by_side
+from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
+from sim.readings.noise import has_spectral_line
+from sim.readings.readings import Readings
+from sim.readings.sight import Sight
 
 
 @dataclass(frozen=True)
@@ -66,19 +63,17 @@ def first_fits(
     ``guess`` holds the parameters of the cause that screening found.
     """
     other = replace(base.model, nominal=base.model.nominal.with_other_hold())
-    if isinstance(cause, Slips):
-        fits = [fit_slips(cause, model, base, mask) for model in (base.model, other)]
-        # Half a slip is the hold's doing: whole ones go first.
-        whole = [f for f in fits if f.model.causes[-1].plausible(f.p[base.p.size :], f.model.data)]
-        best = min(whole or fits, key=lambda f: f.sse_um2)
+    own = [f for model in (base.model, other) if (f := cause.own_fit(model, base, mask)) is not None]
+    if own:
+        # What is implausible (half a slip) is the hold's doing: plausible fits go first.
+        whole = [f for f in own if f.model.causes[-1].plausible(f.p[base.p.size :], f.model.data)]
+        best = min(whole or own, key=lambda f: f.sse_um2)
         return best.model.causes[-1], [best]
-    if isinstance(cause, RestoringForceLoop):
-        return cause, [_first_fit_of_force_loop(cause, base, guess, mask)]
+    if cause.takes_over:
+        return cause, [_first_joint_fit(cause, base, guess, mask)]
     fits = [_first_fit(base.model.with_cause(cause), base, guess, mask)]
-    if isinstance(cause, HysteresisShape) and not cause.variant:
-        # Plays remember what happened before the recording: half of the range, or all of it.
-        top = base.model.data.u_high_V
-        used = [replace(cause, before_V=share * top) for share in (0.5, 1.0)]
+    used = cause.histories(base.model.data)
+    if used:
         fits += [_first_fit(base.model.with_cause(c), base, guess, mask) for c in used]
         best = min(fits, key=lambda f: f.sse_um2 * (1.0 if f is fits[0] else 1.03))
         return best.model.causes[-1], [best]
@@ -98,8 +93,8 @@ def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolA
     return calibrate(model, start, mask, 8, 2e-3, known=base.columns())
 
 
-def _first_fit_of_force_loop(cause: RestoringForceLoop, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
-    """From the best of a grid in which the nominal stage's mode gives way to the loop."""
+def _first_joint_fit(cause: CauseModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
+    """From the best of a grid in which a part of the nominal stage gives way to the cause."""
     model = base.model.with_cause(cause)
     names = tuple(parameter.name for parameter in model.parameters[: model.n_nominal])
     between = base.p[model.n_nominal :]
@@ -150,12 +145,17 @@ class Search:
     #: The readings, and what their direct tests say, by cause.
     readings: Readings | None = None
     sights: dict[str, Sight] = field(default_factory=dict)
-    causes: tuple[CauseModel, ...] = CAUSE_MODELS
+    catalogue: Catalogue = CATALOGUE
+    #: The forms of the catalogue, with what is found anew in each residual.
+    causes: tuple[CauseModel, ...] = ()
     first_looks: list[ScreenedCause] = field(default_factory=list)
     #: Parameters of the nominal stage calibrated without causes.
     nominal_p: FloatArray | None = None
     #: Held-out squared error of the nominal stage (µm²).
     nominal_um2: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.causes = self.causes or self.catalogue.forms
 
     def seen(self, cause: CauseModel) -> bool:
         """Whether a direct test that answers to this cause alone sees it."""
@@ -186,12 +186,8 @@ class Search:
         return found, [self.causes[s.index] for s in found]
 
     def _refresh(self, fit: ModelFit) -> None:
-        """Find the places of slips and the frequencies of modes in the residual of ``fit``."""
-        self.causes = tuple(f.with_modes_of(fit) if isinstance(f, Modes) else f for f in self.causes)
-        if any(cause.name == "timing" for cause in fit.model.causes):
-            return
-        found = find_slips(fit.model.data.y_um, fit.signals.reading_um, self.mask)
-        self.causes = tuple(replace(f, found=found) if isinstance(f, Slips) else f for f in self.causes)
+        """Find what is to be found anew (places of slips, frequencies of modes) in the residual of ``fit``."""
+        self.causes = tuple(cause.found_again(fit, self.mask) for cause in self.causes)
 
     def refit(self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float) -> list[CauseCandidate]:
         """The most promising guesses fitted jointly, the lowest cost first."""
@@ -199,15 +195,15 @@ class Search:
             return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
         # Of causes that show only their sum, each is fitted.
-        beside = same_set({self.causes[s.index].name for s in chosen})
-        timing = bool(chosen) and self.causes[chosen[0].index].name == "timing"
+        beside = self.catalogue.same_set({self.causes[s.index].name for s in chosen})
+        first = self.causes[chosen[0].index].name if chosen else ""
         for look in looks:
             cause = self.causes[look.index]
-            # These are fitted even with a small linearised gain: mains hum, because a spectral line is specific; a loop
-            # in the restoring force, because it shows only when the mode is fitted with it; slips beside a timing
-            # guess, because several of them look like a clock error at first; and what a direct test sees.
-            line = cause.name == "mains_hum" and self.is_line(look, base)
-            own = line or isinstance(cause, RestoringForceLoop) or (timing and isinstance(cause, Slips))
+            # These are fitted even with a small linearised gain: a line in the spectrum, because it is specific; what
+            # takes over a part of the nominal stage, because it shows only when that is fitted with it; a form that
+            # looks like another form of its effect at first; and what a direct test sees.
+            own = self.is_line(cause, look.start, base) or cause.takes_over
+            own = own or (cause.beside_its_kind and cause.name == first)
             if self.seen(cause) or cause.name in beside:
                 own = own or all(self.causes[c.index].name != cause.name for c in chosen)
             if own and all(look is not c for c in chosen):
@@ -221,31 +217,29 @@ class Search:
 
         return sorted(side_by_side(fitted, chosen), key=lambda c: c.cost)
 
-    def is_line(self, look: ScreenedCause, base: ModelFit) -> bool:
-        return has_spectral_line(base.residual_um, base.model.data, float(look.start[0]))
+    def is_line(self, cause: CauseModel, p: FloatArray, base: ModelFit) -> bool:
+        """Whether the cause is a line that the spectrum of the residual shows."""
+        line_hz = cause.line_hz(p)
+        return line_hz is not None and has_spectral_line(base.residual_um, base.model.data, line_hz)
 
     def polish(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The same cause fitted to convergence."""
-        more = 40 if candidate.cause.variant.startswith("restoring") else 12
-        fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, more, 1e-5)
+        fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, candidate.cause.iterations, 1e-5)
         fit = with_new_columns(fit, self.mask)
         held = self.held(fit)
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
     def plausible(self, candidate: CauseCandidate) -> bool:
         """Whether the fitted parameters have a plausible size and sign, and the readings do not speak against it."""
-        if self.vetoed(candidate.cause):
+        cause = candidate.cause
+        if self.vetoed(cause):
             return False
-        clock = candidate.cause.name == "timing" and not isinstance(candidate.cause, Slips)
-        if clock and self.sights and self.sights["timing"].seen is not True:
-            # A clock that runs wrong makes the readings later and later, or it is something else.
+        if cause.must_be_seen and self.sights and self.sights[cause.name].seen is not True:
             return False
-        if isinstance(candidate.cause, Slips) and self.readings is not None:
-            slips = next(f.found for f in candidate.fit.model.causes if isinstance(f, Slips))
-            if not slips_are_borne_out(self.readings, slips):
-                return False
+        if self.readings is not None and not cause.borne_out(self.readings):
+            return False
         model = candidate.fit.model
-        return candidate.cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
+        return cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
 
     def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
         """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
@@ -256,8 +250,8 @@ class Search:
             return False
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
-        if best.cause.name == "mains_hum":
-            return gain > 30.0 * self.sigma_um**2 and has_spectral_line(base.residual_um, base.model.data, float(q[0]))
+        if best.cause.line_hz(q) is not None:
+            return gain > 30.0 * self.sigma_um**2 and self.is_line(best.cause, q, base)
         if len(parameters) == 1 and (q[0] <= parameters[0].low or q[0] >= parameters[0].high):
             return False
         if not self.plausible(best):
@@ -295,7 +289,7 @@ class Search:
         steps: list[AcceptedCause] = []
         for round_ in range(self.thresholds.most_causes):
             self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.thresholds.most_causes)
-            looks, _ = self.looks(current, same_set({f.name for f in current.model.causes}))
+            looks, _ = self.looks(current, self.catalogue.same_set({f.name for f in current.model.causes}))
             if round_ == 0:
                 self.first_looks = looks
             ranked = self.refit(
@@ -314,10 +308,10 @@ class Search:
             if accepted is None:
                 break
             if not self.seen(accepted.cause):
-                slanted = self._with_slanted_shape(current)
-                if slanted is not None and slanted.cost < accepted.cost:
-                    # The loop itself explains it better: no further cause.
-                    current, held = slanted.fit, slanted.held
+                freer = self._with_freer_form(current)
+                if freer is not None and freer.cost < accepted.cost:
+                    # What is there already explains it better: no further cause.
+                    current, held = freer.fit, freer.held
                     continue
             accepted = self._other_hold(self._with_refined_model(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
@@ -327,19 +321,19 @@ class Search:
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
 
-    def _with_slanted_shape(self, fit: ModelFit) -> CauseCandidate | None:
-        """The model whose loop shape, if it has one, may change with the voltage; None if it has none or it is so."""
+    def _with_freer_form(self, fit: ModelFit) -> CauseCandidate | None:
+        """The model with the first of its causes that has a freer form in that form; None if none has."""
         for i, cause in enumerate(fit.model.causes):
-            if not isinstance(cause, HysteresisShape) or cause.variant not in ("", "fine"):
+            freer = cause.freer()
+            if freer is None:
                 continue
-            slanted = replace(cause, variant="slanted")
-            model = replace(fit.model, causes=(*fit.model.causes[:i], slanted, *fit.model.causes[i + 1 :]))
+            model = replace(fit.model, causes=(*fit.model.causes[:i], freer, *fit.model.causes[i + 1 :]))
             where = fit.model.slice_of(i)
-            own = np.zeros(len(slanted.parameters(model.data)))
+            own = np.array([s.neutral for s in freer.parameters(model.data)])
             start = np.concatenate([fit.p[: where.start], own, fit.p[where.stop :]])
             better = with_new_columns(calibrate(model, start, self.mask, 10, 1e-4), self.mask)
             held = self.held(better)
-            return CauseCandidate(slanted, better, held, self.cost(better, held, fit))
+            return CauseCandidate(freer, better, held, self.cost(better, held, fit))
         return None
 
     def _with_witness(self, candidate: CauseCandidate) -> float:
@@ -362,7 +356,7 @@ class Search:
         """The candidate with a finer model of the same cause, if there is one and it costs less."""
         left = np.sqrt(accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
         own = accepted.fit.p[len(base.p) :]
-        found = refined_model(accepted.cause, own, float(left), base.model.data)
+        found = accepted.cause.refined(own, float(left), base.model.data)
         if found is None:
             return accepted
         cause, starts = found
@@ -374,20 +368,22 @@ class Search:
         cost = self.cost(fit, held, base)
         return CauseCandidate(cause, fit, held, cost) if cost < accepted.cost else accepted
 
-    def with_refitted_slips(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
-        """The fit with its slips, if any, dated again beside all causes found since."""
-        better = refit_slips(fit, self.mask)
-        if better is fit:
-            return fit, held
-        better = with_new_columns(better, self.mask)
-        return better, self.held(better)
+    def fitted_again(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
+        """The fit with what its causes find anew beside all causes found since."""
+        for i, cause in enumerate(fit.model.causes):
+            better = cause.fitted_again(fit, i, self.mask)
+            if better is not fit:
+                # Its causes may stand in another order now.
+                better = with_new_columns(better, self.mask)
+                return better, self.held(better)
+        return fit, held
 
     def without(self, fit: ModelFit, index: int) -> ModelFit:
         """The model without one cause, calibrated again."""
         where = fit.model.slice_of(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
-        if isinstance(fit.model.causes[index], RestoringForceLoop) and self.nominal_p is not None:
-            # The loop changed the nominal mode too much: start from the nominal stage calibrated alone.
+        if fit.model.causes[index].takes_over and self.nominal_p is not None:
+            # It changed the nominal stage too much: start from that calibrated alone.
             start[: fit.model.n_nominal] = self.nominal_p
             return calibrate(fit.model.without_cause(index), start, self.mask, 12, 1e-4)
         return calibrate(fit.model.without_cause(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
@@ -427,7 +423,7 @@ def review(
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
         keep = thresholds.least_gain / (thresholds.seen_eases if search.seen(cause) else 1.0)
-        keep = keep if cause.name != "mains_hum" else 0.0
+        keep = keep if cause.line_hz(fit.model.parameters_of(fit.p, index)) is None else 0.0
         if gain <= keep * held_less.sse_um2:
             fit, held = less, held_less
             found, index = [], 0
@@ -461,8 +457,9 @@ def _rivals(
     for rival in rivals:
         lost, sigmas = worse_by(rival.held, held)
         close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
+        own = rival.fit.model.parameters_of(rival.fit.p, len(rival.fit.model.causes) - 1)
         # A permanent narrow line cannot be confused with another cause.
-        if rival.cause.name == "mains_hum":
+        if rival.cause.line_hz(own) is not None:
             continue
         if close and search.plausible(rival) and all(rival.cause.name != other.cause.name for other in out):
             out.append(rival)

@@ -18,13 +18,12 @@ from pyarrow import parquet
 from adaptive.types import FloatArray
 from lab.cli import main
 from service.reports.diagnosis import write_report
-from service.reports.diagnosis_curves import MEASURED, WITH, WITHOUT, envelope, picture
 from service.reports.diagnosis_page import Source, best_known_number, length, spaced, with_unit
-from sim.diagnosis.causes.catalogue import NAMES
 from sim.diagnosis.diagnose import Options, diagnose
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.result import NamedCause
-from sim.effects import Chain, effect, simulate
+from sim.diagnosis.result import NamedCause, picture
+from sim.effects import CAUSES, Chain, effect, simulate
+from sim.fitting.fit_data import FitData
+from sim.pictures import MEASURED, WITH, WITHOUT, envelope
 from sim.stage.file import load_stage, save_stage
 from sim.stage.stage import Stage
 
@@ -233,7 +232,7 @@ def settings() -> dict[str, FitData]:
     return made
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CAUSES)
 @pytest.mark.parametrize("kind", ["steps", "sine", "noise"])
 def test_every_cause_has_a_picture_on_every_record(name: str, kind: str) -> None:
     data = settings()[kind]

@@ -322,3 +322,14 @@ def test_a_wire_that_stands_still_holds_up_nobody_and_its_losses_are_counted() -
     assert ring.lost == n - len(seq)
     assert 5000 <= ring.lost <= 5000 + 2 * MAX_MESSAGE
     assert max(len(batch) for batch in sent) <= MAX_MESSAGE
+
+
+def test_a_simulated_stage_loads_no_diagnosis_and_no_large_part_of_scipy() -> None:
+    """The files of effects hold their forms and direct tests as well; a stage must not wait for what those call."""
+    code = (
+        "import sys; import service.stage_node.node, sim.stage.presets; "
+        "heavy = [f'scipy.{part}' for part in ('optimize', 'stats', 'signal', 'interpolate')]; "
+        "found = {*heavy, 'sim.diagnosis', 'sim.recordings', 'sim.readings.readings'} & sys.modules.keys(); "
+        "assert not found, found"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -11,9 +11,9 @@ import pytest
 from adaptive.types import FloatArray
 from sim.diagnosis.diagnose import Options, diagnose
 from sim.diagnosis.export import export_stage
-from sim.diagnosis.model.fit_data import FitData
 from sim.diagnosis.result import Diagnosis
 from sim.effects import Chain, Effect, effect, simulate
+from sim.fitting.fit_data import FitData
 from sim.stage.file import from_dict, to_dict
 
 DT = 1e-3

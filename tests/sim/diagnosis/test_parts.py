@@ -11,25 +11,25 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
-from sim.diagnosis.causes.hysteresis import HysteresisShape
-from sim.diagnosis.causes.motion import friction
-from sim.diagnosis.causes.reading import resample
-from sim.diagnosis.model.calibration import calibrate
-from sim.diagnosis.model.dynamics import Dynamics, respond
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.hysteresis_loops import bouc_wen_loop, bouc_wen_paced
-from sim.diagnosis.model.nominal import BoucWenStage
-from sim.diagnosis.model.readings import (
+from sim.diagnosis.nominal import BoucWenStage
+from sim.diagnosis.prepare import prepare
+from sim.diagnosis.search.held_out import split
+from sim.effects import effect, simulate
+from sim.effects.hysteresis_shape import HysteresisShape
+from sim.effects.stick_slip import friction
+from sim.effects.timing import resample
+from sim.fitting.calibration import calibrate
+from sim.fitting.dynamics import Dynamics, respond
+from sim.fitting.fit_data import FitData
+from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced
+from sim.fitting.stage_model import StageModel
+from sim.readings.noise import (
     converter_grid,
     has_spectral_line,
     noise_floor,
     repeated_period,
     repeated_readings,
 )
-from sim.diagnosis.model.stage_model import StageModel
-from sim.diagnosis.prepare import prepare
-from sim.diagnosis.search.held_out import split
-from sim.effects import effect, simulate
 from sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 

@@ -9,10 +9,10 @@ from adaptive.types import FloatArray
 from baselines.bouc_wen.mechanical import MechanicalBoucWen
 from sim.diagnosis.diagnose import diagnose_prepared
 from sim.diagnosis.export import export_stage
-from sim.diagnosis.model.dynamics import Dynamics, ForceLoop, respond
-from sim.diagnosis.model.hysteresis_loops import plays_nested
 from sim.diagnosis.prepare import prepare
 from sim.effects import effect, simulate
+from sim.fitting.dynamics import Dynamics, ForceLoop, respond
+from sim.fitting.hysteresis_loops import plays_nested
 from sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.slips import SlipList, best_slip_move, date_slips, find_slips, merge_close_slips
+from sim.effects.timing import SlipList, best_slip_move, date_slips, find_slips, merge_close_slips
 
 N = 6000
 NOISE_UM = 0.005

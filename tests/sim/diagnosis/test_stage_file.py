@@ -11,13 +11,13 @@ import pytest
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.mechanics import peaks
-from sim.diagnosis.causes.slips import find_slips
 from sim.diagnosis.diagnose import diagnose_prepared
 from sim.diagnosis.export import OFFSET, export_stage
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.result import TEST, Diagnosis
 from sim.effects import Chain, effect
+from sim.effects.timing import find_slips
+from sim.fitting.modes import peaks
 from sim.recordings import Recording, read
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage

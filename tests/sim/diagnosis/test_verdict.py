@@ -14,12 +14,13 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from sim.diagnosis import diagnose
 from sim.diagnosis.diagnose import Options, explained_share, verdict_of
-from sim.diagnosis.model.calibration import ModelFit, calibrate_nominal, fit_on_other_recording
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.model.readings import RepeatedReadings, noise_floor, recording_defects, repeated_readings
+from sim.diagnosis.nominal import calibrate_nominal, fit_on_other_recording
 from sim.diagnosis.result import Diagnosis, NamedCause
 from sim.diagnosis.search.held_out import split
 from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import ModelFit
+from sim.readings.noise import RepeatedReadings, noise_floor, recording_defects, repeated_readings
 
 DT = 1e-3
 SIGMA_UM = 0.01

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.diagnosis.causes.catalogue import NAMES
-from sim.diagnosis.model.fit_data import FitData
-from sim.diagnosis.witnesses import Readings, Sight, witnesses
-from sim.diagnosis.witnesses.other import slips_are_borne_out
+from sim.diagnosis.witnesses import witnesses
+from sim.effects import CAUSES
+from sim.effects.timing import slips_are_borne_out
+from sim.fitting.fit_data import FitData
+from sim.readings.readings import Readings
+from sim.readings.sight import Sight
 from tests.hidden.excitation import FS_HZ, excitation
 from tests.hidden.stage import Truth, record
 
@@ -62,7 +64,7 @@ def test_each_test_sees_its_cause_and_no_other(name: str) -> None:
 def test_on_a_healthy_stage_nothing_but_the_loop_is_seen() -> None:
     found = sights("")
     assert {name for name, sight in found.items() if sight.seen} == {"hysteresis_shape"}
-    assert set(found) <= set(NAMES)
+    assert set(found) <= set(CAUSES)
     assert all(sight.words for sight in found.values())
 
 

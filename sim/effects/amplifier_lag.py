@@ -1,0 +1,89 @@
+"""First-order lag of the amplifier that drives the actuator's capacitance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from adaptive.types import FloatArray
+from sim import pictures
+from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from sim.effects.holds import first_order
+from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.lags import lag_ends
+from sim.fitting.stage_model import CauseModel, Guess, single_guesses
+from sim.readings.response_lags import second_lag
+
+# Its step in the simulation.
+
+
+@block
+def run_amplifier_lag(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
+    """p: pole, weight of the held command. s: output, V."""
+    for k in range(n):
+        s[0] = p[0] * s[0] + p[1] * x[k]
+        x[k] = s[0]
+
+
+def derive_amplifier_lag(values: Mapping[str, float], context: Context) -> Sequence[float]:
+    # the input is the held level of the converter; later effects take the output's shape from Context.hold_per_s
+    a, _, b = first_order(values["tau_s"], context.dt_s, float("inf"))
+    return a, b
+
+
+def hold_of_later_effects(values: Mapping[str, float], context: Context) -> Context:
+    tau_s = values["tau_s"]
+    return replace(context, hold_per_s=min(context.hold_per_s, 1.0 / tau_s)) if tau_s > 0.0 else context
+
+
+# Its form in a diagnosis.
+
+
+@dataclass(frozen=True)
+class AmplifierLag(CauseModel):
+    """First-order lag of the voltage before the hysteresis, 30 µs (5 kHz) to 30 ms."""
+
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
+    fast: bool = True
+    substeps: int = 4
+    continuous: bool = True
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return (ModelParameter("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * data.dt_s), ActsOn.DRIVE),)
+
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        dt = data.dt_s
+        return single_guesses([0.1 * dt, 0.3 * dt, dt, 4.0 * dt, 12.0 * dt])
+
+    def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        ratio = p[0] / data.dt_s
+        return lag_ends(u_V, max(ratio, 1e-3), data.straight)
+
+
+def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    v = {name: value for name, (value, _) in form.reported(p, data).items()}
+    return InLibrary((AMPLIFIER_LAG.clipped(tau_s=v["tau_s"]),))
+
+
+AMPLIFIER_LAG = Kind(
+    name="amplifier_lag",
+    place=Place.AMPLIFIER,
+    parameters=(Parameter("tau_s", "s", 0.0, 5e-3, 6.4e-5, "time constant; corner frequency 1/(2 pi tau)"),),
+    derive=derive_amplifier_lag,
+    rest=lambda values, context: (0.0,),
+    block=run_amplifier_lag,
+    shares=hold_of_later_effects,
+    signature="small-signal roll-off of first order, the same at every amplitude",
+    mistaken_for=("sensor_lag", "delay"),
+    tells_apart="a monitor of the voltage; a delay loses no gain",
+    source="RC of amplifier and actuator, corners of 1 to 6 kHz (common knowledge of the field); default 2.5 kHz",
+    cause=Cause(
+        sign="a second lag in phase and gain of the response",
+        forms=(AmplifierLag(),),
+        tests=(second_lag,),
+        in_library=in_library,
+        picture=pictures.after_steps,
+    ),
+)

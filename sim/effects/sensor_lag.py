@@ -1,0 +1,83 @@
+"""First-order low-pass of the sensor electronics; it attenuates signal and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from adaptive.types import FloatArray
+from sim import pictures
+from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from sim.effects.holds import first_order
+from sim.fitting.dynamics import Dynamics
+from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.stage_model import CauseModel, Guess, single_guesses
+from sim.readings.response_lags import second_lag
+
+# Its step in the simulation.
+
+
+@block
+def run_sensor_lag(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
+    """p: (a, b0, b1). s: output, input so far, µm; whether it has begun."""
+    for k in range(n):
+        now = x[k]
+        if s[2] == 0.0:  # start settled
+            s[0], s[1], s[2] = now, now, 1.0
+        s[0] = p[0] * s[0] + p[1] * s[1] + p[2] * now
+        s[1] = now
+        x[k] = s[0]
+
+
+def derive_sensor_lag(values: Mapping[str, float], context: Context) -> Sequence[float]:
+    # the displacement is linear between samples
+    return first_order(values["tau_s"], context.dt_s, 0.0)
+
+
+# Its form in a diagnosis.
+
+
+@dataclass(frozen=True)
+class SensorLag(CauseModel):
+    """A first-order low-pass in the sensor's electronics."""
+
+    test_answers_to_others: bool = True
+    unseen_is_absent: bool = True
+    fast: bool = True
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        return (ModelParameter("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * data.dt_s), ActsOn.DYNAMICS),)
+
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        return single_guesses([f * data.dt_s for f in (0.1, 0.3, 1.0, 3.0, 10.0)])
+
+    def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
+        return replace(system, lags_s=(*system.lags_s, float(p[0]))) if p[0] > 1e-7 else system
+
+
+def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    v = {name: value for name, (value, _) in form.reported(p, data).items()}
+    return InLibrary((SENSOR_LAG.clipped(tau_s=v["tau_s"]),))
+
+
+SENSOR_LAG = Kind(
+    name="sensor_lag",
+    place=Place.SENSOR_LAG,
+    parameters=(Parameter("tau_s", "s", 0.0, 0.01, 3e-4, "time constant"),),
+    derive=derive_sensor_lag,
+    rest=lambda values, context: (0.0, 0.0, 0.0),
+    block=run_sensor_lag,
+    signature="gain AND noise roll off",
+    mistaken_for=("amplifier_lag", "delay"),
+    tells_apart="a monitor of the voltage; the spectrum of the noise at rest",
+    source="0.3 ms at a bandwidth setting of 1 kHz (sensor electronics data sheet)",
+    cause=Cause(
+        sign="a second lag in phase and gain of the response",
+        forms=(SensorLag(),),
+        tests=(second_lag,),
+        in_library=in_library,
+        picture=pictures.after_steps,
+        same_as=("amplifier_lag",),
+    ),
+)

@@ -1,0 +1,127 @@
+"""Additive slow drift: a relaxation towards another temperature, a steady ramp, and a random walk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from sim import pictures
+from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
+from sim.effects.counter_noise import normal
+from sim.fitting.drifts import Drift, spline
+from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.stage_model import CauseModel
+from sim.readings.sight import Sight
+from sim.readings.slow_motion import cycles_over_time, rests_over_time
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Readings
+
+
+# Its step in the simulation.
+
+
+@block
+def run_thermal_drift(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> None:
+    """p: offset, amplitude, dt/tau, ramp per sample, step of the walk, seed. s: walk, µm."""
+    for k in range(n):
+        index = k0 + k
+        if p[4] > 0.0:
+            s[0] += p[4] * normal(p[5], index)
+        x[k] += p[0] - p[1] * math.expm1(-p[2] * index) + p[3] * index + s[0]
+
+
+def derive_thermal_drift(values: Mapping[str, float], context: Context) -> Sequence[float]:
+    dt = context.dt_s
+    walk = values["walk_um_per_sqrt_min"] * math.sqrt(dt / 60.0)
+    ramp = values["ramp_um_per_min"] * dt / 60.0
+    return values["offset_um"], values["amplitude_um"], dt / values["tau_s"], ramp, walk, float(context.seed)
+
+
+# Its form in a diagnosis.
+
+
+@dataclass(frozen=True)
+class ThermalDrift(Drift):
+    """A slow additive drift."""
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        r = data.range_um
+        if self.variant == "temperature":
+            return (ModelParameter("um_per_K", "µm/K", 0.0, -0.2 * r, 0.2 * r, 1e-3 * r, ActsOn.MOTION),)
+        return tuple(
+            ModelParameter(f"drift{j + 1}_um", "µm", 0.0, -0.1 * r, 0.1 * r, 1e-3 * r, ActsOn.MOTION, True)
+            for j in range(self.spans(data))
+        )
+
+    def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        if self.variant == "temperature":
+            return x_um if data.warmth_K is None else x_um + p[0] * data.warmth_K
+        return x_um + spline(p, data)
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        if self.variant == "temperature":
+            return super().reported(p, data)
+        rate = np.zeros(p.size)
+        rate[-1] = 1.0 / data.duration_s
+        return {"rate_um_per_s": (float(rate @ p), rate)}
+
+
+def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
+    ramp = 60.0 * float(p[-1]) / data.duration_s if form.variant != "temperature" else 0.0
+    start = THERMAL_DRIFT.clipped(amplitude_um=1e-3, tau_s=0.3 * data.duration_s, ramp_um_per_min=ramp)
+    return InLibrary((start,), refit=True)
+
+
+# Its signature in the readings.
+
+
+def in_rests(readings: Readings) -> Sight:
+    """The rests move with time, whatever the voltage."""
+    found, data = readings.once(rests_over_time), readings.data
+    if found.shift is None:
+        return Sight(None, found.missing)
+    v, e = found.shift.value, found.shift.error
+    least = max(2.0 * readings.sigma_um, 1e-4 * data.range_um)
+    words = f"the rests move by {v:.3g} ± {1.96 * e:.1g} µm {found.shift.when}"
+    return Sight(found.shift.seen(abs(v), least, 2e-3 * data.range_um), words)
+
+
+def in_cycles(readings: Readings) -> Sight:
+    """The mean of equal cycles goes with time. Where it is not clear that it is no creep, nothing is decided."""
+    found = readings.once(cycles_over_time)
+    if found.missing:
+        return Sight(None, found.missing)
+    return Sight(True if found.goes_on else None if found.moved else False, found.mean_words)
+
+
+THERMAL_DRIFT = Kind(
+    name="thermal_drift",
+    place=Place.DRIFT,
+    parameters=(
+        Parameter("amplitude_um", "µm", -20.0, 20.0, 0.5, "total way of the relaxation"),
+        Parameter("tau_s", "s", 1.0, 1e5, 300.0, "its time constant"),
+        Parameter("ramp_um_per_min", "µm/min", -10.0, 10.0, 0.0, "steady drift"),
+        Parameter("walk_um_per_sqrt_min", "µm/√min", 0.0, 1.0, 0.0, "random walk, standard deviation after a minute"),
+        Parameter("offset_um", "µm", -1e3, 1e3, 0.0, "constant offset"),
+    ),
+    derive=derive_thermal_drift,
+    rest=lambda values, context: (0.0,),
+    block=run_thermal_drift,
+    signature="also there at zero input; follows the temperature where that is logged",
+    mistaken_for=("creep", "gain_drift"),
+    tells_apart="it does not follow the steps, creep does",
+    source="up to 1 µm per kelvin and 50 mm of aluminium (expansion 23e-6 per kelvin)",
+    cause=Cause(
+        sign="the rests move with time whatever the voltage; or the mean of equal cycles goes with time",
+        forms=(ThermalDrift(), ThermalDrift(variant="temperature", of_one_recording=False)),
+        tests=(in_rests, in_cycles),
+        in_library=in_library,
+        picture=pictures.slowly,
+    ),
+)

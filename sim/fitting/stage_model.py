@@ -1,0 +1,412 @@
+"""The stage model that is fitted: a nominal stage and cause models, simulated block by block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from adaptive.types import BoolArray, FloatArray
+from sim.fitting.dynamics import Dynamics, RestoringForce, changed_midway, respond
+from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.parallel import side_by_side
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Readings
+
+
+class NominalStage(Protocol):
+    """A stage that a recording is compared with. Its parameters are calibrated before causes are searched."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def hold(self) -> str: ...
+    @property
+    def substeps(self) -> int:
+        """Sub-steps per sample at which drive and hysteresis are simulated."""
+        ...
+
+    def with_other_hold(self) -> NominalStage: ...
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]: ...
+    def starts(self, data: FitData) -> list[FloatArray]: ...
+    def static(self, drive_V: FloatArray, p: FloatArray, data: FitData) -> tuple[FloatArray, FloatArray]:
+        """Hysteresis h and static displacement w (µm, (n,) each) for the voltage at the actuator."""
+        ...
+
+    def dynamics(self, p: FloatArray, data: FitData) -> Dynamics: ...
+    def behind_um(self, x_um: FloatArray, data: FitData) -> FloatArray:
+        """(n,) displacement behind the mechanics after what the stage itself adds there."""
+        ...
+
+    def offset_um(self, p: FloatArray) -> float: ...
+    def start_um(self, p: FloatArray) -> float:
+        """Distance (µm) of the first sample from equilibrium with the first voltage."""
+        ...
+
+
+#: Vectors whose simulated differences from the neutral span one linearised guess, and whether they may be scaled.
+Guess = list[FloatArray]
+
+
+@dataclass(frozen=True)
+class CauseModel:
+    """A form of one effect that can be fitted. Each hook is neutral unless overridden.
+
+    ``name`` is that of the effect; the catalogue sets it. ``variant`` tells forms of one effect apart.
+    """
+
+    name: str = ""
+    variant: str = ""
+    #: Parameters of the nominal stage that this cause replaces; they stay at their neutral values.
+    pins: tuple[str, ...] = ()
+    #: Sub-steps per sample at which drive and hysteresis must be simulated.
+    substeps: int = 1
+    #: The drive behind it has no jumps and runs linearly between sub-steps.
+    continuous: bool = False
+    #: It acts within a few samples of a step, so the choice of the hold may have imitated it: fit it with both.
+    fast: bool = False
+    #: Its parameters belong to one recording (drift over time, phase of a hum).
+    of_one_recording: bool = False
+    #: It takes over a part of the nominal stage: it is always fitted, from `joint_starts`, and without it the nominal
+    #: stage starts from its own calibration.
+    takes_over: bool = False
+    #: It is fitted wherever another form of its effect is the most promising guess.
+    beside_its_kind: bool = False
+    #: Its direct test also answers to other causes: it supports the name but does not replace the null distribution.
+    test_answers_to_others: bool = False
+    #: It is not named where its direct test is excited and sees nothing.
+    unseen_is_absent: bool = False
+    #: It is named only where its direct test sees it.
+    must_be_seen: bool = False
+    #: So smooth in time that it imitates the rest of many others: where its test is not excited, it must explain most.
+    imitates_others: bool = False
+    #: Another drive can show it: False for what somebody has to do to the stage.
+    shown_by_a_drive: bool = True
+    #: It is shown by driving another axis, recorded or not.
+    of_other_axis: bool = False
+    #: Model error: share (RMS) of the removed residual that the model may leave behind in a real stage.
+    model_error: float = 0.025
+    #: Iterations of the fit to convergence.
+    iterations: int = 12
+
+    def missing(self, data: FitData) -> str:
+        """What the data lack to show this cause; empty if nothing."""
+        return ""
+
+    def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
+        raise NotImplementedError
+
+    def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
+        """Start values for screening. Default for a linear cause: one guess with a unit step of every parameter."""
+        parameters = self.parameters(data)
+        neutral = np.array([s.neutral for s in parameters])
+        rows = []
+        for i, parameter in enumerate(parameters):
+            row = neutral.copy()
+            row[i] += parameter.step
+            rows.append(row)
+        return [rows]
+
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
+        """Whether the fitted parameters have a plausible size and sign."""
+        return True
+
+    def borne_out(self, readings: Readings) -> bool:
+        """False where the readings speak against what this form has found."""
+        return True
+
+    def line_hz(self, p: FloatArray) -> float | None:
+        """Frequency of the permanent line that the form is; None for any other.
+
+        A line is so specific that the residual's spectrum decides about it, and no other cause is confused with it.
+        """
+        return None
+
+    def found_again(self, fit: ModelFit, mask: BoolArray) -> CauseModel:
+        """The form with what is to be found anew in each residual."""
+        return self
+
+    def own_fit(self, bare: StageModel, base: ModelFit, mask: BoolArray) -> ModelFit | None:
+        """A first joint fit of its own, of ``bare`` and this cause beside ``base``; None where the usual one serves."""
+        return None
+
+    def fitted_again(self, fit: ModelFit, index: int, mask: BoolArray) -> ModelFit:
+        """``fit`` with what this form (``causes[index]``) finds beside all causes; ``fit`` itself if that is not
+        better."""
+        return fit
+
+    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
+        """Start values of the nominal stage (parameters ``names``) and of this cause together; see `takes_over`."""
+        return []
+
+    def histories(self, data: FitData) -> list[CauseModel]:
+        """The same form with other memories of the time before the recording."""
+        return []
+
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        """A finer form of the same cause and its start values; None if there is none or none is needed.
+
+        An error that a coarse form leaves must not be taken for another cause. ``p`` are the fitted parameters;
+        ``left_floors`` is the remaining error in noise floors.
+        """
+        return None
+
+    def freer(self) -> CauseModel | None:
+        """A form of the same cause that must be tried before another cause is added; None if there is none."""
+        return None
+
+    def also(self, data: FitData) -> tuple[str, ...]:
+        """Names of further causes that this one may be, whatever the recording says."""
+        return ()
+
+    def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        return u_V
+
+    def static(
+        self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
+    ) -> FloatArray | None:
+        """(n,) µm added to the static displacement, or None."""
+        return None
+
+    def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
+        return system
+
+    def changed_dynamics(self, system: Dynamics, p: FloatArray) -> tuple[float, Dynamics] | None:
+        """Time (s) of a change of the mechanics and the mechanics after it, or None."""
+        return None
+
+    def added_motion(
+        self, drive_V: FloatArray, static_um: FloatArray, p: FloatArray, data: FitData, system: Dynamics
+    ) -> FloatArray | None:
+        """(n,) motion parallel to the nominal mechanics, or None."""
+        return None
+
+    def restoring(self, p: FloatArray, data: FitData) -> RestoringForce | None:
+        """Hysteresis in the restoring force, or None."""
+        return None
+
+    def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        return x_um
+
+    def reading(self, y_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        return y_um
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        """Reported numbers by name: the value and its gradient with respect to ``p``."""
+        out = {}
+        for i, parameter in enumerate(self.parameters(data)):
+            gradient = np.zeros(p.size)
+            gradient[i] = 1.0
+            out[parameter.name] = (float(p[i]), gradient)
+        return out
+
+
+def single_guesses(values: list[float]) -> list[Guess]:
+    """Guesses of a cause with one parameter."""
+    return [[np.array([v])] for v in values]
+
+
+@dataclass
+class Signals:
+    """Signals between the blocks of one simulation, kept so that a later one may start at any block."""
+
+    drive_V: FloatArray
+    h_um: FloatArray
+    #: Static displacement of the nominal stage alone, and its parameters as bytes.
+    w_um: FloatArray
+    nominal_p: bytes
+    static_um: FloatArray
+    moved_um: FloatArray
+    motion_um: FloatArray
+    reading_um: FloatArray
+
+
+@dataclass(frozen=True)
+class StageModel:
+    """A nominal stage and causes on one recording. The parameter vector begins with the nominal stage."""
+
+    data: FitData
+    nominal: NominalStage
+    causes: tuple[CauseModel, ...] = ()
+    _parameters: tuple[ModelParameter, ...] = field(init=False, repr=False)
+    _cuts: tuple[int, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        groups = [self.nominal.parameters(self.data), *(f.parameters(self.data) for f in self.causes)]
+        cuts = np.cumsum([0, *(len(g) for g in groups)])
+        object.__setattr__(self, "_parameters", tuple(s for g in groups for s in g))
+        object.__setattr__(self, "_cuts", tuple(int(c) for c in cuts))
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        return self._parameters
+
+    @property
+    def n_nominal(self) -> int:
+        return self._cuts[1]
+
+    def parameters_of(self, p: FloatArray, index: int) -> FloatArray:
+        """The parameters of ``causes[index]``; -1 is the nominal stage."""
+        return p[self._cuts[index + 1] : self._cuts[index + 2]]
+
+    def slice_of(self, index: int) -> slice:
+        """Place of the parameters of ``causes[index]`` in the vector."""
+        return slice(self._cuts[index + 1], self._cuts[index + 2])
+
+    @property
+    def substeps(self) -> int:
+        """Sub-steps per sample at which drive and hysteresis are simulated."""
+        return max(self.nominal.substeps, *(cause.substeps for cause in self.causes), 1)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether a cause removes the jumps of the drive."""
+        return any(cause.continuous for cause in self.causes)
+
+    def with_cause(self, cause: CauseModel) -> StageModel:
+        """The model with one cause more, at the end."""
+        return StageModel(self.data, self.nominal, (*self.causes, cause))
+
+    def without_cause(self, index: int) -> StageModel:
+        """The model without ``causes[index]``."""
+        return StageModel(self.data, self.nominal, self.causes[:index] + self.causes[index + 1 :])
+
+    def simulate(self, p: FloatArray, start: ActsOn = ActsOn.DRIVE, kept: Signals | None = None) -> Signals:
+        """All signals with the parameters ``p``; those of blocks before ``start`` are taken from ``kept``."""
+        s = self.data
+        substeps = self.substeps
+        inner = s.subdivided(substeps, self.nominal.hold)
+        parts = [self.parameters_of(p, i) for i in range(len(self.causes))]
+        mine = self.parameters_of(p, -1)
+        pairs = list(zip(self.causes, parts, strict=True))
+        if kept is None:
+            start = ActsOn.DRIVE
+        if start <= ActsOn.DRIVE or kept is None:
+            drive = inner.u_V
+            for cause, q in pairs:
+                drive = cause.drive(drive, q, inner)
+        else:
+            drive = kept.drive_V
+        if start <= ActsOn.STATIC or kept is None:
+            own = mine.tobytes()
+            if kept is not None and start == ActsOn.STATIC and kept.nominal_p == own:
+                # Only a cause has changed: the nominal hysteresis, which costs most time, is the same.
+                h, w = kept.h_um, kept.w_um
+            else:
+                h, w = self.nominal.static(drive, mine, inner)
+            extra = [e for cause, q in pairs if (e := cause.static(drive, h, w, q, mine, inner)) is not None]
+            static = w + sum(extra) if extra else w
+        else:
+            h, w, own, static = kept.h_um, kept.w_um, kept.nominal_p, kept.static_um
+        if start <= ActsOn.DYNAMICS or kept is None:
+            began = self.nominal.start_um(mine)
+            if began != 0.0:
+                static = static.copy()
+                static[0] += began
+            back = next((r for cause, q in pairs if (r := cause.restoring(q, s)) is not None), None)
+            system = self.dynamics(p)
+            moved = respond(static, system, inner.dt_s, back)
+            for cause, q in pairs:
+                # With hysteresis in the force superposition does not hold.
+                change = cause.changed_dynamics(system, q) if back is None else None
+                if change is not None:
+                    moved = changed_midway(static, moved, system, change, inner.dt_s)
+            for cause, q in pairs:
+                more = cause.added_motion(drive, static, q, inner, system)
+                if more is not None:
+                    moved = moved + more
+            if substeps > 1:
+                moved = np.ascontiguousarray(moved[::substeps])
+        else:
+            moved = kept.moved_um
+        if start <= ActsOn.MOTION or kept is None:
+            motion = moved
+            for cause, q in pairs:
+                motion = cause.motion(motion, q, s)
+            motion = self.nominal.behind_um(motion, s)
+        else:
+            motion = kept.motion_um
+        reading = motion
+        for cause, q in pairs:
+            reading = cause.reading(reading, q, s)
+        reading = reading + self.nominal.offset_um(mine)
+        return Signals(drive, h, w, own, static, moved, motion, reading)
+
+    def dynamics(self, p: FloatArray) -> Dynamics:
+        """The mechanics: those of the nominal stage and what the causes add."""
+        system = self.nominal.dynamics(self.parameters_of(p, -1), self.data)
+        if self.continuous:
+            system = replace(system, hold="first")
+        for i, cause in enumerate(self.causes):
+            system = cause.dynamics(system, self.parameters_of(p, i))
+        return system
+
+    def jacobian(self, p: FloatArray, base: Signals, which: list[int] | None = None) -> FloatArray:
+        """(m, n) derivatives of the reading with respect to the parameters ``which`` (default: all)."""
+        chosen = range(len(self.parameters)) if which is None else which
+        rows = np.empty((len(chosen), self.data.n))
+
+        def column(at: tuple[int, int]) -> None:
+            row, j = at
+            parameter = self.parameters[j]
+            step = 1e-3 * parameter.step if p[j] + 1e-3 * parameter.step <= parameter.high else -1e-3 * parameter.step
+            moved = p.copy()
+            moved[j] += step
+            rows[row] = (self.simulate(moved, parameter.acts_on, base).reading_um - base.reading_um) / step
+
+        side_by_side(column, enumerate(chosen))
+        return rows
+
+
+@dataclass(frozen=True)
+class JacobianColumns:
+    """Jacobian columns of an earlier fit: ``rows`` (m, n), scaled and masked; ``parameters`` are their indices."""
+
+    rows: FloatArray
+    parameters: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """A calibrated model. ``sse_um2`` sums over the samples of the mask; ``residual_um`` is (n,), over all samples."""
+
+    model: StageModel
+    p: FloatArray
+    signals: Signals
+    residual_um: FloatArray
+    sse_um2: float
+    #: Indices of the parameters that may move.
+    free: list[int]
+    #: Jacobian columns (m, n), scaled and masked, of parameters away from their bounds; of the last step but one.
+    rows: FloatArray | None = None
+    #: Indices of the parameters of ``rows``.
+    row_indices: tuple[int, ...] = ()
+
+    def columns(self, without: slice | None = None) -> JacobianColumns | None:
+        """The columns as a start for a model with one cause more, or with the parameters ``without`` left out."""
+        if self.rows is None:
+            return None
+        if without is None:
+            return JacobianColumns(self.rows, self.row_indices)
+        width = without.stop - without.start
+        keep = [i for i, index in enumerate(self.row_indices) if not without.start <= index < without.stop]
+        indices = tuple(k if k < without.start else k - width for k in (self.row_indices[i] for i in keep))
+        return JacobianColumns(self.rows[keep], indices)
+
+    def without_signals(self) -> ModelFit:
+        """The fit without what needs memory: of the simulated signals only drive and reading stay."""
+        none = np.empty(0)
+        signals = replace(self.signals, h_um=none, w_um=none, static_um=none, moved_um=none, motion_um=none)
+        return replace(self, signals=signals, rows=None, row_indices=())
+
+    def drive_at_samples(self) -> FloatArray:
+        """(n,) voltage at the actuator at the sampling instants, just before the next command acts."""
+        drive = self.signals.drive_V
+        m = self.model.substeps
+        if self.model.continuous:
+            return np.ascontiguousarray(drive[::m])
+        if m == 1:
+            return np.concatenate([drive[:1], drive[:-1]])
+        return np.concatenate([drive[:1], drive[m - 1 : -1 : m]])

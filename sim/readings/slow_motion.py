@@ -1,0 +1,225 @@
+"""Slow motion in rests and in the cycles of a repeated motion: what creep and drifts are seen by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from sim.fitting.lags import slow_poles
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Cycle, Readings
+
+
+#: Time constants (s) of the slow motion that a rest may show after the moves before it.
+_TAUS_S = (0.1, 0.4, 1.6, 6.4, 25.0, 100.0)
+#: Standard errors from which a signature counts as seen.
+_SIGMAS = 3.8
+_WHEN = {"": "over the record", "early": "in its first half", "late": "in its second half"}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change, its standard error, and in which part of the record it is clearest."""
+
+    value: float
+    error: float
+    when: str = ""
+
+    def seen(self, value: float, least: float, usual: float) -> bool | None:
+        """Whether ``value`` (this one, or its size) counts as seen; None between, and where the error is as large as a
+        ``usual`` value."""
+        if value > _SIGMAS * self.error and value > least:
+            return True
+        return False if value < max(2.5 * self.error, least) and 2.0 * self.error < usual else None
+
+
+@dataclass(frozen=True)
+class RestsOverTime:
+    """What the rests show. ``missing``: what they lack to show anything; then nothing else is given.
+
+    ``creep``: rise per decade of time, of the step before (None: no rest follows a step); ``shift`` in µm;
+    ``gain``: relative change (None: all rests are at one voltage).
+    """
+
+    missing: str
+    creep: Change | None = None
+    shift: Change | None = None
+    gain: Change | None = None
+
+
+def rests_over_time(readings: Readings) -> RestsOverTime:
+    """What the rests show: motion after each step in proportion to it, motion in time alone, and in proportion to u.
+
+    Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the voltage; both drifts are
+    a line and exponentials in time. The standard errors come from leaving out one rest in turn.
+    """
+    data = readings.data
+    long_enough = [r for r in readings.rests if (r.last - r.first) * data.dt_s >= 0.5]
+    if len(long_enough) < 4:
+        return RestsOverTime(f"{len(long_enough)} rests of half a second or more; four are needed")
+    t, y, of = readings.bins(max(0.02, data.duration_s / 4000.0))
+    thin = max(1, round(0.01 / data.dt_s))
+    u = np.ascontiguousarray(data.u_V[::thin])
+    poles = np.asarray(slow_poles(u, thin * data.dt_s / np.array(_TAUS_S)))
+    grid_s = thin * data.dt_s * np.arange(u.size)
+    level = np.interp(t, grid_s, u)
+    x = t / data.duration_s
+    gain = max(abs(data.gain_um_per_V), 1e-12)
+    per_decade = _per_decade(data.slowest_s)
+    # Creep by the logarithm of time, and the part of it that is faster or slower than that.
+    law = np.array([np.ones(poles.shape[0]), np.linspace(-1.0, 1.0, poles.shape[0])]) @ poles
+    creep_um = 0.02 / float(per_decade.sum()) * gain * np.array([np.interp(t, grid_s, row) for row in law])
+    span = float(np.ptp(level))
+    # One unit of each column is a size that a stage can have, so that one ridge fits all.
+    drifts = np.array([x, np.exp(-5.0 * x), np.exp(-20.0 * x)])
+    columns = [*creep_um, *(0.01 * data.range_um * drifts)]
+    if span > 0.1 * data.swing_V:
+        columns += [*(0.02 * gain * (level - data.u_low_V) * drifts[:2])]
+    rows = np.array(columns)
+    grams, slopes = [], []
+    for i in np.unique(of):
+        inside = of == i
+        rows[:, inside] -= rows[:, inside].mean(axis=1, keepdims=True)
+        y[inside] -= y[inside].mean()
+        grams.append(rows[:, inside] @ rows[:, inside].T)
+        slopes.append(rows[:, inside] @ y[inside])
+    decade = np.zeros(rows.shape[0])
+    decade[:2] = 0.02, 0.02 * float(np.linspace(-1.0, 1.0, poles.shape[0]) @ per_decade) / float(per_decade.sum())
+    functionals = {"creep": decade}
+    first, last = float(x.min()), float(x.max())
+    middle = 0.5 * (first + last)
+    for name, at, unit, count in (("thermal_drift", 2, 0.01 * data.range_um, 3), ("gain_drift", 5, 0.02, 2)):
+        if at >= rows.shape[0]:
+            continue
+        for part, (begin, end) in {"": (first, last), ".early": (first, middle), ".late": (middle, last)}.items():
+            row = np.zeros(rows.shape[0])
+            change = [end - begin, math.exp(-5.0 * end) - math.exp(-5.0 * begin)]
+            change += [math.exp(-20.0 * end) - math.exp(-20.0 * begin)]
+            row[at : at + count] = unit * np.array(change[:count])
+            functionals[name + part] = row
+    values, errors = _jackknife(grams, slopes, functionals, float(np.var(y)))
+    stepped = any(
+        float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
+        for r in long_enough
+    )
+    found: dict[str, Change] = {}
+    for name in ("thermal_drift", "gain_drift"):
+        parts = [k for k in values if k.split(".")[0] == name]
+        if parts:
+            best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
+            found[name] = Change(values[best], errors[best], _WHEN[best[len(name) + 1 :]])
+    creep = Change(values["creep"], errors["creep"]) if stepped else None
+    return RestsOverTime("", creep, found["thermal_drift"], found.get("gain_drift"))
+
+
+def _per_decade(slowest_s: float) -> FloatArray:
+    """(m,) slope of each slow lag's step response over log10 t, from 0.1 s to half the record."""
+    t = np.logspace(-1.0, math.log10(max(slowest_s / 6.0, 0.3)), 60)
+    rise = 1.0 - np.exp(-t[None, :] / np.array(_TAUS_S)[:, None])
+    z = np.log10(t) - np.log10(t).mean()
+    return np.asarray(rise @ z / float(z @ z))
+
+
+def _jackknife(
+    grams: list[FloatArray], slopes: list[FloatArray], functionals: dict[str, FloatArray], variance: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Each functional of the least-squares solution, and its standard error by leaving out one rest in turn."""
+    gram, slope = np.sum(np.array(grams), axis=0), np.sum(np.array(slopes), axis=0)
+    ridge = 1e-3 * variance * np.eye(gram.shape[0])
+    solved = np.linalg.solve(gram + ridge, slope)
+    pairs = zip(grams, slopes, strict=True)
+    without = np.array([np.linalg.solve(gram - g + ridge, slope - s) for g, s in pairs])
+    n = without.shape[0]
+    values, errors = {}, {}
+    for name, row in functionals.items():
+        values[name] = float(row @ solved)
+        each = without @ row
+        errors[name] = float(np.sqrt((n - 1) / n * np.sum(np.square(each - each.mean()))))
+    return values, errors
+
+
+@dataclass(frozen=True)
+class CyclesOverTime:
+    """What equal cycles show. ``missing``: what they lack to show anything; then nothing else is given.
+
+    ``grew``: their height changes in time (None: it settles). ``moved``: their mean does, ``creeps`` clearly with the
+    logarithm of time, ``goes_on`` clearly with time.
+    """
+
+    missing: str
+    height_words: str = ""
+    grew: bool | None = None
+    mean_words: str = ""
+    moved: bool = False
+    creeps: bool = False
+    goes_on: bool = False
+
+
+def cycles_over_time(readings: Readings) -> CyclesOverTime:
+    """Creep and both drifts from height and mean of cycles of one kind: do they go with time or with its logarithm?
+
+    A drift goes on; creep after the beginning of the motion falls off with the logarithm of time.
+    """
+    data = readings.data
+    kinds: dict[tuple[int, int], list[Cycle]] = {}
+    for cycle in readings.cycles:
+        tall_V, period = cycle.amplitude_V(data.u_V), cycle.period_s(data.dt_s)
+        kinds.setdefault((round(math.log(tall_V) / 0.03), round(math.log(period) / 0.05)), []).append(cycle)
+    same = max(kinds.values(), key=lambda c: (c[-1].stop - c[0].start) * min(len(c), 4), default=[])
+    # The first cycle of a kind still carries the history before it.
+    same = same[1:]
+    if len(same) < 5 or (same[-1].stop - same[0].start) < 0.15 * data.n:
+        return CyclesOverTime("no motion is repeated often enough, over long enough a time")
+    t = np.array([0.5 * (c.start + c.stop) * data.dt_s for c in same])
+    heights, means = [], []
+    for c in same:
+        turn = data.y_um[c.start : c.stop]
+        phase = 2.0 * np.pi * (np.arange(turn.size) / turn.size)
+        means.append(float(turn.mean()))
+        heights.append(float(np.hypot(turn @ np.cos(phase), turn @ np.sin(phase))) * 2.0 / turn.size)
+    height = np.array(heights)
+    relative = height / height.mean() - 1.0
+    change, error = _slope(t, relative)
+    level = float(np.mean(means)) - data.middle_um + abs(data.centre_um)
+    means_um = np.array(means) - relative * level
+    shift, shift_error = _slope(t, means_um)
+    span = float(t[-1] - t[0])
+    gained = abs(change * span) > 3e-4 and abs(change) > _SIGMAS * error
+    moved = abs(shift * span) > max(readings.sigma_um, 1e-4 * data.range_um) and abs(shift) > _SIGMAS * shift_error
+    since = np.log10(t - same[0].start * data.dt_s + (t[1] - t[0]))
+    settles = gained and _misfit(since, relative) < 0.9 * _misfit(t, relative)
+    creeps = moved and _misfit(since, means_um) < 0.7 * _misfit(t, means_um)
+    goes_on = moved and _misfit(t, means_um) < 0.7 * _misfit(since, means_um)
+    n = len(same)
+    per_decade, per_decade_error = _slope(since, means_um)
+    manner = "the logarithm of time" if creeps else "time" if goes_on else "neither time nor its logarithm"
+    mean_words = (
+        f"the mean of {n} equal cycles changes by {shift * span:.2g} µm in {span:.3g} s, and goes with {manner}"
+    )
+    height_words = (
+        f"the height of {n} equal cycles changes by {100 * change * span:.2g} ± {196 * error * span:.1g} % in "
+        f"{span:.3g} s"
+    )
+    if settles:
+        height_words += ", and settles with the logarithm of time"
+    settled = creeps and abs(per_decade) > 5.0 * per_decade_error
+    return CyclesOverTime("", height_words, None if settles else gained, mean_words, moved, settled, goes_on)
+
+
+def _misfit(t: FloatArray, v: FloatArray) -> float:
+    """Squared error of a straight line of v over t."""
+    slope, _ = _slope(t, v)
+    return float(np.sum(np.square(v - v.mean() - slope * (t - t.mean()))))
+
+
+def _slope(t: FloatArray, v: FloatArray) -> tuple[float, float]:
+    """Slope of v over t and its standard error."""
+    x = t - t.mean()
+    slope = float(x @ v / (x @ x))
+    left = v - v.mean() - slope * x
+    return slope, float(np.sqrt(left @ left / max(1, t.size - 2) / (x @ x)))
