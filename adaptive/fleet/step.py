@@ -269,7 +269,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
 @compiled
 def _gain_is_possible(s: Rows, c: Fixed, b: int) -> bool:
     """`Parts.gain_is_possible`; only a model with a linear part has a bound."""
-    f, most, served = c.axis[b], c.config[0].envelope.gain, s.numbers[b].front.track.served
+    f, most, served = c.axis[b], c.config[0].envelope.gain ** 2, s.numbers[b].front.track.served
     if f.allowed_V == 0.0:
         return True
     gain = learner.learnt_gain(c.swing[b], c.beta[b], s.beta[b], served.gain / f.frame_gain)

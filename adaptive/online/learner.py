@@ -413,12 +413,15 @@ class Parts:
 
     @property
     def gain_is_possible(self) -> bool:
-        """Whether a stage can have the gain that was learnt: motion is slow to show it where it is small."""
+        """Whether a stage can have the gain that was learnt: where it moves little, no voltage is far off.
+
+        Frame and linear part may each have changed by the envelope's factor.
+        """
         if not self.swing.size:
             return True
-        base, served = self.intake.base, self.intake.served
+        base, served, most = self.intake.base, self.intake.served, self.config.envelope.gain**2
         gain = learnt_gain(self.swing, base.beta, self.filter.beta, served.gain / base.features.gain)
-        return self.config.envelope.gain_allows(gain)
+        return 1.0 / most <= gain <= most
 
     def watch_trial(self) -> bool:
         """Update ``alone`` after a sample; returns whether it has changed."""
