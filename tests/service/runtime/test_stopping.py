@@ -19,7 +19,8 @@ SLEEPER = ["-c", "import time; print('up', flush=True); time.sleep(60)"]
 
 @pytest.fixture(autouse=True)
 def _handlers() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and StopSignal leaves it so
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
