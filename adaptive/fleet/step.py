@@ -267,16 +267,6 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
 
 
 @compiled
-def _gain_is_possible(s: Rows, c: Fixed, b: int) -> bool:
-    """`Parts.gain_is_possible`; only a model with a linear part has a bound."""
-    f, most, served = c.axis[b], c.config[0].envelope.gain ** 2, s.numbers[b].front.track.served
-    if f.allowed_V == 0.0:
-        return True
-    gain = learner.learnt_gain(c.swing[b], c.beta[b], s.beta[b], served.gain / f.frame_gain)
-    return bool(1.0 / most <= gain <= most)
-
-
-@compiled
 def _finds_fault(
     s: Rows, c: Fixed, b: int, h: FloatArray, target: float, u: float, frozen_V: float, saturated: bool, checks: bool
 ) -> bool:
@@ -307,7 +297,11 @@ def _finds_fault(
             if f.tells and r.front.credit > 0:
                 fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
                 fault = _follow(r.front.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
-                fault = fault or not _gain_is_possible(s, c, b)
+                frame, most = r.front.track.served.gain / f.frame_gain, config.envelope.gain
+                bounded = f.allowed_V > 0.0  # only a model with a linear part is
+                fault = fault or (
+                    bounded and not learner.gain_is_possible(c.swing[b], c.beta[b], s.beta[b], frame, most)
+                )
                 r["confirmed"] = r.front.following.good >= CONFIRMED or r.past_count == 0
             places = r.confirmed
         confirms = r.confirmed

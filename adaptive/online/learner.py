@@ -249,14 +249,19 @@ def swing_of(model: LssvmInverse) -> FloatArray:
 
 
 @shared
-def learnt_gain(swing: FloatArray, identified: FloatArray, beta: FloatArray, frame: float) -> float:
-    """Gain of the learnt linear part (p,) over that of the ``identified`` one; 0 where it has none or another sign.
+def gain_is_possible(swing: FloatArray, identified: FloatArray, beta: FloatArray, frame: float, most: float) -> bool:
+    """Whether a stage can have the gain of the learnt linear part ``beta`` (p,) in its frame.
 
-    ``swing`` : (p,) basis at a high place less that at a low one. ``frame`` : gain of the frame over that identified.
+    Frame and linear part may each differ from those identified by the factor ``most`` of the envelope.
+
+    ``swing`` : (p,) see `swing_of`. ``frame`` : gain of the frame over that identified.
     """
     p = swing.size
     learnt_V, identified_V = dot(swing, beta, p), dot(swing, identified, p)
-    return frame * identified_V / learnt_V if learnt_V * identified_V > 0.0 else 0.0
+    if not learnt_V * identified_V > 0.0:  # it has no gain, or one of the other sign
+        return False
+    gain = frame * identified_V / learnt_V
+    return bool(1.0 / (most * most) <= gain <= most * most)
 
 
 @shared
@@ -413,15 +418,15 @@ class Parts:
 
     @property
     def gain_is_possible(self) -> bool:
-        """Whether a stage can have the gain that was learnt: where it moves little, no voltage is far off.
+        """Whether a stage can have the learnt gain.
 
-        Frame and linear part may each have changed by the envelope's factor.
+        The distance in volts does not tell: while the stage moves little, a wrong gain causes small errors only.
         """
         if not self.swing.size:
             return True
-        base, served, most = self.intake.base, self.intake.served, self.config.envelope.gain**2
-        gain = learnt_gain(self.swing, base.beta, self.filter.beta, served.gain / base.features.gain)
-        return 1.0 / most <= gain <= most
+        base, most = self.intake.base, self.config.envelope.gain
+        frame = self.intake.served.gain / base.features.gain
+        return gain_is_possible(self.swing, base.beta, self.filter.beta, frame, most)
 
     def watch_trial(self) -> bool:
         """Update ``alone`` after a sample; returns whether it has changed."""
