@@ -75,6 +75,8 @@ def first_fits(
     used = cause.histories(base.model.data)
     if used:
         fits += [_first_fit(base.model.with_cause(c), base, guess, mask) for c in used]
+        # A few steps do not tell one memory from another: beside the right one the nominal loop may move furthest.
+        fits = [calibrate(f.model, f.p, mask, cause.iterations, 1e-5) for f in fits]
         best = min(fits, key=lambda f: f.sse_um2 * (1.0 if f is fits[0] else 1.03))
         return best.model.causes[-1], [best]
     if cause.fast:
