@@ -309,7 +309,9 @@ class Search:
                     break
             if accepted is None:
                 break
-            if not self.seen(accepted.cause):
+            # A freer form imitates what it stands beside: it does not take over a signature that the readings show.
+            sight = self.sights.get(accepted.cause.name)
+            if sight is None or sight.seen is not True:
                 freer = self._with_freer_form(current)
                 if freer is not None and freer.cost < accepted.cost:
                     # What is there already explains it better: no further cause.

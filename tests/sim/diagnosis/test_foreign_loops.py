@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.diagnosis import prepare
+from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
 from sim.diagnosis.nominal import calibrate_nominal
 from sim.diagnosis.search.search import first_fits
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.fitting.calibration import with_new_columns
 from tests.hidden.foreign.cases import single
+from tests.hidden.foreign.record import Case, Rig
 from tests.hidden.foreign.score import recording_of
 
 #: Elasto-slide elements that begin relaxed and a bent sensor, at 500 Hz: a sample is longer than the stage's lag.
 CURVED = single(18)
+#: Sixty plays and branches that are not point-symmetric.
+BOWED = Case(
+    "single",
+    1,
+    Rig(1, "play_sum", False, "raster", "white", 1000.0, 20.0, 8.0, 85.0, 1.04e-3, False, 0.0, 0.0038, 4.0),
+    {"asymmetry": {"share": -0.019}},
+)
+
+
+def diagnosed(case: Case) -> Diagnosis:
+    return diagnose_prepared(prepare(recording_of(case), nominal="bouc_wen"))
 
 
 def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None:
@@ -24,3 +36,8 @@ def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None
     chosen, _ = first_fits(shape, start, base, prepared.mask)
     assert isinstance(chosen, HysteresisShape)
     assert chosen.before_V == 0.0
+
+
+def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
+    said = diagnosed(BOWED)
+    assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
