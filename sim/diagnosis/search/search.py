@@ -17,6 +17,7 @@ from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_new_columns
+from sim.fitting.fit_data import ActsOn
 from sim.fitting.parallel import side_by_side
 from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 from sim.readings.noise import has_spectral_line
@@ -318,6 +319,7 @@ class Search:
                     current, held = freer.fit, freer.held
                     continue
             accepted = self._other_hold(self._with_refined_model(accepted, current), current)
+            accepted = self._off_bounds(accepted, current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.cause.model_error**2 * gone
@@ -353,6 +355,27 @@ class Search:
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
             return accepted
         other = with_new_columns(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
+        held = self.held(other)
+        return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+
+    def _off_bounds(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
+        """The candidate with the nominal mechanics started anew where one of their numbers stands at its bound, if that
+        fits better: a large cause drove it there (a lag of nothing and a reading a sample late, for a lag)."""
+        fit = accepted.fit
+        mine = [
+            (i, s)
+            for i, s in enumerate(fit.model.parameters[: fit.model.n_nominal])
+            if i in fit.free and s.acts_on == ActsOn.DYNAMICS
+        ]
+        # A step of a fit ends close to a bound, not on it.
+        if all(s.low + 0.02 * s.step < fit.p[i] < s.high - 0.02 * s.step for i, s in mine):
+            return accepted
+        start = fit.p.copy()
+        start[[i for i, _ in mine]] = [s.neutral for _, s in mine]
+        other = calibrate(fit.model, start, self.mask, 20, 1e-4)
+        if other.sse_um2 > fit.sse_um2 * 0.99:
+            return accepted
+        other = with_new_columns(calibrate(fit.model, other.p, self.mask, 12, 1e-5), self.mask)
         held = self.held(other)
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 

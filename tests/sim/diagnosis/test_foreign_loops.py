@@ -38,6 +38,14 @@ def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None
     assert chosen.before_V == 0.0
 
 
+def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
+    said = diagnosed(CURVED)
+    lag_s = dict(zip((s.name for s in said.extended.model.parameters), said.extended.p, strict=True))["tau_s"]
+    assert abs(lag_s - CURVED.rig.lag_s) < 0.1 * CURVED.rig.lag_s
+    assert {c.name for c in said.causes} <= {"hysteresis_shape", "sensor_nonlinearity", "asymmetry"}
+    assert said.extended_heldout_um < 1.5 * said.noise_floor_um
+
+
 def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
     said = diagnosed(BOWED)
     assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
