@@ -17,6 +17,7 @@ from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_new_columns
+from sim.fitting.fit_data import ActsOn
 from sim.fitting.parallel import side_by_side
 from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 from sim.readings.noise import has_spectral_line
@@ -75,6 +76,8 @@ def first_fits(
     used = cause.histories(base.model.data)
     if used:
         fits += [_first_fit(base.model.with_cause(c), base, guess, mask) for c in used]
+        # A few steps do not tell one memory from another: beside the right one the nominal loop may move furthest.
+        fits = [calibrate(f.model, f.p, mask, cause.iterations, 1e-5) for f in fits]
         best = min(fits, key=lambda f: f.sse_um2 * (1.0 if f is fits[0] else 1.03))
         return best.model.causes[-1], [best]
     if cause.fast:
@@ -307,13 +310,16 @@ class Search:
                     break
             if accepted is None:
                 break
-            if not self.seen(accepted.cause):
+            # A freer form imitates what it stands beside: it does not take over a signature that the readings show.
+            sight = self.sights.get(accepted.cause.name)
+            if sight is None or sight.seen is not True:
                 freer = self._with_freer_form(current)
                 if freer is not None and freer.cost < accepted.cost:
                     # What is there already explains it better: no further cause.
                     current, held = freer.fit, freer.held
                     continue
             accepted = self._other_hold(self._with_refined_model(accepted, current), current)
+            accepted = self._off_bounds(accepted, current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.cause.model_error**2 * gone
@@ -349,6 +355,27 @@ class Search:
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
             return accepted
         other = with_new_columns(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
+        held = self.held(other)
+        return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+
+    def _off_bounds(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
+        """The candidate with the nominal mechanics started anew where one of their numbers stands at its bound, if that
+        fits better: a large cause drove it there (a lag of nothing and a reading a sample late, for a lag)."""
+        fit = accepted.fit
+        mine = [
+            (i, s)
+            for i, s in enumerate(fit.model.parameters[: fit.model.n_nominal])
+            if i in fit.free and s.acts_on == ActsOn.DYNAMICS
+        ]
+        # A step of a fit ends close to a bound, not on it.
+        if all(s.low + 0.02 * s.step < fit.p[i] < s.high - 0.02 * s.step for i, s in mine):
+            return accepted
+        start = fit.p.copy()
+        start[[i for i, _ in mine]] = [s.neutral for _, s in mine]
+        other = calibrate(fit.model, start, self.mask, 20, 1e-4)
+        if other.sse_um2 > fit.sse_um2 * 0.99:
+            return accepted
+        other = with_new_columns(calibrate(fit.model, other.p, self.mask, 12, 1e-5), self.mask)
         held = self.held(other)
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 

@@ -77,6 +77,21 @@ def test_a_record_that_excites_nothing_decides_nothing() -> None:
         assert found[name].seen is None, found[name].words
 
 
+def test_asymmetry_is_asked_of_each_height_of_cycle_alone() -> None:
+    heights = np.repeat([4.0, 8.0, 4.0], [12, 4, 12])
+    ramp = np.linspace(0.0, 1.0, 400, endpoint=False)
+    u = np.concatenate([np.zeros(400), *(h * np.r_[ramp, 1.0 - ramp] for h in heights), np.zeros(400)])
+    noise = SIGMA_UM * np.random.default_rng(6).normal(size=u.size)
+    # The gain changes where small cycles do not come: most of the cycles see nothing of it.
+    y = 10.0 * u + 0.3 * np.maximum(u - 5.0, 0.0) + noise
+    whole = np.ones(u.size, dtype=np.bool_)
+    assert witnesses(Readings(FitData(DT, u, y), whole, SIGMA_UM))["asymmetry"].seen is True
+    # One cycle that does not close is the first rise of a loop, whatever its height.
+    rise = np.arange(u.size) < 400 + 800 * 12 + 400
+    y = 10.0 * u - np.where(rise, 0.4 * np.maximum(u - 4.0, 0.0), 0.0) + noise
+    assert witnesses(Readings(FitData(DT, u, y), whole, SIGMA_UM))["asymmetry"].seen is False
+
+
 def staircase(seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Time, a staircase of holds of 2 s, and noise."""
     rng = np.random.default_rng(seed)

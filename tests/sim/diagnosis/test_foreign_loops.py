@@ -1,0 +1,51 @@
+"""A loop of another class than the nominal stage must not hide a cause, take its name, or drive the lag away."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
+from sim.diagnosis.nominal import calibrate_nominal
+from sim.diagnosis.search.search import first_fits
+from sim.effects.hysteresis_shape import HysteresisShape
+from sim.fitting.calibration import with_new_columns
+from tests.hidden.foreign.cases import single
+from tests.hidden.foreign.record import Case, Rig
+from tests.hidden.foreign.score import recording_of
+
+#: Elasto-slide elements that begin relaxed and a bent sensor, at 500 Hz: a sample is longer than the stage's lag.
+CURVED = single(18)
+#: Sixty plays and branches that are not point-symmetric.
+BOWED = Case(
+    "single",
+    1,
+    Rig(1, "play_sum", False, "raster", "white", 1000.0, 20.0, 8.0, 85.0, 1.04e-3, False, 0.0, 0.0038, 4.0),
+    {"asymmetry": {"share": -0.019}},
+)
+
+
+def diagnosed(case: Case) -> Diagnosis:
+    return diagnose_prepared(prepare(recording_of(case), nominal="bouc_wen"))
+
+
+def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None:
+    prepared = prepare(recording_of(CURVED), nominal="bouc_wen")
+    base = with_new_columns(calibrate_nominal("bouc_wen", prepared.data, prepared.mask), prepared.mask)
+    shape = HysteresisShape()
+    start = np.zeros(len(shape.parameters(prepared.data)))
+    chosen, _ = first_fits(shape, start, base, prepared.mask)
+    assert isinstance(chosen, HysteresisShape)
+    assert chosen.before_V == 0.0
+
+
+def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
+    said = diagnosed(CURVED)
+    lag_s = dict(zip((s.name for s in said.extended.model.parameters), said.extended.p, strict=True))["tau_s"]
+    assert abs(lag_s - CURVED.rig.lag_s) < 0.1 * CURVED.rig.lag_s
+    assert {c.name for c in said.causes} <= {"hysteresis_shape", "sensor_nonlinearity", "asymmetry"}
+    assert said.extended_heldout_um < 1.5 * said.noise_floor_um
+
+
+def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
+    said = diagnosed(BOWED)
+    assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
