@@ -22,7 +22,7 @@ from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
 from adaptive.online.kernel_window import NOWHERE, WeightConfig
 from adaptive.online.learner import Judgement
-from adaptive.online.sensor_trust import CONFIRMED, Following
+from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following
 from adaptive.smoothing import smooth_one
 from adaptive.types import BoolArray, FloatArray, IntArray
 
@@ -294,16 +294,20 @@ def _finds_fault(
         fault = fault or (saturated and r.rail_s >= learner.RAIL_S and j.short_V2 > (learner.RAIL_SHARE * span_V) ** 2)
         if not saturated:
             r["confirmed"] = False
-            if f.tells and r.front.credit > 0:
+            follows = r.front.following
+            if f.tells:
                 fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
-                fault = _follow(r.front.following, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s) or fault
+                odd = _follow(follows, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s)
+                fault = fault or (odd and r.front.credit > 0) or follows.still >= DOUBTED_STEPS
+            if f.tells and r.front.credit > 0:
                 frame, most = r.front.track.served.gain / f.frame_gain, config.envelope.gain
                 bounded = f.allowed_V > 0.0  # only a model with a linear part is
                 fault = fault or (
                     bounded and not learner.gain_is_possible(c.swing[b], c.beta[b], s.beta[b], frame, most)
                 )
-                r["confirmed"] = r.front.following.good >= CONFIRMED or r.past_count == 0
-            places = r.confirmed
+                r["confirmed"] = follows.good >= CONFIRMED or r.past_count == 0
+            # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.
+            places = r.confirmed or (f.tells and r.front.credit <= 0 and follows.steps == 0 and follows.still == 0)
         confirms = r.confirmed
     if fault:
         return True
@@ -315,7 +319,8 @@ def _finds_fault(
         s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
         s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
     if places:
-        _count_again(r.front.following)
+        if r.confirmed:
+            _count_again(r.front.following)
         _remember_place(s, b, False)
     return False
 

@@ -27,7 +27,7 @@ from adaptive.online.dead_reckoning import Reckoning, answers, drive_V, mean_slo
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Verdict
 from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
-from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following, Outcome, Trial
+from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, STILL_STEPS, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
 from adaptive.smoothing import FixedLagSmoother, smoother_of
 from adaptive.types import FloatArray, Sample, StateDict, joined, parted, prefixed
@@ -85,10 +85,10 @@ KNOWN = 0.05
 PAST_SHARE = 0.02
 #: Age of a place that is certainly from before a fault that is detected now, s.
 CLEAN_S = 0.06
-#: Control trials: those in a row, more failed than passed, after which the model judges no sensor; what it begins with,
-#: so that a model that was never right judges none; time from one to the next while it has full credit, and while not,
-#: s; windows after which one has shown nothing.
-CREDIT, FIRST_CREDIT, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 5.0, 0.3, 4
+#: Control trials: most credit of a model, which may judge only with some; what it begins with, so that a model that was
+#: never right judges no sensor; passed trials that a failed one takes away; time to the next while it has full credit,
+#: and while not, s; windows after which one has shown nothing.
+CREDIT, FIRST_CREDIT, FAILURE, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 2, 5.0, 0.3, 4
 
 Model = Callable[[], LssvmInverse]
 
@@ -187,6 +187,11 @@ class Intake:
     def why(self) -> str:
         """The reason for ``fault`` in words."""
         return "" if self._trial is None else self._trial.why
+
+    @property
+    def tried_by_voltages(self) -> bool:
+        """Whether readings are on trial, and the model may not say where the stage is."""
+        return self._trial is not None and bool(self._trial.by_voltages)
 
     @property
     def distrusted_s(self) -> float:
@@ -351,7 +356,8 @@ class Intake:
         self._until_control = round((CONTROL_S if self._credit == CREDIT else CONTROL_AGAIN_S) / self.dt_s)
 
     def _give_credit(self, credit: int) -> None:
-        self._credit = min(max(self._credit + credit, -CREDIT), CREDIT)
+        # A model that fails every second time would get credit now and then, and accuse a good sensor with it.
+        self._credit = min(max(self._credit + (credit if credit >= 0 else FAILURE * credit), -CREDIT), CREDIT)
 
     def _lags(self, track: Track, y_um: float) -> bool:
         """Whether the reading has not moved with the voltage, by a rough measure: the reckoning is to tell, then.
@@ -384,7 +390,7 @@ class Intake:
         ``past`` : or from where it was when the readings had followed the drive, where the last ones are in doubt too.
         """
         gates = self.gates
-        if past and self._pasts:
+        if past and self._pasts and self._judges:
             reckoning = self._from_past(track, model)
             # A place from long ago, over a long way, is no better than readings that may have rung.
             if reckoning.std_um <= PAST_SHARE * self.range_um:
@@ -512,7 +518,9 @@ class Intake:
         The place is reckoned from one at which they still followed, over the voltages since.
         """
         track = self.track
-        if track is None or track.motion is None or self._trial is not None or not self._judges:
+        if track is None or track.motion is None or self._trial is not None:
+            return None
+        if not (self._judges or self.following.still >= STILL_STEPS):
             return None
         if self._hold is not None:
             reckoning = self._hold.reckoning
@@ -539,7 +547,7 @@ class Intake:
             track.enter(proven)
             self.undone += 1
         self._hold, self._before, self._proven, self.missing = None, None, None, None
-        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump)
+        self._trial = Trial.begin(reckoning, self.base, track.memory_now(True), *jump, by_voltages=not self._judges)
         self.trials += 1
         self._forget()
         return Taken(admission.UNTRUSTED, undone=undone, distrusted=True)
@@ -639,6 +647,7 @@ class Intake:
             or self._proven is not None
             or self._proven_past is not None
             or self.on_probation
+            or self.stands_still
         )
 
     # ---- what it teaches
@@ -696,7 +705,7 @@ class Intake:
         """
         track, self.confirmed = self.track, False
         assert track is not None
-        if not self._judges:
+        if not self._tells:
             return False
         if track.features is not track.served:
             # Motion from before and after a jump cannot be compared.
@@ -704,6 +713,11 @@ class Intake:
             return False
         fastest_V_per_s = self._envelope.drift_per_s * self._drive_V
         fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s, fastest_V_per_s)
+        if not self._judges:
+            # A model that cannot say where the stage is still says that it moves.
+            if self.following.moved:
+                self._pasts = [*self._pasts[-1:], Past.of(track)]
+            return self.following.still >= STILL_STEPS
         self.confirmed = self._hold is None and (self.following.good >= CONFIRMED or not self._pasts)
         if self.confirmed:
             if self.following.good >= CONFIRMED:
@@ -716,7 +730,7 @@ class Intake:
     def stands_still(self) -> bool:
         """Whether the readings do not move with the voltage at present: it is too early to say that the sensor sticks,
         and what they show is not learnt meanwhile."""
-        return self._judges and self.following.still >= DOUBTED_STEPS
+        return self.following.still >= DOUBTED_STEPS
 
     def rests(self, y_um: float) -> bool:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""

@@ -433,7 +433,9 @@ class Parts:
         on_trial_s, before = self.intake.distrusted_s, self.alone
         if on_trial_s or before:
             limit_V = min(ALONE_SHARE_PER_S * on_trial_s, ALONE_SHARE) * self.filter.span_V
-            self.alone = on_trial_s >= ALONE_S and self.judgement.frozen_V2 <= limit_V * limit_V
+            known = on_trial_s >= ALONE_S and self.judgement.frozen_V2 <= limit_V * limit_V
+            # A model that may not judge the sensor has confirmed no reading, and so no estimate.
+            self.alone = known or (on_trial_s > 0.0 and self.intake.tried_by_voltages)
         if self.alone and not before:
             self.intake.reckon_by(self.intake.base)
         return self.alone != before

@@ -20,7 +20,8 @@ advances the hysteresis memory. The readings y are compared with the dead-reckon
 
 Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
 While p follows the applied voltage u, no fault is reported. After ``OBEYED`` such windows the readings are trusted,
-even if they contradict dead reckoning.
+even if they contradict dead reckoning. A model whose dead reckoning has often been wrong judges by the voltages alone:
+it cannot say where the stage is, but whether the readings move with the drive.
 """
 
 from __future__ import annotations
@@ -101,6 +102,11 @@ class Following:
         self.steps = self.good = self.still = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
         self.drift_V_per_s = self.drift2 = 0.0
+
+    @property
+    def moved(self) -> bool:
+        """Whether a step has just ended in which the readings did not stand still."""
+        return self.steps == 0 and self.still == 0
 
     @shared
     def count_again(self) -> None:
@@ -223,6 +229,14 @@ UNCLEAR = 6
 #: that; the same slope if dead reckoning shows a gain that the envelope does not allow; largest mean of p - u, as a
 #: share of the drive's range, of readings without a change.
 OBEYED, OBEYS, OBEYS_SLOPE, OBEYS_SURE, SAME_SHARE = 2, 0.8, 1.4, 1.2, 0.03
+#: Time over which p and u are compared beside the windows, s; smallest motion of u for that, as a share of the drive's
+#: range. A poor model fails in one window or another, but over seconds its voltages still lie on a line with u. Those
+#: of another stage do not.
+LONG_S, LONG_SWING = 4.0, 0.05
+#: What it costs a model to have named a fault of readings that then follow over ``LONG_S``.
+ACCUSED = 3
+#: Time on trial by voltages alone, s, after which readings that move are trusted: the model is as likely wrong.
+BY_VOLTAGES_S = 2.0
 
 
 class Outcome(Enum):
@@ -236,8 +250,8 @@ class Outcome(Enum):
 
 
 class Decision(NamedTuple):
-    """Outcome with the new frame. credit : 1 if dead reckoning and readings agreed, -1 if only the readings were right,
-    else 0."""
+    """Outcome with the new frame. credit : 1 if dead reckoning and readings agreed, negative if only the readings were
+    right, else 0."""
 
     outcome: Outcome
     slope: float = 1.0
@@ -267,6 +281,9 @@ class Trial:
     readings of another stage move like this one's now and then.
     open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
     bent : 1 if readings that seemed shifted have bent otherwise than the position: they may be of another stage.
+    by_voltages : 1 if the dead-reckoned position is not to be believed: only the voltages are compared.
+    mean_u_V, mean_p_V, uu, pp, up : means of u and p over ``LONG_S``, V, and of the products of their deviations, V²;
+    with forgetting.
     """
 
     reckoning: Reckoning
@@ -290,16 +307,32 @@ class Trial:
     open_slope: float = 0.0
     open_shift_um: float = 0.0
     bent: int = 0
+    by_voltages: int = 0
+    mean_u_V: float = 0.0
+    mean_p_V: float = 0.0
+    uu: float = 0.0
+    pp: float = 0.0
+    up: float = 0.0
 
     @classmethod
     def begin(
-        cls, reckoning: Reckoning, base: LssvmInverse, memory: FloatArray, slope: float = 0.0, shift_um: float = 0.0
+        cls,
+        reckoning: Reckoning,
+        base: LssvmInverse,
+        memory: FloatArray,
+        slope: float = 0.0,
+        shift_um: float = 0.0,
+        by_voltages: bool = False,
     ) -> Trial:
         """Start a trial. ``memory`` (m,) : of the identified model ``base`` at the start.
 
         ``slope``, ``shift_um`` : jumps that are reverted now: they mapped a reading y to slope y + shift. 0 for none.
+        ``by_voltages`` : judge by the voltages alone.
         """
-        return cls(reckoning, base, memory, np.zeros((4, VALUES)), open_slope=slope, open_shift_um=shift_um)
+        return cls(
+            reckoning, base, memory, np.zeros((4, VALUES)),
+            open_slope=slope, open_shift_um=shift_um, by_voltages=int(by_voltages),
+        )  # fmt: skip
 
     def go_on_from(self, reckoning: Reckoning) -> None:
         """Continue with a better dead-reckoned position of the same instant."""
@@ -315,6 +348,7 @@ class Trial:
             p_V = self.base.evaluate_point(y_um, 0.0, 0.0, self.memory)[0]
             self.window[:, self.count % VALUES] = u_V, y_um, position_um, p_V
             self.count += 1
+            self._take_long(u_V, p_V, max(stride * now.dt_s / LONG_S, 1.0 / self.count))
         size = min(VALUES, int(samples / stride))
         # Half a window is enough to detect readings that do not follow.
         if 2 * self.count < size or (self.since - self.looked) * LOOKS < samples:
@@ -323,9 +357,31 @@ class Trial:
         self.looked = self.since
         last = np.arange(self.count - size, self.count) % VALUES
         u, y, x, p = self.window[:, last]
-        decision = self._evaluate(u, y, x, p, full, now)
+        if self._obeyed_long(now):
+            decision = Decision(Outcome.SAME, credit=-ACCUSED if self.fault else -1)
+        elif self.by_voltages:
+            decision = self._compare_voltages(u, p, full, now)
+        else:
+            decision = self._evaluate(u, y, x, p, full, now)
         self.returned = self.returned + 1 if self.fault and decision.outcome is not Outcome.OPEN else 0
         return OPEN if self.fault and self.returned <= LOOKS else decision
+
+    def _take_long(self, u_V: float, p_V: float, share: float) -> None:
+        """Take a pair (u, p) into the means over ``LONG_S``, with the weight ``share``."""
+        du, dp = u_V - self.mean_u_V, p_V - self.mean_p_V
+        self.mean_u_V += share * du
+        self.mean_p_V += share * dp
+        self.uu += share * ((1.0 - share) * du * du - self.uu)
+        self.pp += share * ((1.0 - share) * dp * dp - self.pp)
+        self.up += share * ((1.0 - share) * du * dp - self.up)
+
+    def _obeyed_long(self, now: Circumstances) -> bool:
+        """Whether p follows the applied voltage over ``LONG_S``."""
+        moves = self.uu > (LONG_SWING * drive_V(self.base)) ** 2 and self.pp > 0.0
+        if self.since * now.dt_s < LONG_S or not moves:
+            return False
+        line = Slope(self.up / self.uu, 0.0, 0.0, 0.0, self.up * self.up / (self.uu * self.pp), math.sqrt(self.uu))
+        return self._obeyed_by(line, self.mean_p_V - self.mean_u_V, now)
 
     def _evaluate(
         self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, full: bool, now: Circumstances
@@ -336,11 +392,7 @@ class Trial:
         self.rested = 0
         voltages, off_V = slope_of(u, p), float(np.mean(p - u))
         drive = drive_V(self.base)
-        obeyed = (
-            voltages.share >= OBEYS
-            and 1.0 / OBEYS_SLOPE <= voltages.slope <= OBEYS_SLOPE
-            and abs(off_V) <= now.envelope.offset * drive
-        )
+        obeyed = self._obeyed_by(voltages, off_V, now)
         straight, allowed = s.share >= FOLLOWS, now.envelope.gain_allows(s.slope)
         follows = straight and allowed
         if self.open_slope and not self.fault and self._confirms_reverted_jumps(s, x, y, now):
@@ -382,6 +434,29 @@ class Trial:
         if not obeyed:
             self._suspect(*fault)
         return OPEN
+
+    def _obeyed_by(self, voltages: Slope, off_V: float, now: Circumstances) -> bool:
+        """Whether p follows the applied voltage, by the line ``voltages`` of p over u and the mean of p - u, V."""
+        return (
+            voltages.share >= OBEYS
+            and 1.0 / OBEYS_SLOPE <= voltages.slope <= OBEYS_SLOPE
+            and abs(off_V) <= now.envelope.offset * drive_V(self.base)
+        )
+
+    def _compare_voltages(self, u: FloatArray, p: FloatArray, full: bool, now: Circumstances) -> Decision:
+        """The decision without the dead-reckoned position. Readings that move are trusted again in any case, later."""
+        voltages = slope_of(u, p)
+        if voltages.swing < SWING_SHARE * drive_V(self.base):
+            return OPEN
+        obeyed = self._obeyed_by(voltages, float(np.mean(p - u)), now)
+        spread_V = float(np.std(p))
+        still = spread_V <= STILL * voltages.swing
+        # The memory of the model relaxes: p may follow a straight line although the readings stand still.
+        fault = _fault(voltages._replace(share=0.0) if still else voltages, spread_V, "V")
+        self._suspect(*(("", "") if obeyed else fault))
+        self.obeyed = self.obeyed + 1 if obeyed and full else 0
+        late = self.since * now.dt_s > BY_VOLTAGES_S and not still
+        return Decision(Outcome.SAME) if self.obeyed >= LOOKS or late else OPEN
 
     def _drifted_um(self, u: FloatArray, y: FloatArray, x: FloatArray, p: FloatArray, now: Circumstances) -> float:
         """Shift of the readings by a drift of the zero that has gone on over the window, µm; 0 if there is none."""
@@ -461,8 +536,8 @@ class Trial:
         window = np.array(values["window"], dtype=np.float64)
         if window.shape != (4, VALUES):
             raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # Older states have no entries for reverted jumps, for bends, and for the return of a reported fault.
-        values = {"open_slope": 0.0, "open_shift_um": 0.0, "bent": 0, "returned": 0} | values
+        # Older states have no entries for what was added since.
+        values = dict.fromkeys(_NUMBERS, 0) | {"fault": "", "why": "", "suspected": ""} | values
         numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
         memory = np.array(values["memory"], dtype=np.float64)
         return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
@@ -471,7 +546,8 @@ class Trial:
 _NUMBERS = {
     "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
     "obeyed": int, "followed": int, "agreed": int, "returned": int, "slope": float, "shift_um": float,
-    "open_slope": float, "open_shift_um": float, "bent": int,
+    "open_slope": float, "open_shift_um": float, "bent": int, "by_voltages": int,
+    "mean_u_V": float, "mean_p_V": float, "uu": float, "pp": float, "up": float,
 }  # fmt: skip
 
 

@@ -105,7 +105,8 @@ def test_tables_of_nothing_or_of_what_has_no_number_are_still_tables() -> None:
 def test_the_line_says_all_in_plain_words() -> None:
     records = [
         run("none", settled_pct=0.03), run("knock", settled_pct=0.05), run("gap", settled_pct=0.07, large_s=0.11),
-        run("sign", sensor_excess=0.5, named_s=0.4, settled_pct=3.0, large_s=0.3), run("sensor_gain", sensor_excess=0.5),
+        run("sign", sensor_excess=0.5, named_s=0.4, settled_pct=3.0, large_s=0.3),
+        run("sensor_gain", sensor_excess=0.5),
     ]  # fmt: skip
     assert line(records) == (
         "foreign stages: 5 runs, 0 at a rail, 1 of 3 with an intact stage above 5 % of range for longer than 0.1 s, "

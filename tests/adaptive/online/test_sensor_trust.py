@@ -857,6 +857,73 @@ def test_a_model_that_has_lost_its_credit_judges_no_sensor_until_it_reckons_righ
     assert learner.trouble == SENSOR_SIGN
 
 
+@pytest.mark.parametrize("fault", ["stuck_1e-9", "stuck_1e-5"])
+def test_a_model_without_credit_still_says_that_a_sensor_stands_still(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], fault: str
+) -> None:
+    """It cannot say where the stage is, but that it moves."""
+    at = ATS[0]
+    u, clean = motions["tones"]
+    learner = Learner.from_state(warm["tones", at] | {"front.credit": -3, "front.until_control": 10**6})
+    y = wrong(fault, clean, at, range_of(model))
+    feed(learner, (u, y), at, at + NAMED)
+    assert learner.trouble == SENSOR_STUCK
+    assert learner.snapshot().beta.tobytes() == model.beta.tobytes()
+    before = learnt(learner)
+    feed(learner, (u, y), at + NAMED, at + WRONG)
+    assert learnt(learner) == before
+    feed(learner, (u, clean), at + WRONG, at + WRONG + BACK)
+    assert learner.trouble == ""
+    assert learner.diagnostics()["recent_rms_error_pct"] < 1.0
+
+
+def test_by_voltages_alone_readings_that_move_are_trusted_after_two_seconds(
+    model: LssvmInverse, motions: dict[str, Recording]
+) -> None:
+    at, now = 3000, circumstances(model)
+    u, clean = motions["tones"]
+    for y, least, most in ((clean, 1, 600), (3.0 * clean, 2000, 2200)):
+        trial = replace(begun(model, (u, clean), at), by_voltages=1)
+        decision, after = judged(trial, (u, y), at, at + 3000, now)
+        assert decision == Decision(Outcome.SAME)
+        assert least <= after <= most
+    still = np.full_like(clean, clean[at])
+    trial = replace(begun(model, (u, clean), at), by_voltages=1)
+    assert judged(trial, (u, still), at, at + 4000, now)[0].outcome is Outcome.OPEN
+    assert trial.fault == SENSOR_STUCK
+
+
+def test_a_poor_model_shuts_out_no_sensor_for_good_but_one_of_another_stage_stays_out(
+    model: LssvmInverse, motions: dict[str, Recording]
+) -> None:
+    """Each window is wrong by a share of the range that changes from window to window; over seconds they all follow."""
+    at, now = 1000, circumstances(model)
+    u, clean = motions["tones"]
+    rng = np.random.default_rng(8)
+    off = np.repeat(rng.choice([-0.05, 0.05], clean.size // 30 + 1), 30)[: clean.size] * range_of(model)
+    wild = replace(model, beta=2.4 * model.beta, alpha=2.4 * model.alpha)
+    trial = reckoned_by(wild, begun(model, (u, clean), at), (u, clean), at)
+    decision, after = judged(trial, (u, clean + off), at, at + 5900, now)
+    assert decision.outcome is Outcome.SAME
+    assert decision.credit < 0
+    assert 4000 <= after <= 5000
+    foreign = wrong("foreign", clean, at, range_of(model), clean.size - at)
+    trial = reckoned_by(wild, begun(model, (u, clean), at), (u, clean), at)
+    assert judged(trial, (u, foreign), at, at + 5900, now)[0].outcome is Outcome.OPEN
+
+
+def test_a_failed_control_trial_takes_away_two_that_were_passed(
+    model: LssvmInverse, motions: dict[str, Recording]
+) -> None:
+    learner = Learner.from_model(replace(model, beta=0.5 * model.beta, alpha=0.5 * model.alpha))
+    credits = []
+    for k in range(2500):
+        feed(learner, motions["tones"], k, k + 1)
+        credits.append(learner.state_dict()["front.credit"])
+    # One from -2 leaves -3, the least there is.
+    assert -2 in np.diff(credits)
+
+
 def test_readings_that_only_the_identified_model_explains_cost_the_reckoning_its_credit(
     model: LssvmInverse, motions: dict[str, Recording]
 ) -> None:
