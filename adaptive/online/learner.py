@@ -789,11 +789,11 @@ class Learner:
                 return refused
             if self._frozen:
                 return admission.FROZEN
+            # Where nothing is learnt, the stated deviation is of the errors until now all the same.
+            self._cache = None
             if intake.stands_still:
                 return admission.UNTRUSTED
             if not parts.follow(self._basis, target, pair.u_V, weight, rest):
-                # Nothing is learnt, but the stated deviation is of the errors until now.
-                self._cache = None
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:
@@ -809,9 +809,11 @@ class Learner:
     def _waits(self, pair: Pair) -> str:
         """The gate for which the pair is no measure of the model, or ""."""
         c, intake = self.config, self.parts.intake
-        if intake.missing is not None and intake.recall(pair, self.snapshot, c.filter_every):
+        if intake.missing is not None:
+            missing = intake.recall(pair, self.snapshot, c.filter_every)
             self._cache = None
-            return admission.GAP
+            if missing:
+                return admission.GAP
         if admission.settling(c.admission, intake.gates):
             return admission.SETTLING
         return "" if pair.good else admission.GLITCH

@@ -17,6 +17,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig
 from adaptive.online.kernel_window import WeightConfig
 from adaptive.online.learner import Learner
+from adaptive.online.sensor_trust import SENSOR_STUCK
 from adaptive.types import Sample
 from adaptive.window.window import SolverConfig
 from sim.signals.voltages import training_input
@@ -141,6 +142,32 @@ def test_axes_equal_single_learners_while_stages_drift_beside_the_voltage(models
     assert max(map(abs, rates)) > 0.0
     got = [fleet.learner_of(axis).parts.intake.following.drift_V_per_s for axis in range(4)]
     np.testing.assert_allclose(got, rates, rtol=1e-9, atol=1e-9)
+
+
+def test_axes_equal_single_learners_while_sensors_lie(models: list[LssvmInverse]) -> None:
+    """Stuck with noise; a gain that no stage has under a motion too small to be surprising; the same two without
+    credit, where the models may not judge the sensor."""
+    config, n, at = LearnerConfig(window=60), 3000, 1500
+    t_s = np.arange(n) * DT
+    u, y = np.empty((4, n)), np.empty((4, n))
+    for axis in range(4):
+        stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
+        small = np.where(t_s < 0.5 * at * DT, 1.0, 0.1) if axis % 2 else np.ones(n)
+        u[axis] = 4.0 + small * 1.5 * np.sin(2.0 * np.pi * (1.1 + 0.3 * axis) * t_s)
+        y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+        if axis % 2:
+            y[axis, at:] = y[axis, at] + 3.0 * (y[axis, at:] - y[axis, at])
+        else:
+            y[axis, at:] = y[axis, at] + 1e-4 * np.random.default_rng(axis).standard_normal(n - at)
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    compare(fleet, singles, 0, u[:, :at], y[:, :at], 250)
+    for axis in (2, 3):
+        doubtful = singles[axis].state_dict() | {"front.credit": -3, "front.until_control": 10_000}
+        singles[axis] = Learner.from_state(doubtful)
+        fleet.load_axis(axis, doubtful)
+    compare(fleet, singles, at, u[:, at:], y[:, at:], 10)
+    assert [single.counters()["trials"] > 0 for single in singles][:3] == [True, True, True]
+    assert singles[2].trouble == SENSOR_STUCK
 
 
 def test_axes_equal_single_learners_at_a_limit_and_where_the_model_fails(models: list[LssvmInverse]) -> None:
