@@ -13,6 +13,7 @@ bend; creep in logarithmic time; none, one or two lightly damped modes; drift; w
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -30,6 +31,12 @@ HYSTERESIS = ("plays", "preisach", "bouc_wen", "duhem")
 STEP_S = 2.5e-4
 #: Turning points that the Preisach stack holds.
 STACK = 2048
+#: Smallest slope just after a turn, over the mean slope. Of every piezo some part follows the voltage at once; with a
+#: slope below 0 a stage would move against its voltage after each turn.
+LEAST_SLOPE = 0.1
+
+#: Time of one step of a loop so slow that its rate does not matter, s.
+SLOWLY_S = 1e3
 
 # Places in the state vector.
 _AMP, _LAG, _V, _Y1, _V1, _Y2, _V2, _TARGET, _COUNT = range(9)
@@ -112,7 +119,7 @@ def _loop(kind: int, n: int, p: FloatArray, w: FloatArray, z: FloatArray) -> Flo
         for k in range(n):
             share = (k + 1.0) / n
             new = share if branch % 2 == 0 else 1.0 - share
-            out[branch, k] = _hysteresis(kind, v, new, 1e3, p, w, z)
+            out[branch, k] = _hysteresis(kind, v, new, SLOWLY_S, p, w, z)
             v = new
     return out
 
@@ -247,7 +254,7 @@ class RandomStage:
         """Come to rest at a voltage: by way of it from the lowest, all that creeps having crept."""
         y = 0.0
         for v in np.linspace(0.0, v_rest, 50):
-            y = _hysteresis(self._kind, max(0.0, v - v_rest / 49.0), v, 1e3, self._p, self._w, self._z)
+            y = _hysteresis(self._kind, max(0.0, v - v_rest / 49.0), v, SLOWLY_S, self._p, self._w, self._z)
         low, size, mix, b2, b3 = self._c[4:9]
         x = (1.0 - mix) * v_rest + mix * (y - low) / size
         g = x + 4.0 * b2 * x * (1.0 - x) + 10.0 * b3 * x * (1.0 - x) * (x - 0.5)
@@ -309,6 +316,27 @@ def _fitted(kind: int, p: FloatArray, w: FloatArray, width: float) -> tuple[floa
     return low, high - low, width / float(((down - up) / (high - low)).max())
 
 
+def _least_slope(kind: int, p: FloatArray, w: FloatArray, step: float = 0.002) -> float:
+    """The smallest slope of the hysteresis just after a turn on either branch of the largest loop."""
+    slopes = []
+    for turn in np.linspace(0.1, 1.0, 10):
+        for ends, back in (((1.0, 0.0, turn), -step), ((1.0, 0.0, 1.0, 1.0 - turn), step)):
+            z, v, y = _memory(kind, w.size), 0.0, 0.0
+            for end in ends:
+                for new in np.linspace(v, end, 401)[1:]:
+                    y, v = _hysteresis(kind, v, new, SLOWLY_S, p, w, z), new
+            slopes.append((_hysteresis(kind, v, v + back, SLOWLY_S, p, w, z) - y) / back)
+    return min(slopes)
+
+
+def _possible_width(kind: int, parameters: Sequence[float], weights: Sequence[float], width: float) -> float:
+    """The width of the largest loop, or the largest that a stage with this hysteresis can have: see `LEAST_SLOPE`."""
+    p, w = np.array(parameters), np.array(weights)
+    _, size, share = _fitted(kind, p, w, width)
+    steeper = 1.0 - _least_slope(kind, p, w) / size
+    return width if share * steeper <= 1.0 - LEAST_SLOPE else width * (1.0 - LEAST_SLOPE) / (share * steeper)
+
+
 def random_plant(seed: int) -> StageFactory:
     """A stage drawn from the whole family."""
     rng = np.random.default_rng([seed, 20])
@@ -350,7 +378,7 @@ def random_plant(seed: int) -> StageFactory:
             excite_V=excite,
             range_um=range_um,
             offset_um=size * float(rng.choice([0.0, rng.uniform(-1.0, 1.0), rng.uniform(-10.0, 10.0)])),
-            width=float(rng.uniform(0.08, 0.2)),
+            width=_possible_width(kind, parameters, weights, float(rng.uniform(0.08, 0.2))),
             bend2=float(rng.uniform(-0.03, 0.03)),
             bend3=float(rng.uniform(-0.03, 0.03)),
             creep_s=tuple(0.1 * 10.0**i * float(rng.uniform(0.5, 2.0)) for i in range(n_creep)),
@@ -381,7 +409,7 @@ def issue_plant(seed: int) -> StageFactory:
             excite_V=(0.0, 7.85),
             range_um=float(rng.uniform(90.0, 150.0)),
             offset_um=0.0,
-            width=float(rng.uniform(0.1, 0.16)),
+            width=_possible_width(PLAYS, parameters, weights, float(rng.uniform(0.1, 0.16))),
             bend2=float(rng.uniform(-0.02, 0.02)),
             bend3=0.0,
             creep_s=tuple(0.1 * 10.0**i * float(rng.uniform(0.7, 1.5)) for i in range(3)),

@@ -87,6 +87,21 @@ def test_the_largest_loop_is_as_wide_as_told_and_the_voltage_leads(kind: int) ->
     assert (np.diff(up) > 0.0).all()
 
 
+@pytest.mark.parametrize("seed", [130000474, 131000039, 130000016, 40000162, 12])
+def test_a_stage_moves_with_the_voltage_also_just_after_a_turn(seed: int) -> None:
+    """No piezo moves against its voltage. The first four would, with loops as wide as they were drawn."""
+    traits = random_plant(seed).traits
+    factory = with_traits(random_plant(seed), modes=(), creep=(), creep_s=(), drift_um=0.0, noise_um=0.0)
+    plant = factory()
+    low_V, high_V = traits.u_min_V, traits.u_max_V
+    turn_V = low_V + 0.6 * (high_V - low_V)
+    plant.run(np.linspace(low_V, turn_V, 20_000))
+    rest_um, _ = plant.run(np.full(2000, turn_V))
+    back_um, _ = plant.run(np.linspace(turn_V, turn_V - 0.02 * (high_V - low_V), 2000))
+    moved = (back_um[-1] - rest_um[-1]) / traits.range_um
+    assert -0.03 < moved < -0.001
+
+
 @pytest.mark.parametrize("kind", [PLAYS, PREISACH])
 def test_a_minor_loop_closes_and_is_wiped_out(kind: int) -> None:
     plant = of_kind(kind)()
