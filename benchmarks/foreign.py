@@ -33,9 +33,9 @@ import numpy as np
 from lab.rehearsal.disturbance import CLASSES, SENSOR, draw
 from service.reports.tables import markdown
 
-PRESETS = ("random", "issue")
+PRESETS = ("random", "issue", "as_drawn")
 #: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.
-SETTLE_S, LATER_S = {"random": 4.0, "issue": 9.0}, 1.5
+SETTLE_S, LATER_S = {"random": 4.0, "issue": 9.0, "as_drawn": 4.0}, 1.5
 #: Closed loop after the event, s.
 AFTER_S = 5.0
 #: Share of the tones in the reference for the preset "issue", whose stages follow tones alone.
@@ -68,7 +68,7 @@ def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER
     begin, begin_cpu = time.perf_counter(), time.process_time()
     record: Record = {"seed": seed, "preset": preset, "class": name}
     try:
-        factory = issue_plant(seed) if preset == "issue" else random_plant(seed)
+        factory = issue_plant(seed) if preset == "issue" else random_plant(seed, as_drawn=preset == "as_drawn")
         at_s = SETTLE_S[preset] + float(np.random.default_rng([seed, 22]).uniform(0.0, LATER_S))
         record["stage"] = factory.traits.summary()
         low_V, high_V = factory.traits.excite_V
@@ -468,7 +468,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="EVENT", help=f"classes of events: {', '.join(CLASSES)}"
     )
-    parser.add_argument("--preset", choices=PRESETS, default="random", help="which stages (random)")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="random",
+        help="which stages (random); as_drawn: also such as move against their voltage after a turn, as no piezo does",
+    )  # fmt: skip
     parser.add_argument(
         "--after", type=float, default=AFTER_S, metavar="S", help=f"closed loop after the event, s ({AFTER_S:g})"
     )

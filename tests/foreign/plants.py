@@ -337,8 +337,8 @@ def _possible_width(kind: int, parameters: Sequence[float], weights: Sequence[fl
     return width if share * steeper <= 1.0 - LEAST_SLOPE else width * (1.0 - LEAST_SLOPE) / (share * steeper)
 
 
-def random_plant(seed: int) -> StageFactory:
-    """A stage drawn from the whole family."""
+def random_plant(seed: int, as_drawn: bool = False) -> StageFactory:
+    """A stage drawn from the whole family. ``as_drawn``: with a loop as wide as drawn, also where no piezo has it."""
     rng = np.random.default_rng([seed, 20])
 
     def between(low: float, high: float) -> float:
@@ -368,6 +368,8 @@ def random_plant(seed: int) -> StageFactory:
         modes = [(modes[0][0], modes[0][1], 1.0), (modes[1][0], modes[1][1], share)]
     n_creep = int(rng.integers(4))
     parameters, weights = _drawn_hysteresis(kind, rng)
+    offset_um = size * float(rng.choice([0.0, rng.uniform(-1.0, 1.0), rng.uniform(-10.0, 10.0)]))
+    width = float(rng.uniform(0.08, 0.2))
     return StageFactory(
         Traits(
             seed=seed,
@@ -377,8 +379,8 @@ def random_plant(seed: int) -> StageFactory:
             u_max_V=u_max,
             excite_V=excite,
             range_um=range_um,
-            offset_um=size * float(rng.choice([0.0, rng.uniform(-1.0, 1.0), rng.uniform(-10.0, 10.0)])),
-            width=_possible_width(kind, parameters, weights, float(rng.uniform(0.08, 0.2))),
+            offset_um=offset_um,
+            width=width if as_drawn else _possible_width(kind, parameters, weights, width),
             bend2=float(rng.uniform(-0.03, 0.03)),
             bend3=float(rng.uniform(-0.03, 0.03)),
             creep_s=tuple(0.1 * 10.0**i * float(rng.uniform(0.5, 2.0)) for i in range(n_creep)),

@@ -10,24 +10,24 @@ from tests.foreign.plants import random_plant
 
 
 @pytest.mark.parametrize(
-    ("event", "seed"),
+    ("event", "seed", "preset"),
     [
         # The stage stands still, or goes on, while the voltage turns back by a tenth of the drive.
-        ("number_stray", 40_000_162),
+        ("number_stray", 40_000_162, "as_drawn"),
         # The gain falls while the stage is nearly at rest: its zero drifts faster than the voltage moves it.
-        ("gain_fast", 15_000_092),
+        ("gain_fast", 15_000_092, "random"),
         # The zero jumps by no more than the model's doubt, and the stage rings by twice as much.
-        ("zero_at_once", 15_000_094),
+        ("zero_at_once", 15_000_094, "random"),
         # The identified model is wrong from the first motion on: what was never right judges no sensor.
-        ("none", 70_000_170),
-        ("lag_fast", 70_000_121),
+        ("none", 70_000_170, "as_drawn"),
+        ("lag_fast", 70_000_121, "random"),
         # The zero drifts by 8 % of the range in 0.2 s beside a slow motion, which looks like another gain.
-        ("zero_fast", 70_000_415),
-        ("zero_fast", 70_000_445),
+        ("zero_fast", 70_000_415, "random"),
+        ("zero_fast", 70_000_445, "random"),
     ],
 )
-def test_no_large_error_and_no_trouble_with_an_intact_stage(event: str, seed: int) -> None:
-    record = run_one(event, seed, after_s=4.0)
+def test_no_large_error_and_no_trouble_with_an_intact_stage(event: str, seed: int, preset: str) -> None:
+    record = run_one(event, seed, preset, after_s=4.0)
     assert "failed" not in record
     assert record["troubles"] == []
     assert record["adaptive"]["large_s"] <= LARGE_S
@@ -35,7 +35,7 @@ def test_no_large_error_and_no_trouble_with_an_intact_stage(event: str, seed: in
 
 def test_a_right_model_that_lies_at_its_bound_on_one_branch_is_served() -> None:
     """A Duhem stage that never rests: ``model_bad`` from 0.4 s on, while a model was looked at going up only."""
-    factory = random_plant(90_000_004)
+    factory = random_plant(90_000_004, as_drawn=True)
     low_V, high_V = factory.traits.excite_V
     config = RehearsalConfig(excite_low_V=low_V, excite_high_V=high_V, block=20, snapshot_every=20)
     run = run_healthy(factory, identify(factory, config), config, 5.0, 90_000_004)
