@@ -4,7 +4,8 @@
 slowly. Therefore the identified model computes the voltage p that belongs to each reading, and the steps of p are
 compared with the steps of the applied voltage u. A step ends when u or p has moved far enough, well above the noise of
 p. All steps have the same weight, whatever their size. Three results show a fault: the readings stand still in several
-steps in a row, the slope p/u is one that no stage has, or the steps do not lie on a straight line.
+steps in a row, the slope p/u is one that no stage has, or the steps do not lie on a straight line. A step in which p
+goes to and fro about u shows a stage that rings, and is left out.
 
 **On trial** (`Trial`). Readings of a suspected sensor neither train the model nor move its frame. Dead reckoning
 advances the hysteresis memory. The readings y are compared with the dead-reckoned positions x over a window of
@@ -13,9 +14,9 @@ advances the hysteresis memory. The readings y are compared with the dead-reckon
     y = slope x + constant, share = share of the variance of y that this line explains
 
 - Share near 1 and a slope that a stage can have: the sensor follows. Slope and constant give the change of the frame.
-- Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. Another slope: ``sensor_gain``. No
-  straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have found it. After that
-  the readings must be right for one more window before they are trusted again.
+- Readings that hardly vary: ``sensor_stuck``. Negative slope: ``sensor_sign``. A slope that no stage has:
+  ``sensor_gain``. No straight line: ``sensor_foreign``. A fault is reported after ``NAMED`` evaluations in a row have
+  found it. After that the readings must be right for one more window before they are trusted again.
 - A stage at rest only shows whether the reading is the same as before.
 
 Wrong dead reckoning must not exclude a good sensor. Therefore the trial also computes the voltage p of the readings.
@@ -41,6 +42,9 @@ from adaptive.types import FloatArray, StateDict, numbers_of, prefixed, under
 
 # --- The check that always runs.
 
+#: A step in which p - u goes to and fro shows ringing, not a fault: its net change is below this share of its way.
+#: Changes between two pairs below this multiple of the noise of p do not count.
+TO_AND_FRO, WAY_SIGMA = 0.5, 3.0
 #: Smallest step, as a share of the voltage span and as a multiple of the noise of p; the larger of the two applies.
 STEP_SHARE, STEP_SIGMA = 0.004, 8.0
 #: Number of pairs (u, p) over which this noise is averaged.
@@ -55,6 +59,9 @@ CREEP_PER_S = 0.05
 ENOUGH_SLOPE = 6.0
 #: Slopes p/u that a stage can have, with hysteresis and a wrong model allowed for; smallest squared correlation.
 FOLLOWING_SLOPES, FOLLOWING_STRAIGHT = (0.62, 1.6), 0.35
+#: Slopes that are a fault after ``ENOUGH`` steps already, if so much of the steps lies on a line, and p - u changes
+#: faster than a stage can drift.
+FAR_SLOPES, FAR_STRAIGHT = (0.5, 2.0), 0.9
 #: The stage itself drifts if p - u changes at a rate whose standard deviation is below this share of its mean; a step
 #: follows if p differs from u by no more than this share. Forgetting factor of the rate for each step.
 STEADY, FORGET_DRIFT = 0.35, 0.5
@@ -77,6 +84,7 @@ class Following:
     uu, pp, up : sums of the products over the steps; with forgetting.
     good, still : number of steps in a row in which the readings followed, and stood still.
     last_V, noise2 : last p - u, V, and its mean square change between two pairs, V².
+    way_V : length of the way of p - u since the end of the last step, V.
     drift_V_per_s, drift2 : mean rate of p - u over the last steps, V/s, and its mean square; with forgetting.
     """
 
@@ -92,13 +100,14 @@ class Following:
     still: int = 0
     last_V: float = math.nan
     noise2: float = 0.0
+    way_V: float = 0.0
     drift_V_per_s: float = 0.0
     drift2: float = 0.0
 
     def forget(self) -> None:
         """Discard all steps so far."""
         self.u_V = self.p_V = math.nan
-        self.last_V = math.nan
+        self.last_V, self.way_V = math.nan, 0.0
         self.steps = self.good = self.still = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
         self.drift_V_per_s = self.drift2 = 0.0
@@ -126,6 +135,7 @@ class Following:
             self.noise2 += (min(change_V * change_V, 16.0 * self.noise2 + (STEP_SHARE * span_V) ** 2) - self.noise2) / (
                 NOISE_PAIRS
             )
+            self.way_V += abs(change_V) if change_V * change_V > WAY_SIGMA**2 * self.noise2 else 0.0
         step_V = max(STEP_SHARE * span_V, STEP_SIGMA * math.sqrt(self.noise2))
         du, dp = u_V - self.u_V, p_V - self.p_V
         if math.isnan(du) or math.isnan(dp):
@@ -136,8 +146,9 @@ class Following:
             return False
         step_s = self.steps * dt_s
         slow = size < CREEP_PER_S * span_V * step_s
-        self.u_V, self.p_V, self.steps = u_V, p_V, 0
-        if slow:
+        rings = abs(dp - du) > STEADY * size and abs(dp - du) < TO_AND_FRO * self.way_V
+        self.u_V, self.p_V, self.steps, self.way_V = u_V, p_V, 0, 0.0
+        if slow or rings:
             return False
         u, p = du / size, dp / size
         rate = (dp - du) / step_s
@@ -164,8 +175,8 @@ class Following:
         """Inverse of ``state_dict``; older states have no entries and give an empty check."""
         if not values:
             return cls()
-        # States of before there was a drift have no entries for it.
-        values = {"drift_V_per_s": 0.0, "drift2": 0.0} | values
+        # Older states have no entries for what was added since.
+        values = {"drift_V_per_s": 0.0, "drift2": 0.0, "way_V": 0.0} | values
         return cls(**{name: type(value)(values[name]) for name, value in numbers_of(cls()).items()})
 
 
@@ -181,7 +192,10 @@ def _shows_fault(sums: Following, follows: bool, fastest_V_per_s: float) -> bool
             return False
         # Large pp: the readings move more than the drive explains. Something else moves the stage; no sensor fault.
         return sums.pp <= FOLLOWING_SLOPES[1] ** 2 * sums.uu
-    return sums.count >= ENOUGH_SLOPE and not follows and not FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]
+    if follows or FOLLOWING_SLOPES[0] <= slope <= FOLLOWING_SLOPES[1]:
+        return False
+    far = straight >= FAR_STRAIGHT and not FAR_SLOPES[0] <= slope <= FAR_SLOPES[1]
+    return sums.count >= ENOUGH_SLOPE or (far and abs(sums.drift_V_per_s) > fastest_V_per_s)
 
 
 # --- The trial of a suspected sensor.
@@ -413,10 +427,11 @@ class Trial:
         drifted_um = 0.0 if self.fault or follows else self._drifted_um(u, y, x, p, now)
         if drifted_um:
             return Decision(Outcome.CHANGED, 1.0, drifted_um)
-        fault = _fault(s, float(np.std(y)))
+        fault = _fault(s, float(np.std(y)), allowed)
         if s.swing < TELLS * self.reckoning.std_um:
             # The dead-reckoned position is less certain than the motion is large: only the voltages can decide.
-            fault = _fault(voltages, float(np.std(p)), "V") if voltages.share < STRAIGHT_ALONE else ("", "")
+            alone = voltages.share < STRAIGHT_ALONE
+            fault = _fault(voltages, float(np.std(p)), False, "V") if alone else ("", "")
         if not full:
             if not (obeyed or follows):
                 self._suspect(*fault)
@@ -452,7 +467,8 @@ class Trial:
         spread_V = float(np.std(p))
         still = spread_V <= STILL * voltages.swing
         # The memory of the model relaxes: p may follow a straight line although the readings stand still.
-        fault = _fault(voltages._replace(share=0.0) if still else voltages, spread_V, "V")
+        allowed = 1.0 / OBEYS_SLOPE <= voltages.slope <= OBEYS_SLOPE
+        fault = _fault(voltages._replace(share=0.0) if still else voltages, spread_V, allowed, "V")
         self._suspect(*(("", "") if obeyed else fault))
         self.obeyed = self.obeyed + 1 if obeyed and full else 0
         late = self.since * now.dt_s > BY_VOLTAGES_S and not still
@@ -583,14 +599,17 @@ def _of_bends(x: FloatArray, y: FloatArray) -> tuple[Slope, float]:
     return s, s.std * correlated(dy - s.slope * dx)
 
 
-def _fault(s: Slope, spread: float, unit: str = "um") -> tuple[str, str]:
-    """(name, reason as text) of the fault of readings that do not follow.
+def _fault(s: Slope, spread: float, allowed: bool, unit: str = "um") -> tuple[str, str]:
+    """(name, reason as text) of the fault of readings that do not follow; empty if they show none.
 
     ``s`` : line of the readings over the positions (``unit`` "um"), or of the voltages p over u ("V"). ``spread`` :
-    standard deviation of the readings, or of p.
+    standard deviation of the readings, or of p. ``allowed`` : whether a stage can have the slope of the line. Readings
+    on such a line, with too much beside it to be trusted, ring or belong to another stage: both show later.
     """
     why = f"readings move {s.slope:.3g} times as far as the voltage moves the stage, {s.share:.0%} on a straight line"
     if s.share >= STRAIGHT:
+        if allowed:
+            return "", ""
         return (SENSOR_SIGN if s.slope < 0.0 else SENSOR_GAIN), why
     if spread <= STILL * s.swing:
         expected = f"expected {s.swing:.3g} {unit} from the motion of the stage"
