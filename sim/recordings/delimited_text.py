@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.recordings.columns import ColumnMap, stated_unit
+from sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
 from sim.recordings.table import MAX_BYTES, Table, seconds
 from sim.recordings.text_formats import (
     different,
@@ -69,6 +69,8 @@ _SEPARATORS: Final = {
     ".": "points", ",": "commas", "'": "apostrophes", "\u2019": "apostrophes", "\u00a0": "blanks",
     "\u202f": "blanks", " ": "blanks",
 }  # fmt: skip
+#: A duration as MATLAB writes it into a table.
+_DURATION: Final = re.compile(r"([+-]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?) (sec|min|ms|us)")
 _DATE: Final = re.compile(r"(\d{4}-\d{2}-\d{2}(?:[T ]\d{2}:\d{2}(?::\d{2}(?:\.\d*)?)?)?) ?(?:Z|UTC|[+-]\d{2}:?\d{2})?")
 
 
@@ -213,7 +215,7 @@ def _kind(cell: str, decimal: str) -> str:
         plain_number(cell)
     ):
         return "n"
-    return "d" if _DATE.fullmatch(cell) or _TIME_OF_DAY.fullmatch(cell) else "t"
+    return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY, _DURATION)) else "t"
 
 
 def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) -> _Block | None:
@@ -355,7 +357,12 @@ def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...], directly
 
 
 def _fit(line: str, block: _Block, columns: tuple[int, ...]) -> list[str]:
-    return _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True) or []
+    found = _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True)
+    if found is None and block.delimiter == " ":
+        # Names with blanks in them stand further apart; SPEC's begin with #L.
+        text = line.strip().removeprefix("#L ").lstrip("#% ")
+        found = _fitting(re.split(r"\s{2,}|\t", text), block, columns, True)
+    return found or []
 
 
 def _names_above(
@@ -376,14 +383,12 @@ def _names_above(
         names, units = traces
         return names, units, [f"columns named by the preamble: {', '.join(names)}"]
     if not cells or not all(cells):
+        if named := _names_and_units(lines, block, columns, above):
+            return named
+        _refuse_commas_between_commas(source, lines[last], block)
         return None, {}, []
-    upper = _fit(lines[above[-2]], block, columns) if len(above) > 1 else []
-    if upper and all(upper):
-        names = different(upper)
-        units = units_row(names, cells)
-        # Above a whole row of units, numbers are names of channels.
-        if units and (len(units) == len(names) or not any(is_number(cell, block.decimal) for cell in upper)):
-            return names, units, [_units_note(last, units)]
+    if named := _names_and_units(lines, block, columns, above):
+        return named
     if comment:
         if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells):
             return None, {}, []
@@ -395,6 +400,33 @@ def _names_above(
     if any(_kind(cell, block.decimal) == "d" for cell in cells):
         return None, {}, []
     return different(cells), {}, []
+
+
+def _refuse_commas_between_commas(source: str, line: str, block: _Block) -> None:
+    """Raise InputError where each name stands above two cells: numbers with decimal commas between commas."""
+    names = _cells_of(line, block.delimiter)
+    if block.delimiter == "," and 2 * len(names) == len(block.kinds) > 2 and not any(is_number(n, ".") for n in names):
+        raise InputError(
+            f"{source}: got {len(names)} names and {len(block.kinds)} cells a line, expected as many: decimal commas "
+            "between commas cannot be told apart; save it with ';' between the columns, or with points"
+        )
+
+
+def _names_and_units(
+    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str], dict[str, str], list[str]] | None:
+    """Names above a row of units: directly above the samples, or further up where every column has a unit."""
+    for k, (named, stated) in reversed(list(enumerate(itertools.pairwise(above), 2))):
+        upper = _fit(lines[named], block, columns)
+        if not upper or not all(upper):
+            continue
+        names = different(upper)
+        units = units_row(names, _fit(lines[stated], block, columns))
+        # Above a whole row of units, numbers are names of channels.
+        plain = not any(is_number(cell, block.decimal) for cell in upper)
+        if len(units) == len(names) or (units and plain and k == len(above)):
+            return names, units, [_units_note(stated, units)]
+    return None
 
 
 def _traces(
@@ -557,7 +589,7 @@ class _Rows:
         first = {layout.columns[self._numbers[0]]: "ne"} if self._numbers else {}
         times = {at: "de" for at, kind in zip(layout.columns, layout.kinds, strict=True) if kind == "d"}
         return bool(cells) and all(
-            _kind(cells[at], layout.decimal) in kinds for at, kinds in {**first, **times}.items() if at in cells
+            at in cells and _kind(cells[at], layout.decimal) in kinds for at, kinds in {**first, **times}.items()
         )
 
     def _reserve(self, n: int, characters: int) -> None:
@@ -682,6 +714,10 @@ def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
             return seconds(np.array([date[1] if date else "NaT" for date in dates], dtype="datetime64[ns]")), True
         except ValueError:
             return np.array(cells), False
+    durations = [_DURATION.fullmatch(cell) for cell in cells]
+    if filled and all(duration for cell, duration in zip(cells, durations, strict=True) if cell):
+        factors = QUANTITIES["t"][1]
+        return np.array([float(d[1]) * factors[stated_unit(d[2]) or "s"] if d else np.nan for d in durations]), True
     if filled and all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
         of_day = np.array(list(_seconds_of_day(cells)))
         # Midnight is no step back.

@@ -95,9 +95,15 @@ def _understood(recording: Recording) -> dict[str, Any]:
         "rate_Hz": 1.0 / recording.dt_s,
         "duration_s": recording.duration_s,
         "columns": list(recording.columns()),
-        "u_V": [float(np.nanmin(recording.u_V)), float(np.nanmax(recording.u_V))],
-        "y_um": [float(np.nanmin(recording.y_um)), float(np.nanmax(recording.y_um))],
+        "u_V": _ends(recording.u_V),
+        "y_um": _ends(recording.y_um),
     }
+
+
+def _ends(values: NDArray[Any]) -> list[float]:
+    """Smallest and largest finite value; NaN where there is none."""
+    good = values[np.isfinite(values)]
+    return [float(good.min()), float(good.max())] if good.size else [float("nan")] * 2
 
 
 def commands(args: argparse.Namespace, options: tuple[str, ...], usable: bool) -> list[str]:

@@ -111,8 +111,17 @@ PLAIN: dict[str, tuple[str, str]] = {
     "times with a zone": ("time,u_V,y_um\n", "{iso}+01:00,{u:.5f},{y:.5f}\n"),
     "universal times": ("time (s),u_V,y_um\n", "{iso}Z,{u:.5f},{y:.5f}\n"),
     "a preamble of 602 lines": (LONG + "Time[s]\tU[V]\tX[um]\n", "{t:.3f}\t{u:.5f}\t{y:.5f}\n"),
+    "names with blanks in fixed columns": (
+        "  Time (s)     Voltage (V)    Position (um)\n", "   {t:.3f}   {u:9.5f}   {y:9.5f}\n",
+    ),
+    "COMSOL": ("% Version:   6.1\n% t (s)    Voltage (V)    Displacement (um)\n", "{t:.6f}    {u:.6f}    {y:.6f}\n"),
+    "rows between the units and the samples": (
+        "HBM\n\nZeit\tSpannung\tWeg\ns\tV\tµm\n25.11.2026\t25.11.2026\t25.11.2026\n1 kHz\t1 kHz\t1 kHz\n",
+        "{t:.3f}\t{u:.5f}\t{y:.5f}\n",
+    ),
+    "MATLAB's durations": ("Time,u_V,y_um\n", "{t:.6g} sec,{u:.5f},{y:.5f}\n"),
     "thousands in quotes": ("Time (ms),Voltage (mV),Position (nm)\n", '"{ms:,.1f}","{u_mV:,.2f}","{y_nm:,.1f}"\n'),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PLAIN)
@@ -148,6 +157,20 @@ def test_minus_signs_of_spreadsheets_and_exponents_of_fortran(tmp_path: Path) ->
     recording = read(tmp_path / "a.csv")
     np.testing.assert_allclose(recording.u_V, U_V - 5, atol=1e-5)
     np.testing.assert_allclose(recording.y_um, Y_UM, rtol=1e-6)
+
+
+def test_decimal_commas_between_commas_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    body = rows("{t:.3f};{u:.5f};{y:.5f}\n").replace(".", ",").replace(";", ",")
+    (tmp_path / "a.csv").write_text("Zeit,Spannung,Weg\n" + body)
+    with pytest.raises(InputError, match=r"3 names and 6 cells a line.*save it with ';'"):
+        read(tmp_path / "a.csv")
+
+
+def test_an_end_mark_below_columns_that_begin_with_a_delimiter(tmp_path: Path) -> None:
+    head = "IGOR\nWAVES/D\ttime_s\tu_V\ty_um\nBEGIN\n"
+    (tmp_path / "a.itx").write_text(head + rows("\t{t:.3f}\t{u:.5f}\t{y:.5f}\n") + "END\nX SetScale/P x 0,1\n")
+    recording, _ = second_try(tmp_path / "a.itx")
+    assert_read(recording)
 
 
 @pytest.mark.parametrize("tail", ["\nEnd of measurement\nOperator: lab\n", "Mean,5.0,27.0\nMax,10,70\n", "\x1a"])
