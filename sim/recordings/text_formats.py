@@ -109,7 +109,7 @@ def decode(path: Path, content: bytes) -> str:
 
 
 #: The exponent of Fortran's double precision, and the minus sign that spreadsheets of some countries write.
-_EXPONENT_D = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d+$)")
+_EXPONENT_D = re.compile(r"(?<=[\d.])[dD](?=[+-]\d+$)")
 _MINUS = str.maketrans("\N{MINUS SIGN}", "-")
 
 
