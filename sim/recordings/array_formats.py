@@ -170,7 +170,7 @@ class _Hdf5:
         cells = _text(member.attrs.get("MATLAB_class", "")) == "cell"
         kind = "cells" if cells else "a struct array"
         in_struct = _text(group.attrs.get("MATLAB_class", "")) == "struct"
-        if not (cells or in_struct) or "MATLAB_empty" in member.attrs or member.size > MOST_ELEMENTS:
+        if not (cells or in_struct) or "MATLAB_empty" in member.attrs or (member.size or 0) > MOST_ELEMENTS:
             self.left_out.append(f"{name} ({kind if cells or in_struct else 'no numbers'})")
             return
         before = len(self.arrays), len(self.left_out)
@@ -466,16 +466,28 @@ def _cells(values: list[Any]) -> NDArray[Any]:
     filled = [value for value in values if value is not None]
     if filled and all(isinstance(value, datetime.datetime) for value in filled):
         return np.array([np.datetime64("NaT") if value is None else value for value in values], dtype="datetime64[us]")
+    if filled and all(isinstance(value, datetime.time | datetime.timedelta) for value in filled):
+        return np.array([_microseconds(value) for value in values], dtype="timedelta64[us]")
     if all(isinstance(value, int | float) for value in filled):
         return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    texts = [value for value in filled if isinstance(value, str)]
+    # Numbers that were stored as texts.
+    texts = [value for value in filled if not isinstance(value, int | float)]
     for decimal in (".", ","):
-        if all(is_number(text, decimal) for text in texts):
+        if all(isinstance(text, str) and is_number(text, decimal) for text in texts):
             plain = [
                 plain_number(v.replace(",", ".") if decimal == "," else v) if isinstance(v, str) else v for v in values
             ]
             return np.array([np.nan if value is None else float(value) for value in plain], dtype=np.float64)
     return np.array([np.nan if value is None else value for value in values], dtype=object)
+
+
+def _microseconds(value: Any) -> Any:
+    """A time of day or a duration of a workbook, for ``timedelta64[us]``; None for an empty cell."""
+    import datetime
+
+    if isinstance(value, datetime.time):
+        return datetime.datetime.combine(datetime.date.min, value) - datetime.datetime.min
+    return value
 
 
 def _require_unpacked_size(path: Path, content: bytes) -> None:

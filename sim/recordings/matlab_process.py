@@ -45,7 +45,7 @@ def _flatten(name: str, found: Any, into: dict[str, NDArray[Any]], left_out: lis
     """
     value = np.asarray(found)
     if type(found).__name__ in ("MatlabOpaque", "MatlabFunction"):
-        left_out.append(f"{name} (no array of numbers)")
+        left_out.append(f"{name} (a table or an object: save its columns as arrays)")
     elif value.dtype.names is not None and value.ndim == 0:
         for field in value.dtype.names:
             _flatten(f"{name}.{field}", value[field].item(), into, left_out)

@@ -101,7 +101,7 @@ def likely(quantity: str, table: Table, taken: Collection[tuple[str, str]]) -> C
 
 def likely_time_unit(values: NDArray[Any]) -> str:
     """The unit that gives a time (n,) a likely rate: ``s``, ``ms``, ``us`` or ``ns``."""
-    if values.dtype.kind not in "fiu":
+    if values.ndim != 1 or values.dtype.kind not in "fiu":
         return "s"
     steps = np.diff(values[:_LOOKED_AT].astype(np.float64))
     steps = steps[steps > 0.0]

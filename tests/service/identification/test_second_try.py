@@ -355,6 +355,13 @@ BINARY: dict[str, Callable[[Path], None]] = {
     ),
     "notes.xlsx": lambda path: workbook(path, [NAMES, *TABLE], notes="see Data"),
     "texts.xlsx": lambda path: workbook(path, [NAMES, *([commas(f"{v:.6f}") for v in row] for row in TABLE)]),
+    "times.xlsx": lambda path: workbook(
+        path,
+        [
+            ["Clock", *NAMES[1:]],
+            *([(datetime(2026, 1, 1, 14) + timedelta(seconds=t)).time(), u, y] for t, u, y in TABLE),
+        ],
+    ),
     "statistics.xlsx": lambda path: workbook(
         path, [[*NAMES, None, "Mean", 5.2], [*TABLE[0], None, "Max", 10.0], *TABLE[1:], ["End of measurement"]]
     ),
@@ -366,6 +373,19 @@ def test_files_of_programs_that_open_at_the_second_try(tmp_path: Path, name: str
     BINARY[name](tmp_path / name)
     recording, _ = second_try(tmp_path / name)
     assert_read(recording)
+
+
+def test_a_scalar_called_as_the_time_is_no_time(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t": 3.0, "u_V": U_V, "y_um": Y_UM})
+    with pytest.raises(InputError, match="column 't' for t has no unit"):
+        read(tmp_path / "a.mat")
+
+
+def test_a_sheet_of_dates_and_numbers_in_one_column_is_refused(tmp_path: Path) -> None:
+    mixed = [[datetime(2026, 1, 1) if k % 2 else 1.0, u, y] for k, (_, u, y) in enumerate(TABLE)]
+    workbook(tmp_path / "a.xlsx", [NAMES, *mixed])
+    with pytest.raises(InputError, match="expected a number"):
+        read(tmp_path / "a.xlsx")
 
 
 @pytest.mark.parametrize(
