@@ -23,7 +23,7 @@ the other. Displacement in µm, time in s, errors in percent of the commanded ra
 error may be at most 1.1 times that of the frozen model plus three noise floors; if it is larger, the exit status is 1.
 
   dehyst scenarios --out out/scenarios
-  dehyst scenarios --only glitches --seeds 10 --out out/glitches
+  dehyst scenarios --only glitches --only offset_jump --out out/sensor
   dehyst scenarios --only dwell --rest 1 --out out/stop
   dehyst scenarios --only gain_step --only creep --config learner.toml --out out/tuned
 """

@@ -20,7 +20,6 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from service.protocol.errors import FieldError
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
 
@@ -145,9 +144,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             controller = SimulatedPi(float(after_s), float(share))
         except ValueError:
-            raise FieldError("--gain-drop", repr(args.gain_drop), "S:SHARE such as 60:0.06") from None
+            parser.error(f"--gain-drop: got {args.gain_drop!r}, expected S:SHARE such as 60:0.06")
     controller.advance()
-    with socket.create_server(("127.0.0.1", args.port)) as listener:
+    try:
+        listener = socket.create_server(("127.0.0.1", args.port))
+    except OSError as error:
+        parser.error(
+            f"port {args.port} is not free ({error.strerror}): does one run already? Stop it, or add --port, and give "
+            "the same port in my_stage.py"
+        )
+    with listener:
         print(f"ready: simulated PI controller at 127.0.0.1, port {listener.getsockname()[1]}", flush=True)
         serve(listener, controller)
 

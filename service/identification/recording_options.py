@@ -17,7 +17,7 @@ READING = """\
 Columns: t_s, u_V, y_um and, where present, u2_V, y2_um, monitor_V, temperature_C. Other names and units are given by
 options (or once and for all in a TOML file of the same words), never guessed. Formats by ending: .csv and other
 text with or without a header line, .lvm and .tdms of LabVIEW, .mat of every version, .h5, .npy, .npz, .xlsx, .parquet
-(or a folder of a recorder's segments), and the array files of piezo controllers. Examples: docs/recordings.md.
+(or a folder of a recorder's segments), .feather, and array files of piezo controllers. Examples: docs/recordings.md.
 """
 
 
@@ -180,9 +180,23 @@ def to_paste(args: argparse.Namespace, options: Sequence[str]) -> str:
     """The command of the user with ``options`` added, to be pasted, and what to check in it."""
     given = " ".join(shlex.quote(word) for word in vars(args).get("given", ()))
     command = f"dehyst {given}" if given else f"dehyst {args.command}"
-    open_ones = [word for word in ("HZ", "FILE", "FACTOR") if any(option.endswith(word) for option in options)]
-    fill = f", and fill in {', '.join(open_ones)}" if open_ones else ""
-    return f"To go on, check the columns and units in this command{fill}:\n  {command} {' '.join(options)}"
+    return (
+        f"To go on, check the columns and units in this command{to_fill_in(options)}:\n  {command} {' '.join(options)}"
+    )
+
+
+#: Words in proposed options that the user replaces, with what they are.
+_OPEN = {
+    "HZ": "HZ (samples per second)",
+    "FILE": "FILE (the file with it)",
+    "FACTOR": "FACTOR (µm per unit in the file)",
+}
+
+
+def to_fill_in(options: Sequence[str]) -> str:
+    """What to fill in in proposed options, as the end of a sentence; "" for nothing."""
+    found = [what for word, what in _OPEN.items() if any(option.endswith(word) for option in options)]
+    return f", and fill in {', '.join(found)}" if found else ""
 
 
 def describe(recording: Recording, findings: list[Finding]) -> str:

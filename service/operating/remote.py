@@ -214,7 +214,15 @@ def table(statuses: Sequence[dict[str, Any]], width: int = 0, colour: bool = Fal
         ]
     if not statuses:
         lines.append("no instance replies")
+    lines += [line[:width] if width else line for status in statuses for line in warnings(status)]
     return "\n".join(lines)
+
+
+def warnings(status: Mapping[str, Any]) -> list[str]:
+    """What did not fit at the start of an axis, one line each."""
+    found = status.get("warnings")
+    texts = [text for text in found if isinstance(text, str)] if isinstance(found, list) else []
+    return [_safe(f"warning: {status.get('stage')}/{status.get('axis')}: {text}") for text in texts]
 
 
 def screen(statuses: Sequence[dict[str, Any]], endpoint: str, events: Sequence[str]) -> str:

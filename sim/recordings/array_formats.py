@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from sim.recordings.columns import ColumnMap
+from sim.recordings.matlab_process import MOST_ELEMENTS
 from sim.recordings.table import MAX_BYTES, Table, plain_arrays
-from sim.recordings.text_formats import different, from_arrow, has_names, units_row
+from sim.recordings.text_formats import different, from_arrow, has_names, is_number, plain_number, units_row
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: MATLAB puts a text header of this length before the HDF5 data of version 7.3.
@@ -30,6 +31,8 @@ _MATLAB_4_HEADER = 20
 MATLAB_TIME_S, _MATLAB_BYTES_PER_S = 60.0, 5e6
 #: Most memory of the process that reads it: the file, its arrays, and the interpreter with scipy.
 MATLAB_MEMORY_BYTES = 3 * MAX_BYTES
+#: Rows of a sheet in which its names and first samples are looked for.
+_SHEET_HEAD = 1000
 #: Deepest nesting of groups in an HDF5 file, and most of its members: more is a loop of links.
 _DEEPEST, _MOST_MEMBERS = 16, 10_000
 
@@ -44,6 +47,21 @@ def read_parquet(path: Path, content: bytes) -> Table:
         table = parquet.ParquetFile(io.BytesIO(content), pre_buffer=False).read(use_threads=False)
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: is not a whole Parquet file ({error})") from error
+    return _arrow_table(path, table)
+
+
+def read_feather(path: Path, content: bytes) -> Table:
+    """Feather and other files of Arrow's; times as in Parquet."""
+    import pyarrow as pa
+
+    try:
+        table = pa.ipc.open_file(io.BytesIO(content)).read_all()
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: is not a whole Feather file ({_line(error)})") from error
+    return _arrow_table(path, table)
+
+
+def _arrow_table(path: Path, table: Any) -> Table:
     columns = {name: from_arrow(table.column(name)) for name in table.column_names}
     units = {name: "s" for name, (_, stamped) in columns.items() if stamped}
     return Table(str(path), {name: array for name, (array, _) in columns.items()}, units=units)
@@ -120,22 +138,59 @@ class _Hdf5:
             if key.startswith("#"):  # MATLAB's own store of cells and objects
                 continue
             name = f"{prefix}{key}"
-            self.members += 1
-            if self.members > _MOST_MEMBERS or depth > _DEEPEST:
-                raise InputError(
-                    f"{self.path}: got more than {_MOST_MEMBERS} members or {_DEEPEST} levels of groups, expected a "
-                    "recording: copy the arrays into a file of their own"
-                )
-            if not isinstance(group.get(key, getlink=True), self.h5py.HardLink):
-                self.left_out.append(f"{name} (a link)")
-                continue
-            member = group[key]
-            if isinstance(member, self.h5py.Group):
-                self.add(member, f"{name}.", depth + 1)
-            elif reason := self._unreadable(member):
-                self.left_out.append(f"{name} ({reason})")
+            if isinstance(group.get(key, getlink=True), self.h5py.HardLink):
+                self._add_member(group, name, group[key], depth)
             else:
-                self._add_array(name, member)
+                self.left_out.append(f"{name} (a link)")
+
+    def _add_member(self, group: Any, name: str, member: Any, depth: int) -> None:
+        self.members += 1
+        if self.members > _MOST_MEMBERS or depth > _DEEPEST:
+            raise InputError(
+                f"{self.path}: got more than {_MOST_MEMBERS} members or {_DEEPEST} levels of groups, expected a "
+                "recording: copy the arrays into a file of their own"
+            )
+        if isinstance(member, self.h5py.Group):
+            self.add(member, f"{name}.", depth + 1)
+        else:
+            self._add_dataset(group, name, member, depth)
+
+    def _add_dataset(self, group: Any, name: str, member: Any, depth: int) -> None:
+        if isinstance(member, self.h5py.Dataset) and self.h5py.check_ref_dtype(member.dtype) is self.h5py.Reference:
+            self._add_elements(group, name, member, depth)
+        elif reason := self._unreadable(member):
+            self.left_out.append(f"{name} ({reason})")
+        elif member.dtype.names is not None and not _is_complex(member.dtype):
+            self._add_fields(name, member)
+        else:
+            self._add_array(name, member)
+
+    def _add_elements(self, group: Any, name: str, member: Any, depth: int) -> None:
+        """MATLAB's cells (``data{2}``), or one field of an array of structures (``rec.Y(2).Data``)."""
+        cells = _text(member.attrs.get("MATLAB_class", "")) == "cell"
+        kind = "cells" if cells else "a struct array"
+        in_struct = _text(group.attrs.get("MATLAB_class", "")) == "struct"
+        if not (cells or in_struct) or "MATLAB_empty" in member.attrs or (member.size or 0) > MOST_ELEMENTS:
+            self.left_out.append(f"{name} ({kind if cells or in_struct else 'no numbers'})")
+            return
+        before = len(self.arrays), len(self.left_out)
+        base, _, field = name.rpartition(".")
+        for k, reference in enumerate(np.asarray(member[()]).reshape(-1), 1):
+            if reference:
+                element = f"{name}{{{k}}}" if cells else f"{base}({k}).{field}"
+                self._add_member(group, element, member.file[reference], depth + 1)
+        if len(self.arrays) == before[0]:  # names, as a rule
+            self.left_out[before[1] :] = [f"{name} ({kind})"]
+
+    def _add_fields(self, name: str, member: Any) -> None:
+        """The columns of a table, as h5py and pandas write records."""
+        self._reserve(name, member)
+        table = np.asarray(member[()])
+        for field in table.dtype.names or ():
+            if table.dtype[field].kind in "fiub":
+                self.arrays[f"{name}.{field}"] = np.ascontiguousarray(table[field])
+            else:
+                self.left_out.append(f"{name}.{field} (no numbers)")
 
     def _unreadable(self, member: Any) -> str:
         """Why a member holds no array of numbers; "" where it does."""
@@ -150,11 +205,11 @@ class _Hdf5:
             return {"char": "text", "cell": "cells"}.get(matlab, f"a {matlab}") + (
                 "" if matlab != "struct" else " array"
             )
-        if member.dtype.kind in "fiub" or _is_complex(member.dtype):
+        if member.dtype.kind in "fiub" or member.dtype.names is not None:
             return ""
         return "no numbers"
 
-    def _add_array(self, name: str, member: Any) -> None:
+    def _reserve(self, name: str, member: Any) -> None:
         # Compressed data may unpack to a thousand times the file.
         self.bytes += member.size * member.dtype.itemsize
         if self.bytes > MAX_BYTES:
@@ -162,6 +217,9 @@ class _Hdf5:
                 f"{self.path}: its arrays take more than {MAX_BYTES / 1e9:g} GB unpacked ({name} has shape "
                 f"{member.shape}), expected at most that: copy the recording into a file of its own"
             )
+
+    def _add_array(self, name: str, member: Any) -> None:
+        self._reserve(name, member)
         array = np.asarray(member[()])
         if array.dtype.names is not None:
             array = array["real"] + 1j * array["imag"]
@@ -186,15 +244,29 @@ def _text(value: object) -> str:
     return str(value).strip() if isinstance(value, str) else ""
 
 
+_PICKLED = "a pickled Python object, which is never loaded"
+
+
 def read_npz(path: Path, content: bytes) -> Table:
-    """numpy archives. Pickled objects are refused."""
+    """numpy archives. Pickled objects are left out."""
     _require_unpacked_size(path, content)
+    read: dict[str, NDArray[Any]] = {}
+    left_out: list[str] = []
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays, units = plain_arrays({name: archive[name] for name in archive.files})
+            for name in archive.files:
+                try:
+                    read[name] = archive[name]
+                except ValueError as error:
+                    if "Object arrays" not in str(error):
+                        raise
+                    left_out.append(f"{name} ({_PICKLED})")
+            arrays, units = plain_arrays(read)
     except Exception as error:  # numpy raises many kinds of errors on a damaged file
         raise InputError(f"{path}: is not a whole .npz file of plain arrays ({_line(error)})") from error
-    return Table(str(path), arrays, units=units)
+    if left_out and not arrays:
+        raise InputError(f"{path}: holds {_PICKLED}, expected plain arrays: save each as one")
+    return Table(str(path), arrays, units=units, left_out=tuple(left_out))
 
 
 def read_npy(path: Path, content: bytes) -> Table:
@@ -205,6 +277,11 @@ def read_npy(path: Path, content: bytes) -> Table:
     try:
         array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # numpy raises many kinds of errors on a damaged file
+        if "Object arrays" in str(error):
+            raise InputError(
+                f"{path}: holds {_PICKLED}, expected a plain array: of a dictionary of arrays, "
+                "numpy.savez('recording.npz', **data) makes a file that opens"
+            ) from error
         raise InputError(f"{path}: is not a whole .npy file of a plain array ({_line(error)})") from error
     fields = array.dtype.names
     arrays, units = plain_arrays({path.stem: array} if fields is None else {name: array[name] for name in fields})
@@ -287,24 +364,74 @@ def read_xlsx(path: Path, content: bytes, mapping: ColumnMap) -> Table:
     filled = {title: rows for title, rows in sheets.items() if rows}
     if not filled:
         raise InputError(f"{path}: got a workbook without values, expected one row per sample")
+    # A sheet of remarks is none of samples.
+    filled = {title: rows for title, rows in filled.items() if _number_columns(rows)} or filled
     arrays: dict[str, NDArray[Any]] = {}
     units: dict[str, str] = {}
     notes: list[str] = []
     for title, rows in filled.items():
         prefix = "" if len(filled) == 1 else f"{title}!"
-        source = str(path) if len(filled) == 1 else f"{path}, sheet {title}"
+        source = str(path) if len(sheets) == 1 else f"{path}, sheet {title}"
         columns, stated, said = _sheet(source, rows, mapping)
         plain, times = plain_arrays(columns)
         arrays |= {prefix + name: array for name, array in plain.items()}
         units |= {prefix + name: unit for name, unit in {**stated, **times}.items()}
-        notes += [said] if said else []
+        notes += said
     return Table(str(path), arrays, notes=tuple(notes), units=units, positional=len(filled) == 1)
+
+
+def _is_sample(cell: Any) -> bool:
+    """Whether a cell holds a number, also one that was stored as a text, or a time."""
+    if isinstance(cell, str):
+        return bool(cell.strip()) and (is_number(cell, ".") or is_number(cell, ","))
+    return cell is not None
+
+
+def _number_columns(rows: list[list[Any]]) -> list[int]:
+    """The columns of a sheet that hold numbers or times in most cells, and are as long as the others."""
+    filled = [[row[k] for row in rows if k < len(row) and row[k] is not None] for k in range(max(map(len, rows)))]
+    numbers = [sum(map(_is_sample, cells)) for cells in filled]
+    longest = max(numbers, default=0)
+    return [k for k, n in enumerate(numbers) if 2 * n > max(len(filled[k]), longest)]
 
 
 def _sheet(
     source: str, rows: list[list[Any]], mapping: ColumnMap
-) -> tuple[dict[str, NDArray[Any]], dict[str, str], str]:
-    """The columns of a sheet, the units in the row below their names, and what to tell the user."""
+) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str]]:
+    """The columns of a sheet, their units where a row below the names states them, and what to tell the user."""
+    width = max(map(len, rows))
+    rows = [row + [None] * (width - len(row)) for row in rows]
+    while width and all(row[width - 1] is None for row in rows):
+        width -= 1
+    texts = [["" if cell is None else str(cell).strip() for cell in row[:width]] for row in rows[:_SHEET_HEAD]]
+    above, start = _names_and_start(source, rows, texts, mapping)
+    notes = []
+    if above:
+        names = different(texts[above[0]])
+        units = units_row(names, texts[above[1]]) if len(above) > 1 else {}
+        if units:
+            notes.append(f"units from row {above[1] + 1}: {', '.join(f'{n} in {u}' for n, u in units.items())}")
+        if above[0] and mapping.header is None and any(any(row) for row in texts[: above[0]]):
+            notes.append(f"columns named by row {above[0] + 1}")
+    else:
+        names, units = [str(k) for k in range(1, width + 1)], {}
+        notes.append("no names of columns in the workbook: they are called by their position, from 1")
+    stop = len(rows)
+    numbers = [k for k in _number_columns(rows[start:]) if k < width] if start < len(rows) else []
+    while numbers and stop > start and isinstance(rows[stop - 1][numbers[0]], str):
+        stop -= 1 if not _is_sample(rows[stop - 1][numbers[0]]) else stop
+    stop = stop if stop > start else len(rows)
+    if stop < len(rows):
+        notes.append(f"the last {len(rows) - stop} rows are no samples and left out: {rows[stop][numbers[0]]!r}")
+    if start >= stop:
+        raise InputError(f"{source}: got names of columns and no samples below, expected one row per sample")
+    return {name: _cells([row[k] for row in rows[start:stop]]) for k, name in enumerate(names)}, units, notes
+
+
+def _names_and_start(
+    source: str, rows: list[list[Any]], texts: list[list[str]], mapping: ColumnMap
+) -> tuple[list[int], int]:
+    """The rows of names and of units, from 0, where there are such, and the first row of samples."""
     first = next(k for k, row in enumerate(rows) if any(cell is not None for cell in row))
     if mapping.header not in (None, "none"):
         first = int(str(mapping.header)) - 1
@@ -312,24 +439,24 @@ def _sheet(
             raise InputError(
                 f"{source}: header: got row {mapping.header}, beyond the {len(rows)} rows, expected the row of names"
             )
-    width = max(len(row) for row in rows[first:])
-    rows = [row + [None] * (width - len(row)) for row in rows[first:]]
-    while width and all(row[width - 1] is None for row in rows):
-        width -= 1
-    cells = ["" if cell is None else str(cell).strip() for cell in rows[0][:width]]
-    note, units = "", {}
-    if has_names(source, cells, mapping, "row", first + 1):
-        names, rows = different(cells), rows[1:]
-        below = ["" if cell is None else str(cell).strip() for cell in rows[0][:width]] if rows else []
-        if units := units_row(names, below):
-            note = f"units from row {first + 2}: {', '.join(f'{name} in {unit}' for name, unit in units.items())}"
-            rows = rows[1:]
-    else:
-        names = [str(k) for k in range(1, width + 1)]
-        note = "no names of columns in the workbook: they are called by their position, from 1"
-    if not rows:
-        raise InputError(f"{source}: got names of columns and no samples below, expected one row per sample")
-    return {name: _cells([row[k] for row in rows]) for k, name in enumerate(names)}, units, note
+    elif mapping.header is None and (numbers := _number_columns(rows)):
+        start = next(
+            (
+                k
+                for k, row in enumerate(rows[:_SHEET_HEAD])
+                if _is_sample(row[numbers[0]]) and 2 * sum(_is_sample(row[j]) for j in numbers) > len(numbers)
+            ),
+            first,
+        )
+        named = [k for k in range(start) if all(texts[k][j] and not _is_sample(rows[k][j]) for j in numbers)]
+        if named:
+            two = len(named) > 1 and units_row(texts[named[-2]], texts[named[-1]])
+            return named[-2:] if two else named[-1:], start
+        first = start if start > first else first
+    if first < len(texts) and has_names(source, texts[first], mapping, "row", first + 1):
+        below = first + 1 < len(texts) and units_row(different(texts[first]), texts[first + 1])
+        return ([first, first + 1], first + 2) if below else ([first], first + 1)
+    return [], first
 
 
 def _cells(values: list[Any]) -> NDArray[Any]:
@@ -339,9 +466,28 @@ def _cells(values: list[Any]) -> NDArray[Any]:
     filled = [value for value in values if value is not None]
     if filled and all(isinstance(value, datetime.datetime) for value in filled):
         return np.array([np.datetime64("NaT") if value is None else value for value in values], dtype="datetime64[us]")
+    if filled and all(isinstance(value, datetime.time | datetime.timedelta) for value in filled):
+        return np.array([_microseconds(value) for value in values], dtype="timedelta64[us]")
     if all(isinstance(value, int | float) for value in filled):
         return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    # Numbers that were stored as texts.
+    texts = [value for value in filled if not isinstance(value, int | float)]
+    for decimal in (".", ","):
+        if all(isinstance(text, str) and is_number(text, decimal) for text in texts):
+            plain = [
+                plain_number(v.replace(",", ".") if decimal == "," else v) if isinstance(v, str) else v for v in values
+            ]
+            return np.array([np.nan if value is None else float(value) for value in plain], dtype=np.float64)
     return np.array([np.nan if value is None else value for value in values], dtype=object)
+
+
+def _microseconds(value: Any) -> Any:
+    """A time of day or a duration of a workbook, for ``timedelta64[us]``; None for an empty cell."""
+    import datetime
+
+    if isinstance(value, datetime.time):
+        return datetime.datetime.combine(datetime.date.min, value) - datetime.datetime.min
+    return value
 
 
 def _require_unpacked_size(path: Path, content: bytes) -> None:

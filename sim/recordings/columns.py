@@ -25,14 +25,19 @@ KELVIN_AT_0_C = 273.15
 
 #: Names of units that acquisition programs write into their files, in lower case.
 _UNIT_WORDS = {
-    **dict.fromkeys(("volt", "volts"), "V"),
-    **dict.fromkeys(("millivolt", "millivolts"), "mV"),
+    **dict.fromkeys(("volt", "volts", "vdc"), "V"),
+    **dict.fromkeys(("millivolt", "millivolts", "mvdc"), "mV"),
     **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres", "micron", "microns"), "um"),
+    **dict.fromkeys(("mikrometer", "mikron", "micromètre", "micromètres"), "um"),
+    # UTF-8 that a program took for Latin-1.
+    **dict.fromkeys(("âμm", "î¼m"), "um"),
     **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
     **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
-    **dict.fromkeys(("sec", "second", "seconds"), "s"),
-    **dict.fromkeys(("millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunde", "sekunden", "secondes"), "s"),
+    **dict.fromkeys(("millisecond", "milliseconds", "msec", "msecs", "millisekunden"), "ms"),
+    **dict.fromkeys(("microsecond", "microseconds", "usec", "usecs", "μsec", "mikrosekunden", "âμs"), "us"),
+    **dict.fromkeys(("nanosecond", "nanoseconds", "nsec", "nanosekunden"), "ns"),
     **dict.fromkeys(("°c", "deg c", "celsius"), "C"),
     **dict.fromkeys(("kelvin",), "K"),
     **dict.fromkeys(("hertz",), "Hz"),
@@ -183,8 +188,11 @@ def is_unit(text: str) -> bool:
     return stated_unit(text) is not None
 
 
-#: The unit at the end of a name: ``y_nm``, ``pos [nm]``, ``Voltage (V)``, ``t / ms``, ``Position, um``, ``t in ms``.
-_UNIT_AT_END = re.compile(r"(?:_|[\s_]*[\[({]\s*|\s*/\s*|\s*,\s*|\s+in\s+)([°A-Za-zµμ]+(?: C)?)\s*[\])}]?\s*$")
+#: The unit at the end of a name: ``y_nm``, ``pos [nm]``, ``Voltage (V)``, ``t / ms``, ``Position, um``, ``t in ms``,
+#: ``in s``, ``Time: s``, ``Time - s``, ``Time <s>``.
+_UNIT_AT_END = re.compile(
+    r"(?:_|[\s_]*[\[({<]\s*|\s*[/,:]\s*|\s+[-–]\s+|(?:^|\s+)in\s+)([°A-Za-zµμÂÎ¼è]+(?: C)?)\s*[\])}>]?\s*$"
+)
 
 
 def unit_of_name(quantity: str, column: str) -> str | None:
@@ -193,6 +201,13 @@ def unit_of_name(quantity: str, column: str) -> str | None:
     match = _UNIT_AT_END.search(column)
     unit = stated_unit(match.group(1)) if match else None
     return unit if unit in factors else None
+
+
+def other_unit_of_name(quantity: str, column: str) -> str | None:
+    """A unit at the end of a column's name that is none of the quantity, as the volts of a sensor; else None."""
+    match = _UNIT_AT_END.search(column)
+    unit = stated_unit(match.group(1)) if match else None
+    return unit if unit is not None and unit not in QUANTITIES[quantity][1] else None
 
 
 def default_column(source: str, quantity: str, names: list[str]) -> str | None:
@@ -231,9 +246,11 @@ def column_by_unit(quantity: str, names: list[str], units: Mapping[str, str], ta
     return found[0] if quantity in BY_UNIT and len(found) == 1 else None
 
 
+#: Names of a time, in lower case.
+TIME_WORDS = ("time", "zeit", "temps", "t", "x_value", "timestamp", "x", "x-axis", "x axis")
 #: Words in the names of columns, for a proposal that the user checks; never used without a word from the user.
 _WORDS = {
-    "t": ("time", "zeit", "temps", "t", "x_value", "timestamp", "x", "x-axis", "x axis"),
+    "t": TIME_WORDS,
     "u": ("volt", "drive", "command", "spannung", "tension", "piezo", "output", "ao", "dac", "ch1", "u", "1"),
     "y": ("pos", "displ", "sensor", "weg", "auslenkung", "measured", "input", "ai", "adc", "ch2", "y", "2"),
 }  # fmt: skip
@@ -298,6 +315,12 @@ def factor_and_unit(
                 f"{named}, expected the same: settle it with --unit {quantity}={unit} or {quantity}={named}"
             )
     unit = unit or unit_of_name(quantity, column)
+    if unit is None and (other := other_unit_of_name(quantity, column)):
+        raise MissingError(
+            f"{source}: column {column!r} for {quantity} is in {other} by its name, {accepted}",
+            f"the factor from {other} to {own} of column {column!r} for {quantity}",
+            f"--scale {quantity}=FACTOR",
+        )
     if unit is None:
         raise MissingError(
             f"{source}: column {column!r} for {quantity} has no unit in its name, and units are never guessed; "

@@ -18,35 +18,60 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
-from sim.recordings.columns import ColumnMap, stated_unit
+from sim.recordings.columns import QUANTITIES, ColumnMap, stated_unit
 from sim.recordings.table import MAX_BYTES, Table, seconds
-from sim.recordings.text_formats import different, encoding_of, has_names, is_number, split_cells, units_row
+from sim.recordings.text_formats import (
+    different,
+    encoding_of,
+    has_names,
+    is_number,
+    plain_number,
+    split_cells,
+    units_row,
+)
 
 #: Lines from which the layout is found, and rows that are converted at a time.
 _HEAD_LINES: Final = 400
+#: The same where these hold a long preamble only.
+_LONG_HEAD_LINES: Final = 20_000
 _BLOCK_ROWS: Final = 200_000
+#: Most lines of text below the samples.
+_MOST_TAIL_LINES: Final = 1000
 #: Delimiters in the order in which they are tried; a blank stands for any number of blanks.
-_DELIMITERS: Final = ("\t", ";", ",", " ")
-_NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", " ": "blanks"}
+_DELIMITERS: Final = ("\t", ";", ",", "|", " ")
+_NAMES: Final = {"\t": "tabs", ";": "';'", ",": "','", "|": "'|'", " ": "blanks"}
 #: Words for a missing value.
 _MISSING: Final = frozenset({
     "", "na", "n/a", "#n/a", "nan", "-nan", "1.#qnan", "-1.#ind", "null", "none", "-", "--", "---", "----", "*",
     "ovrng", "overrange", "over range", "overload", "overflow", "ol", "out of range", "invalid", "error",
+    "\N{INFINITY}", "-\N{INFINITY}", "+\N{INFINITY}",
 })  # fmt: skip
 #: Words in front of the units and the sample time in preambles of oscilloscopes, in lower case without a colon.
-_X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit")
-_Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit")
-_X_STEP: Final = ("sample interval", "xinc", "x increment", "xincrement", "increment")
+_X_UNITS: Final = ("horizontal units", "x units", "xunits", "x unit", "hunit")
+_Y_UNITS: Final = ("vertical units", "y units", "yunits", "y unit", "vunit")
+_X_STEP: Final = (
+    "sample interval", "xinc", "x increment", "xincrement", "increment", "sampling period", "hresolution", "delta t",
+    "tinc",
+)  # fmt: skip
+#: A word with its value in one cell: ``tInc = 1.0e-03``.
+_IN_ONE_CELL: Final = re.compile(r"(t0|tinc)\s*=\s*(\S+)", re.IGNORECASE)
 #: A time of day, also behind a date in any order of day, month and year, which only a midnight would need.
 _TIME_OF_DAY: Final = re.compile(
-    r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)(?: ?([AaPp])[Mm])?"
+    r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]+)?(\d{1,2}):(\d{2}):(\d{2}(?:[.,:]\d*)?)(?: ?([AaPp])[Mm])?"
 )
 #: A number with thousands separated, by its decimal sign.
 _THOUSANDS: Final = {
-    ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+"),
-    ".": re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+"),
+    ",": re.compile(r"[+-]?\d{1,3}([.'\u2019\u00a0\u202f ]\d{3})+(,\d+)?(?<!\.\d{3})"),
+    ".": re.compile(r"[+-]?\d{1,3}([,'\u2019\u00a0\u202f ]\d{3})+(\.\d+)?(?<!,\d{3})"),
 }
-_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d*)?)?)?")
+#: What separates thousands, with its name for people.
+_SEPARATORS: Final = {
+    ".": "points", ",": "commas", "'": "apostrophes", "\u2019": "apostrophes", "\u00a0": "blanks",
+    "\u202f": "blanks", " ": "blanks",
+}  # fmt: skip
+#: A duration as MATLAB writes it into a table.
+_DURATION: Final = re.compile(r"([+-]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?) (sec|min|ms|us)")
+_DATE: Final = re.compile(r"(\d{4}-\d{2}-\d{2}(?:[T ]\d{2}:\d{2}(?::\d{2}(?:\.\d*)?)?)?) ?(?:Z|UTC|[+-]\d{2}:?\d{2})?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +85,8 @@ class Layout:
     columns : position from 0 of each column. names : its name. kinds : "n" for numbers, "d" for times, "t" for texts.
     units : name -> unit, where the file states it apart from the name.
     dt_s : sample time that the preamble states, s, or None. notes : what was found, for people.
-    thousands : whether the other decimal sign separates thousands. heads : lines of names and units, without blanks,
-    which may come again between the rows.
+    thousands : what separates thousands in the first lines, "" for nothing.
+    heads : lines of names and units, without blanks, which may come again between the rows.
     """
 
     encoding: str
@@ -75,7 +100,7 @@ class Layout:
     units: dict[str, str] = field(default_factory=dict)
     dt_s: float | None = None
     notes: tuple[str, ...] = ()
-    thousands: bool = False
+    thousands: str = ""
     heads: frozenset[str] = frozenset()
 
 
@@ -94,8 +119,7 @@ def read_delimited(path: Path, head: bytes, mapping: ColumnMap) -> Table:
 
 
 def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
-    with path.open(encoding=encoding, newline=None) as file:
-        layout = find_layout(str(path), list(itertools.islice(file, _HEAD_LINES)), encoding, mapping)
+    layout = _layout_of(path, encoding, mapping)
     with path.open(encoding=encoding, newline=None) as file:
         for _ in range(layout.start):
             next(file, None)
@@ -109,6 +133,18 @@ def _read(path: Path, encoding: str, mapping: ColumnMap) -> Table:
         )
     units = {**layout.units, **dict.fromkeys(stamped, "s")}
     return Table(str(path), arrays, dt_s=layout.dt_s, notes=(*layout.notes, *rows.notes), units=units, positional=True)
+
+
+def _layout_of(path: Path, encoding: str, mapping: ColumnMap) -> Layout:
+    with path.open(encoding=encoding, newline=None) as file:
+        lines = list(itertools.islice(file, _HEAD_LINES))
+        try:
+            return find_layout(str(path), lines, encoding, mapping)
+        except InputError:
+            more = list(itertools.islice(file, _LONG_HEAD_LINES))
+            if not more:
+                raise
+            return find_layout(str(path), lines + more, encoding, mapping)
 
 
 def _at_end(file: TextIO, lines: list[str]) -> bool:
@@ -141,7 +177,9 @@ def find_layout(source: str, lines: list[str], encoding: str, mapping: ColumnMap
         block
         for delimiter in delimiters
         for decimal in decimals
-        if not (delimiter == decimal == ",") and (block := _block(lines, delimiter, decimal, named))
+        # Numbers with a decimal comma between commas stand in quotes.
+        if (not delimiter == decimal == "," or any('"' in line for line in lines))
+        and (block := _block(lines, delimiter, decimal, named))
     ]
     # The reading with the most numbers; of equal ones the first. One with more texts than numbers is none.
     best = max(found, key=_numbers, default=None)
@@ -173,9 +211,11 @@ def _kind(cell: str, decimal: str) -> str:
     """n: number, e: empty or missing, d: a date or time of day, t: any other text."""
     if cell.casefold() in _MISSING:
         return "e"
-    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _THOUSANDS[decimal].fullmatch(cell):
+    if (not (decimal == "," and "." in cell) and is_number(cell, decimal)) or _THOUSANDS[decimal].fullmatch(
+        plain_number(cell)
+    ):
         return "n"
-    return "d" if _DATE.fullmatch(cell) or _TIME_OF_DAY.fullmatch(cell) else "t"
+    return "d" if any(times.fullmatch(cell) for times in (_DATE, _TIME_OF_DAY, _DURATION)) else "t"
 
 
 def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) -> _Block | None:
@@ -206,6 +246,7 @@ def _block(lines: list[str], delimiter: str, decimal: str, named: int | None) ->
         k
         for k, row in same
         if (row[numbers[0]] == "n" or kinds[: numbers[0]].strip("e"))
+        and all(row[j] in "de" for j in range(width) if kinds[j] == "d")
         and 2 * sum(row[j] in "ne" for j in numbers) >= len(numbers)
         and any(row[j] == "n" for j in numbers)
     ]
@@ -279,13 +320,20 @@ def _layout(
         notes.append("units from the preamble: " + ", ".join(f"{name} in {unit}" for name, unit in over.items()))
     if dt_s is not None:
         notes.append(f"the preamble states a sample time of {dt_s:g} s")
-    thousands = any(
-        _THOUSANDS[block.decimal].fullmatch(cell)
-        for line in lines[start:]
-        for cell in split_cells(line.strip("\r\n"), block.delimiter)
+    thousands = "".join(
+        sorted(
+            {
+                sign
+                for line in lines[start:]
+                for cell in split_cells(line.strip("\r\n"), block.delimiter)
+                if _THOUSANDS[block.decimal].fullmatch(cell)
+                for sign in _SEPARATORS
+                if sign in cell and sign != block.decimal
+            }
+        )
     )
     if thousands:
-        notes.append(f"thousands separated by {'points' if block.decimal == ',' else 'commas'}")
+        notes.append(f"thousands separated by {_SEPARATORS[thousands[0]]}")
     return Layout(
         encoding, block.delimiter, block.decimal, start, len(block.kinds), columns, tuple(names), kinds, units, dt_s,
         (*said, *notes), thousands, frozenset(lines[k].strip() for k in above[-2:]),
@@ -309,7 +357,12 @@ def _fitting(cells: list[str], block: _Block, columns: tuple[int, ...], directly
 
 
 def _fit(line: str, block: _Block, columns: tuple[int, ...]) -> list[str]:
-    return _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True) or []
+    found = _fitting(_cells_of(line, block.delimiter, strip=True), block, columns, True)
+    if found is None and block.delimiter == " ":
+        # Names with blanks in them stand further apart; SPEC's begin with #L.
+        text = line.strip().removeprefix("#L ").lstrip("#% ")
+        found = _fitting(re.split(r"\s{2,}|\t", text), block, columns, True)
+    return found or []
 
 
 def _names_above(
@@ -326,15 +379,16 @@ def _names_above(
     if len(cells) > 2 and not cells[0] and all(cells[1:]) and not any(is_number(cell, ".") for cell in cells):
         # As pandas writes its index: the first column has no name.
         cells[0] = "index"
+    if traces := _traces(lines, block, columns, above) or _pairs(lines, block, columns, above):
+        names, units = traces
+        return names, units, [f"columns named by the preamble: {', '.join(names)}"]
     if not cells or not all(cells):
+        if named := _names_and_units(lines, block, columns, above):
+            return named
+        _refuse_commas_between_commas(source, lines[last], block)
         return None, {}, []
-    upper = _fit(lines[above[-2]], block, columns) if len(above) > 1 else []
-    if upper and all(upper):
-        names = different(upper)
-        units = units_row(names, cells)
-        # Above a whole row of units, numbers are names of channels.
-        if units and (len(units) == len(names) or not any(is_number(cell, block.decimal) for cell in upper)):
-            return names, units, [_units_note(last, units)]
+    if named := _names_and_units(lines, block, columns, above):
+        return named
     if comment:
         if len(set(cells)) < len(cells) or any(is_number(cell, ".") for cell in cells):
             return None, {}, []
@@ -343,7 +397,64 @@ def _names_above(
         if all(_is_comment(lines[k]) for k in above[:-1]):
             has_names(source, cells, mapping, "line", last + 1)
         return None, {}, []
+    if any(_kind(cell, block.decimal) == "d" for cell in cells):
+        return None, {}, []
     return different(cells), {}, []
+
+
+def _refuse_commas_between_commas(source: str, line: str, block: _Block) -> None:
+    """Raise InputError where each name stands above two cells: numbers with decimal commas between commas."""
+    names = _cells_of(line, block.delimiter)
+    if block.delimiter == "," and 2 * len(names) == len(block.kinds) > 2 and not any(is_number(n, ".") for n in names):
+        raise InputError(
+            f"{source}: got {len(names)} names and {len(block.kinds)} cells a line, expected as many: decimal commas "
+            "between commas cannot be told apart; save it with ';' between the columns, or with points"
+        )
+
+
+def _names_and_units(
+    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str], dict[str, str], list[str]] | None:
+    """Names above a row of units: directly above the samples, or further up where every column has a unit."""
+    for k, (named, stated) in reversed(list(enumerate(itertools.pairwise(above), 2))):
+        upper = _fit(lines[named], block, columns)
+        if not upper or not all(upper):
+            continue
+        names = different(upper)
+        units = units_row(names, _fit(lines[stated], block, columns))
+        # Above a whole row of units, numbers are names of channels.
+        plain = not any(is_number(cell, block.decimal) for cell in upper)
+        if len(units) == len(names) or (units and plain and k == len(above)):
+            return names, units, [_units_note(stated, units)]
+    return None
+
+
+def _traces(
+    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str], dict[str, str]] | None:
+    """The names of the columns where a line of the preamble begins with the word ``TraceName``."""
+    for k in above:
+        cells = _cells_of(lines[k], block.delimiter)
+        if cells and cells[0].casefold() == "tracename" and len(cells) == len(columns) + 1:
+            return different(cells[1:]), {}
+    return None
+
+
+def _pairs(
+    lines: list[str], block: _Block, columns: tuple[int, ...], above: list[int]
+) -> tuple[list[str], dict[str, str]] | None:
+    """Names and units of an export of TwinCAT's scope: a column of times in front of each channel's values.
+
+    Each line of the preamble has a word and a value for each channel, ``Name`` among them.
+    """
+    rows = [_cells_of(lines[k], block.delimiter) for k in above]
+    words = {row[0]: row[1::2] for row in rows if row and len(row) == len(columns) and set(row[::2]) == {row[0]}}
+    if "Name" not in words or len(columns) % 2:
+        return None
+    names = different([name for channel in words["Name"] for name in (f"time of {channel}", channel)])
+    stated = {name: "ms" for name in names[::2] if "SampleTime[ms]" in words}
+    stated |= {name: unit.strip("()") for name, unit in zip(names[1::2], words.get("Unit", []), strict=False)}
+    return names, {name: unit for name, unit in stated.items() if stated_unit(unit)}
 
 
 def _rigol(
@@ -374,10 +485,13 @@ def _preamble(lines: list[str], delimiter: str) -> dict[str, list[str]]:
         word = cells[0].strip(' :"').casefold() if cells else ""
         if len(cells) > 1 and word and not is_number(word, "."):
             found.setdefault(word, [cell for cell in cells[1:] if cell])
-        if len(upper) > 2 and upper[-1].casefold() == "increment" and len(cells) == len(upper):
-            found.setdefault("increment", cells[-1:])
+        for cell in cells:
+            if match := _IN_ONE_CELL.fullmatch(cell):
+                found.setdefault(match[1].casefold(), [match[2]])
         while cells and not cells[-1]:
             cells.pop()
+        if len(upper) > 2 and upper[-1].casefold() == "increment" and len(cells) == len(upper):
+            found.setdefault("increment", cells[-1:])
         upper = cells
     return found
 
@@ -388,7 +502,9 @@ def _of_preamble(names: list[str], preamble: dict[str, list[str]], decimal: str)
     y = next((preamble[word] for word in _Y_UNITS if preamble.get(word)), [])
     step = next((preamble[word] for word in _X_STEP if preamble.get(word)), [])
     units: dict[str, str] = {}
-    if x and len(names) > 1 and stated_unit(x[0]):
+    if "tracename" in preamble and len(y) == len(names):  # channels without a column for the time
+        units = {name: unit for name, unit in zip(names, y, strict=True) if stated_unit(unit)}
+    elif x and len(names) > 1 and stated_unit(x[0]):
         units[names[0]] = x[0]
         channels = names[1:]
         labels = y if len(y) >= len(channels) else y * len(channels) if len(y) == 1 == len(channels) else []
@@ -443,6 +559,8 @@ class _Rows:
         """Take the next lines of the file; ``last`` says that there are no more."""
         numbered = self._line
         self._line += len(lines)
+        if last:
+            lines = self._without_tail(lines)
         block = None if self._texts or self.layout.thousands else self._fast(lines)
         if block is None:
             block = self._slow(lines, numbered, last)
@@ -450,6 +568,29 @@ class _Rows:
         self._reserve(n, sum(map(len, lines)))
         self._values[:, self.n : self.n + n] = block
         self.n += n
+
+    def _without_tail(self, lines: list[str]) -> list[str]:
+        """``lines`` without a text below the samples: an end mark, remarks, a row of means."""
+        stop = len(lines)
+        while stop > max(0, len(lines) - _MOST_TAIL_LINES) and not self._begins_as_row(lines[stop - 1]):
+            stop -= 1
+        tail = [
+            line.strip() for line in lines[stop:] if not _is_comment(line) and line.strip() not in self.layout.heads
+        ]
+        if tail and stop:
+            what = f"the last {len(tail)} lines are" if len(tail) > 1 else "the last line is"
+            self.notes.append(f"{what} no samples and left out: {tail[0][:60]!r}")
+        return lines[:stop] if stop else lines
+
+    def _begins_as_row(self, line: str) -> bool:
+        """Whether a line has a number, or nothing, in the first column of numbers, and times where there are times."""
+        layout = self.layout
+        cells = dict(enumerate(split_cells(line.strip("\r\n"), layout.delimiter))) if line.strip("\x1a \r\n") else {}
+        first = {layout.columns[self._numbers[0]]: "ne"} if self._numbers else {}
+        times = {at: "de" for at, kind in zip(layout.columns, layout.kinds, strict=True) if kind == "d"}
+        return bool(cells) and all(
+            at in cells and _kind(cells[at], layout.decimal) in kinds for at, kinds in {**first, **times}.items()
+        )
 
     def _reserve(self, n: int, characters: int) -> None:
         if self.n + n <= self._values.shape[1]:
@@ -476,6 +617,8 @@ class _Rows:
             count = layout.width - 1
             if any(line.count(delimiter) != count for line in lines if line.strip()):
                 return None
+        if layout.delimiter == layout.decimal:
+            return None
         source = (line.replace(",", ".") for line in lines) if layout.decimal == "," else lines
         usecols = None if self._whole else [layout.columns[i] for i in self._numbers]
         try:
@@ -518,19 +661,18 @@ class _Rows:
 
     def _column(self, i: int, cells: list[str]) -> FloatArray:
         comma = self.layout.decimal == ","
-        plain = [cell.replace("." if comma else ",", "") for cell in cells] if self.layout.thousands else cells
-        plain = [cell.replace(",", ".") for cell in plain] if comma else plain
-        try:
-            return np.array(plain, dtype=np.float64)
-        except ValueError:
-            pass
-        values = np.full(len(cells), np.nan)
-        for row, cell in enumerate(plain):
+        if not self.layout.thousands:
             try:
-                values[row] = float(cell)
+                return np.array([cell.replace(",", ".") for cell in cells] if comma else cells, dtype=np.float64)
             except ValueError:
-                if cell.casefold() not in _MISSING:
-                    self._wrong.setdefault(i, {})[self.n + row] = cells[row]
+                pass
+        values = np.full(len(cells), np.nan)
+        for row, cell in enumerate(cells):
+            value = _number(cell, self.layout.decimal, self.layout.thousands)
+            if value is not None:
+                values[row] = value
+            elif cell.casefold() not in _MISSING:
+                self._wrong.setdefault(i, {})[self.n + row] = cell
         return values
 
     def arrays(self) -> tuple[dict[str, NDArray[Any]], list[str]]:
@@ -551,14 +693,31 @@ class _Rows:
         return found, stamped
 
 
+def _number(cell: str, decimal: str, thousands: str) -> float | None:
+    """A cell as a number; None where it is none. ``thousands``: what separates them in other rows."""
+    plain = plain_number(cell)
+    separators = thousands or ("".join(_SEPARATORS) if _THOUSANDS[decimal].fullmatch(plain) else "")
+    for sign in separators:
+        plain = plain if sign == decimal else plain.replace(sign, "")
+    try:
+        return float(plain.replace(",", ".") if decimal == "," else plain)
+    except ValueError:
+        return None
+
+
 def _times_or_texts(cells: list[str]) -> tuple[NDArray[Any], bool]:
     """Dates or times of day (n,) as seconds since the first and True, or the texts and False."""
     filled = [cell for cell in cells if cell]
-    if filled and all(_DATE.fullmatch(cell) for cell in filled):
+    dates = [_DATE.fullmatch(cell) for cell in cells]
+    if filled and all(date for cell, date in zip(cells, dates, strict=True) if cell):
         try:
-            return seconds(np.array([cell or "NaT" for cell in cells], dtype="datetime64[ns]")), True
+            return seconds(np.array([date[1] if date else "NaT" for date in dates], dtype="datetime64[ns]")), True
         except ValueError:
             return np.array(cells), False
+    durations = [_DURATION.fullmatch(cell) for cell in cells]
+    if filled and all(duration for cell, duration in zip(cells, durations, strict=True) if cell):
+        factors = QUANTITIES["t"][1]
+        return np.array([float(d[1]) * factors[stated_unit(d[2]) or "s"] if d else np.nan for d in durations]), True
     if filled and all(_TIME_OF_DAY.fullmatch(cell) for cell in filled):
         of_day = np.array(list(_seconds_of_day(cells)))
         # Midnight is no step back.
@@ -574,4 +733,4 @@ def _seconds_of_day(cells: list[str]) -> Iterator[float]:
             yield np.nan
             continue
         hour = int(match[1]) if match[4] is None else int(match[1]) % 12 + 12 * (match[4] in "Pp")
-        yield 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", "."))
+        yield 3600.0 * hour + 60.0 * int(match[2]) + float(match[3].replace(",", ".").replace(":", "."))

@@ -38,6 +38,10 @@ LONGER = 2
 LARGEST_LEAD = 0.02
 #: Below this correlation the columns do not form a loop, and are not judged.
 LEAST_CORRELATION = 0.8
+#: Share of samples with the time of the one before from which the time has too few digits.
+OFTEN_DOUBLED = 0.2
+#: Longest likely sample time, s: a longer one is a counter, or milliseconds that were taken for seconds.
+SLOWEST_DT_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +147,14 @@ def _time_base(recording: Recording) -> list[Finding]:
         found.append(Finding("backwards", "warning", "t_s", len(back), _places(recording, back), message))
     if len(doubled):
         message = f"{len(doubled)} samples share their time with the one before, first at {t_s[doubled[0]]:.4g} s"
+        if len(doubled) > OFTEN_DOUBLED * len(steps):
+            message += ": the time has too few digits; state the sample time by --rate or --dt-s"
         found.append(Finding("doubled", "warning", "t_s", len(doubled), _places(recording, doubled), message))
+    if dt > SLOWEST_DT_S:
+        message = (
+            f"t_s: one sample each {dt:.4g} s, expected at most {SLOWEST_DT_S:g} s: is the unit of the time right?"
+        )
+        found.append(Finding("unit", "warning", "t_s", len(t_s), (), message))
     regular = steps[np.isfinite(steps) & (steps >= 0.5 * dt) & (steps <= 1.5 * dt)]
     jitter = float(np.std(regular) / dt) if len(regular) else 0.0
     if jitter > 0.02:

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+#: Most elements of an array of structures or of cells that are looked into.
+MOST_ELEMENTS = 64
+
 
 def answer(content: bytes) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """The line for the content of a file, and the arrays behind it."""
@@ -31,20 +34,35 @@ def answer(content: bytes) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     left_out: list[str] = []
     for name, value in variables.items():
         if not name.startswith("__"):
-            _flatten(name, np.asarray(value), arrays, left_out)
+            _flatten(name, value, arrays, left_out)
     return {"names": list(arrays), "left_out": left_out}, list(arrays.values())
 
 
-def _flatten(name: str, value: NDArray[Any], into: dict[str, NDArray[Any]], left_out: list[str]) -> None:
-    """Add a numeric array, or each field of a structure; texts, cells, tables and objects are left out."""
-    if value.dtype.names is not None and value.ndim == 0:
+def _flatten(name: str, found: Any, into: dict[str, NDArray[Any]], left_out: list[str]) -> None:
+    """Add a numeric array, or those in a structure or in cells; texts, tables and objects are left out.
+
+    Of an array of structures each one is called as MATLAB does, ``rec.Y(2).Data``, and each cell ``data{2}``.
+    """
+    value = np.asarray(found)
+    if type(found).__name__ in ("MatlabOpaque", "MatlabFunction"):
+        left_out.append(f"{name} (a table or an object: save its columns as arrays)")
+    elif value.dtype.names is not None and value.ndim == 0:
         for field in value.dtype.names:
-            _flatten(f"{name}.{field}", np.asarray(value[field].item()), into, left_out)
+            _flatten(f"{name}.{field}", value[field].item(), into, left_out)
+    elif (value.dtype.names is not None or value.dtype == object) and 0 < value.size <= MOST_ELEMENTS:
+        before = len(into), len(left_out)
+        for k, element in enumerate(value.reshape(-1), 1):
+            _flatten(f"{name}({k})" if value.dtype.names is not None else f"{name}{{{k}}}", element, into, left_out)
+        if len(into) == before[0]:  # names, as a rule
+            left_out[before[1] :] = [f"{name} (cells)"]
     elif value.dtype.kind in "fiubc":
         into[name] = value
+    elif value.dtype.kind in "SU":
+        # The name of a channel beside its samples.
+        in_array = value.ndim == 0 and ("(" in name or "{" in name)
+        left_out.append(f"{name} ({repr(str(value)[:40]) if in_array else 'text'})")
     else:
-        kind = "text" if value.dtype.kind in "SU" else "no array of numbers"
-        left_out.append(f"{name} ({kind})")
+        left_out.append(f"{name} (no array of numbers)")
 
 
 def _limit(memory_bytes: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,8 @@ from sim.recordings.columns import (
     column_by_unit,
     default_column,
     factor_and_unit,
-    proposed_column,
 )
+from sim.recordings.proposals import Candidate, in_another_file, likely, likely_time, likely_time_unit
 from sim.recordings.recording import Recording
 from sim.recordings.table import MAX_BYTES, Table
 
@@ -118,6 +117,8 @@ _BY_ENDING: dict[str, Callable[[Path, bytes], Table]] = {
     ".npz": arrays.read_npz,
     ".npy": arrays.read_npy,
     ".tdms": arrays.read_tdms,
+    ".feather": arrays.read_feather,
+    ".arrow": arrays.read_feather,
 }
 #: First bytes of a file -> its reader, for files with another ending.
 _BY_FIRST_BYTES: dict[bytes, Callable[[Path, bytes], Table]] = {
@@ -125,6 +126,7 @@ _BY_FIRST_BYTES: dict[bytes, Callable[[Path, bytes], Table]] = {
     b"TDSm": arrays.read_tdms,
     b"\x93NUMPY": arrays.read_npy,
     b"PAR1": arrays.read_parquet,
+    b"ARROW1": arrays.read_feather,
     b"MATLAB ": arrays.read_mat,
 }
 #: Formats to be saved as another one, with what to do.
@@ -132,6 +134,21 @@ _REFUSED = {
     ".xls": "an old Excel workbook, expected .xlsx or .csv: save it as one of these",
     ".tdms_index": "the index of a TDMS file, expected the .tdms file beside it",
     ".ods": "an OpenDocument sheet, expected .xlsx or .csv: save it as one of these",
+    ".json": "JSON, expected a table: save it as .csv or .npz",
+    ".jsonl": "JSON, expected a table: save it as .csv or .npz",
+    ".pkl": "a pickled Python object, which is never loaded: save its arrays as .npz or .csv",
+}
+#: First bytes of files that are no recordings, with what they are and what to do.
+_REFUSED_BY_FIRST_BYTES: dict[bytes, str] = {
+    b"\x1f\x8b": "a file packed by gzip: unpack it first (gunzip)",
+    b"PK\x03\x04": "a packed folder (zip): unpack it first",
+    b"%PDF": "a PDF, expected the samples themselves: export them as .csv",
+    b"\xd0\xcf\x11\xe0": "an old Office file, expected .xlsx or .csv: save it as one of these",
+    b"SQLite format 3": "a database (SQLite): export its table as .csv",
+    b"<!DOCTYPE": "a web page, expected the samples themselves: was the log-in of a server saved?",
+    b"<html": "a web page, expected the samples themselves: was the log-in of a server saved?",
+    b":WFM": "a scope's own waveform file: export it as .csv from the instrument or its program",
+    b"WAVEDESC": "a scope's own waveform file: export it as .csv from the instrument or its program",
 }
 
 
@@ -148,6 +165,9 @@ def _table(path: Path, digest: Any, mapping: ColumnMap) -> Table:
         # A text may begin with the same letters, and holds no zero bytes.
         if head.startswith(first) and b"\x00" in head[:4096]:
             return reader(path, _content(path))
+    for first, what in _REFUSED_BY_FIRST_BYTES.items():
+        if head.lstrip().startswith(first):
+            raise InputError(f"{path}: is {what}")
     if text.is_gcs(head):
         return text.read_gcs(path, _content(path), mapping)
     if text.is_lvm(head):
@@ -178,8 +198,8 @@ class _Reading:
         self.notes = [note for table in self.tables for note in table.notes]
         #: quantity -> name of its array in its table, for the columns that were read.
         self.names: dict[str, str] = {}
-        #: Arrays that were proposed for quantities whose column is unknown.
-        self._proposals: list[str] = []
+        #: Name and index of arrays that were proposed for quantities whose column is unknown.
+        self._proposals: set[tuple[str, str]] = set()
 
     def recording(self, source: str, sha256: str) -> Recording:
         """The columns under their names, all of one length. Raises InputError; MissingError with all that is
@@ -219,47 +239,60 @@ class _Reading:
         name = default_column(table.source, quantity, list(table.arrays))
         # A format's own clock goes over a column in seconds.
         if name is None and table.positional and len(table.arrays) > 1 and not (quantity == "t" and table.clocks):
-            taken = [*self.names.values(), *self._said_in(table)]
-            name = column_by_unit(quantity, list(table.arrays), table.units, taken)
+            name = column_by_unit(quantity, list(table.arrays), table.units, self._taken(table))
             if name is not None:
                 self.notes.append(f"{quantity} is the column {name!r}, by its unit")
-        if name is None and len(table.arrays) == 1:
+        only = self._only_array(table, quantity) if name is None else None
+        if only is not None:
             # Quantities that can only mean this array: the user names the file or the part of the array for them, or
             # the other one of u and y is in another file.
             sharing = [q for q, other in self.by_quantity.items() if other is table and q not in self.mapping.columns]
             rest = [q for q in ("u", "y") if q not in self.by_quantity]
             if quantity in self.mapping.index or sharing == [quantity] or (table is self.main and rest == [quantity]):
-                return next(iter(table.arrays))
+                return only
         return name
+
+    def _only_array(self, table: Table, quantity: str) -> str | None:
+        """The array of a table with one, or with one beside the time, as of a scope that writes a file a channel."""
+        names = list(table.arrays)
+        if len(names) == 2 and table.positional and quantity != "t":
+            time = likely_time(table)
+            clock = self.mapping.columns.get("t") or (time.name if time else None)
+            names = [name for name in names if name != clock]
+        return names[0] if len(names) == 1 else None
 
     def _said_in(self, table: Table) -> list[str]:
         """The arrays of a table that the user has given to quantities."""
         said = [(q, n) for q, n in self.mapping.columns.items() if self.by_quantity.get(q, self.main) is table]
         return [table.named(quantity, name) for quantity, name in said]
 
+    def _taken(self, table: Table) -> list[str]:
+        """The arrays of a table that are quantities."""
+        read = [name for q, name in self.names.items() if self.by_quantity.get(q, self.main) is table]
+        return [*read, *self._said_in(table)]
+
     def _proposed(self, quantity: str, table: Table, otherwise: tuple[str, ...]) -> tuple[str, ...]:
         """The options to add for a quantity whose column is unknown; ``otherwise`` where none can be it."""
-        taken = [*self.names.values(), *self._said_in(table), *self._proposals]
-        likely_time = _likely_time(table)
-        if quantity == "t" and likely_time not in taken:
-            return self._with_unit("t", likely_time, table) if likely_time is not None else otherwise
-        taken += [likely_time] if likely_time is not None else []
-        name = proposed_column(quantity, list(table.arrays), taken)
-        if name is None:
+        taken = {(name, "") for name in self._taken(table)} | self._proposals
+        time = likely_time(table)
+        one = time if quantity == "t" and time and (time.name, time.index) not in taken else None
+        if quantity != "t":
+            one = likely(quantity, table, taken)
+        if one is None:
             return otherwise
-        self._proposals.append(name)
-        return self._with_unit(quantity, name, table)
+        self._proposals.add((one.name, one.index))
+        return self._with_unit(quantity, one, table)
 
-    def _with_unit(self, quantity: str, name: str, table: Table) -> tuple[str, ...]:
+    def _with_unit(self, quantity: str, one: Candidate, table: Table) -> tuple[str, ...]:
         """The options that make an array a quantity."""
-        column = f"--column {shlex.quote(f'{quantity}={name}')}"
+        chosen = one.options(quantity)
         try:
-            factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
+            factor_and_unit(table.source, quantity, one.name, self.mapping, table.units.get(one.name))
         except MissingError as error:
-            return (column, *error.options)
+            return (*chosen, *_with_time_unit(quantity, error.options, one.values))
         except InputError:  # in a unit of another kind: a sensor's volts
-            return (column, f"--scale {quantity}=FACTOR")
-        return (column,)
+            return (*chosen, f"--scale {quantity}=FACTOR")
+        return chosen
 
     def _missing_time(self) -> list[MissingError]:
         """What is missing for the time, where other things are missing too."""
@@ -288,13 +321,17 @@ class _Reading:
                 f"in another file, --file {quantity}=FILE",
                 f"which column is {canonical}, {WORDS.get(quantity, quantity)} (--column {quantity}={way}), and "
                 f"its unit ({', '.join(factors)}); if it is in another file, --file {quantity}=FILE",
-                *self._proposed(quantity, table, (f"--file {quantity}=FILE",)),
+                *self._proposed(quantity, table, in_another_file(quantity, table)),
             )
         self.names[quantity] = name
         return self._values(quantity, table, name)
 
     def _values(self, quantity: str, table: Table, name: str) -> FloatArray:
-        factor, unit = factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
+        try:
+            factor, unit = factor_and_unit(table.source, quantity, name, self.mapping, table.units.get(name))
+        except MissingError as error:
+            options = _with_time_unit(quantity, error.options, table.array(quantity, name))
+            raise MissingError(str(error), error.what, *options) from error
         values, done = table.column(quantity, name, self.mapping.index.get(quantity))
         if done:
             self.notes.append(done)
@@ -455,12 +492,11 @@ class _Reading:
 WORDS = {"t": "the time", "u": "the voltage", "y": "the displacement"}
 
 
-def _likely_time(table: Table) -> str | None:
-    """An array to propose as the time: by its name, else the only one that rises with every sample."""
-    numbers = {name: a for name, a in table.arrays.items() if a.ndim == 1 and a.dtype.kind in "fiu" and len(a) > 2}
-    name = proposed_column("t", list(table.arrays), ())
-    rising = [name for name, array in numbers.items() if bool(np.all(np.diff(array[:100_000]) > 0.0))]
-    return name if name is not None else rising[0] if len(rising) == 1 else None
+def _with_time_unit(quantity: str, options: tuple[str, ...], values: NDArray[Any]) -> tuple[str, ...]:
+    """``options`` with the unit that gives a time (n,) a likely rate."""
+    if quantity != "t":
+        return options
+    return tuple(f"--unit t={likely_time_unit(values)}" if o.startswith("--unit t=") else o for o in options)
 
 
 def _all_missing(source: str, held: str, missing: list[MissingError]) -> MissingError:

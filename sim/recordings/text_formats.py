@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import re
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,17 @@ def units_row(names: list[str], cells: list[str]) -> dict[str, str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """The cells of a line of text, without blanks and quotes around them; a blank delimiter means any blanks."""
-    cells = line.split() if delimiter == " " else line.split(delimiter)
+    """The cells of a line of text, without blanks and quotes around them; a blank delimiter means any blanks.
+
+    A delimiter between quotes is part of its cell.
+    """
+    if '"' in line and delimiter != " " and line.count('"') % 2 == 0:
+        try:
+            cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+        except csv.Error:
+            cells = line.split(delimiter)
+    else:
+        cells = line.split() if delimiter == " " else line.split(delimiter)
     return [cell.strip().strip('"') for cell in cells]
 
 
@@ -98,21 +108,40 @@ def decode(path: Path, content: bytes) -> str:
         return content.decode("latin-1")
 
 
+#: The exponent of Fortran's double precision, and the minus sign that spreadsheets of some countries write.
+_EXPONENT_D = re.compile(r"(?<=[\d.])[dD](?=[+-]\d+$)")
+_MINUS = str.maketrans("\N{MINUS SIGN}", "-")
+
+
+def plain_number(text: str) -> str:
+    """A cell as Python reads it: with a plain minus sign and exponent."""
+    return _EXPONENT_D.sub("e", text.translate(_MINUS))
+
+
 def is_number(text: str, decimal: str | None) -> bool:
     """Whether a cell of text is a number with this decimal sign."""
     if "_" in text:  # which Python reads, and no instrument writes
         return False
+    plain = plain_number(text)
     try:
-        float(text.replace(",", ".") if decimal == "," else text)
+        float(plain.replace(",", ".") if decimal == "," else plain)
     except ValueError:
         return False
     return True
 
 
 def from_arrow(column: Any) -> tuple[NDArray[Any], bool]:
-    """A column of pyarrow as an array, and whether it held timestamps, which become seconds since the first."""
+    """A column of pyarrow as an array, and whether it held times, which become seconds.
+
+    Timestamps count from the first one, durations and times of day from zero.
+    """
     import pyarrow as pa
 
+    if pa.types.is_time(column.type):
+        since_midnight = pa.int64() if pa.types.is_time64(column.type) else pa.int32()
+        column = column.cast(since_midnight).cast(pa.int64()).cast(pa.duration(column.type.unit))
+    if pa.types.is_duration(column.type):
+        return seconds(column.cast(pa.duration("ns")).to_numpy().astype("timedelta64[ns]")), True
     if pa.types.is_timestamp(column.type):
         return seconds(column.cast(pa.timestamp("ns")).to_numpy().astype("datetime64[ns]")), True
     if pa.types.is_decimal(column.type):

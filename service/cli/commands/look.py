@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptive.errors import InputError
 from service.cli.options import add_epilog, add_shared
-from service.identification.recording_options import add_mapping_arguments, mapping_from
+from service.identification.recording_options import add_mapping_arguments, mapping_from, to_fill_in
 from sim.recordings import Finding, Recording, check
 from sim.recordings.columns import MissingError
 from sim.recordings.reader import read, read_table
@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
         "understood": None if recording is None else _understood(recording),
         "findings": [finding.as_dict() for finding in findings],
         "missing": missing or None,
-        "commands": commands(args, options, usable),
+        "commands": commands(args, options, usable) if usable or options else [],
+        "fill_in": to_fill_in(options),
         "picture": None if picture is None else str(picture),
     }
     print(json.dumps(found) if args.json else text(found, findings))
@@ -94,9 +95,15 @@ def _understood(recording: Recording) -> dict[str, Any]:
         "rate_Hz": 1.0 / recording.dt_s,
         "duration_s": recording.duration_s,
         "columns": list(recording.columns()),
-        "u_V": [float(np.nanmin(recording.u_V)), float(np.nanmax(recording.u_V))],
-        "y_um": [float(np.nanmin(recording.y_um)), float(np.nanmax(recording.y_um))],
+        "u_V": _ends(recording.u_V),
+        "y_um": _ends(recording.y_um),
     }
+
+
+def _ends(values: NDArray[Any]) -> list[float]:
+    """Smallest and largest finite value; NaN where there is none."""
+    good = values[np.isfinite(values)]
+    return [float(good.min()), float(good.max())] if good.size else [float("nan")] * 2
 
 
 def commands(args: argparse.Namespace, options: tuple[str, ...], usable: bool) -> list[str]:
@@ -140,8 +147,9 @@ def text(found: dict[str, Any], findings: list[Finding]) -> str:
         lines += [f"  {f.severity}: {f.message}" for f in findings if f.message not in found["notes"]]
     if found["missing"]:
         lines.append(f"not understood: {found['missing'].removeprefix(found['file'] + ': ')}")
-        lines.append("go on with this command, after you have checked its columns and units:")
-    else:
+    if found["missing"] and found["commands"]:
+        lines.append(f"go on with this command, after you have checked its columns and units{found['fill_in']}:")
+    elif found["commands"]:
         lines.append("use it by:")
     lines += [f"  {command}" for command in found["commands"]]
     lines += [f"picture: {found['picture']}"] if found["picture"] else []

@@ -12,9 +12,9 @@ from typing import Any
 import zenoh
 
 from service.cli.options import add_connection, add_epilog, add_selection, add_shared, check_selection
-from service.operating.remote import Standbys, in_order, screen, statuses, table
+from service.operating.remote import Standbys, in_order, screen, statuses, table, warnings
 from service.protocol.container import fields_of
-from service.protocol.errors import FieldError
+from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import ROOT
 from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
@@ -49,7 +49,14 @@ def run(args: argparse.Namespace) -> int:
     check_selection(args)
     if not 0.1 <= args.period <= 3600.0:
         raise FieldError("--period", args.period, "0.1 to 3600 s")
-    with open_client(args.endpoint, args.wait, args.zenoh_config) as session:
+    try:
+        opened = open_client(args.endpoint, args.wait, args.zenoh_config)
+    except SessionError as error:
+        if not args.check:
+            raise
+        print(error)
+        return 4
+    with opened as session:
         standbys = Standbys(session, args.stage, args.axis)
         try:
             if not args.once and not args.check:
@@ -77,11 +84,13 @@ def _check(found: list[dict[str, Any]]) -> int:
         state, reason = str(status.get("state", "unknown")), str(status.get("state_reason", ""))
         if state == "ok":
             print(f"{name}: ok")
+            print("".join(f"{line}\n" for line in warnings(status)), end="")
             continue
         # It still answers, safely: a human should look. A wrong sensor or model is more urgent.
         urgent = bool(status.get("trouble")) or state in ("stale", "dropping")
         worst = max(worst, 3 if urgent else 1)
         print(f"{name}: {state}: {reason}")
+        print("".join(f"{line}\n" for line in warnings(status)), end="")
     return worst
 
 

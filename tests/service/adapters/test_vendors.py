@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import re
+import socket
 import subprocess
 import sys
 import types
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 
 from adaptive.errors import InputError
+from service.adapters import simulated_pi
 from service.adapters.adapter import AdapterError, StageAdapter
 from service.adapters.jena import Nv200Stage
 from service.adapters.ni import NiStage
@@ -50,6 +52,19 @@ def pi_port() -> Iterator[int]:
     process.kill()
     process.stdout.close()
     process.wait(10)
+
+
+def test_the_simulated_pi_controller_says_what_is_wrong_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        for words, message in (
+            (["--port", port], f"port {port} is not free"),
+            (["--gain-drop", "6 %"], "--gain-drop: got '6 %', expected S:SHARE"),
+        ):
+            with pytest.raises(SystemExit) as ended:
+                simulated_pi.main(words)
+            assert ended.value.code == 2
+            assert message in capsys.readouterr().err
 
 
 @needs_pipython

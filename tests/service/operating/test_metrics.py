@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import json
 import re
+import socket
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -13,8 +14,10 @@ from typing import Any
 import pytest
 
 from adaptive.errors import InputError
+from lab.cli import main
 from service.cli.commands.status import _check
 from service.operating.metrics import page, serve_page
+from service.operating.remote import table
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 
@@ -88,6 +91,20 @@ def test_the_page_over_http_and_a_reading_that_fails() -> None:
 )
 def test_the_health_check(found: list[dict[str, Any]], code: int) -> None:
     assert _check(found) == code
+
+
+def test_the_health_check_names_what_did_not_fit_at_the_start(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _check([status(warnings=["the limits of 0 to 9 V are narrower", 7])]) == 0
+    warned = "warning: demo/x: the limits of 0 to 9 V are narrower"
+    assert capsys.readouterr().out.splitlines() == ["demo/x: ok", warned]
+    assert table([status(warnings=["the limits of 0 to 9 V are narrower"])]).splitlines()[-1] == warned
+
+
+def test_the_health_check_where_nothing_listens(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    assert main(["status", "--check", "--wait", "0", "--endpoint", f"tcp/127.0.0.1:{port}"]) == 4
+    assert f"no answer at tcp/127.0.0.1:{port}" in capsys.readouterr().out
 
 
 def test_the_dashboard_asks_only_for_metrics_that_there_are() -> None:

@@ -180,6 +180,14 @@ def test_jitter_and_wrong_units() -> None:
     assert kinds(replace(base, t_s=base.t_s + 1e-4 * rng.standard_normal(4000))) == {"jitter": "warning"}
     assert kinds(replace(base, y_um=base.y_um * 1e3)) == {"unit": "warning"}
     assert kinds(replace(base, u_V=base.u_V * 1e-3)) == {"unit": "warning"}
+    # Milliseconds that were taken for seconds, or a counter of the samples.
+    assert kinds(replace(base, t_s=base.t_s * 1e3, dt_s=base.dt_s * 1e3)) == {"unit": "warning"}
+
+
+def test_a_time_with_too_few_digits_names_the_option() -> None:
+    base = healthy()
+    found = check(replace(base, t_s=np.floor(base.t_s * 100.0 + 1e-6) / 100.0, dt_s=1e-2))
+    assert any("the time has too few digits; state the sample time by --rate" in finding.message for finding in found)
 
 
 def test_columns_of_another_length_are_refused() -> None:

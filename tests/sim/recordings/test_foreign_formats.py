@@ -266,7 +266,7 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", objects, allow_pickle=True)
     np.savez(tmp_path / "a.npz", u_V=objects)
     for name in ("a.npy", "a.npz"):
-        with pytest.raises(InputError, match=r"not a whole \.np[yz] file of (a )?plain array"):
+        with pytest.raises(InputError, match="holds a pickled Python object, which is never loaded"):
             read(tmp_path / name)
     assert not (tmp_path / "opened").exists()
 
@@ -455,7 +455,7 @@ def test_hdf5_with_groups_and_stated_units(tmp_path: Path) -> None:
         file["table"] = np.zeros(3, dtype=[("a", "f8"), ("b", "f8")])
     columns = {"u": "run1.drive", "y": "run1.sensor"}
     same(read(tmp_path / "a.h5", ColumnMap(columns=columns)), rtol=1e-15)
-    with pytest.raises(InputError, match=r"left out: elsewhere \(a link\), table \(no numbers\)"):
+    with pytest.raises(InputError, match=r"table\.a, table\.b \(left out: elsewhere \(a link\)\)"):
         read(tmp_path / "a.h5")
 
 

@@ -1,0 +1,418 @@
+"""Exports as programs write them: read as they are, or by the options that the first message proposes."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import openpyxl
+import pyarrow as pa
+import pytest
+from pyarrow import feather, parquet
+from scipy.io import savemat
+
+from adaptive.errors import InputError
+from service.identification.recording_options import add_mapping_arguments, mapping_from
+from sim.recordings import Recording, read
+from sim.recordings.columns import ColumnMap, MissingError, unit_of_name
+
+N, DT_S = 3000, 1e-3
+T_S = np.arange(N) * DT_S
+U_V = 5.0 - 4.5 * np.cos(2 * np.pi * 1.3 * T_S)
+Y_UM = 8.0 * U_V + 1.5 * np.sin(2 * np.pi * 1.3 * T_S) + 3.0
+RECORDS = np.zeros(N, dtype=[("time", "f8"), ("voltage_V", "f8"), ("pos_nm", "f8")])
+RECORDS["time"], RECORDS["voltage_V"], RECORDS["pos_nm"] = T_S, U_V, 1e3 * Y_UM
+
+
+def second_try(path: Path, filled: dict[str, str] | None = None) -> tuple[Recording, int]:
+    """The recording, and the tries that it took: 2 with the options of the first message, ``filled`` in by the user."""
+    try:
+        return read(path), 1
+    except MissingError as error:
+        options = shlex.split(" ".join(error.options))
+    for word, value in (filled or {}).items():
+        options = [
+            f"{option.removesuffix(word)}{value}" if option.endswith(f"={word}") or option == word else option
+            for option in options
+        ]
+    parser = argparse.ArgumentParser()
+    add_mapping_arguments(parser)
+    return read(path, mapping_from(parser.parse_args(options))), 2
+
+
+def assert_read(recording: Recording, y_um: np.ndarray[Any, Any] = Y_UM, tolerance: float = 1e-3) -> None:
+    assert recording.dt_s == pytest.approx(DT_S)
+    np.testing.assert_allclose(recording.u_V, U_V, atol=tolerance)
+    np.testing.assert_allclose(recording.y_um, y_um, atol=10 * tolerance)
+
+
+def rows(line: str) -> str:
+    """A line for each sample: k, t, u, y in the canonical units, v the sensor at 10 µm per V, and times."""
+    start = datetime(2026, 11, 25, 14, 3, 11)
+    return "".join(
+        line.format(
+            k=k, t=t, u=u, y=y, v=y / 10, ms=1e3 * t,
+            iso=(start + timedelta(milliseconds=k)).isoformat("T", "milliseconds"),
+            clock=(start + timedelta(milliseconds=k)).strftime("%d.%m.%Y %H:%M:%S.%f"),
+            day=f"11/25/2026 14:00:{int(t):02d}", rest=k % 1000, u_mV=1e3 * u, y_nm=1e3 * y,
+        )
+        for k, (t, u, y) in enumerate(zip(T_S.tolist(), U_V.tolist(), Y_UM.tolist(), strict=True))
+    )  # fmt: skip
+
+
+def commas(text: str) -> str:
+    return text.replace(".", ",")
+
+
+YOKOGAWA = """"//YOKOGAWA ASCII FILE FORMAT"
+"FormatVersion","1.11"
+"TraceName","Piezo U","Sensor"
+"BlockSize",3000,3000
+"VUnit","V","V"
+"SampleRate",1.000000E+03,1.000000E+03
+"HResolution",1.000000E-03,1.000000E-03
+"HUnit","s","s"
+"Date","2026/11/25","2026/11/25"
+"Time","14:00:00.123456","14:00:00.123456"
+
+"""
+TWINCAT = """Name\tYT Scope Project
+File\tC:\\lab.tcscopex
+
+Name\tGVL.fU\tName\tGVL.fY
+Data-Type\tREAL64\tData-Type\tREAL64
+SampleTime[ms]\t1\tSampleTime[ms]\t1
+Unit\t(None)\tUnit\t(None)
+
+"""
+LABVIEW = """waveform\t[0]\t[1]
+t0\t25.11.2026 14:03:11,000000\t25.11.2026 14:03:11,000000
+delta t\t0,001000\t0,001000
+
+time\tY[0]\tY[1]
+"""
+BENCHLINK = "Name:,scan1\nOwner:,lab\nScan,Time,101 <u> (VDC),101 Alarm,102 <y> (VDC),102 Alarm\n"
+LONG = "[Settings]\n" + "".join(f"Parameter{k}={k / 2}\n" for k in range(600)) + "[Data]\n"
+
+#: Opened as they are.
+PLAIN: dict[str, tuple[str, str]] = {
+    "units in odd words": ("Time (msec),Drive Voltage [Volts],Position (Mikrometer)\n", "{ms:.3f},{u:.5f},{y:.5f}\n"),
+    "units behind colons": ("Time: s,Voltage: V,Position: um\n", "{t:.3f},{u:.5f},{y:.5f}\n"),
+    "units behind dashes": ("Time - s,Voltage - V,Position - µm\n", "{t:.3f},{u:.5f},{y:.5f}\n"),
+    "units between angles": ("Time <s>;Voltage <V>;Position <µm>\n", "{t:.3f};{u:.5f};{y:.5f}\n"),
+    "a µ that was read in another encoding": ("Time (s),Voltage (V),Position (Âµm)\n", "{t:.3f},{u:.5f},{y:.5f}\n"),
+    "bars": ("t_s|u_V|y_um\n", "{t:.3f}|{u:.5f}|{y:.5f}\n"),
+    "times with a zone": ("time,u_V,y_um\n", "{iso}+01:00,{u:.5f},{y:.5f}\n"),
+    "universal times": ("time (s),u_V,y_um\n", "{iso}Z,{u:.5f},{y:.5f}\n"),
+    "a preamble of 602 lines": (LONG + "Time[s]\tU[V]\tX[um]\n", "{t:.3f}\t{u:.5f}\t{y:.5f}\n"),
+    "names with blanks in fixed columns": (
+        "  Time (s)     Voltage (V)    Position (um)\n", "   {t:.3f}   {u:9.5f}   {y:9.5f}\n",
+    ),
+    "COMSOL": ("% Version:   6.1\n% t (s)    Voltage (V)    Displacement (um)\n", "{t:.6f}    {u:.6f}    {y:.6f}\n"),
+    "rows between the units and the samples": (
+        "HBM\n\nZeit\tSpannung\tWeg\ns\tV\tµm\n25.11.2026\t25.11.2026\t25.11.2026\n1 kHz\t1 kHz\t1 kHz\n",
+        "{t:.3f}\t{u:.5f}\t{y:.5f}\n",
+    ),
+    "MATLAB's durations": ("Time,u_V,y_um\n", "{t:.6g} sec,{u:.5f},{y:.5f}\n"),
+    "thousands in quotes": ("Time (ms),Voltage (mV),Position (nm)\n", '"{ms:,.1f}","{u_mV:,.2f}","{y_nm:,.1f}"\n'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_text_that_opens_at_once(tmp_path: Path, name: str) -> None:
+    head, line = PLAIN[name]
+    (tmp_path / "a.csv").write_text(head + rows(line), encoding="utf-8")
+    recording, _ = second_try(tmp_path / "a.csv")
+    assert_read(recording)
+
+
+def test_decimal_commas_in_quotes_between_commas(tmp_path: Path) -> None:
+    body = "".join(
+        ",".join(f'"{value:.5f}"'.replace(".", ",") for value in row) + "\n"
+        for row in zip(T_S.tolist(), U_V.tolist(), Y_UM.tolist(), strict=True)
+    )
+    (tmp_path / "a.csv").write_text('"Zeit [s]","Spannung [V]","Weg [µm]"\n' + body, encoding="utf-8")
+    assert_read(read(tmp_path / "a.csv"))
+
+
+@pytest.mark.parametrize(("sign", "word"), [("\u00a0", "blanks"), ("\u202f", "blanks"), ("'", "apostrophes")])
+def test_thousands_of_other_countries(tmp_path: Path, sign: str, word: str) -> None:
+    body = rows("{ms:,.1f};{u_mV:,.2f};{y_nm:,.1f}\n").replace(",", sign).replace(".", ",")
+    (tmp_path / "a.csv").write_text("Temps (ms);Tension (mV);Position (nm)\n" + body, encoding="utf-8")
+    recording = read(tmp_path / "a.csv")
+    assert_read(recording)
+    assert any(f"thousands separated by {word}" in note for note in recording.notes)
+
+
+def test_minus_signs_of_spreadsheets_and_exponents_of_fortran(tmp_path: Path) -> None:
+    body = "".join(f"{t:.3f},{u - 5:.5f},{y:.6E}\n" for t, u, y in zip(T_S, U_V, Y_UM, strict=True))
+    body = body.replace(",-", ",\N{MINUS SIGN}").replace("E", "D")
+    (tmp_path / "a.csv").write_text("t_s,u_V,y_um\n" + body, encoding="utf-8")
+    recording = read(tmp_path / "a.csv")
+    np.testing.assert_allclose(recording.u_V, U_V - 5, atol=1e-5)
+    np.testing.assert_allclose(recording.y_um, Y_UM, rtol=1e-6)
+
+
+def test_decimal_commas_between_commas_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    body = rows("{t:.3f};{u:.5f};{y:.5f}\n").replace(".", ",").replace(";", ",")
+    (tmp_path / "a.csv").write_text("Zeit,Spannung,Weg\n" + body)
+    with pytest.raises(InputError, match=r"3 names and 6 cells a line.*save it with ';'"):
+        read(tmp_path / "a.csv")
+
+
+def test_an_end_mark_below_columns_that_begin_with_a_delimiter(tmp_path: Path) -> None:
+    head = "IGOR\nWAVES/D\ttime_s\tu_V\ty_um\nBEGIN\n"
+    (tmp_path / "a.itx").write_text(head + rows("\t{t:.3f}\t{u:.5f}\t{y:.5f}\n") + "END\nX SetScale/P x 0,1\n")
+    recording, _ = second_try(tmp_path / "a.itx")
+    assert_read(recording)
+
+
+@pytest.mark.parametrize("tail", ["\nEnd of measurement\nOperator: lab\n", "Mean,5.0,27.0\nMax,10,70\n", "\x1a"])
+def test_text_below_the_samples_is_left_out_and_said(tmp_path: Path, tail: str) -> None:
+    (tmp_path / "a.csv").write_text("t_s,u_V,y_um\n" + rows("{t:.3f},{u:.5f},{y:.5f}\n") + tail)
+    recording = read(tmp_path / "a.csv")
+    assert_read(recording)
+    assert tail == "\x1a" or any("no samples and left out" in note for note in recording.notes)
+
+
+#: Opened at the second try: the head, a row, and what the user fills in.
+SCOPES: dict[str, tuple[str, str, dict[str, str]]] = {
+    "volts of the sensor in the name": ("Time(s),CH1(V),CH2(V)\n", "{t:.6e},{u:.5e},{v:.6e}\n", {"FACTOR": "10"}),
+    "in s": ("in s,C1 in V,C2 in V\n", "{t:.6E},{u:.5E},{v:.6E}\n", {"FACTOR": "10"}),
+    "increment in the line of names": (
+        "CH1(V),CH2(V),t0 = -5.0e-03, tInc = 1.000000e-03,\n", "{u:.5e},{v:.6e},,\n", {"FACTOR": "10"},
+    ),
+    "increment below the names, with a comma behind": (
+        "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,0.0e+00,1.0e-03,\n", "{k},{u:.5e},{v:.6e},,\n",
+        {"FACTOR": "10"},
+    ),
+    "Yokogawa": (YOKOGAWA, ",{u:.6E},{v:.6E},\n", {"FACTOR": "10"}),
+    "TwinCAT": (TWINCAT, "{k}\t{u:.6f}\t{k}\t{y:.6f}\n", {}),
+    "LabVIEW's waveforms": (LABVIEW, commas("{clock}\t{u:.6f}\t{y:.6f}\n").replace(":,", ":."), {}),
+    "BenchLink": (BENCHLINK, "{k},{day}:{rest:03d},{u:.5E},0,{v:.6E},0\n", {"FACTOR": "10"}),
+    "a counter in place of a time": ("Sample,U (V),Y (um)\n", "{k},{u:.5f},{y:.5f}\n", {"HZ": "1000"}),
+    "a time in ms without a unit": ("Time,Drive (V),Sensor (um)\n", "{ms:.1f},{u:.5f},{y:.5f}\n", {}),
+    "an alarm beside each channel": ("Time (s),A,Alarm,B\n", "{t:.3f},{u:.5f},0,{y:.5f}\n", {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCOPES)
+def test_exports_that_open_at_the_second_try(tmp_path: Path, name: str) -> None:
+    head, line, filled = SCOPES[name]
+    body = rows(line)
+    if name.startswith("LabVIEW"):
+        body = body.replace(".", ",").replace("25,11,2026", "25.11.2026")
+    (tmp_path / "a.csv").write_text(head + body, encoding="utf-8")
+    recording, _ = second_try(tmp_path / "a.csv", filled)
+    assert_read(recording)
+
+
+def test_readings_beyond_a_pico_scopes_range_are_missing(tmp_path: Path) -> None:
+    lines = rows("{ms:.6f},{u:.6f},{v:.7f}\n").splitlines(keepends=True)
+    lines[700] = lines[700].rsplit(",", 1)[0] + ",\N{INFINITY}\n"
+    head = "Time,Channel A,Channel B\n(ms),(V),(V)\n\n"
+    (tmp_path / "a.csv").write_text(head + "".join(lines), encoding="utf-8")
+    recording, _ = second_try(tmp_path / "a.csv", {"FACTOR": "10"})
+    assert np.flatnonzero(np.isnan(recording.y_um)).tolist() == [700]
+
+
+@pytest.mark.parametrize(
+    ("head", "factor"),
+    [
+        ("Record Length,3000\nSample Interval,0.001\nVertical Units,V\nHorizontal Units,S\n", {"FACTOR": "10"}),
+        ("LECROYWS3024,12345,Waveform\nSegments,1,SegmentSize,3000\nTime,Ampl\n", {}),
+    ],
+)
+def test_a_file_for_each_channel(tmp_path: Path, head: str, factor: dict[str, str]) -> None:
+    (tmp_path / "u.csv").write_text(head + rows("{t:.6e},{u:.5f}\n"))
+    (tmp_path / "y.csv").write_text(head + rows("{t:.6e},{v:.6f}\n"))
+    recording, tries = second_try(tmp_path / "u.csv", {"FILE": str(tmp_path / "y.csv"), **factor})
+    assert tries == 2
+    # Where the file states no unit, the proposed one is to be checked.
+    assert_read(recording, Y_UM if factor else Y_UM / 10)
+
+
+def struct_array(**fields: list[Any]) -> Any:
+    n = len(next(iter(fields.values())))
+    array = np.zeros((1, n), dtype=[(name, "O") for name in fields])
+    for k in range(n):
+        array[0, k] = tuple(values[k] for values in fields.values())
+    return array
+
+
+def simulink(path: Path) -> None:
+    signals = struct_array(values=[U_V[:, None], Y_UM[:, None]], label=["u", "y"])
+    savemat(path, {"ScopeData": {"time": T_S[:, None], "signals": signals, "blockName": "m/Scope"}})
+
+
+def dspace(path: Path) -> None:
+    axis = struct_array(Name=["Time"], Data=[T_S[None, :]])
+    channels = struct_array(Name=["Piezo/u", "Sensor/y"], Data=[U_V[None, :], Y_UM[None, :]])
+    savemat(path, {"rec1": {"X": axis, "Y": channels}})
+
+
+def cells(path: Path) -> None:
+    data = np.empty((1, 2), dtype=object)
+    data[0, 0], data[0, 1] = U_V[:, None], Y_UM[:, None]
+    savemat(path, {"t": T_S, "data": data})
+
+
+def write_v73(path: Path, build: Callable[[h5py.File], None]) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        build(file)
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(116) + bytes(8) + b"\x00\x02IM")
+
+
+def put(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:
+    stored = group.create_dataset(name, data=np.asarray(values, dtype=np.float64).reshape(1, -1))
+    stored.attrs["MATLAB_class"] = np.bytes_("double")
+    return stored
+
+
+def v73_with_references(path: Path) -> None:
+    def build(file: h5py.File) -> None:
+        store = file.create_group("#refs#")
+        values = [put(store, "a", U_V), put(store, "b", Y_UM)]
+        scope = file.create_group("scope")
+        scope.attrs["MATLAB_class"] = np.bytes_("struct")
+        put(scope, "time", T_S)
+        put(scope, "fs", [1000.0])
+        signals = scope.create_group("signals")
+        signals.attrs["MATLAB_class"] = np.bytes_("struct")
+        field = signals.create_dataset("values", (1, 2), dtype=h5py.ref_dtype)
+        field[0, 0], field[0, 1] = values[0].ref, values[1].ref
+
+    write_v73(path, build)
+
+
+def v73_cells(path: Path) -> None:
+    def build(file: h5py.File) -> None:
+        store = file.create_group("#refs#")
+        values = [put(store, "a", U_V), put(store, "b", Y_UM)]
+        put(file, "t", T_S)
+        data = file.create_dataset("data", (1, 2), dtype=h5py.ref_dtype)
+        data.attrs["MATLAB_class"] = np.bytes_("cell")
+        data[0, 0], data[0, 1] = values[0].ref, values[1].ref
+
+    write_v73(path, build)
+
+
+def records(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["rec"] = RECORDS
+
+
+def with_object(path: Path) -> None:
+    np.savez(path, t=T_S, u=U_V, y=Y_UM, meta=np.array({"stage": 7}, dtype=object))
+
+
+def durations(path: Path) -> None:
+    times = pa.array((np.arange(N) * 1_000_000).astype("m8[ns]"))
+    parquet.write_table(pa.table({"t": times, "u_V": U_V, "y_um": Y_UM}), path)
+
+
+def feather_file(path: Path) -> None:
+    feather.write_feather(pa.table({"t_s": T_S, "u_V": U_V, "y_um": Y_UM}), str(path))
+
+
+def workbook(path: Path, rows_of: list[list[Any]], notes: str = "") -> None:
+    book = openpyxl.Workbook()
+    sheet = book.active
+    if notes:
+        sheet.append([notes])
+        sheet = book.create_sheet("Data")
+    for row in rows_of:
+        sheet.append(row)
+    book.save(path)
+
+
+TABLE = np.stack([T_S, U_V, Y_UM], axis=1).tolist()
+NAMES = ["Time (s)", "Voltage (V)", "Position (µm)"]
+BINARY: dict[str, Callable[[Path], None]] = {
+    "n2.npy": lambda path: np.save(path, np.stack([T_S, U_V, Y_UM], axis=1)),
+    "2n.npy": lambda path: np.save(path, np.stack([T_S, U_V, Y_UM])),
+    "fields.npy": lambda path: np.save(path, RECORDS),
+    "object.npz": with_object,
+    "to_file.mat": lambda path: savemat(path, {"ans": np.stack([T_S, U_V, Y_UM])}),
+    "scope.mat": simulink,
+    "dspace.mat": dspace,
+    "cells.mat": cells,
+    "references.mat": v73_with_references,
+    "cells73.mat": v73_cells,
+    "records.h5": records,
+    "durations.parquet": durations,
+    "a.feather": feather_file,
+    "title.xlsx": lambda path: workbook(path, [["Measurement of stage 7"], [], NAMES, *TABLE]),
+    "units.xlsx": lambda path: workbook(
+        path, [["Stage 7", "25.11.2026"], [None], ["Time", "Voltage", "Position"], ["s", "V", "µm"], *TABLE]
+    ),
+    "notes.xlsx": lambda path: workbook(path, [NAMES, *TABLE], notes="see Data"),
+    "texts.xlsx": lambda path: workbook(path, [NAMES, *([commas(f"{v:.6f}") for v in row] for row in TABLE)]),
+    "times.xlsx": lambda path: workbook(
+        path,
+        [
+            ["Clock", *NAMES[1:]],
+            *([(datetime(2026, 1, 1, 14) + timedelta(seconds=t)).time(), u, y] for t, u, y in TABLE),
+        ],
+    ),
+    "statistics.xlsx": lambda path: workbook(
+        path, [[*NAMES, None, "Mean", 5.2], [*TABLE[0], None, "Max", 10.0], *TABLE[1:], ["End of measurement"]]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BINARY)
+def test_files_of_programs_that_open_at_the_second_try(tmp_path: Path, name: str) -> None:
+    BINARY[name](tmp_path / name)
+    recording, _ = second_try(tmp_path / name)
+    assert_read(recording)
+
+
+def test_a_scalar_called_as_the_time_is_no_time(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t": 3.0, "u_V": U_V, "y_um": Y_UM})
+    with pytest.raises(InputError, match="column 't' for t has no unit"):
+        read(tmp_path / "a.mat")
+
+
+def test_a_sheet_of_dates_and_numbers_in_one_column_is_refused(tmp_path: Path) -> None:
+    mixed = [[datetime(2026, 1, 1) if k % 2 else 1.0, u, y] for k, (_, u, y) in enumerate(TABLE)]
+    workbook(tmp_path / "a.xlsx", [NAMES, *mixed])
+    with pytest.raises(InputError, match="expected a number"):
+        read(tmp_path / "a.xlsx")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", b"\x1f\x8b\x08" + bytes(100), r"packed by gzip: unpack it first"),
+        ("a.csv", b"%PDF-1.4\n" + bytes(100), "is a PDF"),
+        ("a.csv", b"<!DOCTYPE html><html></html>\n", "is a web page"),
+        ("a.csv", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(100), "an old Office file"),
+        ("a.isf", b":WFMPRE:BYT_NR 2;:CURVE #46000" + bytes(100), "own waveform file: export it as .csv"),
+        ("a.json", b'{"t_s": [0.0, 1.0]}', "is JSON, expected a table: save it as"),
+    ],
+)
+def test_a_refused_file_is_called_what_it_is(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read(tmp_path / name)
+
+
+def test_a_unit_of_another_kind_asks_for_a_factor_and_an_option_overrides_it(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_s,u_V,sensor (V)\n" + rows("{t:.3f},{u:.5f},{v:.6f}\n"))
+    with pytest.raises(MissingError, match="is in V by its name") as caught:
+        read(tmp_path / "a.csv", ColumnMap(columns={"y": "sensor (V)"}))
+    assert caught.value.options == ("--scale y=FACTOR",)
+    assert_read(read(tmp_path / "a.csv", ColumnMap(columns={"y": "sensor (V)"}, units={"y": "um"})), Y_UM / 10)
+
+
+@pytest.mark.parametrize("name", ["Axis 1", "drive", "signal-to-noise", "V", "in", "run/7"])
+def test_names_without_a_unit_have_none(name: str) -> None:
+    assert unit_of_name("u", name) is None
