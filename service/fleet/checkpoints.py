@@ -8,6 +8,7 @@ axis takes its next sample whatever its number.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -38,19 +39,21 @@ class FleetCheckpoints:
         self._writing: list[Future[None]] = []
         self.counts = {"written": 0, "errors": 0, "restored": 0, "refused": 0}
 
-    def restore(self) -> None:
-        """Continue each axis from its file; what does not fit is counted, and its axis begins with its model."""
-        stage, dt_s = self._names[0], self._fleet.bases[0].dt_s
-        for axis in range(self._fleet.axes):
+    def restore(self, axes: Iterable[int]) -> list[int]:
+        """Continue axes from their files; returns those that do. What does not fit is counted, its axis stays."""
+        stage, dt_s, restored = self._names[0], self._fleet.bases[0].dt_s, []
+        for axis in axes:
             if not self._path(axis).exists():
                 continue
             try:
                 meta, state = decode_checkpoint(self._path(axis).read_bytes())
                 meta.refuse_unless(stage, str(axis), dt_s)
                 self._fleet.load_axis(axis, under("learner.", state), anew=True)
-                self.counts["restored"] += 1
+                restored.append(axis)
             except (OSError, DehystError):
                 self.counts["refused"] += 1
+        self.counts["restored"] += len(restored)
+        return restored
 
     def write_due(self) -> None:
         """Copy the axes that are due, in the thread that learns; fewer where the disk is slower."""
@@ -63,12 +66,18 @@ class FleetCheckpoints:
 
     def close(self) -> None:
         """Write all axes once more and end the thread."""
-        for axis in range(self._fleet.axes):
+        self.write(range(self._fleet.axes))
+        self._writer.shutdown()
+        self._lock.close()
+
+    def write(self, axes: Iterable[int]) -> bool:
+        """Write some axes now and wait for the disk; whether no write has failed meanwhile."""
+        errors = self.counts["errors"]
+        for axis in axes:
             self._copy(axis)
             # One at a time: a state may be megabytes.
             wait(self._writing)
-        self._writer.shutdown()
-        self._lock.close()
+        return self.counts["errors"] == errors
 
     def _copy(self, axis: int) -> None:
         learner, (stage, instance) = self._fleet.learner_of(axis), self._names

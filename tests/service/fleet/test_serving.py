@@ -19,6 +19,8 @@ from adaptive.online.learner import Learner
 from adaptive.types import under
 from service.config.settings import parse_config
 from service.fleet import wire
+from service.operating.remote import operate
+from service.protocol.errors import RefusedError
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
@@ -214,6 +216,63 @@ def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
             eventually(lambda: status(session)["samples"]["received"] == 200)
             eventually(lambda: status(session, axis=9)["gates"]["learnt"] > before)
             assert status(session, axis=9)["gates"]["out_of_order"] == 0
+    finally:
+        process.kill()
+
+
+@pytest.mark.e2e
+def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    path, port = tmp_path / "serve.toml", unused_port()
+    # Written where an operator commands it, and else not within this test.
+    path.write_text(configuration(port, 'checkpoints = "kept"\ncheckpoint_s = 80000.0\n'), encoding="utf-8")
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            for first in range(0, 600, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["seq"] == 599)
+            answer = operate(session, KEYS, "freeze", "alice", {"axes": [9, 5]})
+            assert (answer["durable"], answer["result"]) == (True, {"axes": [9, 5]})
+            # What they serve stays, to the last bit; all others learn on.
+            at = np.full((1, AXES), 40.0)
+            memory = reply_to(session, query(at))["memory"]
+            held, learnt = reply_to(session, query(at, memory)), status(session, axis=9)["gates"]["learnt"]
+            for first in range(600, 800, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["seq"] == 799)
+            now = reply_to(session, query(at, memory))
+            for name in ("u_V", "std_V"):
+                changed = (now[name] != held[name]).any(0)
+                assert np.flatnonzero(~changed).tolist() == [5, 9], name
+            assert status(session)["frozen"] == [5, 9]
+            assert status(session, axis=9)["gates"]["learnt"] == learnt
+            for wrong in ({"axes": [64]}, {"axes": [True]}, {"axes": 3}, {}):
+                with pytest.raises(RefusedError, match=r"arguments\.axes"):
+                    operate(session, KEYS, "freeze", "alice", wrong)
+            with pytest.raises(RefusedError, match="one of freeze, thaw, rollback"):
+                operate(session, KEYS, "select", "alice", {"axes": [1]})
+    finally:
+        process.kill()
+    lines = (tmp_path / "kept" / "operations.jsonl").read_text(encoding="utf-8").splitlines()
+    said = [{name: json.loads(line)[name] for name in ("who", "verb", "arguments")} for line in lines]
+    assert said == [{"who": "alice", "verb": "freeze", "arguments": {"axes": [9, 5]}}]
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            assert status(session)["frozen"] == [5, 9]
+            operate(session, KEYS, "thaw", "bob", {"axes": [5]})
+            assert status(session)["frozen"] == [9]
+            before = status(session, axis=5)["gates"]["learnt"]
+            for first in range(0, 400, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session, axis=5)["gates"]["learnt"] > before)
+            # Axis 7 was never written.
+            answer = operate(session, KEYS, "rollback", "bob", {"axes": [5, 7]})
+            assert answer["result"] == {"axes": [5]}
+            assert status(session, axis=5)["gates"]["learnt"] == before
+            with pytest.raises(RefusedError, match="none of these axes has a checkpoint"):
+                operate(session, KEYS, "rollback", "bob", {"axes": [7]})
     finally:
         process.kill()
 
