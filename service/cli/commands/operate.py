@@ -19,7 +19,7 @@ the service, zenoh's access control decides what an operator may do (docs/access
 
 """
 _EXAMPLES: Final = {
-    "freeze": "  dehyst freeze --axis x --who alice\n  dehyst freeze --axis fleet --axes 3 17    # of a fleet\n",
+    "freeze": "  dehyst freeze --axis x --who alice\n",
     "thaw": "  dehyst thaw --axis x --who alice\n",
     "rollback": "  dehyst checkpoints --axis x\n  dehyst rollback 41 --axis x    # a number of that list\n",
     "checkpoints": "  dehyst checkpoints --axis x\n",
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add("--report", action="store_true", help="also write a report with pictures")
     add_shared(parser, "stage", "axis")
     if verb in _OF_FLEETS:
-        add("--axes", type=int, nargs="+", metavar="K", help="axes of a fleet, with --axis fleet")
+        add("--axes", type=int, nargs="+", metavar="K", help="axes of a fleet: --axis fleet --axes 3 17")
     add_connection(parser, timeout_s=5.0)
     add("--who", metavar="NAME", help="operator, for the event log (the login name)")
     add_shared(parser, json={"help": "print the answer as JSON"})
