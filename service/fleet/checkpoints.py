@@ -47,7 +47,7 @@ class FleetCheckpoints:
                 continue
             try:
                 meta, state = decode_checkpoint(self._path(axis).read_bytes())
-                meta.refuse_unless(stage, str(axis), dt_s)
+                meta.refuse_unless(stage, self._name(axis), dt_s)
                 self._fleet.load_axis(axis, under("learner.", state), anew=True)
                 restored.append(axis)
             except (OSError, DehystError):
@@ -85,7 +85,9 @@ class FleetCheckpoints:
             return
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
-        meta = CheckpointMeta(stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance)
+        meta = CheckpointMeta(
+            stage, self._name(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance
+        )
         self._writing.append(self._writer.submit(self._write, axis, meta, learner.state_dict()))
 
     def _write(self, axis: int, meta: CheckpointMeta, state: StateDict) -> None:
@@ -97,4 +99,9 @@ class FleetCheckpoints:
             self.counts["errors"] += 1
 
     def _path(self, axis: int) -> Path:
-        return self._directory / f"axis-{axis:04d}{SUFFIX}"
+        return self._directory / f"{self._name(axis)}{SUFFIX}"
+
+    @staticmethod
+    def _name(axis: int) -> str:
+        """The axis as a service of a single axis may be called: its files are those of such a service."""
+        return f"axis-{axis:04d}"

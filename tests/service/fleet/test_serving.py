@@ -15,17 +15,22 @@ import pytest
 import zenoh
 
 from adaptive.errors import InputError
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import Fleet
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import Learner
-from adaptive.types import under
+from adaptive.types import Sample, prefixed, under
 from service.config.settings import parse_config
 from service.fleet import wire
+from service.fleet.checkpoints import FleetCheckpoints
 from service.operating.remote import operate
 from service.protocol.errors import RefusedError
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
 from service.runtime.session import open_client
-from service.storage.checkpoint import decode_checkpoint
+from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
@@ -198,7 +203,7 @@ def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
     # The file of an axis is a single learner's: it goes on from there.
     meta, state = decode_checkpoint((folder / "axis-0009.ckpt").read_bytes())
     single = Learner.from_state(under("learner.", state))
-    assert (meta.axis, single.seq) == ("9", meta.seq)
+    assert (meta.axis, single.seq) == ("axis-0009", meta.seq)
     assert single.snapshot().features.gain == pytest.approx(GAINS[9], rel=0.05)
     (folder / "axis-0011.ckpt").write_bytes(b"damaged")
     process = ServeProcess(path, port)
@@ -275,6 +280,26 @@ def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
                 operate(session, KEYS, "rollback", "bob", {"axes": [7]})
     finally:
         process.kill()
+
+
+def test_an_axis_continues_from_the_file_of_a_service_of_one_axis(tmp_path: Path) -> None:
+    """Its name is that of the file. What such a service keeps beside its learner is left out."""
+    base = make_models()["lssvm_adaptive"]
+    assert isinstance(base, LssvmInverse)
+    config, single = LearnerConfig(window=60), Learner(base, LearnerConfig(window=60))
+    for k, t_s, u_V, y_um in zip(*motion(0, 300), strict=True):
+        single.handle(Sample(int(k), float(t_s), float(u_V[0]), float(y_um[0])))
+    meta = CheckpointMeta("mirror", "axis-0001", base.dt_s, single.seq, 300, 0.0, "i1")
+    state = prefixed("learner.", single.state_dict()) | {"seq": single.seq}
+    (tmp_path / "axis-0001.ckpt").write_bytes(b"".join(bytes(part) for part in encode_checkpoint(meta, state)))
+    fleet = Fleet([base] * 3, FleetConfig(config))
+    kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
+    assert kept.restore(range(3)) == [1]
+    assert fleet.counters(1) == single.counters()
+    kept.close()
+    # And back.
+    restored = Learner.from_state(under("learner.", decode_checkpoint((tmp_path / "axis-0001.ckpt").read_bytes())[1]))
+    np.testing.assert_array_equal(restored.parts.filter.beta, single.parts.filter.beta)
 
 
 def parts_of(kind: int, rng: np.random.Generator) -> dict[str, Any]:
