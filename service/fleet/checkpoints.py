@@ -71,24 +71,26 @@ class FleetCheckpoints:
         self._lock.close()
 
     def write(self, axes: Iterable[int]) -> bool:
-        """Write some axes now and wait for the disk; whether no write has failed meanwhile."""
-        errors = self.counts["errors"]
+        """Write some axes now and wait for the disk; whether all of them are there."""
+        errors, all_known = self.counts["errors"], True
         for axis in axes:
-            self._copy(axis)
+            all_known &= self._copy(axis)
             # One at a time: a state may be megabytes.
             wait(self._writing)
-        return self.counts["errors"] == errors
+        return all_known and self.counts["errors"] == errors
 
-    def _copy(self, axis: int) -> None:
+    def _copy(self, axis: int) -> bool:
+        """Copy the state of an axis to be written; False where it never had a sample."""
         learner, (stage, instance) = self._fleet.learner_of(axis), self._names
-        if learner.seq < 0:
-            return
+        if learner.parts.intake.track is None:
+            return False
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
         meta = CheckpointMeta(
             stage, self._name(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance
         )
         self._writing.append(self._writer.submit(self._write, axis, meta, learner.state_dict()))
+        return True
 
     def _write(self, axis: int, meta: CheckpointMeta, state: StateDict) -> None:
         try:
