@@ -30,7 +30,7 @@ from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
 from service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
-from service.operating.server import FREEZE, SCHEMA, THAW, Journal
+from service.operating.server import FREEZE, THAW, Journal, answer_to
 from service.operating.verbs import decode_request, take
 from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, ServiceError
@@ -320,13 +320,10 @@ class FleetService:
             fleet.freeze(axes, request.verb == FREEZE)
         # So many at once would hold up the samples; the others are written in their turn.
         durable = kept is not None and len(axes) <= _WRITTEN_AT_ONCE and kept.write(axes)
-        self._newest = fleet.snapshot(), fleet.memory(), self._newest[2]
+        newest = fleet.snapshot()
+        self._newest = newest, fleet.memory(), int(newest.seq.max())
         self._journal.write({"who": request.who, "verb": request.verb, "arguments": {"axes": axes}, "ok": True})
-        return to_json({
-            "schema": SCHEMA, "ok": True, "verb": request.verb, "who": request.who, "stage": self.config.stage,
-            "axis": NAME, "instance": self.instance, "seq": self._newest[2], "durable": durable, "standbys": 0,
-            "result": {"axes": axes},
-        })  # fmt: skip
+        return answer_to(request, self.keys, self.instance, self._newest[2], durable, 0, {"axes": axes})
 
     def status(self) -> dict[str, Any]:
         """The summary: counts, and the worst axes first."""

@@ -240,7 +240,7 @@ def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
                 send(session, samples(*motion(first, 20)))
             eventually(lambda: status(session)["seq"] == 599)
             answer = operate(session, KEYS, "freeze", "alice", {"axes": [9, 5]})
-            assert (answer["durable"], answer["result"]) == (True, {"axes": [9, 5]})
+            assert (answer["durable"], answer["seq"], answer["result"]) == (True, 599, {"axes": [9, 5]})
             # What they serve stays, to the last bit; all others learn on.
             at = np.full((1, AXES), 40.0)
             memory = reply_to(session, query(at))["memory"]
