@@ -16,7 +16,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig
 from adaptive.online.kernel_window import WeightConfig
-from adaptive.online.learner import Learner
+from adaptive.online.learner import MODEL_LEFT_ENVELOPE, Learner
 from adaptive.online.sensor_trust import SENSOR_STUCK
 from adaptive.types import Sample
 from adaptive.window.window import SolverConfig
@@ -176,23 +176,33 @@ def test_axes_equal_single_learners_while_sensors_lie(models: list[LssvmInverse]
     assert singles[2].trouble == SENSOR_STUCK
 
 
-def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(models: list[LssvmInverse]) -> None:
-    """By the check within the batch, at the first instant that is due, on its axis alone."""
-    config, at, n = LearnerConfig(window=60), 2500, 3500
+def small_motion(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """(4, n) voltages and readings: one slow tone each, nothing wrong."""
     u, y = np.empty((4, n)), np.empty((4, n))
     for axis in range(4):
         stage = Stage(preset(("rich", "bouc_wen")[axis % 2], seed=axis))
         u[axis] = 4.0 + 1.5 * np.sin(2.0 * np.pi * (1.1 + 0.3 * axis) * np.arange(n) * DT)
         y[axis] = (1.0 + 0.01 * axis) * stage.run(stage.initial_state(), u[axis])[0]
+    return u, y
+
+
+def doctor(fleet: Fleet, singles: list[Learner], axis: int, beta: np.ndarray) -> None:
+    """Another estimate of the linear part, in both; frozen, or they would find their way by themselves, slowly."""
+    doctored = singles[axis].state_dict() | {"filter.beta": beta, "frozen": True}
+    singles[axis] = Learner.from_state(doctored)
+    fleet.load_axis(axis, doctored)
+
+
+def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(models: list[LssvmInverse]) -> None:
+    """By the check within the batch, at the first instant that is due, on its axis alone."""
+    config, at = LearnerConfig(window=60), 2500
+    u, y = small_motion(3500)
     fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
     compare(fleet, singles, 0, u[:, :at], y[:, :at], 250)
     learnt = [single.parts.filter.beta.copy() for single in singles]
     for axis in (1, 2):
-        # Frozen, or it would find its way by itself, slowly.
-        doctored = singles[axis].state_dict() | {"filter.beta": 2.0 * learnt[axis], "frozen": True}
-        singles[axis] = Learner.from_state(doctored)
+        doctor(fleet, singles, axis, 2.0 * learnt[axis])
         assert not singles[axis].parts.gain_is_possible
-        fleet.load_axis(axis, doctored)
     # A sample takes them back into the batch: what is found there is found by the fleet's own check. Outcomes are
     # compared alone: a frozen axis serves what it served before, a single learner its confirmed estimate.
     compare(fleet, singles, at, u[:, at : at + 1], y[:, at : at + 1], 2, gaps=False)
@@ -210,6 +220,27 @@ def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(mo
     compare(fleet, singles, at + 11, u[:, at + 11 :], y[:, at + 11 :], 50)
     assert fleet.troubles() == {}
     assert [fleet.counters(axis)["begun_again"] for axis in range(4)] == [0, 0, 0, 0]
+
+
+def test_a_model_that_leaves_its_envelope_ends_in_the_identified_one_as_in_a_single_learner(
+    models: list[LssvmInverse],
+) -> None:
+    config, at = LearnerConfig(window=60), 2500
+    u, y = small_motion(4000)
+    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
+    compare(fleet, singles, 0, u[:, :at], y[:, :at], 250)
+    beta = singles[1].parts.filter.beta
+    beta[0] += 0.6 * models[1].span_V
+    doctor(fleet, singles, 1, beta)
+    compare(fleet, singles, at, u[:, at : at + 50], y[:, at : at + 50], 51, gaps=False)
+    assert fleet.counters(1)["begun_again"] == 0
+    compare(fleet, singles, at + 50, u[:, at + 50 : at + 150], y[:, at + 50 : at + 150], 101, gaps=False)
+    assert [fleet.counters(axis)["begun_again"] for axis in range(4)] == [0, 1, 0, 0]
+    assert fleet.troubles() == {1: MODEL_LEFT_ENVELOPE}
+    fleet.freeze([1], False)
+    singles[1].thaw()
+    compare(fleet, singles, at + 150, u[:, at + 150 :], y[:, at + 150 :], 50)
+    assert fleet.troubles() == {}
 
 
 def test_axes_equal_single_learners_at_a_limit_and_where_the_model_fails(models: list[LssvmInverse]) -> None:
