@@ -6,8 +6,9 @@ The single learners run on one core, the fleet on ``--threads``: the ratio is wh
 For each number of axes: time of a step of all axes (median, p99), the same of as many single learners one after the
 other (measured on at most 64 of them, times the number of axes), and of solving all kernel matrices anew with
 ``torch.linalg.solve``, which a step of all windows replaces; evaluation of all axes at one point; start-up; memory; and
-the bytes of the inverses that a step of all windows must read and write (one triangle each), over the bandwidth that a
-copy of a large array reaches here. All axes have the same model, each with a gain of its own.
+the bytes of the inverses that a step of all windows must read and write (one triangle each), over the bandwidth of a
+copy of a large array and of one that is changed in place. All axes have the same model, each with a gain of its own.
+Processor times (all threads of the process) hold beside other work too; times by the clock do not.
 """
 
 from __future__ import annotations
@@ -54,12 +55,14 @@ def recording(stage: Stage, n: int) -> tuple[FloatArray, FloatArray]:
     return np.asarray(u), stage.run(stage.initial_state(), u)[0]
 
 
-def bandwidth(device: str) -> float:
-    """Bytes a second that a copy of 256 MB reads and writes."""
+def bandwidth(device: str) -> tuple[float, float]:
+    """Bytes a second that a copy of 256 MB reads and writes, and a change of 256 MB in place."""
     source = torch.zeros(2**25, dtype=torch.float64, device=device)
     target = torch.empty_like(source)
-    times = [timed(lambda: target.copy_(source), device) for _ in range(7)]
-    return 2.0 * source.numel() * 8 / float(np.median(times))
+    copies = [timed(lambda: target.copy_(source), device) for _ in range(7)]
+    changes = [timed(lambda: source.add_(1.0), device) for _ in range(7)]
+    moved = 2.0 * source.numel() * 8
+    return moved / float(np.median(copies)), moved / float(np.median(changes))
 
 
 def timed(work: Callable[[], object], device: str) -> float:
@@ -84,7 +87,7 @@ def naive_s(axes: int, window: int, device: str) -> float:
     return seconds
 
 
-def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
+def measure(axes: int, args: argparse.Namespace, moved_bytes_s: tuple[float, float]) -> None:
     """Print the lines of one number of axes."""
     form = "inverse" if args.device != "cpu" or args.backend == "torch" else args.form
     config = LearnerConfig(window=args.window, learn_every=args.learn_every, solver=SolverConfig(form=form))
@@ -98,18 +101,21 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
     u, y = recording(stage, args.before + args.steps)
     singles = [Learner(one, config) for one in models[: min(axes, MOST_SINGLE)]]
     together, alone, apart, stepped = [], [], 0, 0
+    worked: list[tuple[float, float]] = []
     for k in range(args.before + args.steps):
         if k == args.before:
             stepped = -sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
         readings = gains * y[k]
         if args.lost and k >= args.before:
             readings[7 * k % axes] = np.nan
+        start = time.process_time()
         together.append(timed(lambda k=k, y=readings: fleet.step(k, k * DT_S, u[k], y), args.device))  # type: ignore[misc]
         apart += len(fleet.apart) if k >= args.before else 0
-        begin = time.perf_counter()
+        begin, middle = time.perf_counter(), time.process_time()
         for reading, single in zip(readings, singles, strict=False):
             single.handle(Sample(k, k * DT_S, float(u[k]), float(reading)))
         alone.append((time.perf_counter() - begin) * axes / len(singles))
+        worked.append((middle - start, (time.process_time() - middle) * axes / len(singles)))
     stepped += sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
     steps, loops = np.array(together[args.before :]), np.array(alone[args.before :])
     snapshot, memory = fleet.snapshot(), fleet.memory()
@@ -127,10 +133,14 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: float) -> None:
           f"{0.5 * stepped:.0f} window steps of an axis")  # fmt: skip
     print(f"  single x B    mean {loops.mean() * ms:8.2f} ms on one core, {loops.mean() / steps.mean():.2f} times the "
           f"fleet's on {args.threads}")  # fmt: skip
+    ours, theirs = np.mean(worked[args.before :], axis=0)
+    print(f"  processor     {ours * ms:8.2f} ms, {theirs * ms:.2f} for single x B: {theirs / ours:.2f} times")
     print(f"  solve x B     mean {solved * ms:8.2f} ms for the windows alone, {solved / steps.mean():.1f} times")
-    share = triangles / moved_bytes_s / steps.mean()
-    print(f"  inverses      {triangles / 1e6:.1f} MB a sample, {triangles / moved_bytes_s * ms:.2f} ms at a copy's "
-          f"{moved_bytes_s / 1e9:.1f} GB/s: {100 * share:.0f} % of the fleet's time")  # fmt: skip
+    copied_s, changed_s = (triangles / moved for moved in moved_bytes_s)
+    print(f"  inverses      {triangles / 1e6:.1f} MB a sample, {copied_s * ms:.2f} ms at a copy's "
+          f"{moved_bytes_s[0] / 1e9:.1f} GB/s, {changed_s * ms:.2f} at the {moved_bytes_s[1] / 1e9:.1f} of a change in "
+          f"place: {100 * copied_s / steps.mean():.0f} and {100 * changed_s / steps.mean():.0f} % of the fleet's "
+          f"time")  # fmt: skip
     print(f"  evaluation    median {np.median(answers) * ms:.2f} ms for one point of all axes", flush=True)
 
 

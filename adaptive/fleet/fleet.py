@@ -59,6 +59,8 @@ class Fleet:
         self._windows = self._make_windows(arrays)
         self._apart: dict[int, Learner] = {}
         self._shells: dict[int, Learner] = {}
+        #: What frozen axes serve: their rows of a snapshot.
+        self._held: dict[int, tuple[Any, ...]] = {}
         self._cache: FleetSnapshot | None = None
         for i in range(B):
             # Before its first sample an axis has no place: the single learner takes that one.
@@ -218,20 +220,34 @@ class Fleet:
         if given.config != self.config.learner:
             raise ModelFileError(f"axis {axis}: the state is of another configuration of the learner")
         self._shells.pop(axis, None)
+        self._held.pop(axis, None)
         self._windows.put(axis, given.parts.window.window_arrays)
         learner = self._learner(axis)
         learner.resume(state, arrays=False)
+        self._state.rows.numbers["frozen"][axis] = learner.frozen
         if anew:
             learner.resync()
         # Its next sample shows whether it is ordinary.
         self._set_apart(axis, learner)
 
     def freeze(self, axes: Iterable[int], frozen: bool = True) -> None:
-        """Stop the learning of some axes; with ``frozen=False`` let them learn again."""
+        """Stop the learning of some axes and keep what they serve; with ``frozen=False`` let them learn again.
+
+        Their samples are still tracked and judged.
+        """
         for axis in axes:
             self._state.rows.numbers["frozen"][axis] = frozen
             if axis in self._apart:
                 (self._apart[axis].freeze if frozen else self._apart[axis].thaw)()
+            if not frozen:
+                self._held.pop(axis, None)
+        self._cache = None
+        self.snapshot()
+
+    @property
+    def frozen(self) -> IntArray:
+        """The axes that do not learn."""
+        return np.flatnonzero(self._state.rows.numbers["frozen"])
 
     # ---- models out
 
@@ -241,15 +257,26 @@ class Fleet:
             apart = {axis: learner.snapshot() for axis, learner in self._apart.items()}
             rows, samples = self._state.rows, self._windows.samples()
             self._cache = snapshot_of(self.bases, rows, self._c, samples, apart, self._threads)
+            learnt = self._cache.learnt
+            for axis in self.frozen.tolist():
+                held = self._held.setdefault(axis, tuple(part[axis].copy() for part in learnt))
+                for part, kept in zip(learnt, held, strict=True):
+                    part[axis] = kept
         return self._cache
 
     def memory(self) -> FloatArray:
         """(B, m) hysteresis memory with which each axis' served model goes on from its last sample."""
         s = self._state.rows
         out = np.empty_like(s.memory)
-        steps.memory_now(s, self._c, s.numbers["judgement"]["fallback"].copy(), out)
+        identified, snapshot = s.numbers["judgement"]["fallback"].copy(), self.snapshot()
+        for axis in self._held:
+            f = self.bases[axis].features
+            identified[axis] = tuple(snapshot.linear[axis, :2]) == (f.gain, f.offset_um)
+        steps.memory_now(s, self._c, identified, out)
         for axis, learner in self._apart.items():
             kept = learner.memory_for(learner.snapshot())
+            if kept is not None and axis in self._held:
+                kept = learner.parts.intake.memory_now(bool(identified[axis]))
             out[axis] = learner.memory() if kept is None else kept
         return out
 

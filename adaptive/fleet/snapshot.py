@@ -53,6 +53,11 @@ class FleetSnapshot:
     threads: Threads
 
     @property
+    def learnt(self) -> tuple[BoolArray, FloatArray, FloatArray, IntArray]:
+        """All that depends on what the axes have learnt, (B, ...) each."""
+        return self.valid, self.linear, self.packed, self.counts
+
+    @property
     def memory_size(self) -> int:
         """m."""
         return self.bases[0].memory_size

@@ -7,10 +7,8 @@ Numbers are in records that have the names of the single learner's dataclasses, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import getitem
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -43,6 +41,8 @@ _ALIASES: Final = {
     "front.reckoned_seq": "front.gates.seq", "front.track.features.gain": "front.track.served.gain",
     "front.track.features.offset_um": "front.track.served.offset_um",
 }  # fmt: skip
+#: Samples by outcome, by their names in a learner's state.
+_COUNTERS: Final = tuple(f"counters.{name}" for name in OUTCOMES)
 #: Numbers beside those of a learner. confirmed : whether the last check has confirmed that the readings follow the
 #: drive. The others: see `Rows`.
 _OWN: Final[StateDict] = {"delay_count": 0, "past_count": 0, "past_written": 0, "confirmed": False}
@@ -50,11 +50,6 @@ _OWN: Final[StateDict] = {"delay_count": 0, "past_count": 0, "past_written": 0, 
 
 def _numbers(state: StateDict) -> StateDict:
     return {name: value for name, value in state.items() if isinstance(value, bool | int | float)}
-
-
-def _at(records: Any, name: str) -> Any:
-    """The field of records that a flat name stands for; a view."""
-    return reduce(getitem, name.split("."), records)
 
 
 def _record(numbers: StateDict) -> np.dtype[Any]:
@@ -70,12 +65,27 @@ def _record(numbers: StateDict) -> np.dtype[Any]:
     return np.dtype(kinds, align=True)
 
 
+def _leaves(kind: np.dtype[Any], group: str = "", at: int = 0) -> Iterator[tuple[str, np.dtype[Any], int]]:
+    """Flat names, kinds and places of what is in a nested record, in the order of the numbers that it was made of."""
+    for name, (inner, offset, *_) in (kind.fields or {}).items():
+        if inner.names is None:
+            yield group + name, inner, at + offset
+        else:
+            yield from _leaves(inner, f"{group}{name}.", at + offset)
+
+
+def _flat(records: Any) -> Any:
+    """The same records by flat names: a view."""
+    names, kinds, places = zip(*_leaves(records.dtype), strict=True)
+    size = records.dtype.itemsize
+    return records.view(np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": size}))
+
+
 def _records(rows: Sequence[StateDict], like: StateDict) -> Any:
     """A record for each of ``rows``, flat numbers, of the names and kinds of ``like``."""
-    kinds = _numbers(like)
-    records = np.zeros(len(rows), _record(kinds))
-    for name in kinds:
-        _at(records, name)[:] = [row[name] for row in rows]
+    records = np.zeros(len(rows), _record(_numbers(like)))
+    flat = _flat(records)
+    flat[:] = [tuple(row[name] for name in flat.dtype.names) for row in rows]
     return records
 
 
@@ -215,11 +225,9 @@ class FleetState:
         numbers = {n: v for n, v in _numbers(state).items() if n not in _ALIASES and not n.startswith("counters.")}
         rows = {name: np.zeros((B, *like.shape), like.dtype) for name, like in likes.items()}
         self.rows = s = Rows(np.zeros(B, _record(numbers | _OWN)), **rows)
-        #: Where the entries of a learner's state are, (B, ...) each; and those of its past places.
-        self._fields = {name: _at(s.numbers, name) for name in numbers}
-        self._fields |= {alias: self._fields[name] for alias, name in _ALIASES.items()}
-        self._fields |= {path: getattr(s, name) for name, path in _ARRAYS.items()}
-        self._fields |= {f"counters.{name}": s.counters[:, i] for i, name in enumerate(OUTCOMES)}
+        #: Where the numbers of a learner's state are, then its arrays, (B, ...) each, and those of its past places.
+        self._numbers = _flat(s.numbers)[list(numbers)]
+        self._fields = {path: getattr(s, name) for name, path in _ARRAYS.items()}
         for j, mark in enumerate(MARKS):
             self._fields |= {f"{mark}.beta": s.marks[:, j], f"{mark}.covariance": s.mark_covariances[:, j]}
         parts: dict[str, Any] = {
@@ -233,6 +241,10 @@ class FleetState:
         """Take the state of an ordinary learner, without the arrays of its window. Raises KeyError, ValueError."""
         rest, s = dict(state), self.rows
         row, served = s.numbers[axis], s.numbers["front"]["track"]["served"][axis]
+        self._numbers[axis] = tuple(rest.pop(name) for name in self._numbers.dtype.names)
+        s.counters[axis] = [rest.pop(name) for name in _COUNTERS]
+        for alias in _ALIASES:
+            del rest[alias]
         _take(self._fields, axis, rest)
         s.frames[axis] = served["offset_um"], 1.0 / served["gain"], served["dead_um"]
         delay = np.asarray(rest.pop("delay"), dtype=np.float64).reshape(-1, s.beta.shape[1])
@@ -252,6 +264,9 @@ class FleetState:
         """Inverse of ``load``."""
         s, row = self.rows, self.rows.numbers[axis]
         state = self._rest[axis] | _given(self._fields, axis)
+        state |= zip(self._numbers.dtype.names, self._numbers[axis].item(), strict=True)
+        state |= zip(_COUNTERS, s.counters[axis].tolist(), strict=True)
+        state |= {alias: state[name] for alias, name in _ALIASES.items()}
         kept, taken = s.delay.shape[1] - 1, int(row["delay_count"])
         state["delay"] = s.delay[axis, np.arange(max(taken - kept, 0), taken) % (kept + 1)]
         ring, written = s.past_voltages[axis], int(row["past_written"])
@@ -272,4 +287,4 @@ def _take(fields: StateDict, axis: int, state: StateDict) -> None:
 
 def _given(fields: StateDict, axis: int) -> StateDict:
     """Inverse of `_take`: copies."""
-    return {name: field[axis].item() if field.ndim == 1 else field[axis].copy() for name, field in fields.items()}
+    return {name: field[axis].copy() if field.ndim > 1 else field[axis].item() for name, field in fields.items()}

@@ -8,6 +8,7 @@ axis takes its next sample whatever its number.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
@@ -38,19 +39,21 @@ class FleetCheckpoints:
         self._writing: list[Future[None]] = []
         self.counts = {"written": 0, "errors": 0, "restored": 0, "refused": 0}
 
-    def restore(self) -> None:
-        """Continue each axis from its file; what does not fit is counted, and its axis begins with its model."""
-        stage, dt_s = self._names[0], self._fleet.bases[0].dt_s
-        for axis in range(self._fleet.axes):
+    def restore(self, axes: Iterable[int]) -> list[int]:
+        """Continue axes from their files; returns those that do. What does not fit is counted, its axis stays."""
+        stage, dt_s, restored = self._names[0], self._fleet.bases[0].dt_s, []
+        for axis in axes:
             if not self._path(axis).exists():
                 continue
             try:
                 meta, state = decode_checkpoint(self._path(axis).read_bytes())
-                meta.refuse_unless(stage, str(axis), dt_s)
+                meta.refuse_unless(stage, self._name(axis), dt_s)
                 self._fleet.load_axis(axis, under("learner.", state), anew=True)
-                self.counts["restored"] += 1
+                restored.append(axis)
             except (OSError, DehystError):
                 self.counts["refused"] += 1
+        self.counts["restored"] += len(restored)
+        return restored
 
     def write_due(self) -> None:
         """Copy the axes that are due, in the thread that learns; fewer where the disk is slower."""
@@ -63,21 +66,31 @@ class FleetCheckpoints:
 
     def close(self) -> None:
         """Write all axes once more and end the thread."""
-        for axis in range(self._fleet.axes):
-            self._copy(axis)
-            # One at a time: a state may be megabytes.
-            wait(self._writing)
+        self.write(range(self._fleet.axes))
         self._writer.shutdown()
         self._lock.close()
 
-    def _copy(self, axis: int) -> None:
+    def write(self, axes: Iterable[int]) -> bool:
+        """Write some axes now and wait for the disk; whether all of them are there."""
+        errors, all_known = self.counts["errors"], True
+        for axis in axes:
+            all_known &= self._copy(axis)
+            # One at a time: a state may be megabytes.
+            wait(self._writing)
+        return all_known and self.counts["errors"] == errors
+
+    def _copy(self, axis: int) -> bool:
+        """Copy the state of an axis to be written; False where it never had a sample."""
         learner, (stage, instance) = self._fleet.learner_of(axis), self._names
-        if learner.seq < 0:
-            return
+        if learner.parts.intake.track is None:
+            return False
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
-        meta = CheckpointMeta(stage, str(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance)
+        meta = CheckpointMeta(
+            stage, self._name(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance
+        )
         self._writing.append(self._writer.submit(self._write, axis, meta, learner.state_dict()))
+        return True
 
     def _write(self, axis: int, meta: CheckpointMeta, state: StateDict) -> None:
         try:
@@ -88,4 +101,9 @@ class FleetCheckpoints:
             self.counts["errors"] += 1
 
     def _path(self, axis: int) -> Path:
-        return self._directory / f"axis-{axis:04d}{SUFFIX}"
+        return self._directory / f"{self._name(axis)}{SUFFIX}"
+
+    @staticmethod
+    def _name(axis: int) -> str:
+        """The axis as a service of a single axis may be called: its files are those of such a service."""
+        return f"axis-{axis:04d}"

@@ -30,8 +30,10 @@ from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
 from service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
+from service.operating.server import FREEZE, THAW, Journal, answer_to
+from service.operating.verbs import decode_request, take
 from service.protocol.container import JSON, fields_of, to_json
-from service.protocol.errors import FieldError
+from service.protocol.errors import FieldError, ServiceError
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
 from service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
@@ -45,6 +47,9 @@ _COUNTED: Final = ("received", "dropped", "malformed", "missing", "unknown_axes"
                    "points_refused", "waiting")  # fmt: skip
 #: Axes that the summary lists, worst first; time between two statuses, s.
 _WORST, _STATUS_S = 10, 1.0
+#: Returns axes to their checkpoints. Most axes that are written before an operator is answered.
+ROLLBACK: Final = "rollback"
+_WRITTEN_AT_ONCE: Final = 16
 
 
 def load_fleet(settings: FleetSettings) -> Fleet:
@@ -129,10 +134,11 @@ class FleetService:
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self._fleet = load_fleet(self.settings)
         self._checkpoints = None
+        self._journal = Journal(self.settings.checkpoints)
         if self.settings.checkpoints is not None:
             folder, period_s = self.settings.checkpoints, self.settings.checkpoint_s
             self._checkpoints = FleetCheckpoints(self._fleet, folder, config.stage, self.instance, period_s)
-            self._checkpoints.restore()
+            self._checkpoints.restore(range(self.settings.axes))
         self._newest = self._fleet.snapshot(), self._fleet.memory(), -1
         self._published = self._newest[0].linear
         self._queue: queue.Queue[FleetMessage | Callable[[], None]] = queue.Queue()
@@ -158,6 +164,7 @@ class FleetService:
                 session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
                 session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
                 session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
+                session.declare_queryable(keys.operate, self._in_turn(keys.operate, self._operate)),
                 # Last, because alive means callable.
                 session.liveliness().declare_token(keys.alive(self.instance)),
             ):
@@ -277,9 +284,11 @@ class FleetService:
         """The axis that a request names; None for none. Raises InputError."""
         if not payload:
             return None
-        axis: object = fields_of(payload).get("axis")
+        return self._checked(fields_of(payload).get("axis"), "axis")
+
+    def _checked(self, axis: object, field: str) -> int:
         if isinstance(axis, bool) or not isinstance(axis, int) or not 0 <= axis < self.settings.axes:
-            raise FieldError("axis", repr(axis), f"an axis from 0 to {self.settings.axes - 1}")
+            raise FieldError(field, repr(axis)[:80], f"an axis from 0 to {self.settings.axes - 1}")
         return axis
 
     def _model(self, payload: bytes) -> bytes:
@@ -294,6 +303,28 @@ class FleetService:
         axis = self._axis_of(payload)
         return to_json(self.status() if axis is None else self.axis_status(axis))
 
+    def _operate(self, payload: bytes) -> bytes:
+        """A verb of the operator for the axes that it names."""
+        request, fleet, kept = decode_request(payload), self._fleet, self._checkpoints
+        verbs = (FREEZE, THAW) if kept is None else (FREEZE, THAW, ROLLBACK)
+        if request.verb not in verbs:
+            raise FieldError("verb", repr(request.verb), f"one of {', '.join(verbs)}")
+        (axes,) = take(request.arguments, axes=list)
+        for axis in axes:
+            self._checked(axis, "arguments.axes")
+        if request.verb == ROLLBACK and kept is not None:
+            axes = kept.restore(axes)
+            if not axes:
+                raise ServiceError("none of these axes has a checkpoint that fits")
+        else:
+            fleet.freeze(axes, request.verb == FREEZE)
+        # So many at once would hold up the samples; the others are written in their turn.
+        durable = kept is not None and len(axes) <= _WRITTEN_AT_ONCE and kept.write(axes)
+        newest = fleet.snapshot()
+        self._newest = newest, fleet.memory(), int(newest.seq.max())
+        self._journal.write({"who": request.who, "verb": request.verb, "arguments": {"axes": axes}, "ok": True})
+        return answer_to(request, self.keys, self.instance, self._newest[2], durable, 0, {"axes": axes})
+
     def status(self) -> dict[str, Any]:
         """The summary: counts, and the worst axes first."""
         fleet = self._fleet
@@ -307,7 +338,7 @@ class FleetService:
             "seq": self._newest[2], "samples": counts,
             "gates": {name: int(n) for name, n in zip(OUTCOMES, outcomes.sum(0), strict=True)},
             "rms_error_pct": {"median": float(np.median(errors)), "max": float(errors.max())},
-            "apart": len(fleet.apart), "in_trouble": len(troubles),
+            "apart": len(fleet.apart), "in_trouble": len(troubles), "frozen": fleet.frozen.tolist(),
             "checkpoints": self._checkpoints.counts if self._checkpoints is not None else None,
             "worst": [{"axis": axis, "rms_error_pct": float(errors[axis]), "trouble": troubles.get(axis, "")}
                       for axis in order[:_WORST]],

@@ -124,6 +124,26 @@ _WAITING: Final = 32
 _STOP: Final = None
 
 
+def answer_to(
+    request: Request, keys: Keys, instance: str, seq: int, durable: bool, standbys: int, result: Mapping[str, Any]
+) -> bytes:
+    """The reply to a command that was carried out (docs/operating.md)."""
+    answer = {
+        "schema": SCHEMA,
+        "ok": True,
+        "verb": request.verb,
+        "who": request.who,
+        "stage": keys.stage,
+        "axis": keys.axis,
+        "instance": instance,
+        "seq": seq,
+        "durable": durable,
+        "standbys": standbys,
+        "result": result,
+    }
+    return to_json(answer)
+
+
 class OperationsServer:
     """The queryable ``.../operate`` of one axis and the thread behind it.
 
@@ -205,20 +225,7 @@ class OperationsServer:
         journaled = self._write(request, seq=seq)
         standbys = self._tell(request.verb, request.who) if request.verb in (FREEZE, THAW) else 0
         settled = request.verb not in self._verbs.background and self._settle()
-        answer = {
-            "schema": SCHEMA,
-            "ok": True,
-            "verb": request.verb,
-            "who": request.who,
-            "stage": self._keys.stage,
-            "axis": self._keys.axis,
-            "instance": self._instance,
-            "seq": seq,
-            "durable": journaled or settled,
-            "standbys": standbys,
-            "result": result,
-        }
-        return to_json(answer)
+        return answer_to(request, self._keys, self._instance, seq, journaled or settled, standbys, result)
 
     def _write(self, request: Request, seq: int | None = None, error: str = "") -> bool:
         """Write to the journal, and note an event if the verb itself does not. Whether the entry is on the disk."""

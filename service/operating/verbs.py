@@ -81,7 +81,9 @@ def take(arguments: Mapping[str, Any], **kinds: type) -> list[Any]:
     for name, kind in kinds.items():
         value = arguments.get(name)
         if not isinstance(value, kind) or isinstance(value, bool):
-            raise FieldError(f"arguments.{name}", repr(value)[:80], {str: "a text", int: "an integer"}[kind])
+            raise FieldError(
+                f"arguments.{name}", repr(value)[:80], {str: "a text", int: "an integer", list: "a list"}[kind]
+            )
         values.append(value)
     return values
 

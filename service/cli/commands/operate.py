@@ -29,6 +29,10 @@ _EXAMPLES: Final = {
 }
 
 
+#: Verbs that a fleet takes too, for the axes that are named.
+_OF_FLEETS: Final = ("freeze", "thaw", "rollback")
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command that the parser is named after, with units in the help."""
     verb = parser.prog.split()[-1]
@@ -36,13 +40,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(verb=verb)
     add = parser.add_argument
     if verb == "rollback":
-        add("checkpoint", type=int, help="number of a checkpoint, from 'dehyst checkpoints'")
+        add("checkpoint", type=int, nargs="?", help="number of a checkpoint, from 'dehyst checkpoints'")
     elif verb == "select":
         add("model", help="name of a model of the axis, such as lssvm_adaptive or linear")
     elif verb == "ask-diagnosis":
         add("--recent", type=float, metavar="S", help="length of the newest samples to diagnose, s")
         add("--report", action="store_true", help="also write a report with pictures")
     add_shared(parser, "stage", "axis")
+    if verb in _OF_FLEETS:
+        add("--axes", type=int, nargs="+", metavar="K", help="axes of a fleet: --axis fleet --axes 3 17")
     add_connection(parser, timeout_s=5.0)
     add("--who", metavar="NAME", help="operator, for the event log (the login name)")
     add_shared(parser, json={"help": "print the answer as JSON"})
@@ -65,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _arguments(args: argparse.Namespace) -> dict[str, Any]:
+    if args.verb in _OF_FLEETS and args.axes is not None:
+        return {"axes": args.axes}
     if args.verb == "rollback":
         return {"checkpoint": args.checkpoint}
     if args.verb == "select":

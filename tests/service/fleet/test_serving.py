@@ -15,15 +15,22 @@ import pytest
 import zenoh
 
 from adaptive.errors import InputError
+from adaptive.fleet.config import FleetConfig
+from adaptive.fleet.fleet import Fleet
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import Learner
-from adaptive.types import under
+from adaptive.types import Sample, prefixed, under
 from service.config.settings import parse_config
 from service.fleet import wire
+from service.fleet.checkpoints import FleetCheckpoints
+from service.operating.remote import operate
+from service.protocol.errors import RefusedError
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
 from service.runtime.session import open_client
-from service.storage.checkpoint import decode_checkpoint
+from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.model_file import BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
@@ -196,7 +203,7 @@ def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
     # The file of an axis is a single learner's: it goes on from there.
     meta, state = decode_checkpoint((folder / "axis-0009.ckpt").read_bytes())
     single = Learner.from_state(under("learner.", state))
-    assert (meta.axis, single.seq) == ("9", meta.seq)
+    assert (meta.axis, single.seq) == ("axis-0009", meta.seq)
     assert single.snapshot().features.gain == pytest.approx(GAINS[9], rel=0.05)
     (folder / "axis-0011.ckpt").write_bytes(b"damaged")
     process = ServeProcess(path, port)
@@ -216,6 +223,87 @@ def test_a_killed_fleet_goes_on_from_its_checkpoints(tmp_path: Path) -> None:
             assert status(session, axis=9)["gates"]["out_of_order"] == 0
     finally:
         process.kill()
+
+
+@pytest.mark.e2e
+def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
+    write_bundle(tmp_path / "x.npz", make_models(), BundleMeta("", "", DT_S, y_min_um=0.0, y_max_um=90.0))
+    path, port = tmp_path / "serve.toml", unused_port()
+    # Written where an operator commands it, and else not within this test.
+    path.write_text(configuration(port, 'checkpoints = "kept"\ncheckpoint_s = 80000.0\n'), encoding="utf-8")
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            # Of an axis that never had a sample nothing is written.
+            assert operate(session, KEYS, "thaw", "alice", {"axes": [9]})["durable"] is False
+            for first in range(0, 600, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["seq"] == 599)
+            answer = operate(session, KEYS, "freeze", "alice", {"axes": [9, 5]})
+            assert (answer["durable"], answer["seq"], answer["result"]) == (True, 599, {"axes": [9, 5]})
+            # What they serve stays, to the last bit; all others learn on.
+            at = np.full((1, AXES), 40.0)
+            memory = reply_to(session, query(at))["memory"]
+            held, learnt = reply_to(session, query(at, memory)), status(session, axis=9)["gates"]["learnt"]
+            for first in range(600, 800, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session)["seq"] == 799)
+            now = reply_to(session, query(at, memory))
+            for name in ("u_V", "std_V"):
+                changed = (now[name] != held[name]).any(0)
+                assert np.flatnonzero(~changed).tolist() == [5, 9], name
+            assert status(session)["frozen"] == [5, 9]
+            assert status(session, axis=9)["gates"]["learnt"] == learnt
+            for wrong in ({"axes": [64]}, {"axes": [True]}, {"axes": 3}, {}):
+                with pytest.raises(RefusedError, match=r"arguments\.axes"):
+                    operate(session, KEYS, "freeze", "alice", wrong)
+            with pytest.raises(RefusedError, match="one of freeze, thaw, rollback"):
+                operate(session, KEYS, "select", "alice", {"axes": [1]})
+    finally:
+        process.kill()
+    lines = (tmp_path / "kept" / "operations.jsonl").read_text(encoding="utf-8").splitlines()
+    said = [{name: json.loads(line)[name] for name in ("who", "verb", "arguments")} for line in lines]
+    assert said[-1] == {"who": "alice", "verb": "freeze", "arguments": {"axes": [9, 5]}}
+    process = ServeProcess(path, port)
+    try:
+        with open_client(process.endpoint) as session:
+            assert status(session)["frozen"] == [5, 9]
+            # Written before the first sample after the restart too: a rollback returns to a state that is thawed.
+            assert operate(session, KEYS, "thaw", "bob", {"axes": [5]})["durable"] is True
+            assert status(session)["frozen"] == [9]
+            before = status(session, axis=5)["gates"]["learnt"]
+            for first in range(0, 400, 20):
+                send(session, samples(*motion(first, 20)))
+            eventually(lambda: status(session, axis=5)["gates"]["learnt"] > before)
+            # Axis 7 was never written.
+            answer = operate(session, KEYS, "rollback", "bob", {"axes": [5, 7]})
+            assert answer["result"] == {"axes": [5]}
+            assert status(session, axis=5)["gates"]["learnt"] == before
+            assert status(session)["frozen"] == [9]
+            with pytest.raises(RefusedError, match="none of these axes has a checkpoint"):
+                operate(session, KEYS, "rollback", "bob", {"axes": [7]})
+    finally:
+        process.kill()
+
+
+def test_an_axis_continues_from_the_file_of_a_service_of_one_axis(tmp_path: Path) -> None:
+    """Its name is that of the file. What such a service keeps beside its learner is left out."""
+    base = make_models()["lssvm_adaptive"]
+    assert isinstance(base, LssvmInverse)
+    config, single = LearnerConfig(window=60), Learner(base, LearnerConfig(window=60))
+    for k, t_s, u_V, y_um in zip(*motion(0, 300), strict=True):
+        single.handle(Sample(int(k), float(t_s), float(u_V[0]), float(y_um[0])))
+    meta = CheckpointMeta("mirror", "axis-0001", base.dt_s, single.seq, 300, 0.0, "i1")
+    state = prefixed("learner.", single.state_dict()) | {"seq": single.seq}
+    (tmp_path / "axis-0001.ckpt").write_bytes(b"".join(bytes(part) for part in encode_checkpoint(meta, state)))
+    fleet = Fleet([base] * 3, FleetConfig(config))
+    kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
+    assert kept.restore(range(3)) == [1]
+    assert fleet.counters(1) == single.counters()
+    kept.close()
+    # And back.
+    restored = Learner.from_state(under("learner.", decode_checkpoint((tmp_path / "axis-0001.ckpt").read_bytes())[1]))
+    np.testing.assert_array_equal(restored.parts.filter.beta, single.parts.filter.beta)
 
 
 def parts_of(kind: int, rng: np.random.Generator) -> dict[str, Any]:
