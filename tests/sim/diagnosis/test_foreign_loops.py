@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
 from sim.diagnosis.nominal import calibrate_nominal
@@ -22,6 +25,12 @@ BOWED = Case(
     Rig(1, "play_sum", False, "raster", "white", 1000.0, 20.0, 8.0, 85.0, 1.04e-3, False, 0.0, 0.0038, 4.0),
     {"asymmetry": {"share": -0.019}},
 )
+#: The nominal stage's own loop, with one cause by a formula of the generator's.
+OWN_LOOP = Rig(3, "bouc_wen", False, "triangles", "white", 1000.0, 30.0, 100.0, 60.0, 1.5e-3, False, 0.0, 0.0018, 1.0)
+WITH_A_BOW = Case("single", 3, replace(OWN_LOOP, drive="staircase"), {"asymmetry": {"share": 0.0086}})
+WIDENED = Case("single", 3, OWN_LOOP, {"rate_dependence": {"per_decade": 0.06, "corner_per_s": 0.3}})
+#: Heat through a thick wall, beside a loop that was used before.
+WARMED = single(403)
 
 
 def diagnosed(case: Case) -> Diagnosis:
@@ -49,3 +58,10 @@ def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
 def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
     said = diagnosed(BOWED)
     assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
+
+
+@pytest.mark.parametrize("case", [WITH_A_BOW, WIDENED, WARMED], ids=lambda case: case.hidden[0])
+def test_what_the_form_of_a_cause_leaves_is_not_another_cause(case: Case) -> None:
+    said = diagnosed(case)
+    assert [c.name for c in said.causes] == list(case.hidden)
+    assert said.extended_heldout_um < 1.25 * said.noise_floor_um
