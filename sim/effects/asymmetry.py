@@ -6,7 +6,7 @@ of the stage change, below it neither.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,9 @@ def run_asymmetry(p: Any, s: Any, x: Any, v: Any, w: Any, n: int, k0: int) -> No
 #: Knees of the dead zones of the displacement and of a wide play: distance from the middle over half the stroke.
 _NEAR = np.array([-0.6, -0.2, 0.2, 0.6])
 _WIDE = np.array([-0.4, 0.0, 0.4])
+#: The same of the form "fine", for a bow that is smooth: pieces a third as long leave a tenth of it.
+_NEAR_FINE = np.linspace(-0.875, 0.875, 15)
+_WIDE_FINE = np.linspace(-0.8, 0.8, 9)
 
 
 @dataclass(frozen=True)
@@ -44,26 +47,37 @@ class Asymmetry(CauseModel):
 
     One-sided dead zones (2.8), on the static displacement and on a wide play of the voltage, which between them
     stand for dead zones on plays of any width; and products of loop and displacement (generalised Bouc-Wen).
+    ``variant`` "fine": more dead zones.
     """
 
     test_answers_to_others: bool = True
     unseen_is_absent: bool = True
     model_error: float = 0.12
 
+    @property
+    def knees(self) -> tuple[FloatArray, FloatArray]:
+        """Knees of the displacement and of the wide play."""
+        return (_NEAR_FINE, _WIDE_FINE) if self.variant == "fine" else (_NEAR, _WIDE)
+
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return 1e-5 <= abs(self.reported(p, data)["bend"][0]) + 0.02 * float(np.max(np.abs(p[7:]))) <= 0.1
+        return 1e-5 <= abs(self.reported(p, data)["bend"][0]) + 0.02 * float(np.max(np.abs(p[-2:]))) <= 0.1
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
-        near = tuple(
-            ModelParameter(f"dead_zone{j}", "1", 0.0, -0.2, 0.2, 0.01, ActsOn.STATIC, True) for j in (1, 2, 3, 4)
-        )
-        wide = tuple(
-            ModelParameter(f"wide_dead_zone{j}", "1", 0.0, -0.2, 0.2, 0.01, ActsOn.STATIC, True) for j in (1, 2, 3)
-        )
+        zones = [f"dead_zone{j + 1}" for j in range(self.knees[0].size)]
+        zones += [f"wide_dead_zone{j + 1}" for j in range(self.knees[1].size)]
+        own = tuple(ModelParameter(name, "1", 0.0, -0.2, 0.2, 0.01, ActsOn.STATIC, True) for name in zones)
         loop = tuple(
             ModelParameter(name, "1", 0.0, -4.0, 4.0, 0.05, ActsOn.STATIC, True) for name in ("branch", "width")
         )
-        return (*near, *wide, *loop)
+        return (*own, *loop)
+
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        if left_floors <= 1.5 or self.variant:
+            return None
+        fine = replace(self, variant="fine")
+        start = np.zeros(len(fine.parameters(data)))
+        start[-2:] = p[-2:]
+        return fine, [start]
 
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
@@ -73,16 +87,15 @@ class Asymmetry(CauseModel):
         x_scale = np.array([low, 0.5 * data.range_um])
         z_scale = np.array([0.15 * data.swing_V, data.u_low_V, 0.5 * data.swing_V])
         q = np.ascontiguousarray(p)
-        return np.asarray(asymmetric(u_V, h_um, w_um, q, _NEAR, _WIDE, x_scale, z_scale, max(loop, 1e-12)))
+        return np.asarray(asymmetric(u_V, h_um, w_um, q, *self.knees, x_scale, z_scale, max(loop, 1e-12)))
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         """The bend over the whole stroke and the weights of both products."""
-        row = np.zeros(p.size)
-        row[:4] = 0.5 * (1.0 - _NEAR) / 2.0
-        row[4:7] = 0.5 * (1.0 - _WIDE) / 2.0
+        near, wide = self.knees
+        row = np.concatenate([0.25 * (1.0 - near), 0.25 * (1.0 - wide), [0.0, 0.0]])
         one, two = np.zeros(p.size), np.zeros(p.size)
-        one[7], two[8] = 1.0, 1.0
-        return {"bend": (float(row @ p), row), "branch": (float(p[7]), one), "width": (float(p[8]), two)}
+        one[-2], two[-1] = 1.0, 1.0
+        return {"bend": (float(row @ p), row), "branch": (float(p[-2]), one), "width": (float(p[-1]), two)}
 
 
 def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:

@@ -13,7 +13,7 @@ from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from sim.effects.counter_noise import normal
-from sim.fitting.drifts import Drift, spline
+from sim.effects.slow_change import SlowChange
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel
 from sim.readings.sight import Sight
@@ -47,7 +47,7 @@ def derive_gain_drift(values: Mapping[str, float], context: Context) -> Sequence
 
 
 @dataclass(frozen=True)
-class GainDrift(Drift):
+class GainDrift(SlowChange):
     """A slow change of the gain."""
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
@@ -61,7 +61,7 @@ class GainDrift(Drift):
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if self.variant == "temperature":
             return x_um if data.warmth_K is None else x_um * (1.0 + p[0] * data.warmth_K)
-        return x_um * (1.0 + spline(p, data))
+        return x_um * (1.0 + self.course(p, data))
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         if self.variant == "temperature":

@@ -70,8 +70,9 @@ def derive_rate_dependence(values: Mapping[str, float], context: Context) -> Seq
 class RateDependence(CauseModel):
     """A loop that widens with log10(1 + rate/v0).
 
-    ``variant`` "width": the loop's width follows the rate at once, and its driving term does; "thresholds" and
-    "added": plays whose thresholds grow by a share, or by as many volts, less the same plays at rest.
+    ``variant`` "width": the loop's width follows the rate at once, and its driving term does; the loop may widen about
+    another line than its own middle, so that the gain changes with the rate as well. "thresholds" and "added": plays
+    whose thresholds grow by a share, or by as many volts, less the same plays at rest.
     """
 
     test_answers_to_others: bool = True
@@ -98,6 +99,7 @@ class RateDependence(CauseModel):
         own = (
             ModelParameter("width_per_decade", "1", 0.0, -1.0, 1.0, 0.02, ActsOn.STATIC),
             ModelParameter("slope_per_decade", "1", 0.0, -1.0, 1.0, 0.02, ActsOn.STATIC),
+            ModelParameter("gain_per_decade", "1", 0.0, -0.05, 0.05, 1e-3, ActsOn.STATIC),
             pace,
         )
         felt = ModelParameter(
@@ -109,8 +111,8 @@ class RateDependence(CauseModel):
         if left_floors <= 1.2 or self.free_rate_lag:
             return None
         free = replace(self, variant="width", free_rate_lag=True)
-        width, slope, pace = p if self.variant == "width" else (0.02, 0.0, float(np.log(2.0 * data.swing_V)))
-        return free, [np.array([width, slope, pace, np.log(rate_lag_s)]) for rate_lag_s in (0.004, 0.02)]
+        known = p if self.variant == "width" else np.array([0.02, 0.0, 0.0, np.log(2.0 * data.swing_V)])
+        return free, [np.append(known, np.log(rate_lag_s)) for rate_lag_s in (0.004, 0.02)]
 
     def _paced(self, p: FloatArray) -> tuple[float, float]:
         """Rate above which the loop grows (V/s), and the time constant of the rate filter (s)."""
@@ -140,7 +142,7 @@ class RateDependence(CauseModel):
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
     ) -> FloatArray | None:
-        if not np.any(p[: 2 if self.variant == "width" else 3]):
+        if not np.any(p[:3]):
             return None
         corner_V_per_s, rate_lag_s = self._paced(p)
         rate = filtered_rate(u_V, float(np.exp(-data.dt_s / rate_lag_s)) if rate_lag_s > 0.0 else 0.0, data.dt_s)
@@ -148,7 +150,7 @@ class RateDependence(CauseModel):
         if self.variant != "width":
             radii, factor, added = self._growth(data)
             return np.asarray(grown_plays(u_V, radii, np.ascontiguousarray(p[:3]), 1.0 + factor * pace, added * pace))
-        out = -p[0] * h_um * pace
+        out = -(p[0] * h_um + p[2] * w_um) * pace
         if p[1] != 0.0 and data.nominal_kind == "bouc_wen":
             slope, beta, gamma = loop_numbers(nominal)
             # The loop diverges if the driving term changes its sign.

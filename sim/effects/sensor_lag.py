@@ -10,10 +10,10 @@ from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from sim.effects.holds import first_order
+from sim.effects.sampled_lags import second_lag
 from sim.fitting.dynamics import Dynamics
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess, single_guesses
-from sim.readings.response_lags import second_lag
 
 # Its step in the simulation.
 

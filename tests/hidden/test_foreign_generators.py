@@ -65,7 +65,8 @@ def test_the_generators_import_nothing_of_the_project() -> None:
 def test_a_base_rises_to_one_with_a_loop_symmetric_about_its_middle(base: str) -> None:
     x = path(0.0, 1.0, 0.0, 1.0, 0.0)
     for seed in range(3):
-        w = bases.displacement(base, x, False, np.random.default_rng(seed))
+        w, remains = bases.displacement(base, x, False, np.random.default_rng(seed))
+        assert remains == 0.0
         assert w[0] == pytest.approx(0.0, abs=1e-12)
         assert float(w.max()) == pytest.approx(1.0, abs=0.08)
         up, down = w[1000:1501], w[1500:2001]
@@ -73,9 +74,9 @@ def test_a_base_rises_to_one_with_a_loop_symmetric_about_its_middle(base: str) -
         assert 0.05 < width < 0.2
         # A depolarised stage does not come back to where it began; one that was used before does.
         assert 0.01 < float(w[-1]) < 0.15
-        again = bases.displacement(base, x, True, np.random.default_rng(seed))
-        assert again[0] == pytest.approx(0.0, abs=1e-3)
-        assert float(again[-1]) == pytest.approx(0.0, abs=1e-3)
+        again, remains = bases.displacement(base, x, True, np.random.default_rng(seed))
+        assert again[0] == pytest.approx(remains, abs=1e-3)
+        assert float(again[-1]) == pytest.approx(remains, abs=1e-3)
         # Turned about its centre the loop is the same.
         assert down - down[0] == pytest.approx(-(up - up[0]), abs=1e-3)
 
@@ -388,6 +389,17 @@ def test_the_causes_take_turns_and_their_sizes_are_those_of_the_record() -> None
         slack = 2.0 * case.rig.sigma_um if name in ("quantisation", "sensor_lag", "timing") else 1e-9
         assert rms == pytest.approx(case.sizes[name] * case.rig.stroke_um, abs=slack, rel=1e-6)
         assert rms >= LEAST_RMS * case.rig.sigma_um
+
+
+def test_a_loop_grows_with_the_rate_by_the_same_whatever_went_before_the_record() -> None:
+    grown = []
+    for used_before in (False, True):
+        stage = rig(drive="triangles", used_before=used_before)
+        case = Case("single", 5, stage, {"rate_dependence": {"per_decade": 0.1, "corner_per_s": 0.1}})
+        more = record(case)["y_um"] - record(case.without("rate_dependence"))["y_um"]
+        # The second half of the record remembers nothing of what was before it.
+        grown.append(more[more.size // 2 :])
+    assert grown[1] == pytest.approx(grown[0], abs=1e-6)
 
 
 def test_several_causes_can_all_be_seen_and_told_apart() -> None:

@@ -369,11 +369,14 @@ BASES: dict[str, Callable[[Array, np.random.Generator], Array]] = {
 OTHER_CLASS = tuple(name for name in BASES if name != "bouc_wen")
 
 
-def displacement(base: str, x: Array, used_before: bool, rng: np.random.Generator) -> Array:
-    """(n,) displacement of one of `BASES`. ``used_before``: two full cycles went before, and their memory is there."""
+def displacement(base: str, x: Array, used_before: bool, rng: np.random.Generator) -> tuple[Array, float]:
+    """(n,) displacement of one of `BASES` from its depolarised state, and what remains of it as the record begins.
+
+    ``used_before``: two full cycles went before, and their memory is there.
+    """
     if not used_before:
-        return BASES[base](x, rng)
+        return BASES[base](x, rng), 0.0
     ramp = np.linspace(0.0, 1.0, 300)
     before = np.tile(np.r_[ramp, ramp[::-1]], 2)
     w = BASES[base](np.r_[before, x], rng)
-    return np.asarray(w[before.size :] - w[before.size - 1])
+    return np.asarray(w[before.size :]), float(w[before.size - 1])

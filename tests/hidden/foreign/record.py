@@ -121,10 +121,12 @@ def _static(x: Array, case: Case, fs: float) -> Array:
     if "amplifier_lag" in what:
         u = fx.first_order(u, what["amplifier_lag"]["tau_s"], fs, held=not rig.straight and "slew_limit" not in what)
     x = u / span
-    w = displacement(rig.base, x, rig.used_before, _generator(rig.seed, 0))
+    w, remains = displacement(rig.base, x, rig.used_before, _generator(rig.seed, 0))
     if "rate_dependence" in what:
+        # A loop grows about its own middle, not about the point at which a record begins.
         own = what["rate_dependence"]
         w = fx.rate_dependence(x, w, own["per_decade"], own["corner_per_s"], fs)
+    w = w - remains
     if "asymmetry" in what:
         own = what["asymmetry"]
         w = w + (fx.branch_curvature(x, own["share"]) if "share" in own else fx.dead_zone(w, own["knee"], own["slope"]))

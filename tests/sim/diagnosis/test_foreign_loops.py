@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
 from sim.diagnosis.nominal import calibrate_nominal
 from sim.diagnosis.search.search import first_fits
 from sim.effects.hysteresis_shape import HysteresisShape
+from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.fitting.calibration import with_new_columns
+from sim.readings.noise import noise_floor
+from sim.readings.readings import Readings
 from tests.hidden.foreign.cases import single
 from tests.hidden.foreign.record import Case, Rig
 from tests.hidden.foreign.score import recording_of
@@ -22,6 +28,22 @@ BOWED = Case(
     Rig(1, "play_sum", False, "raster", "white", 1000.0, 20.0, 8.0, 85.0, 1.04e-3, False, 0.0, 0.0038, 4.0),
     {"asymmetry": {"share": -0.019}},
 )
+#: The nominal stage's own loop, with one cause by a formula of the generator's.
+OWN_LOOP = Rig(3, "bouc_wen", False, "triangles", "white", 1000.0, 30.0, 100.0, 60.0, 1.5e-3, False, 0.0, 0.0018, 1.0)
+WITH_A_BOW = Case("single", 3, replace(OWN_LOOP, drive="staircase"), {"asymmetry": {"share": 0.0086}})
+WIDENED = Case("single", 3, OWN_LOOP, {"rate_dependence": {"per_decade": 0.06, "corner_per_s": 0.3}})
+#: Heat through a thick wall, beside a loop that was used before.
+WARMED = single(403)
+#: A second lag: much like the stage's own on sixty plays; and on relays, at half a sample and less.
+EQUAL_LAGS = Case(
+    "single",
+    62,
+    Rig(62, "play_sum", False, "steps_and_sines", "white", 500.0, 40.0, 10.0, 60.0, 2.7e-3, False, 0.0, 0.003, 1.0),
+    {"amplifier_lag": {"tau_s": 3.4e-3}},
+)
+SHORT_LAG = single(260)
+#: No second lag: relays under a staircase whose steps are read in the middle of a sample.
+ONE_LAG = single(163)
 
 
 def diagnosed(case: Case) -> Diagnosis:
@@ -49,3 +71,19 @@ def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
 def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
     said = diagnosed(BOWED)
     assert "asymmetry" in {name for c in said.causes for name in (c.name, *c.alternatives)}
+
+
+@pytest.mark.parametrize("case", [WITH_A_BOW, WIDENED, WARMED], ids=lambda case: case.hidden[0])
+def test_what_the_form_of_a_cause_leaves_is_not_another_cause(case: Case) -> None:
+    said = diagnosed(case)
+    assert [c.name for c in said.causes] == list(case.hidden)
+    assert said.extended_heldout_um < 1.25 * said.noise_floor_um
+
+
+@pytest.mark.parametrize(("case", "lagged"), [(EQUAL_LAGS, True), (SHORT_LAG, True), (ONE_LAG, False)])
+def test_a_second_lag_is_seen_in_the_response_as_the_recorder_samples_it(case: Case, lagged: bool) -> None:
+    prepared = prepare(recording_of(case), nominal="bouc_wen")
+    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    assert second_lag(readings).seen is lagged
+    # What lags is not late: these readings are taken within a sample.
+    assert lags_of_response(readings).late is False

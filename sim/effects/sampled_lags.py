@@ -1,0 +1,175 @@
+"""Lags and dead time in the frequency response as a recorder samples it: what amplifier, sensor and delay are seen by.
+
+The voltage changes once a sample, by a jump or in a straight line, and the reading falls somewhere into a sample. Both
+are part of the response up to half the sampling rate, so that a second lag of less than a sample can be told from a
+reading that is taken a little later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptive.types import FloatArray
+from sim.readings.sight import Sight
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Readings, Response
+
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class LagsOfResponse:
+    """What the response shows. ``missing``: what it lacks to show anything; then nothing else is given.
+
+    ``late``: a straight part of the phase; ``lagged``: a second lag. Each with its words.
+    """
+
+    missing: str
+    late: bool | None = None
+    late_words: str = ""
+    lagged: bool | None = None
+    lag_words: str = ""
+
+
+def lags_of_response(readings: Readings) -> LagsOfResponse:
+    """A delay by its phase in proportion to frequency; a second lag by its arctangent and its fall in gain.
+
+    The stage's own lag is allowed for; a latency of up to one sample belongs to the recorder.
+    """
+    data = readings.data
+    response = readings.response
+    if response is None or response.f_hz.size < 12:
+        return LagsOfResponse("the voltage has too little power above 5 Hz for a frequency response")
+    f, gain, sigma = _below_modes(response)
+    # What happens within a sample is exact for one lag or two, but not for the modes and the loop above them.
+    low = f <= 0.6 * response.f_hz[-1]
+    if f.size < 10 or f[-1] < 4.0 * f[0] or int(low.sum()) < 10:
+        return LagsOfResponse("the response below the first mode is too narrow")
+    free = _fit(f[low], gain[low], sigma[low], data.dt_s, lags=1, latest_s=0.05)
+    latched = _fit(f[low], gain[low], sigma[low], data.dt_s, lags=1, latest_s=1.5 * data.dt_s)
+    late_s, late_error_s = float(free.p[1]), float(free.errors[1])
+    delayed = late_s > 1.8 * data.dt_s + 5.0 * late_error_s and free.cost < 0.8 * latched.cost
+    # A lag beside a delay is judged with the delay left free.
+    latest_s = 0.05 if delayed else 1.5 * data.dt_s
+    one, two = (_fit(f, gain, sigma, data.dt_s, lags=n, latest_s=latest_s) for n in (1, 2))
+    lag_s, longer_s = float(np.min(two.p[4:])), float(np.max(two.p[4:]))
+    lag_error_s = two.product_error / longer_s
+    # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
+    lagged = two.cost < 0.4 * one.cost and two.product > 5.0 * two.product_error
+    if lagged and not delayed:
+        late_s, late_error_s = float(two.p[1]), float(two.errors[1])
+    words = (
+        f"the phase from {f[0]:.2g} to {f[low][-1]:.3g} Hz has a straight part of {1e3 * late_s:.3g} ± "
+        f"{1.96e3 * late_error_s:.1g} ms"
+    )
+    lag_words = (
+        f"up to {f[-1]:.3g} Hz a second lag of {1e3 * lag_s:.3g} ± {1.96e3 * lag_error_s:.1g} ms lowers the "
+        f"misfit of the response to {100 * two.cost / max(one.cost, 1e-300):.0f} %"
+    )
+    # A little more than the recorder's latch is not decided.
+    late = True if delayed else None if late_s > 1.2 * data.dt_s else False
+    return LagsOfResponse("", late, words, lagged, lag_words)
+
+
+def second_lag(readings: Readings) -> Sight:
+    """The direct test of a lag beside the stage's own: its phase and its loss of gain."""
+    found = readings.once(lags_of_response)
+    return Sight(None, found.missing) if found.missing else Sight(found.lagged, found.lag_words)
+
+
+def _below_modes(response: Response) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """The response up to half the frequency of its largest peak, where it has one."""
+    f, size = response.f_hz, np.abs(response.gain)
+    low = float(np.median(size[: max(3, f.size // 10)]))
+    peak = int(np.argmax(size))
+    top = 0.5 * float(f[peak]) if size[peak] > 1.5 * low and f[peak] > 4.0 * f[0] else float(f[-1])
+    keep = f <= top
+    return f[keep], response.gain[keep], response.sigma[keep]
+
+
+class _Fitted:
+    """Parameters (log gain, latency, lags), their standard errors, and the squared misfit.
+
+    ``product``, ``product_error``: of two lags, s².
+    """
+
+    def __init__(self, p: FloatArray, cover: FloatArray, cost: float) -> None:
+        self.p, self.cost = p, cost
+        self.errors = np.sqrt(np.maximum(np.diag(cover), 0.0))
+        row = np.zeros(p.size)
+        row[4:] = p[4:][::-1]
+        self.product = float(np.prod(p[4:]))
+        self.product_error = float(np.sqrt(max(float(row @ cover @ row), 0.0)))
+
+
+def _fit(f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float) -> _Fitted:
+    """The better fit of a voltage that is held over each sample and of one that runs straight to the next."""
+    both = (_fit_hold(f, gain, sigma, dt_s, lags, latest_s, straight) for straight in (False, True))
+    return min(both, key=lambda fitted: fitted.cost)
+
+
+def _fit_hold(
+    f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float, straight: bool
+) -> _Fitted:
+    from scipy import optimize  # a simulated stage does not wait for it
+
+    turn = np.exp(-2j * np.pi * f * dt_s)
+    weight = 1.0 / np.maximum(sigma, 0.003)
+    size, phase = np.log(np.abs(gain)), np.unwrap(np.angle(gain))
+    start_gain = float(size[0])
+    pace = np.log(f / f[0])
+
+    def misfit(p: FloatArray) -> FloatArray:
+        model = _sampled(turn, np.abs(p[4:]) / dt_s, float(p[1]) / dt_s, straight)
+        # A loop adds a small constant phase, and its gain falls slowly with frequency, as the motion gets smaller.
+        missing = phase - np.unwrap(np.angle(model)) - p[2]
+        missing = missing - 2.0 * np.pi * np.round(missing[0] / (2.0 * np.pi))
+        both = np.concatenate([size - p[0] - p[3] * pace - np.log(np.abs(model)), missing]) * np.concatenate(
+            [weight, weight]
+        )
+        return np.asarray(both)
+
+    best: optimize.OptimizeResult | None = None
+    for first in (1e-3, 4e-3):
+        # More than one start: the second lag hides behind the first.
+        start = np.array([start_gain, 0.0, 0.0, 0.0, first, *[0.3 * first] * (lags - 1)])
+        low = [-50.0, -1.5 * dt_s, -0.3, -0.1, 1e-6, *[1e-6] * (lags - 1)]
+        high = [50.0, latest_s, 0.3, 0.1, 0.1, *[0.1] * (lags - 1)]
+        scale = [1.0, 1e-3, 0.1, 0.1, 1e-3, 1e-3][: start.size]
+        solved = optimize.least_squares(misfit, start, bounds=(low, high), x_scale=scale)
+        if best is None or solved.cost < best.cost:
+            best = solved
+    assert best is not None
+    cover = np.linalg.pinv(best.jac.T @ best.jac) * (2.0 * best.cost / max(1, 2 * f.size - best.x.size))
+    return _Fitted(np.asarray(best.x), np.asarray(cover), float(best.cost))
+
+
+def _sampled(turn: ComplexArray, ratios: FloatArray, late: float, straight: bool) -> ComplexArray:
+    """Response of one or two lags (time constants over the sample time) as a recorder sees it that reads ``late``
+    samples late, exact for a voltage that is held over each sample or runs ``straight`` to the next one."""
+    ratios = np.maximum(ratios, 1e-3)
+    if ratios.size == 1:
+        shares = np.ones(1)
+    else:
+        apart = ratios[0] - ratios[1]
+        if abs(apart) < 1e-3 * float(np.max(ratios)):
+            apart = 1e-3 * float(np.max(ratios))
+        shares = np.array([ratios[0], -ratios[1]]) / apart
+    whole = int(np.floor(late))
+    # The reading falls into the step that begins at its last voltage, after this part of it.
+    part = 1.0 - (late - whole)
+    left, keep = np.exp(-part / ratios)[:, None], np.exp(-1.0 / ratios)[:, None]
+    gap = 1.0 - turn
+    settling = left / (1.0 - keep * turn)
+    if straight:
+        ramps = part + (1.0 - part) * turn
+        out = ramps - (shares * ratios) @ (gap - gap * gap * settling)
+    else:
+        out = turn * (1.0 - shares @ (gap * settling))
+    return np.asarray(out * turn**whole)

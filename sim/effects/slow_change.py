@@ -1,0 +1,42 @@
+"""What the forms of both drifts share: a slow change in time, finer at first where that explains more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from sim.fitting.drifts import Drift, spline
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import CauseModel
+
+#: Knots (shares of the duration) for a change that is fast at first: a temperature settles as the root of time.
+_EARLY = np.array([0.0, 0.02, 0.045, 0.08, 0.13, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
+
+
+@dataclass(frozen=True)
+class SlowChange(Drift):
+    """A drift whose spline has equal spans or, as ``variant`` "early", short ones at first."""
+
+    def spans(self, data: FitData) -> int:
+        return _EARLY.size - 1 if self.variant == "early" else super().spans(data)
+
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        if left_floors <= 1.1 or self.variant:
+            return None
+        equal = np.linspace(0.0, 1.0, p.size + 1)
+        return replace(self, variant="early"), [np.interp(_EARLY[1:], equal, np.append(0.0, p))]
+
+    def course(self, p: FloatArray, data: FitData) -> FloatArray:
+        """(n,) cubic spline in time through 0 at the start and the values ``p`` at the later knots."""
+        if self.variant != "early":
+            return spline(p, data)
+
+        def basis() -> FloatArray:
+            from scipy.interpolate import CubicSpline  # a simulated stage does not wait for it
+
+            each = CubicSpline(_EARLY * data.duration_s, np.eye(_EARLY.size)[:, 1:])
+            return np.ascontiguousarray(each(data.t_s).T)
+
+        return np.asarray(p @ data.derived(("early splines", _EARLY.size), basis))
