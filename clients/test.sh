@@ -42,7 +42,7 @@ if [ -z "${DEHYST_TEST_ZENOH:-}" ]; then
 fi
 echo "test-clients: the zenoh follower, beside a live service"
 cd zenoh
-cargo build --release --quiet
+cargo build --release --quiet --lib --examples
 zenoh="${CARGO_TARGET_DIR:-target}/release"
 # shellcheck disable=SC2086
 for program in controller deadlines; do
