@@ -108,10 +108,11 @@ def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
     assert done.stdout.startswith("1000 points, 0 refused")
 
 
-def test_a_stage_and_a_controller_in_rust_that_asks_ahead(endpoint: str) -> None:
-    examples = Path(LIBRARY).parent / "examples"
+@pytest.mark.parametrize("folder", ["examples", "."])
+def test_a_stage_and_a_controller_that_asks_ahead_in_rust_and_in_c(endpoint: str, folder: str) -> None:
+    examples = Path(LIBRARY).parent / folder
     if not (examples / "ahead").exists():
-        pytest.skip("the examples are not built: clients/test.sh does")
+        pytest.skip("the programs are not built: clients/test.sh does")
     with Client.connect(endpoint) as client:
         received = client.status()["samples"]["received"]
         stage = subprocess.Popen(

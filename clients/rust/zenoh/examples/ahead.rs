@@ -5,9 +5,9 @@
 //! starts the count of its stage with sample 0, as `dehyst stage` and the example `stage` wait for. The last line
 //! printed says how many voltages were sent, and how many of the blocks came too late for their first sample.
 
-use dehyst_zenoh::{open, Options};
+use dehyst::wire::Reply;
+use dehyst_zenoh::{open, Link, Options};
 use std::time::{Duration, Instant};
-use zenoh::{qos::CongestionControl, Config, Wait};
 
 const BLOCK: i64 = 20;
 const LEAD: i64 = 60;
@@ -45,37 +45,16 @@ fn query(motion: &[[f64; 3]], under_way: Option<(i64, &[f64], &[f64])>) -> Vec<u
 fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let word = |i: usize, missing: &str| words.get(i).cloned().unwrap_or_else(|| missing.into());
-    let (endpoint, stage, axis) = (word(0, "tcp/127.0.0.1:7447"), word(1, "demo"), word(2, "x"));
     let (seconds, centre, swing): (f64, f64, f64) =
         (word(3, "5").parse()?, word(4, "45").parse()?, word(5, "20").parse()?);
-    let live = open(&Options {
-        endpoints: vec![endpoint.clone()],
-        stage: stage.clone(),
-        axis: axis.clone(),
+    let options = Options {
+        endpoints: vec![word(0, "tcp/127.0.0.1:7447")],
+        stage: word(1, "demo"),
+        axis: word(2, "x"),
         ..Options::default()
-    })?;
-    let dt_s = live.follower.report().dt_s;
-    let mut config = Config::default();
-    for (key, value) in [
-        ("mode", "\"client\"".to_string()),
-        ("connect/endpoints", format!("[{endpoint:?}]")),
-        ("scouting/multicast/enabled", "false".into()),
-        ("scouting/gossip/enabled", "false".into()),
-    ] {
-        config.insert_json5(key, &value)?;
-    }
-    let session = zenoh::open(config).wait()?;
-    let base = format!("dehyst/v1/{stage}/{axis}");
-    let commands =
-        session.declare_publisher(format!("{base}/command")).congestion_control(CongestionControl::Block).wait()?;
-    let ask = |payload: Vec<u8>| -> Result<dehyst::wire::Reply, Box<dyn std::error::Error + Send + Sync>> {
-        let replies =
-            session.get(format!("{base}/feedforward")).payload(payload).timeout(Duration::from_secs(1)).wait()?;
-        match replies.recv()?.result() {
-            Ok(sample) => Ok(dehyst::wire::Reply::decode(&sample.payload().to_bytes())?),
-            Err(error) => Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned().into()),
-        }
     };
+    let dt_s = open(&options)?.follower.report().dt_s;
+    let link = Link::open(&options, None)?;
     let w = 4.0 * std::f64::consts::PI;
     // From the bottom at rest, so that the first command is no step.
     let point = |k: i64| {
@@ -94,11 +73,11 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         // More than can be under way: the service leaves out what its snapshot has seen.
         let kept = u_v.len().saturating_sub(1000);
         let under_way = (!u_v.is_empty()).then(|| (kept as i64, &y_um[kept..], &u_v[kept..]));
-        let reply = ask(query(&motion, under_way))?;
+        let reply = Reply::decode(&link.ask("feedforward", &query(&motion, under_way))?)?;
         let mut block = header(2, 0, BLOCK);
         block.extend(first.to_le_bytes());
         extend(&mut block, &reply.u_v);
-        commands.put(block).wait()?;
+        link.send("command", block)?;
         if first == 0 {
             begin = Instant::now(); // the stage's clock starts with the first block
         } else if begin.elapsed().as_secs_f64() > first as f64 * dt_s {

@@ -4,9 +4,9 @@
 //! five samples a message. In place of hardware it has a gain and one play; put your own input and output into `Piezo`.
 //! Its clock starts with the command for sample 0. Where a voltage is missing it repeats the last one and counts it.
 
+use dehyst_zenoh::{Link, Options};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
-use zenoh::{qos::CongestionControl, Config, Wait};
 
 const DT_S: f64 = 1e-3;
 const BATCH: usize = 5;
@@ -54,26 +54,14 @@ fn samples(rows: &[(i64, f64, f64, f64)]) -> Vec<u8> {
 fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let word = |i: usize, missing: &str| words.get(i).cloned().unwrap_or_else(|| missing.into());
-    let (endpoint, stage, axis) = (word(0, "tcp/127.0.0.1:7447"), word(1, "demo"), word(2, "x"));
+    let options = Options {
+        endpoints: vec![word(0, "tcp/127.0.0.1:7447")],
+        stage: word(1, "demo"),
+        axis: word(2, "x"),
+        ..Options::default()
+    };
     let last = (word(3, "5").parse::<f64>()? / DT_S).round() as i64;
-    let mut config = Config::default();
-    for (key, value) in [
-        ("mode", "\"client\"".to_string()),
-        ("connect/endpoints", format!("[{endpoint:?}]")),
-        ("scouting/multicast/enabled", "false".into()),
-        ("scouting/gossip/enabled", "false".into()),
-    ] {
-        config.insert_json5(key, &value)?;
-    }
-    let session = zenoh::open(config).wait()?;
-    let base = format!("dehyst/v1/{stage}/{axis}");
-    let (sender, blocks) = std::sync::mpsc::channel();
-    let _subscriber = session
-        .declare_subscriber(format!("{base}/command"))
-        .callback(move |sample| drop(sender.send(sample.payload().to_bytes().into_owned())))
-        .wait()?;
-    let readings =
-        session.declare_publisher(format!("{base}/sample")).congestion_control(CongestionControl::Block).wait()?;
+    let link = Link::open(&options, Some("command"))?;
     println!("ready");
     let (mut piezo, mut planned, mut begin) = (Piezo::default(), BTreeMap::new(), None::<Instant>);
     let (mut rows, mut missing, mut refused) = (Vec::new(), 0, 0);
@@ -82,7 +70,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         let pause = begin.map_or(Duration::from_millis(50), |begin| {
             (begin + Duration::from_secs_f64(k as f64 * DT_S)).saturating_duration_since(Instant::now())
         });
-        if let Ok(data) = blocks.recv_timeout(pause) {
+        if let Some(data) = link.receive(pause) {
             match command(&data) {
                 Some((first, u_v)) => planned.extend((first..).zip(u_v)),
                 None => refused += 1,
@@ -103,7 +91,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         rows.push((k, k as f64 * DT_S, piezo.u_v, y_um));
         k += 1;
         if rows.len() == BATCH || k == last {
-            readings.put(samples(&rows)).wait()?;
+            link.send("sample", samples(&rows))?;
             rows.clear();
         }
     }
