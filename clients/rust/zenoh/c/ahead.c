@@ -1,5 +1,5 @@
-/* A controller that asks the service ahead of time and commands a stage: a 2 Hz sine in blocks of 20 samples, each asked
- * for 60 samples ahead, with what is under way (docs/protocol.md). It starts the count of its stage with sample 0.
+/* A controller that asks the service ahead of time and commands a stage: a 2 Hz sine in blocks of 20 samples, each
+ * asked for 60 samples ahead, with what is under way (docs/protocol.md). It starts the count of its stage with sample 0.
  * Usage: ahead ENDPOINT STAGE AXIS SECONDS CENTRE_UM SWING_UM. For little-endian processors, as the wire is. */
 #include "dehyst_zenoh.h"
 

@@ -1,8 +1,8 @@
 /* A loop at a steady rate that asks the followed model for one point each turn, and the same loop without it. Prints one
  * line of JSON: turns whose work was done only after the next turn was due, and the time of a point.
- * Usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]; without an
- * endpoint the loop is bare. --receivers: the threads that receive models run only where nothing else does (Linux's idle
- * class). --realtime: the loop has a real-time priority, and the threads that receive have none; this needs the right. */
+ * Usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM];
+ * without an endpoint the loop is bare. --receivers: the threads that receive models run only where nothing else does
+ * (Linux's idle class). --realtime: the loop has a real-time priority, which needs the right, and those threads none. */
 #define _GNU_SOURCE
 #include "dehyst_zenoh.h"
 
@@ -42,7 +42,8 @@ int main(int argc, char **argv) {
     double *point_us = turns > 0 ? malloc((size_t)turns * sizeof *point_us) : NULL;
     double *late_us = turns > 0 ? malloc((size_t)turns * sizeof *late_us) : NULL;
     if ((argc != 3 && argc != 9) || !point_us || !late_us) {
-        printf("usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
+        printf("usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ "
+               "[ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
         return 2;
     }
     dehyst *stage = NULL;

@@ -1,6 +1,6 @@
-/* A stage on the wire: takes the command blocks of a controller, applies one voltage each millisecond, and publishes what
- * its sensor reads, five samples a message. In place of hardware it has a gain and one play. Its clock starts with the
- * command for sample 0. Usage: stage ENDPOINT STAGE AXIS SECONDS. For little-endian processors, as the wire is. */
+/* A stage on the wire: takes the command blocks of a controller, applies one voltage each millisecond, and publishes
+ * what its sensor reads, five samples a message. In place of hardware it has a gain and one play. Its clock starts with
+ * the command for sample 0. Usage: stage ENDPOINT STAGE AXIS SECONDS. For little-endian processors, as the wire is. */
 #include "dehyst_zenoh.h"
 
 #include <math.h>
@@ -57,7 +57,8 @@ int main(int argc, char **argv) {
     while (k < last) {
         size_t bytes = 0;
         double wait_s = begin_s < 0.0 ? 0.05 : fmax(0.0, begin_s + (double)k * DT_S - now_s());
-        if (dehyst_link_receive(link, wait_s, block, sizeof block, &bytes) || (bytes && !command(block, bytes, k, &first)))
+        if (dehyst_link_receive(link, wait_s, block, sizeof block, &bytes) ||
+            (bytes && !command(block, bytes, k, &first)))
             refused++;
         if (begin_s < 0.0 && first == 0)
             begin_s = now_s();

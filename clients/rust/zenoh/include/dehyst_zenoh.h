@@ -14,9 +14,9 @@ extern "C" {
 int dehyst_open(const char *endpoint, const char *stage, const char *axis, const char *model, double timeout_s,
                 dehyst **handle);
 
-/* Bytes to and from the keys of an axis, without a model, for a stage or a controller that asks the service ahead. A key
- * is what follows dehyst/v1/STAGE/AXIS/ in docs/protocol.md, which has the payloads. All return 0, or another status with
- * the reason in dehyst_error(). These functions allocate and wait: keep them out of a loop with hard deadlines. */
+/* Bytes to and from the keys of an axis, without a model, for a stage or a controller that asks the service ahead. A
+ * key is what follows dehyst/v1/STAGE/AXIS/ in docs/protocol.md, which has the payloads. All return 0, or another status
+ * with the reason in dehyst_error(). These functions allocate and wait: keep them out of a loop with hard deadlines. */
 typedef struct dehyst_link dehyst_link;
 
 /* receive: the key that dehyst_link_receive takes payloads from, such as "command"; NULL for none. */
