@@ -42,10 +42,10 @@ if [ -z "${DEHYST_TEST_ZENOH:-}" ]; then
 fi
 echo "test-clients: the zenoh follower, beside a live service"
 cd zenoh
-cargo build --release --quiet
+cargo build --release --quiet --lib --examples
 zenoh="${CARGO_TARGET_DIR:-target}/release"
 # shellcheck disable=SC2086
-for program in controller deadlines; do
+for program in stage ahead controller deadlines; do
     "$compiler" $flags -I../include "c/$program.c" -o "$zenoh/$program" -L"$zenoh" -ldehyst_zenoh -lm \
         -Wl,-rpath,'$ORIGIN'
 done

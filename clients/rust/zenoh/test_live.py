@@ -102,19 +102,48 @@ def test_a_controller_in_c_follows_at_its_sample_time(endpoint: str) -> None:
     program = Path(LIBRARY).parent / "controller"
     if not program.exists():
         pytest.skip("c/controller.c is not built: clients/test.sh does")
-    words = [program, endpoint, "demo", "x", "", "1.0", "45", "20"]
+    words: list[str | Path] = [program, endpoint, "demo", "x", "", "1.0", "45", "20"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("1000 points, 0 refused")
 
 
-def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint: str) -> None:
+@pytest.mark.parametrize("folder", ["examples", "."])
+def test_a_stage_and_a_controller_that_asks_ahead_in_rust_and_in_c(endpoint: str, folder: str) -> None:
+    examples = Path(LIBRARY).parent / folder
+    if not (examples / "ahead").exists():
+        pytest.skip("the programs are not built: clients/test.sh does")
+    with Client.connect(endpoint) as client:
+        received = client.status()["samples"]["received"]
+        stage = subprocess.Popen(
+            [examples / "stage", endpoint, "demo", "x", "2"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        with stage:
+            assert stage.stdout is not None
+            assert stage.stdout.readline() == "ready\n"
+            words: list[str | Path] = [examples / "ahead", endpoint, "demo", "x", "2", "45", "20"]
+            done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+            assert done.returncode == 0, done.stderr
+            assert done.stdout.startswith("2000 voltages")
+            out, errors = stage.communicate(timeout=30)
+            assert stage.returncode == 0, errors
+        assert out.startswith("2000 samples")
+        assert out.endswith("0 commands refused\n")
+        until = time.monotonic() + 20.0
+        while client.status()["samples"]["received"] < received + 2000 and time.monotonic() < until:
+            time.sleep(0.05)
+        assert client.status()["samples"]["received"] == received + 2000
+
+
+@pytest.mark.parametrize("threads", [[], ["--receivers"]])
+def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint: str, threads: list[str]) -> None:
     """``python -m benchmarks.native_loop`` compares the two; how many are missed, only a quiet machine can tell."""
     program = Path(LIBRARY).parent / "deadlines"
     if not program.exists():
         pytest.skip("c/deadlines.c is not built: clients/test.sh does")
     for model in ([], [endpoint, "demo", "x", "", "45", "20"]):
-        done = subprocess.run([program, "0.5", "2000", *model], capture_output=True, text=True, timeout=30, check=False)
+        words: list[str | Path] = [program, *threads, "0.5", "2000", *model]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
         assert done.returncode == 0, done.stderr
         told = json.loads(done.stdout)
         assert told["turns"] == 1000

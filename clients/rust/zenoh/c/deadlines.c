@@ -1,11 +1,16 @@
 /* A loop at a steady rate that asks the followed model for one point each turn, and the same loop without it. Prints one
  * line of JSON: turns whose work was done only after the next turn was due, and the time of a point.
- * Usage: deadlines SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]; without an endpoint the loop is bare. */
+ * Usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM];
+ * without an endpoint the loop is bare. --receivers: the threads that receive models run only where nothing else does
+ * (Linux's idle class). --realtime: the loop has a real-time priority, which needs the right, and those threads none. */
+#define _GNU_SOURCE
 #include "dehyst_zenoh.h"
 
 #include <math.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <time.h>
 
 #define PI 3.14159265358979323846
@@ -19,24 +24,43 @@ static int ascending(const void *a, const void *b) {
     return (x > y) - (x < y);
 }
 
+/* The class of the calling thread, which threads that it starts later inherit. */
+static void schedule(int policy, int priority) {
+    struct sched_param wanted = {.sched_priority = priority};
+    if (sched_setscheduler(0, policy, &wanted)) {
+        perror("deadlines: the scheduler's class");
+        exit(1);
+    }
+}
+
 int main(int argc, char **argv) {
+    int receivers = argc > 1 && !strcmp(argv[1], "--receivers");
+    int realtime = argc > 1 && !strcmp(argv[1], "--realtime");
+    argc -= receivers || realtime, argv += receivers || realtime;
     double lasts_s = argc > 1 ? atof(argv[1]) : 0.0, rate_Hz = argc > 2 ? atof(argv[2]) : 0.0;
     long turns = lround(lasts_s * rate_Hz);
     double *point_us = turns > 0 ? malloc((size_t)turns * sizeof *point_us) : NULL;
     double *late_us = turns > 0 ? malloc((size_t)turns * sizeof *late_us) : NULL;
     if ((argc != 3 && argc != 9) || !point_us || !late_us) {
-        printf("usage: deadlines SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
+        printf("usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ "
+               "[ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
         return 2;
     }
     dehyst *stage = NULL;
     double centre_um = 0.0, swing_um = 0.0, w = 4.0 * PI, period_us = 1e6 / rate_Hz;
     if (argc == 9) {
+        if (receivers)
+            schedule(SCHED_IDLE, 0);
         if (dehyst_open(argv[3], argv[4], argv[5], argv[6], 5.0, &stage)) {
             fprintf(stderr, "%s\n", dehyst_error());
             return 1;
         }
         centre_um = atof(argv[7]), swing_um = atof(argv[8]);
     }
+    if (receivers && stage)
+        schedule(SCHED_OTHER, 0);
+    if (realtime)
+        schedule(SCHED_FIFO, 10);
     long missed = 0, refused = 0;
     struct timespec due, start, end;
     clock_gettime(CLOCK_MONOTONIC, &due);

@@ -14,6 +14,27 @@ extern "C" {
 int dehyst_open(const char *endpoint, const char *stage, const char *axis, const char *model, double timeout_s,
                 dehyst **handle);
 
+/* Bytes to and from the keys of an axis, without a model, for a stage or a controller that asks the service ahead. A
+ * key is what follows dehyst/v1/STAGE/AXIS/ in docs/protocol.md, which has the payloads. All return 0, or another status
+ * with the reason in dehyst_error(). These functions allocate and wait: keep them out of a loop with hard deadlines. */
+typedef struct dehyst_link dehyst_link;
+
+/* receive: the key that dehyst_link_receive takes payloads from, such as "command"; NULL for none. */
+int dehyst_link_open(const char *endpoint, const char *stage, const char *axis, const char *receive, double timeout_s,
+                     dehyst_link **link);
+
+/* Publish a payload. Waits while the wire is full, so that nothing is dropped. */
+int dehyst_link_send(const dehyst_link *link, const char *key, const uint8_t *payload, size_t bytes);
+
+/* The next payload that came; *bytes is 0 where none came within wait_s. One thread at a time. */
+int dehyst_link_receive(const dehyst_link *link, double wait_s, uint8_t *payload, size_t room, size_t *bytes);
+
+/* The reply to a query with a payload, such as one of kind 4 on "feedforward"; waits up to the time-out. */
+int dehyst_link_ask(const dehyst_link *link, const char *key, const uint8_t *query, size_t query_bytes, uint8_t *reply,
+                    size_t room, size_t *bytes);
+
+void dehyst_link_close(dehyst_link *link);
+
 #ifdef __cplusplus
 }
 #endif

@@ -9,6 +9,9 @@
 //! ```
 
 pub mod ffi;
+mod link;
+
+pub use link::Link;
 
 use dehyst::json::{self, Value};
 use dehyst::{Error, Follower, Limits, Publisher, Result, Update};
@@ -64,8 +67,8 @@ fn failed(field: &str, error: impl std::fmt::Display, expected: &str) -> Error {
     Error::new(field, error, expected)
 }
 
-/// Connect, fetch the model, and follow it. Waits up to the time-out for the service.
-pub fn open(options: &Options) -> Result<Live> {
+/// What all keys of the axis begin with. Refuses names that are none.
+fn base_of(options: &Options) -> Result<String> {
     for (field, name) in [("stage", &options.stage), ("axis", &options.axis)] {
         let good = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
         let first = name.chars().next().is_some_and(|c| c.is_ascii_lowercase());
@@ -73,10 +76,15 @@ pub fn open(options: &Options) -> Result<Live> {
             return Err(Error::new(field, name, "1 to 64 of a-z, 0-9, _ and -, beginning with a letter"));
         }
     }
+    Ok(format!("dehyst/v1/{}/{}", options.stage, options.axis))
+}
+
+/// Connect, fetch the model, and follow it. Waits up to the time-out for the service.
+pub fn open(options: &Options) -> Result<Live> {
+    let base = base_of(options)?;
     let session = zenoh::open(config(options)?)
         .wait()
         .map_err(|error| failed("endpoints", error, "the endpoint of a running service"))?;
-    let base = format!("dehyst/v1/{}/{}", options.stage, options.axis);
     let mut feed = Feed { _subscriber: None, session, base, timeout: options.timeout };
     let status = feed.status()?;
     let text = |name: &str| status.get(name).and_then(Value::text).unwrap_or("").to_string();
@@ -203,14 +211,19 @@ impl Feed {
 
 /// The one reply to a query, which is repeated until the time-out while nobody answers.
 fn get(session: &Session, selector: &str, timeout: Duration) -> Result<Vec<u8>> {
+    get_with(session, selector, None, timeout)
+}
+
+fn get_with(session: &Session, selector: &str, payload: Option<&[u8]>, timeout: Duration) -> Result<Vec<u8>> {
     let until = Instant::now() + timeout;
     loop {
         let left = until.saturating_duration_since(Instant::now());
-        let replies = session
-            .get(selector)
-            .timeout(left.max(Duration::from_millis(100)))
-            .wait()
-            .map_err(|error| failed("query", error, "an open session"))?;
+        let asked = session.get(selector).timeout(left.max(Duration::from_millis(100)));
+        let asked = match payload {
+            Some(payload) => asked.payload(payload),
+            None => asked,
+        };
+        let replies = asked.wait().map_err(|error| failed("query", error, "an open session"))?;
         while let Ok(reply) = replies.recv() {
             match reply.result() {
                 Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
