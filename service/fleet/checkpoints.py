@@ -82,7 +82,7 @@ class FleetCheckpoints:
     def _copy(self, axis: int) -> bool:
         """Copy the state of an axis to be written; False where it never had a sample."""
         learner, (stage, instance) = self._fleet.learner_of(axis), self._names
-        if learner.parts.intake.track is None:
+        if learner.memory_for(learner.base) is None:
             return False
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
