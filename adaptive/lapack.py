@@ -3,23 +3,49 @@
 ``scipy.linalg.lapack`` holds it for the whole call, which would block queries for milliseconds. The same
 routines, taken from scipy's C interface and called through ctypes, do not. Matrices are C-ordered and
 symmetric; only one triangle is read and written, which Fortran sees as the other one.
+
+`one_thread` limits the BLAS below numpy and scipy, for functions that are called from programs that set no limit.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+import scipy.linalg  # noqa: F401 - it loads scipy's BLAS, which `_pools` must find
 from numba.extending import get_cython_function_address
+from threadpoolctl import ThreadpoolController
 
 from adaptive.errors import NumericsError
 from adaptive.types import FloatArray
 
 _INT = ctypes.POINTER(ctypes.c_int)
 _DOUBLES = ctypes.POINTER(ctypes.c_double)
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+@cache
+def _pools() -> Any:
+    return ThreadpoolController()
+
+
+def one_thread(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """``function`` with one BLAS thread, whatever the environment says; the limit before is restored after it.
+
+    Beside other work the threads of a BLAS wait for each other: two made a search three hundred times slower. The last
+    bits of a result depend on their number, too.
+    """
+
+    @wraps(function)
+    def limited(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with _pools().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 @cache

@@ -146,6 +146,7 @@ class LssvmFit:
         return np.asarray(self.model.alpha / diagonal, dtype=np.float64)
 
 
+@lapack.one_thread
 def fit(
     X: FloatArray,
     y: FloatArray,

@@ -94,6 +94,7 @@ class Evidence:
     J2_curvature: float
 
 
+@lapack.one_thread
 def evaluate(data: EvidenceSamples, gamma: float, widths: FloatArray, third_level: bool = False) -> Evidence:
     """Evidence at one pair of gamma and widths (d,), with its gradients.
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from adaptive.errors import InputError, NumericsError
+from adaptive.lapack import one_thread
 from adaptive.online.kernel_window import SAME
 from adaptive.tuning.config import RetuneConfig
 from adaptive.tuning.evidence import EvidenceSamples, evidence_samples
@@ -53,6 +53,7 @@ def bounds_of(hyper: Hyperparameters, config: RetuneConfig) -> tuple[FloatArray,
     )
 
 
+@one_thread
 def propose(data: WindowData, config: RetuneConfig | None = None, search: Search | None = None) -> Proposal:
     """The hyper-parameters with the best evidence on ``data``, or the present ones where none are better.
 
@@ -60,11 +61,7 @@ def propose(data: WindowData, config: RetuneConfig | None = None, search: Search
     InputError on too few samples or targets that are all equal, NumericsError where the present values cannot be
     evaluated.
     """
-    with threadpool_limits(1, "blas"):
-        return _propose(data, config or RetuneConfig(), search)
-
-
-def _propose(data: WindowData, config: RetuneConfig, search: Search | None) -> Proposal:
+    config = config or RetuneConfig()
     n = data.targets_V.shape[0]
     if n < config.least:
         raise InputError(f"data: got {n} samples, expected at least {config.least} to tune on; let the window fill")

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from threadpoolctl import threadpool_limits
 
 from adaptive.errors import InputError, NumericsError
+from adaptive.lapack import one_thread
 from adaptive.tuning.evidence import Evidence, EvidenceSamples, evaluate
 from adaptive.types import FloatArray
 
@@ -106,20 +106,15 @@ def descend(
     return np.asarray(np.clip(found.x, low, high), dtype=np.float64)
 
 
+@one_thread
 def infer(data: EvidenceSamples, config: InferenceConfig | None = None) -> Inference:
     """Find gamma and the kernel widths. Deterministic, with one BLAS thread whatever the environment says.
-
-    Beside other work two threads wait for each other: they made the same search three hundred times slower.
 
     Raises
     ------
     NumericsError : no start could be evaluated.
     """
-    with threadpool_limits(1, "blas"):
-        return _infer(data, config or InferenceConfig())
-
-
-def _infer(data: EvidenceSamples, config: InferenceConfig) -> Inference:
+    config = config or InferenceConfig()
     few, whole = CountedEvidence(data.subset(_evenly(data.size, config.search_rows))), CountedEvidence(data)
     count = data.dimension if config.ard else 1
     tried = []

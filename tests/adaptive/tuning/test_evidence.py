@@ -179,15 +179,26 @@ def test_length_scales_are_those_of_the_samples() -> None:
     assert least == pytest.approx(1.0 / scale[0])  # nor do samples that coincide
 
 
-def test_the_search_uses_one_blas_thread_whatever_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: set[int] = set()
-    real = inference.evaluate
+@pytest.mark.parametrize("called", ["infer", "evaluate", "fit"])
+def test_one_blas_thread_is_used_whatever_the_environment_says(called: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
-    def watched(*arguments: Any) -> evidence.Evidence:
-        seen.update(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+    seen: set[int] = set()
+    real, data, width = kernels.gram, small_problem(n=40), np.ones(3)
+
+    def watched(*arguments: Any) -> Any:
+        seen.update(threads())
         return real(*arguments)
 
-    monkeypatch.setattr(inference, "evaluate", watched)
+    monkeypatch.setattr(kernels, "gram", watched)
     with threadpool_limits(2, "blas"):
-        inference.infer(small_problem(n=40), InferenceConfig(iterations=2))
+        before = threads()
+        if called == "infer":
+            inference.infer(data, InferenceConfig(iterations=2))
+        elif called == "evaluate":
+            evidence.evaluate(data, 100.0, width)
+        else:
+            lssvm.fit(data.X, data.y, width, 100.0)
+        assert threads() == before  # the caller's limit is his own
     assert seen == {1}
