@@ -135,7 +135,7 @@ def test_a_stage_and_a_controller_that_asks_ahead_in_rust_and_in_c(endpoint: str
         assert client.status()["samples"]["received"] == received + 2000
 
 
-@pytest.mark.parametrize("threads", [[], ["--receivers"]])
+@pytest.mark.parametrize("threads", [[], ["--receivers"], ["--core", "--warm"]])
 def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint: str, threads: list[str]) -> None:
     """``python -m benchmarks.native_loop`` compares the two; how many are missed, only a quiet machine can tell."""
     program = Path(LIBRARY).parent / "deadlines"

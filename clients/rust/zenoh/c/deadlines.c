@@ -1,8 +1,11 @@
 /* A loop at a steady rate that asks the followed model for one point each turn, and the same loop without it. Prints one
  * line of JSON: turns whose work was done only after the next turn was due, and the time of a point.
- * Usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM];
- * without an endpoint the loop is bare. --receivers: the threads that receive models run only where nothing else does
- * (Linux's idle class). --realtime: the loop has a real-time priority, which needs the right, and those threads none. */
+ * Usage: deadlines [WAYS] SECONDS RATE_HZ [ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]; without an endpoint the loop
+ * is bare. WAYS, by default none of them:
+ * --receivers: the threads that receive models run only where nothing else does (Linux's idle class).
+ * --realtime: the loop has a real-time priority, which needs the right, and those threads none.
+ * --core: the loop has the last core, those threads have the others.
+ * --warm: each turn begins 60 us early with a point whose answer is thrown away, so that caches and core are warm. */
 #define _GNU_SOURCE
 #include "dehyst_zenoh.h"
 
@@ -12,8 +15,10 @@
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 
 #define PI 3.14159265358979323846
+#define WARM_US 60
 
 static double since_us(struct timespec from, struct timespec to) {
     return 1e6 * (double)(to.tv_sec - from.tv_sec) + 1e-3 * (double)(to.tv_nsec - from.tv_nsec);
@@ -33,16 +38,44 @@ static void schedule(int policy, int priority) {
     }
 }
 
+/* The calling thread, and threads that it starts later, keep to the last core, or to all but the last. */
+static void keep_to(int last) {
+    long cores = sysconf(_SC_NPROCESSORS_ONLN);
+    cpu_set_t wanted;
+    CPU_ZERO(&wanted);
+    for (long core = last ? cores - 1 : 0; core < (last ? cores : cores - 1); core++)
+        CPU_SET((size_t)core, &wanted);
+    if (sched_setaffinity(0, sizeof wanted, &wanted)) {
+        perror("deadlines: cores");
+        exit(1);
+    }
+}
+
+static void sleep_until(struct timespec due, long less_us) {
+    due.tv_nsec -= 1000 * less_us;
+    if (due.tv_nsec < 0)
+        due.tv_nsec += 1000000000L, due.tv_sec--;
+    clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
+}
+
+static int ask(dehyst *stage, double centre_um, double swing_um, double w, double t_s) {
+    dehyst_answer answer;
+    return dehyst_point(stage, centre_um + swing_um * sin(w * t_s), swing_um * w * cos(w * t_s),
+                        -swing_um * w * w * sin(w * t_s), &answer) != 0;
+}
+
 int main(int argc, char **argv) {
-    int receivers = argc > 1 && !strcmp(argv[1], "--receivers");
-    int realtime = argc > 1 && !strcmp(argv[1], "--realtime");
-    argc -= receivers || realtime, argv += receivers || realtime;
+    int receivers = 0, realtime = 0, core = 0, warm = 0;
+    for (; argc > 1 && !strncmp(argv[1], "--", 2); argc--, argv++) {
+        receivers |= !strcmp(argv[1], "--receivers"), realtime |= !strcmp(argv[1], "--realtime");
+        core |= !strcmp(argv[1], "--core"), warm |= !strcmp(argv[1], "--warm");
+    }
     double lasts_s = argc > 1 ? atof(argv[1]) : 0.0, rate_Hz = argc > 2 ? atof(argv[2]) : 0.0;
     long turns = lround(lasts_s * rate_Hz);
     double *point_us = turns > 0 ? malloc((size_t)turns * sizeof *point_us) : NULL;
     double *late_us = turns > 0 ? malloc((size_t)turns * sizeof *late_us) : NULL;
     if ((argc != 3 && argc != 9) || !point_us || !late_us) {
-        printf("usage: deadlines [--receivers | --realtime] SECONDS RATE_HZ "
+        printf("usage: deadlines [--receivers] [--realtime] [--core] [--warm] SECONDS RATE_HZ "
                "[ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
         return 2;
     }
@@ -51,6 +84,8 @@ int main(int argc, char **argv) {
     if (argc == 9) {
         if (receivers)
             schedule(SCHED_IDLE, 0);
+        if (core)
+            keep_to(0);
         if (dehyst_open(argv[3], argv[4], argv[5], argv[6], 5.0, &stage)) {
             fprintf(stderr, "%s\n", dehyst_error());
             return 1;
@@ -61,6 +96,8 @@ int main(int argc, char **argv) {
         schedule(SCHED_OTHER, 0);
     if (realtime)
         schedule(SCHED_FIFO, 10);
+    if (core)
+        keep_to(1);
     long missed = 0, refused = 0;
     struct timespec due, start, end;
     clock_gettime(CLOCK_MONOTONIC, &due);
@@ -68,14 +105,18 @@ int main(int argc, char **argv) {
         due.tv_nsec += lround(1e3 * period_us);
         while (due.tv_nsec >= 1000000000L)
             due.tv_nsec -= 1000000000L, due.tv_sec++;
-        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
         double t_s = (double)i / rate_Hz;
-        clock_gettime(CLOCK_MONOTONIC, &start);
-        if (stage) {
-            dehyst_answer answer;
-            refused += dehyst_point(stage, centre_um + swing_um * sin(w * t_s), swing_um * w * cos(w * t_s),
-                                    -swing_um * w * w * sin(w * t_s), &answer) != 0;
+        sleep_until(due, warm ? WARM_US : 0);
+        if (warm) {
+            if (stage)
+                refused += ask(stage, centre_um, swing_um, w, t_s);
+            do
+                clock_gettime(CLOCK_MONOTONIC, &start);
+            while (since_us(due, start) < 0.0);
         }
+        clock_gettime(CLOCK_MONOTONIC, &start);
+        if (stage)
+            refused += ask(stage, centre_um, swing_um, w, t_s);
         clock_gettime(CLOCK_MONOTONIC, &end);
         point_us[i] = since_us(start, end);
         late_us[i] = since_us(due, end);
