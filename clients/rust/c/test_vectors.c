@@ -204,6 +204,9 @@ static void refusals(const char *folder, const row *c) {
     CHECK(dehyst_point(handle, 40.0, 0.0, 0.0, &answer) == 0 && answer.flags == 0, "%s", dehyst_error());
     CHECK(dehyst_start(handle, NAN) == 0 && dehyst_point(handle, 40.0, 0.0, 0.0, &again) == 0, "%s", dehyst_error());
     CHECK(answer.u_V == again.u_V, "start goes back to the memory of the payload: %g %g", answer.u_V, again.u_V);
+    CHECK(dehyst_start(handle, NAN) == 0 && dehyst_warm(handle, 40.0, 0.0, 0.0) == 0, "%s", dehyst_error());
+    CHECK(dehyst_point(handle, 40.0, 0.0, 0.0, &again) == 0 && answer.u_V == again.u_V, "a warm start moves nothing");
+    CHECK(dehyst_warm(handle, NAN, 0.0, 0.0) == -1 && strstr(dehyst_error(), "y_um"), "NaN");
     dehyst_report_t report;
     CHECK(dehyst_report(handle, &report) == 0 && report.refused == 1 && report.received == 1, "counts");
     dehyst_close(handle);

@@ -4,7 +4,7 @@
  * expected), -2 internal error. Units: µm, µm/s, µm/s², V, s. Doubles are IEEE.
  *
  * Threads: one thread at a time uses a handle, except that dehyst_update may be called by another one meanwhile.
- * dehyst_point and dehyst_block neither lock nor allocate, whatever dehyst_update does; only the text of a refusal is
+ * dehyst_point, dehyst_block and dehyst_warm neither lock nor allocate, whatever dehyst_update does; only the text of a refusal is
  * allocated.
  */
 #ifndef DEHYST_H
@@ -80,6 +80,10 @@ int dehyst_advance(dehyst *handle, size_t n, const double *y_um, const double *u
 
 /* The voltage for the next point of the wanted motion. */
 int dehyst_point(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2, dehyst_answer *answer);
+
+/* Evaluate a point on a copy of the memory and throw the answer away. Called some 50 us before dehyst_point with about the
+ * same motion, it loads what a point reads into the caches. Memory, slew limit and report stay as they are. */
+int dehyst_warm(dehyst *handle, double y_um, double v_um_per_s, double a_um_per_s2);
 
 /* The voltages for the next n points, dt_s apart. v and a may be NULL for 0. Outputs have n elements. */
 int dehyst_block(dehyst *handle, size_t n, const double *y_um, const double *v_um_per_s, const double *a_um_per_s2,

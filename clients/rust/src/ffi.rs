@@ -216,6 +216,13 @@ pub unsafe extern "C" fn dehyst_point(
 }
 
 /// # Safety
+/// `handle` is open and not in use by another thread.
+#[no_mangle]
+pub unsafe extern "C" fn dehyst_warm(handle: *mut Handle, y_um: f64, v_um_per_s: f64, a_um_per_s2: f64) -> c_int {
+    guarded(|| follower(handle)?.warm(y_um, v_um_per_s, a_um_per_s2))
+}
+
+/// # Safety
 /// `handle` is open and not in use by another thread; all pointers have `n` elements, `v` and `a` may be null.
 #[no_mangle]
 pub unsafe extern "C" fn dehyst_block(

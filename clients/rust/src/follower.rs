@@ -221,6 +221,26 @@ impl Follower {
         Ok(self.last)
     }
 
+    /// Evaluate a point on a copy of the memory and throw the answer away. Called some 50 us before `point`, with about
+    /// the same motion, it loads what a point reads into the caches; a newer snapshot is taken here. Memory, slew limit
+    /// and report stay as they are.
+    pub fn warm(&mut self, y_um: f64, v_um_per_s: f64, a_um_per_s2: f64) -> Result<()> {
+        self.refresh();
+        let motion = Motion { y_um: &[y_um], v_um_per_s: &[v_um_per_s], a_um_per_s2: &[a_um_per_s2] };
+        motion.check(&self.limits)?;
+        let age_s = self.age_s();
+        let snapshot = &mut self.current.snapshot;
+        let mut memory = std::mem::take(&mut snapshot.spare);
+        memory.copy_from_slice(&self.memory);
+        let (mut u_v, mut std_v, mut flags) = ([0.0], [0.0], [0]);
+        let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };
+        answer::answer(snapshot, &mut memory, &motion, self.u_before_v, &self.limits, age_s, &mut out);
+        snapshot.spare = memory;
+        // Without this the compiler may leave out what nobody reads.
+        std::hint::black_box(u_v);
+        Ok(())
+    }
+
     /// The voltages for the next points, one sample time apart. `v` and `a` may be empty for 0.
     pub fn block(&mut self, y_um: &[f64], v_um_per_s: &[f64], a_um_per_s2: &[f64], out: &mut Out) -> Result<()> {
         self.refresh();

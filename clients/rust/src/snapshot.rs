@@ -31,6 +31,8 @@ pub struct Snapshot {
     pub(crate) other: (Vec<f64>, Vec<f64>),
     /// Memory of a query; that of a follower has room here too, so that adopting a model allocates nothing.
     pub(crate) room: Vec<f64>,
+    /// Memory of a point that is evaluated to warm the caches.
+    pub(crate) spare: Vec<f64>,
 }
 
 impl Snapshot {
@@ -74,6 +76,7 @@ impl Snapshot {
         Ok(Snapshot {
             scratch: vec![0.0; model.scratch_size()],
             room: memory.clone(),
+            spare: memory.clone(),
             other,
             snapshot_seq,
             memory,

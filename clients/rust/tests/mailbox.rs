@@ -57,6 +57,7 @@ fn points_and_blocks_allocate_and_free_nothing() {
         let before = CALLS.with(Cell::get);
         // Inside the domain, and outside it with the stand-in.
         for y in [40.0, 41.0, 45.0, 120.0, -20.0] {
+            follower.warm(y, 100.0, 0.0).unwrap();
             follower.point(y + 0.01 * round as f64, 100.0, 0.0).unwrap();
         }
         let mut out = Out { u_v: &mut u, std_v: &mut std, flags: &mut flags };
@@ -88,6 +89,27 @@ fn a_model_of_another_size_brings_its_own_memory_without_allocation() {
     assert!(follower.publisher().publish(&small).is_err());
     assert_eq!(follower.report().refused, 1);
     assert!(follower.publisher().last_error().contains("bouc_wen"));
+}
+
+#[test]
+fn a_warm_start_takes_the_newest_model_and_moves_nothing() {
+    for name in ["auto", "lssvm", "mpi", "bouc_wen"] {
+        let payload = read(name);
+        let (mut warmed, mut plain) =
+            (Follower::new(&payload, LIMITS).unwrap(), Follower::new(&payload, LIMITS).unwrap());
+        for i in 0..50 {
+            let y = 40.0 + 20.0 * (0.3 * i as f64).sin();
+            warmed.warm(y + 1.0, 100.0, 0.0).unwrap();
+            assert_eq!(warmed.point(y, 100.0, 0.0).unwrap(), plain.point(y, 100.0, 0.0).unwrap(), "{name} {i}");
+            assert_eq!(warmed.memory(), plain.memory());
+        }
+        assert_eq!(warmed.report().answered, 50);
+        assert!(warmed.warm(f64::NAN, 0.0, 0.0).is_err());
+    }
+    let mut follower = Follower::new(&read("lssvm"), LIMITS).unwrap();
+    follower.publisher().publish(&read("lssvm-jumped")).unwrap();
+    follower.warm(40.0, 0.0, 0.0).unwrap();
+    assert_eq!(follower.report().gain, 0.94);
 }
 
 #[test]

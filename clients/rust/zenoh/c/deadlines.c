@@ -5,7 +5,7 @@
  * --receivers: the threads that receive models run only where nothing else does (Linux's idle class).
  * --realtime: the loop has a real-time priority, which needs the right, and those threads none.
  * --core: the loop has the last core, those threads have the others.
- * --warm: each turn begins 60 us early with a point whose answer is thrown away, so that caches and core are warm. */
+ * --warm: each turn begins 60 us early with dehyst_warm, so that caches and core are warm. */
 #define _GNU_SOURCE
 #include "dehyst_zenoh.h"
 
@@ -58,12 +58,6 @@ static void sleep_until(struct timespec due, long less_us) {
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL);
 }
 
-static int ask(dehyst *stage, double centre_um, double swing_um, double w, double t_s) {
-    dehyst_answer answer;
-    return dehyst_point(stage, centre_um + swing_um * sin(w * t_s), swing_um * w * cos(w * t_s),
-                        -swing_um * w * w * sin(w * t_s), &answer) != 0;
-}
-
 int main(int argc, char **argv) {
     int receivers = 0, realtime = 0, core = 0, warm = 0;
     for (; argc > 1 && !strncmp(argv[1], "--", 2); argc--, argv++) {
@@ -105,18 +99,20 @@ int main(int argc, char **argv) {
         due.tv_nsec += lround(1e3 * period_us);
         while (due.tv_nsec >= 1000000000L)
             due.tv_nsec -= 1000000000L, due.tv_sec++;
-        double t_s = (double)i / rate_Hz;
+        double phase = w * (double)i / rate_Hz, v_um_per_s = swing_um * w * cos(phase);
+        double y_um = centre_um + swing_um * sin(phase), a_um_per_s2 = -swing_um * w * w * sin(phase);
+        dehyst_answer answer;
         sleep_until(due, warm ? WARM_US : 0);
         if (warm) {
             if (stage)
-                refused += ask(stage, centre_um, swing_um, w, t_s);
+                refused += dehyst_warm(stage, y_um, v_um_per_s, a_um_per_s2) != 0;
             do
                 clock_gettime(CLOCK_MONOTONIC, &start);
             while (since_us(due, start) < 0.0);
         }
         clock_gettime(CLOCK_MONOTONIC, &start);
         if (stage)
-            refused += ask(stage, centre_um, swing_um, w, t_s);
+            refused += dehyst_point(stage, y_um, v_um_per_s, a_um_per_s2, &answer) != 0;
         clock_gettime(CLOCK_MONOTONIC, &end);
         point_us[i] = since_us(start, end);
         late_us[i] = since_us(due, end);
