@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.rehearsal.disturbance import CLASSES, SENSOR, draw
+from lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from service.reports.tables import markdown
 
 PRESETS = ("random", "issue", "as_drawn")
@@ -265,6 +265,11 @@ def goals(records: Sequence[Record]) -> str:
             _percentiles(_numbers(record.get("believed_samples") for record in steps), 50, 95, digits=0),
         ),
         (
+            "wrong readings (spikes and bursts), and jumps that were believed in these runs",
+            "≤ 1 in 1000",
+            _false_beliefs(intact),
+        ),
+        (
             f"settled: median over {len(intact)} runs with an intact stage; twenty scenarios no worse than before",
             "≤ 0.030 %",
             f"{_percentiles(settled, 50)} %; for the scenarios run `dehyst scenarios`",
@@ -277,6 +282,15 @@ def goals(records: Sequence[Record]) -> str:
         ("cost of a sample", "≤ 1.1 × before", "not measured by these runs"),
     ]
     return markdown(GOALS_HEAD, rows)
+
+
+def _false_beliefs(intact: Sequence[Record]) -> str:
+    rates = {"spikes": SPIKES_HZ, "bursts": BURSTS_HZ}
+    wrong = [record for record in intact if record["class"] in rates and "jumps" in record]
+    if not wrong:
+        return "not measured by these runs"
+    readings = sum(rates[record["class"]] * record["event"]["over_s"] for record in wrong)
+    return f"{sum(record['jumps'] for record in wrong)} in some {readings:.0f} of {len(wrong)} runs"
 
 
 HEAD = (

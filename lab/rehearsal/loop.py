@@ -46,7 +46,7 @@ class LoopRecord:
     sent or not. u_V : voltage applied from that instant on. flags : bits of the answer, see
     ``service.protocol.query``. verdict : index into ``verdicts`` of the learner's verdict on the sample. trouble :
     index into ``troubles`` of what the axis reported at that time ("" for nothing).
-    events : (time s, name, detail) of the axis' events.
+    jumps : jumps that the learner has believed up to then. events : (time s, name, detail) of the axis' events.
     """
 
     t_s: FloatArray
@@ -59,6 +59,7 @@ class LoopRecord:
     verdicts: tuple[str, ...]
     trouble: NDArray[np.int16]
     troubles: tuple[str, ...]
+    jumps: NDArray[np.int64]
     events: tuple[tuple[float, str, str], ...]
 
 
@@ -107,6 +108,7 @@ def run_adaptive(
     true_um, read_um, u_V = np.zeros(n), np.zeros(n), np.zeros(n)
     flags = np.zeros(n, dtype=np.uint8)
     verdict, trouble = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int16)
+    jumps = np.zeros(n, dtype=np.int64)
     verdicts, troubles = _NameCodes(NEVER_CAME), _NameCodes("")
     events: list[tuple[float, str, str]] = []
     commanded, count = PendingCommands(), _NumberOffset(first_number)
@@ -139,11 +141,12 @@ def run_adaptive(
         # Known from the end of the block on; until then the value before.
         trouble[held] = trouble[held.start - 1] if held.start else 0
         trouble[held.stop - 1] = troubles(axis.newest.trouble)
+        jumps[held] = axis.learner.counters().get("jumps", 0) if axis.learner is not None else 0
         events += [((held.stop - 1) * dt_s, *_name_and_detail(event)) for event in axis.take_events()]
         progress(held.stop)
     return LoopRecord(
         times(n, dt_s), wanted.y_um, true_um, read_um, u_V, flags, verdict, verdicts.known, trouble,
-        troubles.known, tuple(events),
+        troubles.known, jumps, tuple(events),
     )  # fmt: skip
 
 
@@ -159,7 +162,18 @@ def run_frozen(
     true_um, read_um = plant.run(0, u_V)
     none = np.zeros(n, dtype=np.int16)
     return LoopRecord(
-        times(n, model.dt_s), wanted.y_um, true_um, read_um, u_V, flags, none, ("not_learning",), none, ("",), ()
+        times(n, model.dt_s),
+        wanted.y_um,
+        true_um,
+        read_um,
+        u_V,
+        flags,
+        none,
+        ("not_learning",),
+        none,
+        ("",),
+        np.zeros(n, dtype=np.int64),
+        (),
     )
 
 

@@ -103,6 +103,7 @@ class Outcome:
     named_s : motion, s, from the event to its first report; NaN if it was not reported, or is no sensor fault.
     believed_samples : from the event to the first sample of which it is known what it means, after others of which it
     was not; NaN if there were none, or they went on to the end.
+    jumps : jumps that the learner has believed from the event on.
     noted : names of the axis' events from the event on, with their counts.
     simulated_s : length of the run, s.
     """
@@ -120,6 +121,7 @@ class Outcome:
     healthy_s: float
     named_s: float
     believed_samples: float
+    jumps: int
     noted: dict[str, int]
     simulated_s: float
 
@@ -205,6 +207,7 @@ def outcome(
         healthy_s=healthy_s,
         named_s=true[0].motion_s if true else float("nan"),
         believed_samples=_believed_samples(adaptive, event, dt_s),
+        jumps=int(adaptive.jumps[-1] - adaptive.jumps[max(0, round(event.at_s / dt_s) - 1)]),
         noted=_noted(adaptive, event.at_s),
         simulated_s=adaptive.t_s.size * dt_s,
     )

@@ -64,8 +64,9 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
         FAILED,
     ]
     told_goals = goals(records)
-    intact, sensors, knock, step, believed, settled, false, cost = last_cells(told_goals)
+    intact, sensors, knock, step, believed, wrong, settled, false, cost = last_cells(told_goals)
     assert intact == "2 of 6"
+    assert wrong == "not measured by these runs"
     assert sensors == "3 of 4; 2 of 4; 1 of 4"
     assert knock == "1.10 / 1.30"
     # 0.2 % after 3 % and 0.6 % after 12 % are 0.4 and 0.3 % after 6 %.
@@ -76,6 +77,15 @@ def test_each_goal_is_a_row_with_what_the_runs_came_to() -> None:
     assert cost.startswith("not measured")
     assert "2 runs of 3 to 12 %" in told_goals
     assert "median over 6 runs" in told_goals
+
+
+def test_jumps_are_counted_beside_the_wrong_readings_that_they_may_come_of() -> None:
+    records = [
+        run("spikes", jumps=1, event={"size": 0.1, "over_s": 2.0}),
+        run("bursts", jumps=0, event={"size": 0.1, "over_s": 3.0}),
+        run("knock", jumps=7, event={"size": 0.1, "over_s": 3.0}),
+    ]
+    assert "1 in some 29 of 2 runs" in last_cells(goals(records))
 
 
 def test_classes_are_rows_in_their_order_then_the_groups() -> None:

@@ -276,7 +276,18 @@ def course(error_um: np.ndarray, u_V: np.ndarray, trouble: np.ndarray | None = N
     said = zero if trouble is None else trouble.astype(np.int16)
     true_um = wanted_um - error_um
     return LoopRecord(
-        t_s, wanted_um, true_um, true_um, u_V, zero.astype(np.uint8), zero, ("learnt",), said, ("", "sensor_frozen"), ()
+        t_s,
+        wanted_um,
+        true_um,
+        true_um,
+        u_V,
+        zero.astype(np.uint8),
+        zero,
+        ("learnt",),
+        said,
+        ("", "sensor_frozen"),
+        np.zeros(n, dtype=np.int64),
+        (),
     )
 
 
@@ -364,6 +375,15 @@ def test_a_change_is_believed_with_the_first_sample_that_is_not_held_back() -> N
     assert believed((4002, 4014), (4100, 4200)) == 14.0
     assert np.isnan(believed((3000, 3100), (4200, 4300)))
     assert np.isnan(believed((4002, n)))
+
+
+def test_jumps_are_counted_from_the_event_on() -> None:
+    still = course(np.zeros(9000), np.full(9000, 5.0))
+    jumps = np.zeros(9000, dtype=np.int64)
+    jumps[1000:], jumps[4000:], jumps[8000:] = 1, 2, 3
+    limits = Limits(0.0, 10.0, 1e4)
+    result = outcome(Event("spikes", "spikes", 4.0), replace(still, jumps=jumps), still, 100.0, limits, DT_S, "")
+    assert result.jumps == 2
 
 
 def test_a_whole_rehearsal_learns_is_repeatable_and_tells_both_models_apart() -> None:
