@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import queue
 import threading
 import time
@@ -27,6 +29,9 @@ from service.storage.output import append_line
 FILE: Final = "operations.jsonl"
 FILE_BEFORE: Final = "operations.1.jsonl"
 FREEZE, THAW = "freeze", "thaw"
+#: Beside the journal: a file whose room on the disk the journal takes when the disk is full, and its size, bytes.
+RESERVE: Final = ".operations-reserve"
+_RESERVE_BYTES: Final = 65_536
 #: Size, bytes, beyond which the journal is renamed to operations.1.jsonl and a new one is started.
 JOURNAL_BYTES: Final = 8 * 2**20
 
@@ -90,9 +95,39 @@ class Journal:
         try:
             if self.path.exists() and self.path.stat().st_size + len(line) > self._max_bytes:
                 self.path.replace(self.path.with_name(FILE_BEFORE))
-            append_line(self.path, line)
+            try:
+                append_line(self.path, line)
+            except OSError as error:
+                # A full disk: a freeze must outlive the process all the same.
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not self._release():
+                    raise
+                append_line(self.path, line)
         except OSError:
             self.lost += 1
+            return False
+        self.reserve()
+        return True
+
+    def reserve(self) -> None:
+        """Keep room on the disk for operations, as long as there is some."""
+        if self.path is None:
+            return
+        path = self.path.with_name(RESERVE)
+        with contextlib.suppress(OSError):
+            if path.exists():
+                return
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                # Not zeros, which some file systems do not store.
+                path.write_bytes(os.urandom(_RESERVE_BYTES))
+            except OSError:
+                path.unlink(missing_ok=True)
+
+    def _release(self) -> bool:
+        assert self.path is not None
+        try:
+            self.path.with_name(RESERVE).unlink()
+        except OSError:
             return False
         return True
 
@@ -180,8 +215,11 @@ class OperationsServer:
         self._samples = samples
         self._tell = tell
         self._settle = settle
-        #: Requests refused before they were read, which the thread writes to the journal: (payload, reason).
-        self._turned_away: deque[tuple[bytes, str]] = deque(maxlen=_WAITING)
+        #: Requests refused before they were read, which the thread writes to the journal: (payload, reason); and how
+        #: many more there were than it keeps.
+        self._turned_away: deque[tuple[bytes, str]] = deque()
+        self._more_turned_away = 0
+        self._counting = threading.Lock()
         self._counts = {"done": 0, "refused": 0}
         self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
@@ -193,6 +231,7 @@ class OperationsServer:
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Take requests from now on; returns what is to be undeclared, in this order."""
         self._queue = queue.Queue(_WAITING)
+        self._journal.reserve()
         self._thread = threading.Thread(
             target=self._run, args=(self._queue,), name=f"operate-{self._keys.axis}", daemon=True
         )
@@ -253,6 +292,11 @@ class OperationsServer:
             payload, error = self._turned_away.popleft()
             with contextlib.suppress(DehystError):
                 self._write(decode_request(payload), error=error)
+        with self._counting:
+            more, self._more_turned_away = self._more_turned_away, 0
+        if more:
+            error = f"{more} more requests while {_WAITING} waited: only their number is kept"
+            self._journal.write({"verb": "", "instance": self._instance, "ok": False, "error": error})
 
     def _on_query(self, query: zenoh.Query) -> None:
         # Refused before its bytes are copied.
@@ -264,7 +308,10 @@ class OperationsServer:
             self._queue.put_nowait((query, payload))
         except queue.Full:
             error = ServiceError(f"{_WAITING} requests wait already: ask again later")
-            if payload is not None:
+            if len(self._turned_away) >= _WAITING:
+                with self._counting:
+                    self._more_turned_away += 1
+            elif payload is not None:
                 self._turned_away.append((payload, str(error)))
             self._refuse(query, error)
         except Exception as error:
