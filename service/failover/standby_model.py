@@ -67,8 +67,8 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
             axis.note("checkpoint_refused", f"checkpoint {number} of the other instance: {error}")
             continue
         switch = Journal(files.recordings or files.checkpoints).last_switch()
-        if switch is not None and switch.time_unix_s < meta.time_unix_s:
-            switch = None  # the state includes it
+        if switch is not None and switch.is_in(meta):
+            switch = None
         count = 0
         if files.recordings is not None:
             count = learn_again(axis, files.recordings, switch)

@@ -47,6 +47,19 @@ class Switchable(Protocol):
     def thaw(self, by: str = "") -> int: ...
 
 
+class Written(Protocol):
+    """When a state was copied, and by which process."""
+
+    @property
+    def samples(self) -> int: ...
+
+    @property
+    def time_unix_s(self) -> float: ...
+
+    @property
+    def instance(self) -> str: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Switch:
     """A *freeze* or *thaw* in the journal.
@@ -54,12 +67,23 @@ class Switch:
     Attributes
     ----------
     verb, who : as in the request. samples : count of all samples handled before it held. time_unix_s : of the entry, s.
+    instance : the process that wrote it.
     """
 
     verb: str
     who: str
     samples: int
     time_unix_s: float
+    instance: str = ""
+
+    def is_in(self, state: Written) -> bool:
+        """Whether ``state``, of the same axis, was copied after it: then it includes it.
+
+        In one process the counts of samples tell it, whatever the clock does; between two the time does.
+        """
+        if self.instance and self.instance == state.instance and self.samples != state.samples:
+            return self.samples < state.samples
+        return self.time_unix_s < state.time_unix_s
 
     def apply(self, axis: Switchable) -> None:
         """Freeze or thaw ``axis`` unless it is so already."""
@@ -147,7 +171,7 @@ class Journal:
                 if verb not in (FREEZE, THAW) or entry.get("ok") is not True:
                     continue
                 if isinstance(who, str) and isinstance(at_s, float | int) and isinstance(samples, int):
-                    return Switch(str(verb), who, samples, float(at_s))
+                    return Switch(str(verb), who, samples, float(at_s), str(entry.get("instance", "")))
         return None
 
 

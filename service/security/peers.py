@@ -57,6 +57,11 @@ def _bytes(part: object) -> bytes:
     return bytes(part) if isinstance(part, bytes | bytearray | memoryview) else str(part).encode()
 
 
+def new_secret() -> PeerSecret:
+    """A secret that nobody else knows."""
+    return PeerSecret(secrets.token_bytes(_MOST))
+
+
 def new_nonce() -> str:
     """A random number that cannot be predicted, as text."""
     return secrets.token_hex(16)

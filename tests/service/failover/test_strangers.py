@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_router
 from service.security.peers import OWN_SECRET, Nonces, PeerSecret, read_secret
-from service.server.process import warn_without_secret
+from service.server.process import secret_of, warn_without_secret
 from tests.service.conftest import unused_port
 from tests.service.failover.test_standby import pair_config
 from tests.service.living import Process, Stage, eventually
@@ -110,6 +111,21 @@ def test_a_claim_without_proof_or_with_an_absurd_epoch_is_none() -> None:
     assert claims.highest() is None
     for epoch in ("²", "١", "-1", str(MAX_EPOCH + 1), "9" * 400, "1.5", ""):
         assert parse_claim(f"{KEYS.base}/claim/{epoch}/i-a") is None
+
+
+def test_without_a_place_for_a_secret_nobody_is_believed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    nowhere = tmp_path / "missing" / OWN_SECRET
+    alone = ServeConfig("demo", (), peer_secret=nowhere)
+    with caplog.at_level(logging.WARNING, "dehyst.service"):
+        secret = secret_of(alone, standby=False)
+    assert "no standby can follow" in caplog.text
+    assert secret
+    assert not secret.proves("", "claim", 9, "i-rogue")
+    assert secret_of(alone, standby=False).sign("a") != secret.sign("a")
+    for config, standby in ((alone, True), (replace(alone, standby_listen=("tcp/127.0.0.1:7449",)), False)):
+        with pytest.raises(InputError, match=r"peer_secret: got nothing, .*cannot be written"):
+            secret_of(config, standby)
+    assert secret_of(replace(alone, peer_secret=tmp_path / OWN_SECRET), standby=True)
 
 
 @pytest.mark.parametrize(

@@ -342,6 +342,28 @@ def test_the_last_switch_is_read_from_a_damaged_journal(tmp_path: Path) -> None:
     assert journal.last_switch() == Switch("thaw", "bob", 90, 5.0)
 
 
+@dataclass(frozen=True)
+class State:
+    samples: int
+    time_unix_s: float
+    instance: str = "i1-a"
+
+
+@pytest.mark.parametrize(
+    ("state", "included"),
+    [
+        (State(499, 9999.0), False),  # the clock went back between the two
+        (State(501, 1.0), True),
+        (State(500, 999.0), False),
+        (State(500, 1001.0), True),
+        (State(10, 1001.0, "i2-b"), True),  # the process after it counts anew
+        (State(10_000, 999.0, "i2-b"), False),
+    ],
+)
+def test_a_state_includes_a_switch_whatever_the_clock_does(state: State, included: bool) -> None:
+    assert Switch("freeze", "alice", 500, 1000.0, "i1-a").is_in(state) is included
+
+
 STATUS: dict[str, Any] = {
     "stage": "demo", "axis": "x", "instance": "i1-ab", "role": "primary", "served": "lssvm_adaptive",
     "learning": "lssvm_adaptive", "seq": 12345, "sample_age_s": 0.01, "refused": {"messages": 3},
