@@ -57,7 +57,8 @@ class Health:
     def state(self, status: dict[str, Any], factor: int) -> tuple[str, str]:
         """(state, reason in words) for a status without them; ``factor`` : by which samples are thinned."""
         if status["trouble"]:
-            return str(status["trouble"]), "docs/troubleshooting.md says what it means and what to do"
+            where = "docs/troubleshooting.md says what it means and what to do"
+            return str(status["trouble"]), "; ".join(filter(None, (status.get("trouble_why"), where)))
         if status["stale"]:
             return "stale", "no samples come, or too many wait to be learnt"
         if status["frozen"]:
