@@ -101,7 +101,10 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
         held: deque[zenoh.Query] = deque(maxlen=_CROWD)
 
         def begin(query: zenoh.Query) -> None:
-            """Send the first of some parts, and leave the query open."""
+            """Send the first of some parts, and leave the query open; not to this process itself."""
+            if mine[0]:
+                query.drop()
+                return
             held.append(query)
             query.reply(keys.state, bytes(50_000), attachment=struct.pack("<II", 0, 50))
 
