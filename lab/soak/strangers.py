@@ -103,8 +103,8 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
         def begin(query: zenoh.Query) -> None:
             """Send the first of some parts, and leave the query open; not to this process itself."""
             if mine[0]:
-                query.drop()
-                return
+                with query:
+                    return
             held.append(query)
             query.reply(keys.state, bytes(50_000), attachment=struct.pack("<II", 0, 50))
 
