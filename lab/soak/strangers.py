@@ -1,16 +1,20 @@
 """Strangers to a service: processes on its network that do not know its secret, and try to move it.
 
 ``python -m lab.soak.strangers forge ENDPOINT SEED MODEL.npz`` answers whoever asks for the state with forged ones, and
-makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve. Both ask for the state too. They print ``ready``, run
-until they are stopped, and print JSON: how often they ``tried``, and how many ``states`` they were given.
+with some that it begins and never ends, and makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve, and tells
+again what the one that serves claims. Both ask for the state too, with proofs that they have seen. They
+print ``ready``, run until they are stopped, and print JSON: how often they ``tried``, and how many ``states`` they were
+given.
 """
 
 from __future__ import annotations
 
 import itertools
 import json
+import struct
 import sys
 import time
+from collections import deque
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +37,8 @@ from service.storage.checkpoint import CheckpointMeta, encode_checkpoint
 #: Pause between two attempts, s; longest wait for a state that is asked for, s.
 PAUSE_S: Final = 0.5
 _ASK_S: Final = 0.3
+#: Sessions that begin to send a state and stop.
+_CROWD: Final = 6
 #: An epoch above any that is known.
 EPOCH: Final = 900_000_000
 
@@ -58,11 +64,21 @@ class Stranger:
         self.counts = {"tried": 0, "states": 0}
         self.session = session
         self.keys = Keys(STAGE, AXIS)
+        #: Parameters of the last query with a proof.
+        self.seen = ""
 
     def ask_for_state(self) -> None:
-        """Ask for the state without a proof, as a standby asks where there is no secret."""
+        """Ask for the state without a proof, as a standby asks where there is no secret, and with one that it sent."""
         self.counts["tried"] += 1
         self.counts["states"] += fetch_state(self.session, self.keys.state, _ASK_S) is not None
+        if self.seen:
+            replies = self.session.get(f"{self.keys.state}?{self.seen}", timeout=_ASK_S)
+            self.counts["states"] += any(reply.ok is not None for reply in replies)
+
+    def see(self, query: zenoh.Query) -> None:
+        """Keep the proof in a query for the state."""
+        if query.parameters.get("proof") is not None:
+            self.seen = str(query.parameters)
 
 
 def forge(endpoint: str, seed: int, model: Path) -> int:
@@ -77,11 +93,26 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
         mine = [False]
 
         def answer(query: zenoh.Query) -> None:
+            stranger.see(query)
             with query:
                 if not mine[0]:
                     send_state(query, keys.state, encode_checkpoint(*next(states)))
 
+        held: deque[zenoh.Query] = deque(maxlen=_CROWD)
+
+        def begin(query: zenoh.Query) -> None:
+            """Send the first of some parts, and leave the query open; not to this process itself."""
+            if mine[0]:
+                with query:
+                    return
+            held.append(query)
+            query.reply(keys.state, bytes(50_000), attachment=struct.pack("<II", 0, 50))
+
         queryable = session.declare_queryable(keys.state, answer)
+        for _ in range(_CROWD):
+            crowd = stack.enter_context(open_client(endpoint, 20.0))
+            stack.callback(crowd.declare_queryable(keys.state, begin).undeclare)
+        stack.callback(held.clear)
         print("ready", flush=True)
         while not stop.reason:
             # A standby believes an event at most as far as to ask who serves for the state.
@@ -105,6 +136,7 @@ def claim(endpoint: str, seed: int) -> int:
         keys = stranger.keys
 
         def alive(query: zenoh.Query) -> None:
+            stranger.see(query)
             with query:
                 name = query.parameters.get("alive")
                 if name is not None:
@@ -112,14 +144,22 @@ def claim(endpoint: str, seed: int) -> int:
 
         queryable = session.declare_queryable(keys.state, alive)
         tokens: list[Any] = []
+        claims: list[str] = []
+        again: dict[str, Any] = {}
+        heard = session.liveliness().declare_subscriber(
+            keys.claim_any, lambda sample: claims.append(str(sample.key_expr)), history=True
+        )
         print("ready", flush=True)
         while not stop.reason:
             signature = "" if len(tokens) % 2 else rng.bytes(16).hex()
             key = keys.claim(EPOCH + len(tokens), f"i{len(tokens)}-rogue", signature)
             tokens.append(session.liveliness().declare_token(key))
+            for real in set(claims) - again.keys():
+                if "-rogue" not in real:
+                    again[real] = session.liveliness().declare_token(real)
             stranger.ask_for_state()
             time.sleep(PAUSE_S)
-        for entity in (queryable, *tokens):
+        for entity in (queryable, heard, *again.values(), *tokens):
             entity.undeclare()
     print(json.dumps(stranger.counts), flush=True)
     return 0

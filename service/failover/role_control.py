@@ -5,6 +5,7 @@ A thread of its own decides when claims change: callbacks of zenoh only store wh
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -29,7 +30,7 @@ from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.security.peers import PeerSecret
+from service.security.peers import Nonces, PeerSecret
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 # --- Claims to serve an axis, and the rule that decides which instance serves.
@@ -162,10 +163,12 @@ _TRANSFER_PAUSE_S: Final = 0.3
 #: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
 _CLAIM_LOST_S: Final = 2.0
 _POLL_S: Final = 1.0
-#: Longest wait for a sign of life of an instance that claims to have taken over, s, and longest time without a status
-#: of the serving instance, s, before a standby asks for one.
+#: Longest wait for a sign of life of an instance that claims to serve, s, and pause between two that a standby asks
+#: for, s. It believes nothing else: statuses and liveliness tokens can be told again by anybody.
 _LIFE_S: Final = 2.0
-_SILENT_S: Final = 5.0
+_ASK_S: Final = 1.0
+#: Pause between two transfers of the state to a standby that has one, s: that its model differs anybody may say.
+_REFETCH_S: Final = 1.0
 _LEAST_WAIT_S: Final = 0.01
 #: Longest time for a change of role, and for restoring a received state, in the thread that handles samples, s.
 _CHANGE_S: Final = 60.0
@@ -197,8 +200,11 @@ class RoleControl:
         self.server = server
         self.claims = Claims(server.keys, server.instance, server.secret)
         self._unproven = 0
-        #: When the instance that serves was last heard, by ``time.monotonic``, s, and its name.
-        self._heard: tuple[str, float] = ("", 0.0)
+        #: When the instance that serves last gave a sign of life, by ``time.monotonic``, s, and its name.
+        self._alive: tuple[str, float] = ("", 0.0)
+        #: When a state was last asked for, by ``time.monotonic``, s.
+        self._fetched_s = -math.inf
+        self._proofs = Nonces()
         self.model = StandbyModel(
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
@@ -260,12 +266,17 @@ class RoleControl:
         """A freeze or thaw of the instance that serves must hold even if that one dies before its state has come."""
         with query:
             key, secret, highest = self.server.keys.switch, self.server.secret, self.claims.highest()
-            if self.server.role == PRIMARY or highest is None or (told := told_switch(query, key, secret)) is None:
+            if self.server.role == PRIMARY or highest is None:
                 return  # the sender counts those who confirm
+            if (told := told_switch(query, key, secret, self._proofs)) is None:
+                return
             switch = fields_of(told)
             verb, by = switch.get("verb"), switch.get("by")
             if switch.get("instance") != highest.instance or verb not in (FREEZE, THAW) or not isinstance(by, str):
                 return
+            samples = switch.get("samples")
+            if not isinstance(samples, int) or samples < self.model.state_samples:
+                return  # told again by somebody: the state that came since includes it, and what followed
             self._switch = verb, by[:MAX_WHO]
             self._refetch_state()
             confirm_switch(query, key, secret)
@@ -274,8 +285,6 @@ class RoleControl:
         """Compare the digest of the served model, published once a second, with the own one of the same sample."""
         status = fields_of(sample.payload.to_bytes())
         server = self.server
-        if isinstance(status.get("instance"), str):
-            self._heard = (str(status["instance"]), time.monotonic())
         if server.role == PRIMARY or not server.synced or status.get("instance") == server.instance:
             return
         if self._outdated or self._fetching:
@@ -323,29 +332,34 @@ class RoleControl:
                 self._take_over()
             return
         self.settled.set()
-        if self._outdated:
+        if self._outdated and (not self.server.synced or time.monotonic() - self._fetched_s >= _REFETCH_S):
             self._take_state()
-        self._check_silent(highest)
+        self._check_alive(highest)
 
     def _answers(self, rival: Claim) -> bool:
         """Whether ``rival`` answers; if not, its claim is ignored from now on."""
         server = self.server
-        if gives_sign_of_life(self._session, server.keys.state, rival.instance, _LIFE_S, server.secret):
+        session, key = self._session, server.keys.state
+
+        def wanted() -> bool:
+            return not self._stopping and self.claims.highest() == rival
+
+        if gives_sign_of_life(session, key, rival.instance, _LIFE_S, server.secret, wanted):
             return True
-        if self._stopping or self._reachability.is_cut_off():
+        if not wanted() or self._reachability.is_cut_off():
             return False
         self.claims.ignore(rival)
         detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer: its claim is ignored"
         server.axis.note("claim_ignored", detail)
         return False
 
-    def _check_silent(self, highest: Claim) -> None:
-        """Ask the instance that serves for a sign of life when nothing has been heard of it for long."""
+    def _check_alive(self, highest: Claim) -> None:
+        """Ask the instance that serves for a sign of life: its claim may be told by somebody else, long after it."""
         now = time.monotonic()
-        if self._heard[0] != highest.instance:
-            self._heard = (highest.instance, now)
-        elif now - self._heard[1] > _SILENT_S and self._answers(highest):
-            self._heard = (highest.instance, time.monotonic())
+        if self._alive[0] != highest.instance:
+            self._alive = (highest.instance, now)
+        elif now - self._alive[1] > _ASK_S and self._answers(highest):
+            self._alive = (highest.instance, time.monotonic())
 
     def _note_unproven(self) -> None:
         """Note the first claims that prove nothing; the others are counted."""
@@ -445,6 +459,7 @@ class RoleControl:
             self._outdated = self._outdated or not taken
 
     def _fetch_and_restore(self) -> bool:
+        self._fetched_s = time.monotonic()
         try:
             data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s, self.server.secret)
         except ServiceError as error:

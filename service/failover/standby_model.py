@@ -67,8 +67,8 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
             axis.note("checkpoint_refused", f"checkpoint {number} of the other instance: {error}")
             continue
         switch = Journal(files.recordings or files.checkpoints).last_switch()
-        if switch is not None and switch.time_unix_s < meta.time_unix_s:
-            switch = None  # the state includes it
+        if switch is not None and switch.is_in(meta):
+            switch = None
         count = 0
         if files.recordings is not None:
             count = learn_again(axis, files.recordings, switch)
@@ -108,6 +108,7 @@ class StandbyModel:
     Attributes
     ----------
     synced : True if the axis holds the model of the serving instance. syncs : count of received states.
+    state_samples : count of all samples that the last received state includes.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class StandbyModel:
         on_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self.synced = False
-        self.syncs = 0
+        self.syncs = self.state_samples = 0
         self._axis = axis
         self._sink = sink
         self._kept = kept
@@ -160,7 +161,7 @@ class StandbyModel:
         self.synced = True
         self._overflowed = False
         self.syncs += 1
-        self._state_seq = meta.seq
+        self._state_seq, self.state_samples = meta.seq, meta.samples
         newer = newer_than(list(self._recent), meta.seq)
         self._check_gap(newer)
         for batch in newer:  # all of them are in the recording already
@@ -198,6 +199,7 @@ class StandbyModel:
     def stand_down(self) -> None:
         """Wait for a state again: another instance serves."""
         self.synced = self._overflowed = False
+        self.state_samples = 0
         self._recent.clear()
         self._count = 0
 

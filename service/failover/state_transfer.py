@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import zenoh
 
 from service.protocol.container import JSON
 from service.protocol.errors import FieldError, ServiceError, error_to_json
-from service.security.peers import SIGNATURE_DIGITS, PeerSecret, new_nonce
+from service.security.peers import Nonces, PeerSecret, new_nonce
 
 #: Size of a part, bytes; a packet holds 64 KiB.
 _PART_BYTES: Final = 56 * 1024
@@ -28,7 +28,7 @@ _MAX_PARTS: Final = 4681
 _MOST_SENDERS: Final = 4
 #: Time from the first part until those of other senders must have begun, s.
 _OTHERS_S: Final = 0.2
-#: Attachment of each part: its index and the number of parts.
+#: Attachment of each part: its index and the number of parts, and then its signature.
 _PLACE: Final = struct.Struct("<II")
 #: Pause between two parts, s: in the first transfer, and at most.
 PAUSE_S, MAX_PAUSE_S = 0.001, 0.016
@@ -44,26 +44,42 @@ class UnprovenError(ServiceError):
     """A message does not prove that its sender is an instance of this service."""
 
 
-def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any], secret: PeerSecret = NO_SECRET) -> None:
-    """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s.
+def check_asker(query: zenoh.Query, key: str, secret: PeerSecret, taken: Nonces) -> None:
+    """Raise UnprovenError if ``query`` does not prove that an instance of the same service asks, and for the first
+    time.
 
-    Raises UnprovenError if it does not prove that an instance of the same service asks.
+    It takes microseconds: do it before anything that costs more. ``taken`` : the numbers of all proofs on this key.
     """
     nonce = str(query.parameters.get("nonce") or "")
     if not secret.proves(str(query.parameters.get("proof") or ""), "ask", key, nonce):
         raise UnprovenError("the state is for instances of this service only; see peer_secret in docs/operating.md")
+    if secret and not taken.is_new(nonce):
+        raise UnprovenError("this proof was used before: ask with a new nonce")
+
+
+def send_state(query: zenoh.Query, key: str, buffers: Iterable[Any], secret: PeerSecret = NO_SECRET) -> None:
+    """Answer ``query`` with the bytes of ``buffers`` in parts; its parameter ``pause_s`` sets the pause, s.
+
+    Whether it may have them: `check_asker`.
+    """
+    nonce = str(query.parameters.get("nonce") or "")
     try:
         pause_s = float(query.parameters.get("pause_s") or PAUSE_S)
     except ValueError:
         pause_s = PAUSE_S
     pause_s = min(MAX_PAUSE_S, max(0.0, pause_s)) if pause_s == pause_s else PAUSE_S
-    data = b"".join(buffers)
-    whole = memoryview(secret.sign("state", key, nonce, data).encode() + data)
+    whole = memoryview(b"".join(buffers))
     starts = range(0, len(whole), _PART_BYTES)
     for i, start in enumerate(starts):
         part = bytes(whole[start : start + _PART_BYTES])
-        query.reply(key, part, attachment=_PLACE.pack(i, len(starts)))
+        place = _PLACE.pack(i, len(starts))
+        query.reply(key, part, attachment=place + _signed(secret, key, nonce, place, part))
         time.sleep(pause_s)
+
+
+def _signed(secret: PeerSecret, key: str, nonce: str, place: bytes, part: bytes) -> bytes:
+    """The signature of a part at its place; empty without a secret."""
+    return secret.sign("part", key, nonce, place, part).encode()
 
 
 def fetch_state(
@@ -71,7 +87,8 @@ def fetch_state(
 ) -> bytes | None:
     """The bytes that `send_state` answers with; None if there is no reply or a part is lost.
 
-    Raises UnprovenError if a sender does not prove that it is an instance of the same service.
+    Raises UnprovenError if nobody but such as do not prove that they are an instance of the same service has sent
+    anything.
     """
     nonce = new_nonce()
     proof = f";nonce={nonce};proof={secret.sign('ask', key, nonce)}" if secret else ""
@@ -83,18 +100,25 @@ def fetch_state(
         congestion_control=zenoh.CongestionControl.DROP,
         priority=zenoh.Priority.DATA_LOW,
     )
-    unproven = False
-    # Whoever else answers must not mix its parts with those of the instance that serves.
-    for data in joined_by_sender(_parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s)):
-        if not secret:
-            return data
-        signature, state = data[:SIGNATURE_DIGITS].decode("ascii", "replace"), data[SIGNATURE_DIGITS:]
-        if secret.proves(signature, "state", key, nonce, state):
-            return state
-        unproven = True
-    if unproven:
+    proven = unproven = 0
+
+    def signed_parts() -> Iterator[tuple[str, bytes, bytes]]:
+        """The parts that an instance of this service signed: whoever else answers must not even be waited for."""
+        nonlocal proven, unproven
+        for sender, attached, part in _parts(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s):
+            place = attached[: _PLACE.size] if secret else attached
+            if secret and attached[_PLACE.size :] != _signed(secret, key, nonce, place, part):
+                unproven += bool(attached)  # else it is an error reply
+                continue
+            proven += 1
+            yield sender, place, part
+
+    for data in joined_by_sender(signed_parts()):
+        return data
+    if unproven and not proven:
         raise UnprovenError(
-            f"{key}: a state came from somebody who does not know the secret of this service's instances"
+            f"{key}: a state came from somebody who does not know the secret of this service's instances, or is of "
+            "another release"
         )
     return None
 
@@ -118,11 +142,14 @@ def tell_standbys(
     return sum(secret.proves(text, "held", key, nonce) for text in said)
 
 
-def told_switch(query: zenoh.Query, key: str, secret: PeerSecret = NO_SECRET) -> bytes | None:
-    """The switch in a query of `tell_standbys`; None if it does not prove that an instance of this service asks."""
+def told_switch(query: zenoh.Query, key: str, secret: PeerSecret, taken: Nonces) -> bytes | None:
+    """The switch in a query of `tell_standbys`; None if it does not prove that an instance of this service asks, or
+    if its proof is among those that were ``taken`` before."""
     payload = b"" if query.payload is None else query.payload.to_bytes()
     nonce, proof = (str(query.parameters.get(name) or "") for name in ("nonce", "proof"))
-    return payload if secret.proves(proof, "switch", key, nonce, payload) else None
+    if not secret.proves(proof, "switch", key, nonce, payload) or (secret and not taken.is_new(nonce)):
+        return None
+    return payload
 
 
 def confirm_switch(query: zenoh.Query, key: str, secret: PeerSecret = NO_SECRET) -> None:
@@ -149,25 +176,48 @@ def send_sign_of_life(query: zenoh.Query, key: str, instance: str, secret: PeerS
 
 
 def gives_sign_of_life(
-    session: zenoh.Session, key: str, instance: str, timeout_s: float, secret: PeerSecret = NO_SECRET
+    session: zenoh.Session,
+    key: str,
+    instance: str,
+    timeout_s: float,
+    secret: PeerSecret = NO_SECRET,
+    wanted: Callable[[], bool] = lambda: True,
 ) -> bool:
-    """Whether ``instance`` answers queries, and proves that it knows ``secret``, within ``timeout_s``."""
+    """Whether ``instance`` answers queries, and proves that it knows ``secret``, within ``timeout_s``.
+
+    It is asked as often as fits into that time even if this process stands still meanwhile: it is then not the other
+    one that is silent. Ends at once when ``wanted`` is false.
+    """
     until = time.monotonic() + timeout_s
-    while (left_s := until - time.monotonic()) > 0.0:
+    left = math.ceil(timeout_s / _LIFE_S)
+    while left > 0 or time.monotonic() < until:
+        left -= 1
         nonce = new_nonce()
         replies = session.get(
             f"{key}?alive={instance};nonce={nonce}",
-            timeout=min(_LIFE_S, left_s),
+            timeout=_LIFE_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        for reply in replies:
-            if reply.ok is None:
-                continue
-            said = reply.ok.payload.to_bytes().decode("ascii", "replace")
+        for said in _said(replies, wanted):
             if secret.proves(said, "alive", key, instance, nonce) if secret else said == instance:
                 return True
-        time.sleep(min(_LIFE_PAUSE_S, max(0.0, until - time.monotonic())))
+        if not wanted():
+            return False
+        time.sleep(_LIFE_PAUSE_S)
     return False
+
+
+def _said(replies: zenoh.Handler[zenoh.Reply], wanted: Callable[[], bool]) -> Iterator[str]:
+    """The text of each reply, until the query ends or ``wanted`` is false."""
+    while wanted():
+        try:
+            reply = replies.try_recv()
+        except zenoh.ZError:
+            return
+        if reply is None:
+            time.sleep(_POLL_S)
+        elif reply.ok is not None:
+            yield reply.ok.payload.to_bytes().decode("ascii", "replace")
 
 
 class PartJoiner:

@@ -87,8 +87,13 @@ class _Collector:
         latency = GaugeMetricFamily(
             "dehyst_query_seconds", "time of a query inside the service", labels=(*_LABELS, "quantile")
         )
+        trouble = GaugeMetricFamily(
+            "dehyst_trouble", "1 while there is this trouble, with the reason", labels=(*_LABELS, "trouble", "why")
+        )
         for status in self._statuses:
             labels = _labels(status)
+            if name := str(status.get("trouble") or ""):
+                trouble.add_metric((*labels, name, str(status.get("trouble_why", ""))), 1.0)
             gates = status.get("samples", {}).get("gates", {})
             for verdict, count in gates.items() if isinstance(gates, dict) else ():
                 refused.add_metric((*labels, str(verdict)), float(count))
@@ -98,7 +103,7 @@ class _Collector:
             for name, quantile in (("p50_us", "0.5"), ("p99_us", "0.99")):
                 if (value := _number(status, ("queries", name))) is not None:
                     latency.add_metric((*labels, quantile), 1e-6 * value)
-        yield from (refused, state, healthy, latency)
+        yield from (refused, state, healthy, trouble, latency)
 
 
 def _labels(status: dict[str, Any]) -> tuple[str, ...]:

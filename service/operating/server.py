@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import queue
 import threading
 import time
@@ -27,6 +29,9 @@ from service.storage.output import append_line
 FILE: Final = "operations.jsonl"
 FILE_BEFORE: Final = "operations.1.jsonl"
 FREEZE, THAW = "freeze", "thaw"
+#: Beside the journal: a file whose room on the disk the journal takes when the disk is full, and its size, bytes.
+RESERVE: Final = ".operations-reserve"
+_RESERVE_BYTES: Final = 65_536
 #: Size, bytes, beyond which the journal is renamed to operations.1.jsonl and a new one is started.
 JOURNAL_BYTES: Final = 8 * 2**20
 
@@ -42,6 +47,19 @@ class Switchable(Protocol):
     def thaw(self, by: str = "") -> int: ...
 
 
+class Written(Protocol):
+    """When a state was copied, and by which process."""
+
+    @property
+    def samples(self) -> int: ...
+
+    @property
+    def time_unix_s(self) -> float: ...
+
+    @property
+    def instance(self) -> str: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Switch:
     """A *freeze* or *thaw* in the journal.
@@ -49,12 +67,23 @@ class Switch:
     Attributes
     ----------
     verb, who : as in the request. samples : count of all samples handled before it held. time_unix_s : of the entry, s.
+    instance : the process that wrote it.
     """
 
     verb: str
     who: str
     samples: int
     time_unix_s: float
+    instance: str = ""
+
+    def is_in(self, state: Written) -> bool:
+        """Whether ``state``, of the same axis, was copied after it: then it includes it.
+
+        In one process the counts of samples tell it, whatever the clock does; between two the time does.
+        """
+        if self.instance and self.instance == state.instance and self.samples != state.samples:
+            return self.samples < state.samples
+        return self.time_unix_s < state.time_unix_s
 
     def apply(self, axis: Switchable) -> None:
         """Freeze or thaw ``axis`` unless it is so already."""
@@ -90,9 +119,39 @@ class Journal:
         try:
             if self.path.exists() and self.path.stat().st_size + len(line) > self._max_bytes:
                 self.path.replace(self.path.with_name(FILE_BEFORE))
-            append_line(self.path, line)
+            try:
+                append_line(self.path, line)
+            except OSError as error:
+                # A full disk: a freeze must outlive the process all the same.
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not self._release():
+                    raise
+                append_line(self.path, line)
         except OSError:
             self.lost += 1
+            return False
+        self.reserve()
+        return True
+
+    def reserve(self) -> None:
+        """Keep room on the disk for operations, as long as there is some."""
+        if self.path is None:
+            return
+        path = self.path.with_name(RESERVE)
+        with contextlib.suppress(OSError):
+            if path.exists():
+                return
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                # Not zeros, which some file systems do not store.
+                path.write_bytes(os.urandom(_RESERVE_BYTES))
+            except OSError:
+                path.unlink(missing_ok=True)
+
+    def _release(self) -> bool:
+        assert self.path is not None
+        try:
+            self.path.with_name(RESERVE).unlink()
+        except OSError:
             return False
         return True
 
@@ -112,7 +171,7 @@ class Journal:
                 if verb not in (FREEZE, THAW) or entry.get("ok") is not True:
                     continue
                 if isinstance(who, str) and isinstance(at_s, float | int) and isinstance(samples, int):
-                    return Switch(str(verb), who, samples, float(at_s))
+                    return Switch(str(verb), who, samples, float(at_s), str(entry.get("instance", "")))
         return None
 
 
@@ -180,8 +239,11 @@ class OperationsServer:
         self._samples = samples
         self._tell = tell
         self._settle = settle
-        #: Requests refused before they were read, which the thread writes to the journal: (payload, reason).
-        self._turned_away: deque[tuple[bytes, str]] = deque(maxlen=_WAITING)
+        #: Requests refused before they were read, which the thread writes to the journal: (payload, reason); and how
+        #: many more there were than it keeps.
+        self._turned_away: deque[tuple[bytes, str]] = deque()
+        self._more_turned_away = 0
+        self._counting = threading.Lock()
         self._counts = {"done": 0, "refused": 0}
         self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
@@ -193,6 +255,7 @@ class OperationsServer:
     def declare(self, session: zenoh.Session) -> list[Any]:
         """Take requests from now on; returns what is to be undeclared, in this order."""
         self._queue = queue.Queue(_WAITING)
+        self._journal.reserve()
         self._thread = threading.Thread(
             target=self._run, args=(self._queue,), name=f"operate-{self._keys.axis}", daemon=True
         )
@@ -253,6 +316,11 @@ class OperationsServer:
             payload, error = self._turned_away.popleft()
             with contextlib.suppress(DehystError):
                 self._write(decode_request(payload), error=error)
+        with self._counting:
+            more, self._more_turned_away = self._more_turned_away, 0
+        if more:
+            error = f"{more} more requests while {_WAITING} waited: only their number is kept"
+            self._journal.write({"verb": "", "instance": self._instance, "ok": False, "error": error})
 
     def _on_query(self, query: zenoh.Query) -> None:
         # Refused before its bytes are copied.
@@ -264,7 +332,10 @@ class OperationsServer:
             self._queue.put_nowait((query, payload))
         except queue.Full:
             error = ServiceError(f"{_WAITING} requests wait already: ask again later")
-            if payload is not None:
+            if len(self._turned_away) >= _WAITING:
+                with self._counting:
+                    self._more_turned_away += 1
+            elif payload is not None:
                 self._turned_away.append((payload, str(error)))
             self._refuse(query, error)
         except Exception as error:

@@ -127,7 +127,7 @@ class Verbs:
     ----------
     axis : the axis. between : runs work on it between two batches of samples.
     background : by verb, returns what starts the work; None if the configuration switches it off.
-    listed : is told the numbers of the checkpoints that an operator has been shown.
+    listed : keeps checkpoints for the operator who asks for them, and gives their numbers; None: all there are.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Verbs:
         axis: OperableAxis,
         between: Between,
         background: Mapping[str, Callable[[], Background | None]],
-        listed: Callable[[list[int]], None] = lambda _: None,
+        listed: Callable[[], frozenset[int]] | None = None,
     ) -> None:
         self._axis = axis
         self._between = between
@@ -190,8 +190,8 @@ class Verbs:
 
     def _checkpoints(self, request: Request) -> Outcome:
         take(request.arguments)
-        entries = self._axis.checkpoints()
-        self._listed([int(entry["checkpoint"]) for entry in entries])
+        kept = None if self._listed is None else self._listed()
+        entries = [entry for entry in self._axis.checkpoints() if kept is None or int(entry["checkpoint"]) in kept]
         return self._axis.handled_seq, {"checkpoints": entries}
 
     def _start(self, request: Request) -> Outcome:

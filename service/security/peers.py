@@ -2,7 +2,8 @@
 
 An instance gives up serving, or continues from a state, because another one says so. Whoever reaches the wire could
 say it. With a secret every claim is signed, a state is sent to nobody and taken from nobody without a proof, and a
-proof is bound to a number chosen at random by who asks, so that it cannot be used twice. Signatures are keyed BLAKE2b.
+proof is bound to a number chosen at random by who asks. Whoever listens can repeat a proof: who receives one takes its
+number once (`Nonces`). Signatures are keyed BLAKE2b.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import hashlib
 import hmac
 import os
 import secrets
+import threading
+from collections import OrderedDict
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +27,9 @@ _LEAST, _MOST = 16, 64
 #: Bytes of a signature; as hexadecimal digits on the wire.
 _SIGNATURE: Final = 16
 SIGNATURE_DIGITS: Final = 2 * _SIGNATURE
+#: Numbers of proofs that are remembered, and longest one.
+_REMEMBERED: Final = 65_536
+_LONGEST_NONCE: Final = 64
 
 
 class PeerSecret:
@@ -51,9 +57,36 @@ def _bytes(part: object) -> bytes:
     return bytes(part) if isinstance(part, bytes | bytearray | memoryview) else str(part).encode()
 
 
+def new_secret() -> PeerSecret:
+    """A secret that nobody else knows."""
+    return PeerSecret(secrets.token_bytes(_MOST))
+
+
 def new_nonce() -> str:
     """A random number that cannot be predicted, as text."""
     return secrets.token_hex(16)
+
+
+class Nonces:
+    """The numbers of the proofs that were taken, so that a proof that somebody repeats is none. Any thread may ask.
+
+    Give it numbers of right proofs only: a stranger must not fill it.
+    """
+
+    def __init__(self, remembered: int = _REMEMBERED) -> None:
+        self._remembered = remembered
+        self._taken: OrderedDict[str, None] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def is_new(self, nonce: str) -> bool:
+        """Whether ``nonce`` comes for the first time; it is taken then."""
+        with self._lock:
+            if nonce in self._taken or len(nonce) > _LONGEST_NONCE:
+                return False
+            self._taken[nonce] = None
+            if len(self._taken) > self._remembered:
+                self._taken.popitem(last=False)
+            return True
 
 
 def read_secret(path: Path | None) -> PeerSecret:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -78,6 +79,10 @@ _KEPT: Final = 256
 logging.getLogger("dehyst").addHandler(logging.NullHandler())
 
 
+#: Events at the begin and at the end of a trouble: the detail begins with its name, and is its name.
+TROUBLE, RECOVERED = "trouble", "recovered"
+
+
 class EventLog:
     """The events of one axis. Any thread may note and take.
 
@@ -89,6 +94,11 @@ class EventLog:
     def __init__(self, stage: str, axis: str) -> None:
         self._logger = logging.getLogger(".".join(name for name in (LOGGER, stage, axis) if name))
         self._waiting: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._troubles: dict[str, str] = {}
+
+    def trouble_why(self, trouble: str) -> str:
+        """The reason that was noted when ``trouble`` began, in words; "" where none was, or it is over."""
+        return self._troubles.get(trouble, "")
 
     def note(self, seq: int, event: str, detail: str, **more: Any) -> None:
         """Keep an event with the number of the last sample and the present time, and log it.
@@ -96,6 +106,10 @@ class EventLog:
         A standby publishes its events when it takes over, which may be much later.
         """
         self._waiting.append({"seq": seq, "event": event, "detail": detail, "time_unix_s": time.time(), **more})
+        if event == TROUBLE:
+            self._troubles[re.split(r"[^a-z_]", detail, maxsplit=1)[0]] = detail
+        elif event == RECOVERED:
+            self._troubles.pop(detail, None)
         self._logger.log(LEVELS.get(event, logging.INFO), "%s: %s (sample %d)", event, detail, seq)
 
     def take(self) -> list[dict[str, Any]]:
@@ -273,6 +287,10 @@ class Axis:
     def note(self, event: str, detail: str, **more: Any) -> None:
         """Note an event at the last sample. From any thread."""
         self._events.note(self.sequence.last, event, detail, **more)
+
+    def trouble_why(self, trouble: str) -> str:
+        """The reason for ``trouble``, in words; "" where none is known."""
+        return self._events.trouble_why(trouble)
 
     def take_events(self) -> list[dict[str, Any]]:
         """The events since the last call, oldest first; of a flood only the newest are kept."""

@@ -79,10 +79,15 @@ def load_axis(
             raise FieldError(
                 "learn", repr(config.learn), f'one of the models in {config.model}: {", ".join(models)}, or "" for none'
             )
-        learner = begin(models[config.learn])
-        # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
-        warmed = begin(models[config.learn])
-        _warm_learner(warmed, limits)
+        try:
+            learner = begin(models[config.learn])
+            # Compiled loops are loaded by use; a second learner takes that on itself, and is thrown away.
+            warmed = begin(models[config.learn])
+            _warm_learner(warmed, limits)
+        except ArithmeticError as error:  # numbers that are finite and that no stage has
+            raise ModelFileError(
+                f"{config.model}: model {config.learn!r} cannot learn: {error}; identify the stage again"
+            ) from error
         template = warmed.state_dict()
         models |= champion_of(learner)
     archive = None

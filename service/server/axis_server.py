@@ -227,7 +227,7 @@ class AxisServer:
         )
 
     def _tell_standbys(self, verb: str, by: str) -> int:
-        switch = to_json({"instance": self.instance, "verb": verb, "by": by})
+        switch = to_json({"instance": self.instance, "verb": verb, "by": by, "samples": self._operated_at})
         return tell_standbys(self._session, self.keys.switch, switch, _TOLD_S, self.secret)
 
     # ---- the publishing thread
@@ -266,7 +266,9 @@ class AxisServer:
     def _look_for_losses(self, now_s: float) -> None:
         """Note when samples come and are lost, and when that is over."""
         queue, counts, before = self.loop.queue, self.axis.counts, self._losses.trouble
-        arrivals = Arrivals(counts.samples["received"], counts.refused, counts.foreign, queue.dropped, queue.malformed)
+        received, left_out = counts.samples["received"], queue.dropped + self.loop.thinner.thinned
+        lost = max(0, counts.samples["lost"] - left_out)
+        arrivals = Arrivals(received, counts.refused, counts.foreign, queue.dropped, queue.malformed, lost)
         if not self._losses.look(now_s, arrivals):
             return
         if self._losses.trouble:

@@ -57,7 +57,8 @@ class Health:
     def state(self, status: dict[str, Any], factor: int) -> tuple[str, str]:
         """(state, reason in words) for a status without them; ``factor`` : by which samples are thinned."""
         if status["trouble"]:
-            return str(status["trouble"]), "docs/troubleshooting.md says what it means and what to do"
+            where = "docs/troubleshooting.md says what it means and what to do"
+            return str(status["trouble"]), "; ".join(filter(None, (status.get("trouble_why"), where)))
         if status["stale"]:
             return "stale", "no samples come, or too many wait to be learnt"
         if status["frozen"]:
@@ -85,6 +86,7 @@ class Health:
 # counters of the last second, once for each look of the publishing thread, and gives what is wrong a name.
 
 SAMPLES_DROPPED: Final = "samples_dropped"
+SAMPLES_LOST: Final = "samples_lost"
 SAMPLES_MALFORMED: Final = "samples_malformed"
 SAMPLES_OUT_OF_ORDER: Final = "samples_out_of_order"
 TWO_STAGES: Final = "two_stages"
@@ -95,10 +97,12 @@ _LOOK_S: Final = 0.1
 _HOLDS_S: Final = 0.7
 #: Fewest samples or messages that tell anything.
 _LEAST_ARRIVALS: Final = 4
-#: Shares of what came: dropped; refused for the number; of another sender, with as many in order at least.
+#: Shares of what came: dropped; refused for the number; of another sender, with as many in order at least. Share of
+#: what should have come that is missing. The last two in both halves of the time: one restart or outage is none.
 _DROPPED: Final = 0.1
 _REFUSED: Final = 0.6
-_FOREIGN: Final = 0.4
+_LOST: Final = 0.1
+_FOREIGN: Final = 0.05
 _IN_ORDER: Final = 0.2
 
 
@@ -109,7 +113,8 @@ class Arrivals(NamedTuple):
     ----------
     received : samples that reached the axis. refused : of them, those refused for their number. foreign : of these,
     those that contradict a sample that came before, or belong to another count. dropped : samples for which the queue
-    had no room. malformed : messages that could not be decoded.
+    had no room. malformed : messages that could not be decoded. lost : numbers that are missing although nothing here
+    left them out.
     """
 
     received: int = 0
@@ -117,6 +122,7 @@ class Arrivals(NamedTuple):
     foreign: int = 0
     dropped: int = 0
     malformed: int = 0
+    lost: int = 0
 
 
 class SampleLosses:
@@ -142,7 +148,10 @@ class SampleLosses:
         marks.append((now_s, arrivals))
         while len(marks) > 2 and now_s - marks[1][0] >= LOSSES_S:
             marks.popleft()
-        found, why = _named(Arrivals(*(now - then for now, then in zip(arrivals, marks[0][1], strict=True))))
+        middle = marks[len(marks) // 2][1]
+        found, why = _named(
+            *(_since(*pair) for pair in ((arrivals, marks[0][1]), (middle, marks[0][1]), (arrivals, middle)))
+        )
         if found != self._found:
             self._found, self._since_s = found, now_s
         if found == self.trouble or (found and now_s - self._since_s < _HOLDS_S):
@@ -151,17 +160,27 @@ class SampleLosses:
         return True
 
 
-def _named(came: Arrivals) -> tuple[str, str]:
-    """(name, counts in words) of what the arrivals of a second show; ("", "") for nothing."""
+def _since(now: Arrivals, then: Arrivals) -> Arrivals:
+    return Arrivals(*(a - b for a, b in zip(now, then, strict=True)))
+
+
+def _named(came: Arrivals, *halves: Arrivals) -> tuple[str, str]:
+    """(name, counts in words) of what the arrivals of a second and of its halves show; ("", "") for nothing."""
     samples = came.received + came.dropped
     if came.malformed >= _LEAST_ARRIVALS and samples == 0:
         return SAMPLES_MALFORMED, f"{came.malformed} messages, none of which could be decoded"
-    if samples < _LEAST_ARRIVALS:
+    if samples + came.lost < _LEAST_ARRIVALS:
         return "", ""
     if came.dropped > _DROPPED * samples:
         return SAMPLES_DROPPED, f"{came.dropped} of {samples} samples found no room in the queue"
-    if came.foreign > _FOREIGN * samples and came.received - came.refused >= _IN_ORDER * samples:
+    foreign = all(half.foreign > _FOREIGN * (half.received + half.dropped) for half in halves)
+    if foreign and came.received - came.refused >= _IN_ORDER * samples:
         return TWO_STAGES, f"{came.foreign} of {samples} samples contradict the others: two stages send on one key"
     if came.refused > _REFUSED * samples:
         return SAMPLES_OUT_OF_ORDER, f"{came.refused} of {samples} samples were refused for their numbers"
+    if all(half.lost > _LOST * (half.lost + half.received + half.dropped) for half in halves):
+        missing = f"{came.lost} of {came.lost + samples} numbers are missing"
+        if came.malformed >= _LEAST_ARRIVALS:
+            return SAMPLES_MALFORMED, f"{came.malformed} messages could not be decoded, and {missing}"
+        return SAMPLES_LOST, f"{missing}: samples are lost on the way, or the stage leaves numbers out"
     return "", ""

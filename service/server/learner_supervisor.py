@@ -19,7 +19,7 @@ import numpy as np
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
-from adaptive.online.sensor_trust import SENSOR_FAULTS
+from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition
@@ -55,6 +55,11 @@ MODEL_BAD: Final = "model_bad"
 LEARNER_FAILED: Final = "learner_failed"
 #: After these the learner has restarted, because the model from before was wrong.
 BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
+#: What lets the learner follow such a change.
+_WIDEN: Final = {
+    OUT_OF_ENVELOPE: "if it is real, identify again, or widen learner.envelope.gain or learner.envelope.offset",
+    MODEL_LEFT_ENVELOPE: "if it repeats, identify again, or widen learner.envelope.shape",
+}
 #: During these nothing is learnt.
 POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
 #: Refusals for the values of a sample. A stage at rest, or a sample out of sequence, is no trouble.
@@ -548,7 +553,8 @@ class LearnerSupervisor:
             return
         why = f" ({self.learner.why})" if reported and self.learner is not None else ""
         served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
-        self._note("trouble", f"{now}{why}: {served} is served, then {stand_in or 'nothing else'}")
+        widen = f"; {_WIDEN[now]}" if now in _WIDEN else ""
+        self._note("trouble", f"{now}{why}: {served} is served, then {stand_in or 'nothing else'}{widen}")
 
     def _champion(self, last: Served, good: InverseModel, poisoned: bool) -> dict[str, InverseModel]:
         """The champion under its name. Poisoned samples change no champion, only its model of the learner."""

@@ -22,7 +22,7 @@ from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
 from service.runtime.session import is_loopback, open_service
-from service.security.peers import PeerSecret, read_secret
+from service.security.peers import PeerSecret, new_secret, read_secret
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.server.axis_loop import SampleSink, SampleWatcher
@@ -67,6 +67,26 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     return Watcher(axis, axis.config.diagnosis)
 
 
+def secret_of(config: ServeConfig, standby: bool) -> PeerSecret:
+    """The secret of the instances of this service.
+
+    Where none is named, and none can be made beside the configuration, this instance believes nobody. Raises FieldError
+    if a second one belongs to it, which could not prove itself then.
+    """
+    secret, path = read_secret(config.peer_secret), config.peer_secret
+    if secret or path is None:
+        return secret
+    if standby or config.standby_listen:
+        raise FieldError(
+            "peer_secret",
+            f"nothing, and {path} cannot be written",
+            "a file with a secret that both instances can read",
+            "name one; see docs/operating.md",
+        )
+    _LOGGER.warning("peer_secret: %s cannot be written: no standby can follow or replace this service", path)
+    return new_secret()
+
+
 def warn_without_secret(config: ServeConfig, secret: PeerSecret) -> None:
     """Log a warning where others than this machine's processes are believed without a proof."""
     beyond = [endpoint for endpoint in (*config.listen, *config.connect) if not is_loopback(endpoint)]
@@ -104,7 +124,8 @@ def _restore(server: AxisServer) -> None:
     number = None if folder is None else restore_newest(axis, folder)
     switch = server.journal().last_switch()
     if switch is not None and folder is not None and number is not None:
-        switch = switch if switch.time_unix_s >= folder.written_at(number) else None
+        meta = folder.meta(number)
+        switch = None if meta is not None and switch.is_in(meta) else switch
     if number is not None and axis.config.recorder is not None:
         learn_again(axis, axis.config.recorder, switch)
     elif switch is not None:
@@ -162,7 +183,7 @@ class Service:
         """
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
-        secret = read_secret(config.peer_secret)
+        secret = secret_of(config, self.standby)
         warn_without_secret(config, secret)
         loaded = [load_axis(config.stage, axis) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the

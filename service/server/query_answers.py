@@ -14,14 +14,14 @@ import zenoh
 
 from adaptive.errors import DehystError
 from service.answers.slices import Pace
-from service.failover.state_transfer import NO_SECRET, UnprovenError, send_sign_of_life, send_state
+from service.failover.state_transfer import NO_SECRET, UnprovenError, check_asker, send_sign_of_life, send_state
 from service.protocol.container import JSON, to_json
 from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
 from service.protocol.query import decode_query, encode_reply, points_of
 from service.protocol.samples import MAX_COUNT
-from service.security.peers import PeerSecret
+from service.security.peers import Nonces, PeerSecret
 from service.server.axis import Axis
 from service.server.deltas import DeltaStreams
 from service.server.long_queries import SHORT, LongQueries
@@ -116,6 +116,7 @@ class QueryAnswers:
         self._secret = secret
         #: Queries for the state without a proof that an instance of this service asks.
         self.states_refused = 0
+        self._proofs = Nonces()
         self._sends = threading.BoundedSemaphore(_MOST_STATES)
 
     def declare(self, session: zenoh.Session) -> list[Any]:
@@ -217,7 +218,6 @@ class QueryAnswers:
                 try:
                     send_state(query, self._keys.state, self._state_buffers(), self._secret)
                 except Exception as error:
-                    self.states_refused += isinstance(error, UnprovenError)
                     query.reply_err(error_to_json(error), encoding=JSON)
                 finally:
                     self._sends.release()
@@ -226,9 +226,12 @@ class QueryAnswers:
             check_parameters(query.parameters, "pause_s", "nonce", "proof", "alive")
             if send_sign_of_life(query, self._keys.state, self._instance, self._secret):
                 return
+            # First: strangers must not keep the places of instances, or have a thread each.
+            check_asker(query, self._keys.state, self._secret, self._proofs)
             if not self._sends.acquire(blocking=False):
                 raise ServiceError(f"{_MOST_STATES} states are being sent: ask again later")
         except Exception as error:
+            self.states_refused += isinstance(error, UnprovenError)
             with query:
                 query.reply_err(error_to_json(error), encoding=JSON)
             return

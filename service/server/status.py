@@ -62,6 +62,7 @@ def axis_status(
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
     served, counts, learn = axis.newest, axis.counts, axis.config.learn
+    trouble = served.trouble or losses
     queue_dropped, thinned = queue.dropped, loop.thinner.thinned
     status = {
         "schema": SCHEMA,
@@ -110,7 +111,8 @@ def axis_status(
         "epoch": epoch,
         "synced": synced,
         "stale": stale,
-        "trouble": served.trouble or losses,
+        "trouble": trouble,
+        "trouble_why": axis.trouble_why(trouble),
         "trust": served.trust,
         "stand_in": served.stand_in,
         "frozen": axis.frozen,

@@ -126,12 +126,23 @@ class CheckpointFolder:
         self.directory = directory
         self.kept = kept
         self._belongs = (stage, axis, dt_s)
-        self._pinned: tuple[frozenset[int], float] = frozenset(), 0.0
+        #: Until when checkpoints are kept, by their number, by ``time.monotonic``, s.
+        self._pinned: dict[int, float] = {}
 
-    def pin(self, numbers: list[int], until_s: float) -> None:
-        """Keep these checkpoints until ``until_s`` (``time.monotonic``), beside the others; a full disk still takes
-        them."""
-        self._pinned = frozenset(numbers), until_s
+    def pin(self, now_s: float, long_s: float) -> None:
+        """Keep all that are kept at ``now_s`` (``time.monotonic``) for ``long_s`` more; a full disk still takes them.
+
+        One that is there only because it was pinned before is not pinned again: who lists them all the time must not
+        keep them all.
+        """
+        numbers = self.numbers()
+        kept = self._regular(max(numbers, default=0), numbers)
+        pinned = {number: until_s for number, until_s in self._pinned.items() if until_s > now_s}
+        self._pinned = pinned | dict.fromkeys(kept, now_s + long_s)
+
+    def is_safe(self, number: int, now_s: float, long_s: float) -> bool:
+        """Whether a checkpoint stays for ``long_s`` more at least, but for a full disk."""
+        return self._pinned.get(number, 0.0) >= now_s + long_s
 
     def write(self, meta: CheckpointMeta, state: StateDict) -> Path:
         """Write a checkpoint under the next number, atomically and synced. Raises OSError."""
@@ -181,11 +192,11 @@ class CheckpointFolder:
         meta.refuse_unless(*self._belongs)
         return meta, state
 
-    def written_at(self, number: int) -> float:
-        """Time at which the state of a checkpoint was copied, s since 1970; 0 if it cannot be read."""
+    def meta(self, number: int) -> CheckpointMeta | None:
+        """What a checkpoint belongs to; None if it cannot be read."""
         with contextlib.suppress(OSError, ModelFileError):
-            return _read_meta(self.directory / f"checkpoint-{number:09d}{SUFFIX}").time_unix_s
-        return 0.0
+            return _read_meta(self.directory / f"checkpoint-{number:09d}{SUFFIX}")
+        return None
 
     def numbers(self) -> list[int]:
         """Numbers of all checkpoints, newest first."""
@@ -209,11 +220,14 @@ class CheckpointFolder:
     def _paths(self) -> list[Path]:
         return sorted(path for path in self.directory.glob(f"checkpoint-*{SUFFIX}") if number_of(path) >= 0)
 
+    def _regular(self, newest: int, numbers: list[int]) -> list[int]:
+        """Those of ``numbers``, newest first, that stay by their age."""
+        return [number for number in numbers if is_kept(number, newest - number)][: self.kept]
+
     def _remove_surplus(self, newest: int) -> None:
-        keep = {*[number for number in self.numbers() if is_kept(number, newest - number)][: self.kept]}
-        pinned, until_s = self._pinned
-        if time.monotonic() < until_s:
-            keep |= pinned
+        now_s = time.monotonic()
+        keep = {*self._regular(newest, self.numbers())}
+        keep |= {number for number, until_s in self._pinned.items() if now_s < until_s}
         for path in self._paths():
             if number_of(path) not in keep:
                 path.unlink(missing_ok=True)
@@ -269,7 +283,8 @@ class Switch(Protocol):
 
 #: Most samples that a restart learns again (one minute at 1 kHz, which takes 3 s), and samples per portion.
 _MOST_AGAIN = 60_000
-#: Time, s, for which checkpoints are kept after they were listed.
+#: Time, s, for which checkpoints are kept after they were listed; one that has less than half of it left is no longer
+#: listed.
 LISTED_S: Final = 600.0
 _PORTION = 100
 
@@ -350,10 +365,13 @@ class CheckpointKeeper:
             self._due_at_s = now_s + self._axis.config.checkpoint_s
             self._copy()
 
-    def keep_listed(self, numbers: list[int]) -> None:
-        """Keep these checkpoints for `LISTED_S`: an operator has been shown them, and may go back to one."""
-        if self.folder is not None:
-            self.folder.pin(numbers, self._clock() + LISTED_S)
+    def keep_listed(self) -> frozenset[int]:
+        """The checkpoints that may be shown to an operator, who may go back to one: they stay for `LISTED_S` / 2."""
+        folder, now_s = self.folder, self._clock()
+        if folder is None:
+            return frozenset()
+        folder.pin(now_s, LISTED_S)
+        return frozenset(number for number in folder.numbers() if folder.is_safe(number, now_s, 0.5 * LISTED_S))
 
     def copy_now(self) -> None:
         """Copy the present state, to be written. Call it in the thread that handles samples."""

@@ -159,6 +159,8 @@ def _meta(path: Path, header: dict[str, Any]) -> BundleMeta:
     for name in ("stage", "axis", "source", "source_sha256"):
         if not isinstance(known.get(name, ""), str):
             raise ModelFileError(f"{path}: {name} is {str(known[name])[:40]!r}, expected a text")
+    if not isinstance(known.get("notes", {}), dict):
+        raise ModelFileError(f"{path}: notes are {str(known['notes'])[:40]!r}, expected an object of figures")
     for name in ("y_min_um", "y_max_um", "u_min_V", "u_max_V"):
         value = known.get(name)
         if value is not None and (not isinstance(value, float | int) or not abs(value) < _MOST_RANGE):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import shutil
@@ -61,13 +62,17 @@ def _sync_folder(folder: Path) -> None:
 def append_line(path: Path, line: bytes) -> None:
     """Append a whole ``line`` and sync it to the disk; its folder is made where it is missing. Raises OSError.
 
-    One write in append mode: a crash leaves the line or nothing, and lines of two processes do not mix.
+    One write in append mode: lines of two processes do not mix. A line that a full disk or a crash cut off is ended
+    first: it must not spoil this one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
     try:
+        end = os.lseek(handle, 0, os.SEEK_END)
+        if end and os.lseek(handle, end - 1, os.SEEK_SET) >= 0 and os.read(handle, 1) != b"\n":
+            line = b"\n" + line
         if os.write(handle, line) != len(line):
-            raise OSError("incomplete write")
+            raise OSError(errno.ENOSPC, "incomplete write")
         os.fsync(handle)
     finally:
         os.close(handle)

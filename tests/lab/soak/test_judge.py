@@ -117,6 +117,16 @@ def spoil(observed: Observations, what: str) -> None:
         observed.memory["a"] = [(float(s), 200_000.0 + 60.0 * s, 17) for s in t]
 
 
+def test_samples_that_were_thinned_are_accounted_for() -> None:
+    observed = healthy()
+    for _, _, counters in observed.counters[30:]:
+        counters["samples.gates.learnt"] -= 5000.0
+        counters["samples.thinned"] = 5000.0
+    assert "samples_accounted" not in broken(verdict(observed))
+    observed.counters[-1][2]["samples.thinned"] = 0.0
+    assert "samples_accounted" in broken(verdict(observed))
+
+
 @pytest.mark.parametrize(
     "what",
     ["voltages_finite", "voltages_within_limits", "voltages_within_slew", "answers_safe", "queries_answered",

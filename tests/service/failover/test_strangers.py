@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import struct
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,12 +19,20 @@ from adaptive.errors import InputError
 from service.client.client import Client
 from service.config.settings import ServeConfig
 from service.failover.role_control import MAX_EPOCH, Claim, Claims, claim_parts, parse_claim
-from service.failover.state_transfer import fetch_state, gives_sign_of_life, send_sign_of_life, send_state
+from service.failover.state_transfer import (
+    check_asker,
+    fetch_state,
+    gives_sign_of_life,
+    send_sign_of_life,
+    send_state,
+    tell_standbys,
+    told_switch,
+)
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_router
-from service.security.peers import OWN_SECRET, PeerSecret, read_secret
-from service.server.process import warn_without_secret
+from service.security.peers import OWN_SECRET, Nonces, PeerSecret, read_secret
+from service.server.process import secret_of, warn_without_secret
 from tests.service.conftest import unused_port
 from tests.service.failover.test_standby import pair_config
 from tests.service.living import Process, Stage, eventually
@@ -102,6 +113,21 @@ def test_a_claim_without_proof_or_with_an_absurd_epoch_is_none() -> None:
         assert parse_claim(f"{KEYS.base}/claim/{epoch}/i-a") is None
 
 
+def test_without_a_place_for_a_secret_nobody_is_believed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    nowhere = tmp_path / "missing" / OWN_SECRET
+    alone = ServeConfig("demo", (), peer_secret=nowhere)
+    with caplog.at_level(logging.WARNING, "dehyst.service"):
+        secret = secret_of(alone, standby=False)
+    assert "no standby can follow" in caplog.text
+    assert secret
+    assert not secret.proves("", "claim", 9, "i-rogue")
+    assert secret_of(alone, standby=False).sign("a") != secret.sign("a")
+    for config, standby in ((alone, True), (replace(alone, standby_listen=("tcp/127.0.0.1:7449",)), False)):
+        with pytest.raises(InputError, match=r"peer_secret: got nothing, .*cannot be written"):
+            secret_of(config, standby)
+    assert secret_of(replace(alone, peer_secret=tmp_path / OWN_SECRET), standby=True)
+
+
 @pytest.mark.parametrize(
     ("listen", "secret", "warned"),
     [
@@ -122,13 +148,17 @@ def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> 
     with open_client(endpoint) as serving, open_client(endpoint) as asking:
         secret = [OURS]
         refused: list[str] = []
+        asked: list[str] = []
+        taken = Nonces()
 
         def answer(query: zenoh.Query) -> None:
             def send() -> None:
                 with query:
                     if send_sign_of_life(query, KEYS.state, "i-peer", secret[0]):
                         return
+                    asked.append(str(query.parameters))
                     try:
+                        check_asker(query, KEYS.state, secret[0], taken)
                         send_state(query, KEYS.state, [STATE], secret[0])
                     except ServiceError as error:
                         refused.append(str(error))
@@ -139,6 +169,11 @@ def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> 
         queryable = serving.declare_queryable(KEYS.state, answer)
         time.sleep(0.2)
         assert fetch_state(asking, KEYS.state, 5.0, secret=OURS) == STATE
+        # The proof was seen on the wire, and is repeated.
+        assert "proof=" in asked[0]
+        replies = asking.get(f"{KEYS.state}?{asked[0]}", timeout=5.0, consolidation=zenoh.ConsolidationMode.NONE)
+        assert [reply.ok for reply in replies] == [None]
+        assert "used before" in refused.pop()
         assert gives_sign_of_life(asking, KEYS.state, "i-peer", 2.0, OURS)
         assert not gives_sign_of_life(asking, KEYS.state, "i-other", 0.5, OURS)
         assert fetch_state(asking, KEYS.state, 5.0) is None
@@ -149,6 +184,86 @@ def test_a_state_goes_to_peers_only_and_comes_from_peers_only(endpoint: str) -> 
             fetch_state(asking, KEYS.state, 5.0, secret=OURS)
         assert not gives_sign_of_life(asking, KEYS.state, "i-peer", 0.5, OURS)
         assert fetch_state(asking, KEYS.state, 5.0) == STATE
+        queryable.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_strangers_that_answer_for_the_state_keep_it_from_nobody(endpoint: str) -> None:
+    """They begin to send one and stop, in as many sessions as they like, before the one that serves has begun."""
+    crowd = [open_client(endpoint) for _ in range(6)]
+    held: list[zenoh.Query] = []
+
+    def begin(query: zenoh.Query) -> None:
+        held.append(query)
+        query.reply(KEYS.state, bytes(50_000), attachment=struct.pack("<II", 0, 4) + b"0" * 32)
+
+    def answer(query: zenoh.Query) -> None:
+        def send() -> None:
+            time.sleep(0.1)
+            with query:
+                check_asker(query, KEYS.state, OURS, taken)
+                send_state(query, KEYS.state, [STATE], OURS)
+
+        threading.Thread(target=send).start()
+
+    taken = Nonces()
+    with open_client(endpoint) as serving, open_client(endpoint) as asking, contextlib.ExitStack() as stack:
+        for session in crowd:
+            stack.enter_context(session)
+            stack.callback(session.declare_queryable(KEYS.state, begin).undeclare)
+        stack.callback(held.clear)
+        stack.callback(serving.declare_queryable(KEYS.state, answer).undeclare)
+        time.sleep(0.2)
+        assert fetch_state(asking, KEYS.state, 5.0, secret=OURS) == STATE
+        assert len(held) == len(crowd)
+
+
+def test_a_freeze_that_a_stranger_tells_again_is_none(endpoint: str) -> None:
+    told: list[bytes | None] = []
+    seen: list[tuple[str, bytes]] = []
+    taken = Nonces()
+
+    def on_switch(query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            seen.append((str(query.parameters), query.payload.to_bytes()))
+            told.append(told_switch(query, KEYS.switch, OURS, taken))
+
+    with open_client(endpoint) as serving, open_client(endpoint) as standby:
+        queryable = standby.declare_queryable(KEYS.switch, on_switch)
+        time.sleep(0.2)
+        tell_standbys(serving, KEYS.switch, b"freeze", 1.0, OURS)
+        for payload in (b"freeze", b"thaw"):
+            list(serving.get(f"{KEYS.switch}?{seen[0][0]}", payload=payload, timeout=1.0))
+        queryable.undeclare()  # type: ignore[no-untyped-call]
+    assert told == [b"freeze", None, None]
+
+
+def test_proofs_are_remembered_and_memory_is_bounded() -> None:
+    taken = Nonces(remembered=3)
+    assert [taken.is_new(nonce) for nonce in "aabcda"] == [True, False, True, True, True, True]
+    assert not taken.is_new("x" * 65)
+
+
+def test_who_stands_still_while_it_asks_takes_nobody_for_dead(endpoint: str) -> None:
+    """The time is over when it goes on; the other one answers the next query."""
+    answers = [False]
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            if answers[0]:
+                send_sign_of_life(query, KEYS.state, "i-peer", OURS)
+            else:
+                time.sleep(0.7)
+                answers[0] = True
+
+    with open_client(endpoint) as serving, open_client(endpoint) as asking:
+        queryable = serving.declare_queryable(KEYS.state, answer)
+        time.sleep(0.2)
+        assert gives_sign_of_life(asking, KEYS.state, "i-peer", 0.6, OURS)
+        answers[0] = False
+        begin = time.monotonic()
+        assert not gives_sign_of_life(asking, KEYS.state, "i-peer", 5.0, OURS, lambda: False)
+        assert time.monotonic() - begin < 1.0
         queryable.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -191,7 +306,20 @@ def test_a_stranger_deposes_nobody_and_a_dead_ones_claim_holds_nobody_up(
         signed = next(key for key in heard if f"/claim/1/{first}/" in key)
         repeated = stranger.liveliness().declare_token(signed)
         time.sleep(0.3)
-        processes[0].kill()
-        eventually(lambda: client.status()["instance"] == second, 20.0)
+        # And it goes on saying that the first one serves.
+        gone = threading.Event()
+
+        def say() -> None:
+            while not gone.wait(0.1):
+                stranger.put(KEYS.status, f'{{"instance": "{first}"}}')
+
+        saying = threading.Thread(target=say)
+        saying.start()
+        try:
+            processes[0].kill()
+            eventually(lambda: client.status()["instance"] == second, 10.0)
+        finally:
+            gone.set()
+            saying.join()
         for entity in (answering, rogue, repeated):
             entity.undeclare()  # type: ignore[no-untyped-call]

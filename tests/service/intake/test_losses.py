@@ -10,6 +10,7 @@ from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.health import (
     SAMPLES_DROPPED,
+    SAMPLES_LOST,
     SAMPLES_MALFORMED,
     SAMPLES_OUT_OF_ORDER,
     TWO_STAGES,
@@ -40,7 +41,12 @@ def judged(come: Callable[[float], Arrivals], duration_s: float) -> list[tuple[f
         (Arrivals(received=EACH - 6, dropped=6), SAMPLES_DROPPED),
         (Arrivals(received=EACH, refused=EACH), SAMPLES_OUT_OF_ORDER),
         (Arrivals(received=2 * EACH, refused=EACH, foreign=EACH), TWO_STAGES),
+        (Arrivals(received=EACH + EACH // 5, refused=EACH // 5, foreign=EACH // 5), TWO_STAGES),
         (Arrivals(malformed=1), SAMPLES_MALFORMED),
+        (Arrivals(received=EACH // 2, lost=EACH // 2, malformed=1), SAMPLES_MALFORMED),
+        (Arrivals(received=EACH // 2, lost=EACH // 2), SAMPLES_LOST),
+        (Arrivals(received=1, lost=EACH - 1), SAMPLES_LOST),
+        (Arrivals(received=EACH - EACH // 5, lost=EACH // 5), SAMPLES_LOST),
     ],
 )
 def test_each_way_of_losing_samples_has_a_name_within_two_seconds_and_loses_it(bad: Arrivals, name: str) -> None:
@@ -63,6 +69,19 @@ def test_each_way_of_losing_samples_has_a_name_within_two_seconds_and_loses_it(b
 )
 def test_what_is_usual_has_no_name(usual: Arrivals) -> None:
     assert judged(lambda _: usual, 10.0) == []
+
+
+@pytest.mark.parametrize("outage_s", [0.1, 0.4, 3.0])
+def test_an_outage_that_is_over_has_no_name(outage_s: float) -> None:
+    """The numbers of the time without samples are missing all at once when they come again."""
+
+    def come(t_s: float) -> Arrivals:
+        if 3.0 <= t_s < 3.0 + outage_s:
+            return Arrivals()
+        back = 0.0 <= t_s - 3.0 - outage_s < 0.5 * EACH * 1e-3
+        return Arrivals(received=EACH, lost=round(outage_s * 1e3) if back else 0)
+
+    assert judged(come, 9.0) == []
 
 
 def test_a_stage_that_restarts_its_count_has_no_name() -> None:

@@ -54,6 +54,10 @@ def test_the_page_has_every_axis_with_its_labels() -> None:
     assert found[f'dehyst_state{{{y},state="thinned"}}'.replace('stage="demo",state', 'stage="demo",state')] == 1
     assert found[f"dehyst_thinning_factor{{{y}}}"] == 3
     assert found[f"dehyst_recorder_degraded{{{y}}}"] == 1
+    trouble = status(trouble="samples_lost", trouble_why="9 of 10 numbers are missing")
+    (line,) = (name for name in values(page([trouble]).decode()) if name.startswith("dehyst_trouble{"))
+    assert 'trouble="samples_lost",why="9 of 10 numbers are missing"' in line
+    assert "dehyst_trouble{" not in page([status()]).decode()
     # What an axis does not have is missing, and no zero.
     assert f"dehyst_recorder_degraded{{{x}}}" not in found
     assert f"dehyst_sample_age_seconds{{{x}}}" not in found

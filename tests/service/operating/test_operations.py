@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -23,7 +25,7 @@ from adaptive.errors import InputError
 from lab.cli import main
 from service.client.client import Client
 from service.operating.remote import operate, screen, statuses, table
-from service.operating.server import Journal, OperationsServer, Switch
+from service.operating.server import RESERVE, Journal, OperationsServer, Switch
 from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request, encode_request
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
@@ -185,7 +187,7 @@ def test_the_journal_is_bounded_and_keeps_the_one_before(tmp_path: Path) -> None
     journal = Journal(tmp_path, max_bytes=1000)
     for i in range(40):
         assert journal.write({"verb": "freeze", "number": i})
-    sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir() if path.name != RESERVE}
     assert set(sizes) == {"operations.jsonl", "operations.1.jsonl"}
     assert max(sizes.values()) <= 1000
     newest = [json.loads(line)["number"] for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
@@ -263,6 +265,52 @@ def test_more_than_can_wait_is_refused_at_once(
     assert server.counters()["unlogged"] == 0
 
 
+def test_a_flood_of_refused_requests_is_journaled_as_a_number(
+    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer], tmp_path: Path
+) -> None:
+    axis, client, server = wire_axis
+    operate(client, KEYS, "thaw", "warm")
+    axis.hold.clear()
+    waiting = [client.get(KEYS.operate, payload=ask("freeze", f"a{i}"), timeout=10.0) for i in range(200)]
+    eventually(lambda: server.counters()["refused"] >= 200 - 33)
+    axis.hold.set()
+    refused = sum(reply.err is not None for handler in waiting for reply in handler)
+
+    def told() -> int:
+        lines = [json.loads(line) for line in (tmp_path / "operations.jsonl").read_text().splitlines()]
+        errors = [line["error"] for line in lines if not line["ok"]]
+        return sum(int(error.split()[0]) if "more requests" in error else 1 for error in errors)
+
+    eventually(lambda: told() == refused, 10.0)
+    assert len((tmp_path / "operations.jsonl").read_text().splitlines()) < 80
+
+
+def test_a_freeze_is_written_on_a_full_disk_where_there_was_room_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = Journal(tmp_path)
+    journal.reserve()
+    path = tmp_path / "operations.jsonl"
+    path.write_bytes(b'{"verb": "thaw", "who": "alice", "ok": true}\n{"verb": "sel')  # cut off by a full disk
+    reserve, written = tmp_path / RESERVE, os.write
+    assert reserve.stat().st_size > 10_000
+
+    def full(handle: int, data: bytes) -> int:
+        if reserve.exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return written(handle, data)
+
+    monkeypatch.setattr(os, "write", full)
+    assert journal.write({"verb": "freeze", "who": "bob", "ok": True, "samples": 5})
+    switch = Journal(tmp_path).last_switch()
+    assert switch is not None
+    assert (switch.verb, switch.who) == ("freeze", "bob")
+    assert journal.lost == 0
+    monkeypatch.undo()
+    assert journal.write({"verb": "thaw", "who": "bob", "ok": True, "samples": 6})
+    assert reserve.exists(), "it is made again as soon as there is room"
+
+
 def test_an_answer_says_whether_it_outlives_a_crash(tmp_path: Path) -> None:
     (tmp_path / "full").write_text("a file where a folder should be")
     for folder, durable in ((tmp_path, True), (tmp_path / "full", False), (None, False)):
@@ -292,6 +340,28 @@ def test_the_last_switch_is_read_from_a_damaged_journal(tmp_path: Path) -> None:
     assert journal.last_switch() == Switch("freeze", "alice", 77, 5.0)
     journal.write({"verb": "thaw", "who": "bob", "ok": True, "samples": 90})
     assert journal.last_switch() == Switch("thaw", "bob", 90, 5.0)
+
+
+@dataclass(frozen=True)
+class State:
+    samples: int
+    time_unix_s: float
+    instance: str = "i1-a"
+
+
+@pytest.mark.parametrize(
+    ("state", "included"),
+    [
+        (State(499, 9999.0), False),  # the clock went back between the two
+        (State(501, 1.0), True),
+        (State(500, 999.0), False),
+        (State(500, 1001.0), True),
+        (State(10, 1001.0, "i2-b"), True),  # the process after it counts anew
+        (State(10_000, 999.0, "i2-b"), False),
+    ],
+)
+def test_a_state_includes_a_switch_whatever_the_clock_does(state: State, included: bool) -> None:
+    assert Switch("freeze", "alice", 500, 1000.0, "i1-a").is_in(state) is included
 
 
 STATUS: dict[str, Any] = {

@@ -113,6 +113,23 @@ def health_after(per_s: dict[str, float], seconds: int = 12, dropped: float = 0.
     return health
 
 
+def test_the_status_says_why_there_is_a_trouble_until_it_is_over(axis_loop: Make) -> None:
+    loop = axis_loop(META)
+    axis = loop.axis
+    axis.note("trouble", "samples_lost (95 of 100 numbers are missing)")
+    axis.note("trouble", "out_of_envelope (gain 1.6 of the identified): widen learner.envelope.gain")
+
+    def said(losses: str) -> dict[str, Any]:
+        return axis_status(Keys("demo", "x"), "i-1", loop, LatencyMeter(), losses=losses)
+
+    assert said("samples_lost")["trouble_why"] == "samples_lost (95 of 100 numbers are missing)"
+    assert said("out_of_envelope")["state"] == "out_of_envelope"
+    assert "widen learner.envelope.gain" in said("out_of_envelope")["state_reason"]
+    axis.note("recovered", "out_of_envelope")
+    assert said("out_of_envelope")["trouble_why"] == ""
+    assert said("")["trouble_why"] == ""
+
+
 def test_the_state_names_what_keeps_it_from_learning(axis_loop: Make) -> None:
     loop = axis_loop(META)
     assert status_of(loop)["state"] == "no samples"

@@ -244,7 +244,9 @@ def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: 
             """The first trouble while messages of n samples from ``first`` on come for three seconds."""
             until, at = time.monotonic() + 3.0, first
             while time.monotonic() < until:
-                stage.put(client.keys.sample, payload or samples(at, n))
+                stage.put(client.keys.sample, samples(at, n) if n else payload)
+                if n and payload:
+                    stage.put(client.keys.sample, payload)
                 at += step
                 time.sleep(0.02)
                 if (name := client.status()["trouble"]) and time.monotonic() > until - 2.9:
@@ -256,6 +258,8 @@ def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: 
             ("samples_dropped", lambda: trouble_of(10_000, 100, 100)),
             ("samples_out_of_order", lambda: trouble_of(0, 20, 0)),
             ("samples_malformed", lambda: trouble_of(0, 0, 0, b"rubbish")),
+            ("samples_malformed", lambda: trouble_of(20_000, 10, 20, b"rubbish")),
+            ("samples_lost", lambda: trouble_of(30_000, 10, 20)),
         ):
             assert lost() == name
             eventually(lambda: client.status()["trouble"] == "", 5.0)

@@ -16,8 +16,11 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError, ModelFileError
+from service.answers.guard import Limits
+from service.config.settings import AxisConfig
 from service.intake.sample_queue import SampleQueue
 from service.protocol.errors import FieldError
+from service.server.axis_loading import load_axis
 from service.storage import checkpoint
 from service.storage.checkpoint import CheckpointKeeper
 from service.storage.model_file import BundleMeta, read_bundle, write_bundle
@@ -166,6 +169,8 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked
         {"y_min_um": "low"},
         {"y_min_um": 10**400},
         {"stage": 7},
+        {"notes": 3},
+        {"notes": ["clipped"]},
         {"dt_s": 10**400},
         {"magic": []},
     ],
@@ -174,6 +179,15 @@ def test_a_model_file_with_a_wrong_header_is_refused_in_words(tmp_path: Path, ch
     path = bundle_with(tmp_path, **changes)
     with pytest.raises((ModelFileError, InputError), match=r"x\.npz"):
         read_bundle(path)
+
+
+def test_a_model_of_numbers_that_no_stage_has_is_refused_in_words(tmp_path: Path) -> None:
+    path = bundle_with(tmp_path)
+    with np.load(path) as file:
+        models = json.loads(file["header"].tobytes())["models"]
+    models["lssvm_adaptive"]["values"]["features.offset_um"] = 2.0**63
+    with pytest.raises((ModelFileError, InputError), match=r"x\.npz: model 'lssvm_adaptive' cannot learn"):
+        load_axis("demo", AxisConfig("x", bundle_with(tmp_path, models=models), Limits(0.0, 10.0, 2000.0)))
 
 
 def test_a_message_that_never_fits_says_so() -> None:

@@ -6,6 +6,7 @@ import errno
 import itertools
 import json
 import os
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ from service.server.learner_supervisor import fingerprint
 from service.storage import checkpoint
 from service.storage import model_file as modelfile
 from service.storage.checkpoint import (
+    LISTED_S,
     CheckpointFolder,
     CheckpointKeeper,
     CheckpointMeta,
@@ -166,27 +168,38 @@ def test_a_few_dozen_checkpoints_reach_back_for_months(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*part"))
 
 
-def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back(tmp_path: Path) -> None:
+def test_a_checkpoint_that_was_listed_is_still_there_when_the_operator_goes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     axis, kept = make_axis(), folder(tmp_path)
     axis.handle(recording(0, 100))
     for _ in range(20):
         kept.write(meta(axis), axis.state_dict())
-    keeper = CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", kept)
-    listed: list[dict[str, Any]] = []
-
-    def list_them() -> list[dict[str, Any]]:
-        listed[:] = kept.entries()
-        return listed
-
-    axis_with_list = SimpleNamespace(handled_seq=0, checkpoints=list_them)
+    now_s = [time.monotonic()]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    keeper = CheckpointKeeper(axis, SampleQueue("x", 1000), "demo", "i1", kept, clock=lambda: now_s[0])
+    axis_with_list = SimpleNamespace(handled_seq=0, checkpoints=kept.entries)
     verbs = Verbs(axis_with_list, lambda work: 0, {}, keeper.keep_listed)  # type: ignore[arg-type]
-    verbs.apply(Request("checkpoints", "alice"))
+
+    def listed() -> set[int]:
+        return {entry["checkpoint"] for entry in verbs.apply(Request("checkpoints", "alice"))[1]["checkpoints"]}
+
+    first = listed()
+    assert len(first) > 5
     for _ in range(50):
         kept.write(meta(axis), axis.state_dict())
-    assert {entry["checkpoint"] for entry in listed} <= set(kept.numbers())
-    kept.pin([], 0.0)
+    assert first <= set(kept.numbers())
+    now_s[0] += LISTED_S + 1.0
     kept.write(meta(axis), axis.state_dict())
-    assert not {entry["checkpoint"] for entry in listed} <= set(kept.numbers())
+    assert not first <= set(kept.numbers())
+    # Listed all the time, as by a table on a screen: what was shown in the last five minutes is there, not all.
+    shown: dict[int, float] = {}
+    for _ in range(300):
+        now_s[0] += 7.0
+        kept.write(meta(axis), {"seq": 1})
+        shown |= dict.fromkeys(listed(), now_s[0])
+        assert {number for number, at_s in shown.items() if at_s >= now_s[0] - 0.5 * LISTED_S} <= set(kept.numbers())
+    assert len(kept.numbers()) < 150
     keeper.close()
 
 
