@@ -53,11 +53,6 @@ class FleetSnapshot:
     threads: Threads
 
     @property
-    def learnt(self) -> tuple[BoolArray, FloatArray, FloatArray, IntArray]:
-        """All that depends on what the axes have learnt, (B, ...) each."""
-        return self.valid, self.linear, self.packed, self.counts
-
-    @property
     def memory_size(self) -> int:
         """m."""
         return self.bases[0].memory_size
@@ -83,22 +78,14 @@ class FleetSnapshot:
         return Answers(u, std, inside, after)
 
 
-class _Windows(NamedTuple):
-    V: FloatArray
-    F: FloatArray
-    C: IntArray
-    scaled: FloatArray
-    inverse_widths: FloatArray
-
-
 @compiled
 def _pack(
-    lo: int, hi: int, s: Rows, c: Fixed, w: _Windows, margin: float, packed: FloatArray, counts: IntArray,
-    linear: FloatArray,
+    lo: int, hi: int, s: Rows, c: Fixed, V: FloatArray, F: FloatArray, C: IntArray, support: FloatArray,
+    widths: FloatArray, margin: float, packed: FloatArray, counts: IntArray, linear: FloatArray,
 ) -> None:  # fmt: skip
     """The learnt models of all axes in the layout of `LssvmInverse.packed`, with ``linear`` as of `FleetSnapshot`."""
     for b in range(lo, hi):
-        out, r, f, n = packed[b], s.numbers[b], c.axis[b], w.C[b, COUNT]
+        out, r, f, n = packed[b], s.numbers[b], c.axis[b], C[b, COUNT]
         j, span, bounded = r.judgement, s.domain[b, 1::2] - s.domain[b, ::2], f.allowed_V > 0.0
         counts[b] = c.sizes[f.model]
         counts[b, 5], counts[b, 6], counts[b, 9] = n, 0, bounded
@@ -106,12 +93,12 @@ def _pack(
         m.frame[:], m.scale[:] = s.frames[b], c.features.scale[b]
         m.thresholds[:], m.arcs[:], m.retain[:] = c.features.thresholds[b], c.features.arcs[b], c.features.retain[b]
         out[3] = max(j.long_V2, j.short_V2) + j.doubt_V2
-        out[4], out[5], out[6] = r.window.kernel_variance, 1.0 / (1.0 + 1.0 / w.F[b, GAMMA]), f.allowed_V
+        out[4], out[5], out[6] = r.window.kernel_variance, 1.0 / (1.0 + 1.0 / F[b, GAMMA]), f.allowed_V
         out[7:13:2] = s.domain[b, ::2] - margin * span
         out[8:13:2] = s.domain[b, 1::2] + margin * span
-        beta[:], inverse_widths[:], alpha[:] = s.beta[b], w.inverse_widths[b], w.V[b, ALPHA, :n]
-        beta[0] += w.F[b, BETA]
-        scaled[:] = w.scaled[b, :, :n]
+        beta[:], inverse_widths[:], alpha[:] = s.beta[b], widths[b], V[b, ALPHA, :n]
+        beta[0] += F[b, BETA]
+        scaled[:] = support[b, :, :n]
         if bounded:
             out[at : at + beta.size] = c.beta[b]
         linear[b, 0], linear[b, 1], linear[b, 2:] = r.front.track.served.gain, s.frames[b, 0], beta
@@ -121,21 +108,17 @@ def snapshot_of(
     bases: tuple[LssvmInverse, ...], s: Rows, c: Fixed, windows: dict[str, FloatArray], apart: dict[int, LssvmInverse],
     threads: Threads,
 ) -> FleetSnapshot:  # fmt: skip
-    """Copies of what is served now; ``apart`` : models of the axes that are not in the batch."""
+    """Copies of what is served now; ``apart`` : models of the axes that are not in the batch, or frozen."""
     B, p = s.beta.shape
     d, most = windows["scaled"].shape[1:]
     length = max(17 + int(c.sizes[0, :3].sum()) + 2 * p + d + (1 + d) * most, c.models.shape[1])
     packed, counts = np.empty((B, length)), np.empty((B, c.sizes.shape[1]), dtype=np.int64)
-    linear, parts = np.empty((B, 2 + p)), _Windows(*(windows[name] for name in _Windows._fields))  # type: ignore[arg-type]
-    threads.share(B, _pack, s, c, parts, DOMAIN_MARGIN, packed, counts, linear)
+    linear, parts = np.empty((B, 2 + p)), (windows[name] for name in ("V", "F", "C", "scaled", "inverse_widths"))
+    threads.share(B, _pack, s, c, *parts, DOMAIN_MARGIN, packed, counts, linear)
     seq, valid = s.numbers["front"]["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
-    fallen = [axis for axis in np.flatnonzero(s.numbers["judgement"]["fallback"]).tolist() if axis not in apart]
-    for axis, model in (apart | {axis: bases[axis] for axis in fallen}).items():
+    for axis, model in apart.items():
         row, sizes = model.packed
         packed[axis, : row.size], counts[axis] = row, sizes
         linear[axis] = model.features.gain, model.features.offset_um, *model.beta
-    # The fourth number of a packed model is the variance of its noise.
-    packed[fallen, 3] = s.numbers["judgement"]["frozen_short_V2"][fallen]
-    for axis, model in apart.items():
         seq[axis], valid[axis] = model.seq, model.valid
     return FleetSnapshot(bases, seq, valid, linear, packed, counts, threads)

@@ -92,7 +92,8 @@ def _records(rows: Sequence[StateDict], like: StateDict) -> Any:
 class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
-    numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
+    numbers : a record for each axis, nested as the names of a learner's state are. basis : (B, p) of the instant to
+    learn. frames : (B, 3) offset, 1/gain and
     dead band of the frame that is served. marks, mark_covariances : (B, 4, ...), see ``MARKS``. delay : (B, D + 2, p)
     ring of past estimates; one more than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
     places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
@@ -118,6 +119,7 @@ class Rows(NamedTuple):
     confirmed_ages: IntArray
     delay: FloatArray
     domain: FloatArray
+    basis: FloatArray
     point: FloatArray
     born: IntArray
     own: FloatArray
@@ -171,7 +173,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
-             "mark_every": max(1, round(MARK_S / step_s))}  # fmt: skip
+             "mark_every": max(1, round(MARK_S / step_s)), "window_s": config.learn_every * dt_s,
+             "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
     for base, template, number in zip(bases, templates, numbers, strict=True):
@@ -218,7 +221,7 @@ class FleetState:
         p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
         likes = {name: state[path] for name, path in _ARRAYS.items()} | {
             "frames": np.zeros(3), "marks": np.zeros((marks, p)), "mark_covariances": np.zeros((marks, p, p)),
-            "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2),
+            "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2), "basis": np.zeros(p),
             "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
             "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
         }  # fmt: skip

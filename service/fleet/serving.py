@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from adaptive.compiled import compiled
 from adaptive.errors import DehystError
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.fleet.snapshot import FleetSnapshot
 from adaptive.fleet.state import OUTCOMES
 from adaptive.inverse_model import LssvmInverse
@@ -338,7 +337,7 @@ class FleetService:
             "seq": self._newest[2], "samples": counts,
             "gates": {name: int(n) for name, n in zip(OUTCOMES, outcomes.sum(0), strict=True)},
             "rms_error_pct": {"median": float(np.median(errors)), "max": float(errors.max())},
-            "apart": len(fleet.apart), "in_trouble": len(troubles), "frozen": fleet.frozen.tolist(),
+            "apart": len(fleet.apart), "in_trouble": len(troubles), "frozen": sorted(fleet.held),
             "checkpoints": self._checkpoints.counts if self._checkpoints is not None else None,
             "worst": [{"axis": axis, "rms_error_pct": float(errors[axis]), "trouble": troubles.get(axis, "")}
                       for axis in order[:_WORST]],

@@ -15,8 +15,7 @@ import pytest
 import zenoh
 
 from adaptive.errors import InputError
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import Learner
@@ -299,7 +298,7 @@ def test_an_axis_continues_from_the_file_of_a_service_of_one_axis(tmp_path: Path
     fleet = Fleet([base] * 3, FleetConfig(config))
     kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
     assert kept.restore(range(3)) == [1]
-    assert fleet.counters(1) == single.counters()
+    assert fleet.learner_of(1).counters() == single.counters()
     kept.close()
     # And back.
     restored = Learner.from_state(under("learner.", decode_checkpoint((tmp_path / "axis-0001.ckpt").read_bytes())[1]))
