@@ -160,12 +160,14 @@ class Fleet:
         failed = axes[:0]
         if axes.size:
             share(axes.size, steps.teach, axes, self._windows.predict(axes), s, c, w)
-            self._windows.let_go(axes[w["lets_go"][axes] & (outcome[axes] >= 0)])
-            learning = axes[w["learns"][axes]]
-            status = self._windows.learn(learning, w)
-            learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)
-            outcome[learning] = np.where(status == ACCEPTED, learnt, refused)
-            failed = learning[status == ILL_CONDITIONED]
+            fading, learning = axes[w["lets_go"][axes] & (outcome[axes] >= 0)], axes[w["learns"][axes]]
+            if fading.size:
+                self._windows.let_go(fading)
+            if learning.size:
+                status = self._windows.learn(learning, w)
+                learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)
+                outcome[learning] = np.where(status == ACCEPTED, learnt, refused)
+                failed = learning[status == ILL_CONDITIONED]
             self._cache = None
         counted = inside[outcome[inside] >= 0]
         s.counters[counted, outcome[counted]] += 1
@@ -202,7 +204,7 @@ class Fleet:
         """Note what a single learner said to a sample, and take it back into the batch where it is ordinary."""
         self._samples["outcome"][axis] = OUTCOMES.index(outcome)
         self._note(axis, learner)
-        if learner.parts.ordinary and not learner.parts.judgement.fallback:
+        if learner.parts.ordinary:
             del self.apart[axis]
             arrays = learner.parts.window.window_arrays
             self._windows.put(axis, arrays)
@@ -270,7 +272,7 @@ class Fleet:
 
     def memory(self) -> FloatArray:
         """(B, m) hysteresis memory with which each axis' served model goes on from its last sample."""
-        s, identified = self._state.rows, np.zeros(self.axes, dtype=np.bool_)
+        s, identified = self._state.rows, self._state.rows.numbers["judgement"]["fallback"].copy()
         for axis, model in self.held.items():
             moved = not np.array_equal(s.frames[axis], model.features.arrays.frame)
             identified[axis] = moved and model.features == self.bases[axis].features

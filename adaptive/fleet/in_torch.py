@@ -84,13 +84,8 @@ class TorchWindows:
 
     def learn(self, axes: IntArray, w: Any) -> IntArray:
         """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn` and ``fade``."""
-        s, at, points, turns = (
-            self._rows,
-            self._to(axes),
-            self._to(self._rows.point[axes]),
-            self._rows.numbers["window"],
-        )
-        config = self._fixed.config[0]
+        s, at, turns, config = self._rows, self._to(axes), self._rows.numbers["window"], self._fixed.config[0]
+        points = self._to(s.point[axes])
         column, count = self._column(at, points), self._all["C"][at, ws.COUNT]
         value, nearest = torch.where(self._slots < count[:, None], column, -1.0).max(1)
         room = (count < self._slots.numel()) & (value < SAME)
@@ -104,10 +99,10 @@ class TorchWindows:
         done, slot = axes[good], slots.cpu().numpy()[good]
         turns["clock"][done] += 1
         s.born[done, slot], s.own[done, slot] = turns["clock"][done], w["weight"][done]
-        half_life_s = float(config["weights"]["half_life_s"])
-        if half_life_s > 0.0 and done.size:
+        if config["weights"]["half_life_s"] > 0.0 and done.size:
             slot = turns["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
-            share = 0.5 ** ((turns["clock"][done] - s.born[done, slot]) * config["window_s"] / half_life_s)
+            age_s = (turns["clock"][done] - s.born[done, slot]) * config["window_s"]
+            share = 0.5 ** (age_s / config["weights"]["half_life_s"])
             faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, LEAST_FADED))
             self._alone(done[~faded], windows.fade)
         rest = ~good

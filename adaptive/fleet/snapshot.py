@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,28 +11,18 @@ from adaptive.errors import InputError
 from adaptive.fleet.state import Fixed, Rows
 from adaptive.fleet.windows import Threads
 from adaptive.inverse_model import DOMAIN_MARGIN, LssvmInverse, evaluate_packed, unpacked
-from adaptive.types import BoolArray, FloatArray, IntArray
+from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray
 from adaptive.window.arrays import ALPHA, BETA, COUNT, GAMMA
-
-
-class Answers(NamedTuple):
-    """Voltages of B axes at n points each: ``u_V``, ``std_V``, ``inside`` (B, n) and ``memory`` (B, m), as of
-    `adaptive.types.Feedforward`."""
-
-    u_V: FloatArray
-    std_V: FloatArray
-    inside: BoolArray
-    memory: FloatArray
 
 
 @compiled
 def _evaluate(
-    lo: int, hi: int, packed: FloatArray, counts: IntArray, motion: FloatArray, memory: FloatArray, u: FloatArray,
-    std: FloatArray, inside: BoolArray,
+    lo: int, hi: int, axes: IntArray, packed: FloatArray, counts: IntArray, motion: FloatArray, memory: FloatArray,
+    u: FloatArray, std: FloatArray, inside: BoolArray,
 ) -> None:  # fmt: skip
-    for b in range(lo, hi):
-        y, v, a = motion[0, b], motion[1, b], motion[2, b]
-        evaluate_packed(y, v, a, memory[b], packed[b], counts[b], u[b], std[b], inside[b])
+    for k in range(lo, hi):
+        y, v, a, b = motion[0, k], motion[1, k], motion[2, k], axes[k]
+        evaluate_packed(y, v, a, memory[k], packed[b], counts[b], u[k], std[k], inside[k])
 
 
 @dataclass(frozen=True)
@@ -52,30 +41,29 @@ class FleetSnapshot:
     counts: IntArray
     threads: Threads
 
-    @property
-    def memory_size(self) -> int:
-        """m."""
-        return self.bases[0].memory_size
-
     def rest_memory(self) -> FloatArray:
         """(B, m) memory of stages that have always been at rest."""
         return np.array([base.rest_memory(base.features.y_rest_um) for base in self.bases])
 
     def feedforward(
-        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray
-    ) -> Answers:
-        """Voltages at (B, n) points, one sample time apart. Raises InputError on shapes that do not fit together."""
-        B, given = len(self.bases), [np.asarray(part, dtype=np.float64) for part in (y_um, v_um_per_s, a_um_per_s2)]
+        self, y_um: FloatArray, v_um_per_s: FloatArray, a_um_per_s2: FloatArray, memory: FloatArray,
+        axes: IntArray | None = None,
+    ) -> Feedforward:  # fmt: skip
+        """Voltages (B, n) and memory (B, m) of all axes, or of B ``axes``, at (B, n) points, one sample time apart.
+
+        Raises InputError on shapes that do not fit together.
+        """
+        at = np.arange(len(self.bases)) if axes is None else axes
+        B, given = at.size, [np.asarray(part, dtype=np.float64) for part in (y_um, v_um_per_s, a_um_per_s2)]
         shapes = [part.shape for part in given]
         if len(shapes[0]) != 2 or shapes[0][0] != B or len(set(shapes)) != 1:
             raise InputError(f"y_um, v_um_per_s, a_um_per_s2: got shapes {shapes}, expected three of equal ({B}, n)")
-        if np.shape(memory) != (B, self.memory_size):
-            raise InputError(f"memory: got shape {np.shape(memory)}, expected ({B}, {self.memory_size})")
+        if np.shape(memory) != (B, self.bases[0].memory_size):
+            raise InputError(f"memory: got shape {np.shape(memory)}, expected ({B}, {self.bases[0].memory_size})")
         after, (u, std) = np.array(memory, dtype=np.float64), np.empty((2, *shapes[0]))
         inside = np.empty(shapes[0], dtype=np.bool_)
-        motion = np.array(given)
-        self.threads.share(B, _evaluate, self.packed, self.counts, motion, after, u, std, inside)
-        return Answers(u, std, inside, after)
+        self.threads.share(B, _evaluate, at, self.packed, self.counts, np.array(given), after, u, std, inside)
+        return Feedforward(u, std, inside, after)
 
 
 @compiled
@@ -116,9 +104,13 @@ def snapshot_of(
     linear, parts = np.empty((B, 2 + p)), (windows[name] for name in ("V", "F", "C", "scaled", "inverse_widths"))
     threads.share(B, _pack, s, c, *parts, DOMAIN_MARGIN, packed, counts, linear)
     seq, valid = s.numbers["front"]["gates"]["seq"].copy(), s.numbers["judgement"]["valid"].copy()
-    for axis, model in apart.items():
+    fallen = [axis for axis in np.flatnonzero(s.numbers["judgement"]["fallback"]).tolist() if axis not in apart]
+    for axis, model in (apart | {axis: bases[axis] for axis in fallen}).items():
         row, sizes = model.packed
         packed[axis, : row.size], counts[axis] = row, sizes
         linear[axis] = model.features.gain, model.features.offset_um, *model.beta
+    # The fourth number of a packed model is the variance of its noise.
+    packed[fallen, 3] = s.numbers["judgement"]["frozen_short_V2"][fallen]
+    for axis, model in apart.items():
         seq[axis], valid[axis] = model.seq, model.valid
     return FleetSnapshot(bases, seq, valid, linear, packed, counts, threads)

@@ -250,8 +250,7 @@ def _finds_fault(
 ) -> bool:
     """Errors of the models as they were served, all checks, and marks (`Parts.judge`, `Learner._check`).
 
-    True where the identified model is to be served, or the learner has to return to it, to an earlier estimate, or to a
-    trial of the sensor.
+    True where the learner has to return to an earlier estimate, to the identified model, or to a trial of the sensor.
     """
     r, f, config, p = s.numbers[b], c.axis[b], c.config[0], h.size
     j, span_V, size = r.judgement, f.span_V, s.delay.shape[1]
@@ -260,7 +259,9 @@ def _finds_fault(
     served_V = dot(h, s.delay[b, max(r.delay_count - size + 1, 0) % size], p)
     _judge(j, target - served_V, u - frozen_V, config.step_s)
     _is_valid(j, config.valid_enter * span_V, config.valid_leave * span_V)
-    fault = _falls_back(j, config.fallback_floor * span_V, config.step_s)
+    before = j.fallback
+    r.events["fallbacks"] += _falls_back(j, config.fallback_floor * span_V, config.step_s) and not before
+    fault = j.fallen_s > learner.ROLLBACK_S
     confirms = places = False
     if checks:
         away_V = abs(u - target + dot(h, s.beta[b], p) - dot(h, c.beta[b], p))
@@ -289,12 +290,15 @@ def _finds_fault(
     if fault:
         return True
     if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
-        _mark(s, b)
+        # A good estimate becomes the next mark; see `Parts.judge`.
+        _move_mark(s, b, 1, 0)
+        _mark_now(s, b, 1)
+        if s.ages[b, 2] < s.ages[b, 0]:
+            _move_mark(s, b, 0, 2)
     if confirms:
-        newer = int(s.confirmed_ages[b, 1] >= s.confirmed_ages[b, 0])
-        _copy_mark(s, b, 2 + newer, 2)
-        s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
-        s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
+        if s.ages[b, 3] >= s.ages[b, 2]:
+            _move_mark(s, b, 3, 2)
+        _mark_now(s, b, 3)
     if places:
         if r.confirmed:
             _count_again(r.front.following)
@@ -303,19 +307,14 @@ def _finds_fault(
 
 
 @compiled
-def _mark(s: Rows, b: int) -> None:
-    """A good estimate becomes the next mark; see `Parts.judge`."""
-    _copy_mark(s, b, 1, 0)
-    s.marks[b, 1], s.mark_covariances[b, 1] = s.beta[b], s.covariance[b]
-    s.mark_ages[b, 0], s.mark_ages[b, 1] = s.mark_ages[b, 1], s.numbers[b].judgement.judged
-    if s.confirmed_ages[b, 0] < s.mark_ages[b, 0]:
-        _copy_mark(s, b, 0, 2)
-        s.confirmed_ages[b, 0] = s.mark_ages[b, 0]
+def _move_mark(s: Rows, b: int, source: int, target: int) -> None:
+    s.marks[b, target], s.ages[b, target] = s.marks[b, source], s.ages[b, source]
 
 
 @compiled
-def _copy_mark(s: Rows, b: int, source: int, target: int) -> None:
-    s.marks[b, target], s.mark_covariances[b, target] = s.marks[b, source], s.mark_covariances[b, source]
+def _mark_now(s: Rows, b: int, target: int) -> None:
+    s.marks[b, target, 0], s.marks[b, target, 1:] = s.beta[b], s.covariance[b]
+    s.ages[b, target] = s.numbers[b].judgement.judged
 
 
 @compiled
