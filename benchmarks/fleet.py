@@ -21,8 +21,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
@@ -69,7 +68,7 @@ def timed(work: Callable[[], object], device: str) -> float:
     """Seconds of one call, the device's work included."""
     begin = time.perf_counter()
     work()
-    if device != "cpu":
+    if torch.device(device).type == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter() - begin
 
@@ -89,13 +88,13 @@ def naive_s(axes: int, window: int, device: str) -> float:
 
 def measure(axes: int, args: argparse.Namespace, moved_bytes_s: tuple[float, float]) -> None:
     """Print the lines of one number of axes."""
-    form = "inverse" if args.device != "cpu" or args.backend == "torch" else args.form
+    form = "inverse" if args.device != "cpu" else args.form
     config = LearnerConfig(window=args.window, learn_every=args.learn_every, solver=SolverConfig(form=form))
     model, stage = identified(args.window)
     gains = 1.0 + 0.1 * np.linspace(-1.0, 1.0, axes)
     models = [replace(model, features=replace(model.features, gain=float(gain))) for gain in gains]
     begin = time.perf_counter()
-    fleet = Fleet(models, FleetConfig(config, args.device, args.backend, args.threads))
+    fleet = Fleet(models, FleetConfig(config, args.device, args.threads))
     fleet.warm()
     start_s = time.perf_counter() - begin
     u, y = recording(stage, args.before + args.steps)
@@ -104,7 +103,7 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: tuple[float, flo
     worked: list[tuple[float, float]] = []
     for k in range(args.before + args.steps):
         if k == args.before:
-            stepped = -sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
+            stepped = -sum(fleet.learner_of(axis).counters()["window_steps"] for axis in (0, axes - 1))
         readings = gains * y[k]
         if args.lost and k >= args.before:
             readings[7 * k % axes] = np.nan
@@ -116,7 +115,7 @@ def measure(axes: int, args: argparse.Namespace, moved_bytes_s: tuple[float, flo
             single.handle(Sample(k, k * DT_S, float(u[k]), float(reading)))
         alone.append((time.perf_counter() - begin) * axes / len(singles))
         worked.append((middle - start, (time.process_time() - middle) * axes / len(singles)))
-    stepped += sum(fleet.counters(axis)["window_steps"] for axis in (0, axes - 1))
+    stepped += sum(fleet.learner_of(axis).counters()["window_steps"] for axis in (0, axes - 1))
     steps, loops = np.array(together[args.before :]), np.array(alone[args.before :])
     snapshot, memory = fleet.snapshot(), fleet.memory()
     at_um, still = np.full((axes, 1), 20.0), np.zeros((axes, 1))
@@ -151,7 +150,6 @@ def main() -> None:
     parser.add_argument("--window", type=int, default=100, help="samples in each window")
     parser.add_argument("--learn-every", type=int, default=10, help="samples between two steps of the windows")
     parser.add_argument("--device", default="cpu", help="device of torch: cpu or cuda")
-    parser.add_argument("--backend", default="auto", choices=["auto", "compiled", "torch"], help="see docs/fleet.md")
     parser.add_argument("--form", default="auto", choices=["auto", "inverse", "cholesky"], help="of the windows")
     parser.add_argument("--threads", type=int, default=2, help="that share the axes of a compiled step")
     parser.add_argument(

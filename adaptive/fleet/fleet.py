@@ -10,24 +10,25 @@ learner holds for each axis, and a refused axis costs the others nothing but the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
 from adaptive.fleet import step as steps
-from adaptive.fleet.config import FleetConfig
 from adaptive.fleet.snapshot import FleetSnapshot, snapshot_of
 from adaptive.fleet.state import OUTCOMES, FleetState, check_alike, distinct, fixed_of
-from adaptive.fleet.step import DOUBT, NO_SAMPLE, ODD, TEACHES, Samples, Work
-from adaptive.fleet.windows import CompiledWindows, Step, Threads
+from adaptive.fleet.step import DOUBT, NO_SAMPLE, ODD, SAMPLE, TEACHES
+from adaptive.fleet.windows import CompiledWindows, Threads
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
+from adaptive.online.config import LearnerConfig
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.learner import Learner
 from adaptive.types import FloatArray, IntArray, Sample, StateDict
-from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED, WindowArrays
+from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED
 
 if TYPE_CHECKING:
     from adaptive.fleet.in_torch import TorchWindows
@@ -36,8 +37,42 @@ if TYPE_CHECKING:
 WRITTEN_WITHIN = 256
 
 
+@dataclass(frozen=True, slots=True)
+class FleetConfig:
+    """Frozen configuration of a fleet.
+
+    learner : of every axis, see there.
+    device : ``cpu`` steps the windows by the single learner's own compiled code, on the processor; any device of torch,
+    its processor ``cpu:0`` too, by operations of torch, in the inverse form.
+    threads : that share the axes of a step; the result does not depend on them.
+    checks : most axes at a time whose model is under a control trial (`docs/learner.md`); others wait for their turn.
+    """
+
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    device: str = "cpu"
+    threads: int = 2
+    checks: int = 16
+
+    def __post_init__(self) -> None:
+        form = self.learner.solver.form
+        if not self.device:
+            raise InputError("device: got nothing, expected 'cpu' or a device of torch, as 'cuda'")
+        if not 1 <= self.threads <= 256:
+            raise InputError(f"threads: got {self.threads}, expected 1 to 256")
+        if self.checks < 1:
+            raise InputError(f"checks: got {self.checks}, expected at least 1 axis")
+        if self.device != "cpu" and form != "inverse":
+            raise InputError(f"learner.solver.form: got {form!r}, expected 'inverse', which device {self.device!r} has")
+
+
 class Fleet:
-    """Learns B axes online. Not for several threads at once; snapshots may be used anywhere."""
+    """Learns B axes online. Not for several threads at once; snapshots may be used anywhere.
+
+    Attributes
+    ----------
+    axes : B. bases : (B,) identified models. apart : the axes that are not ordinary at present, as single learners.
+    held : what frozen axes serve.
+    """
 
     def __init__(self, models: Sequence[LssvmInverse], config: FleetConfig | None = None) -> None:
         """``models`` : the identified model of each axis. Raises InputError where their shapes differ."""
@@ -50,36 +85,22 @@ class Fleet:
         self._c = c = fixed_of(models, config.learner, templates)
         self._state = FleetState(models, config.learner, templates[0].parts.delay.steps)
         self._threads = Threads(config.threads)
-        B, p = c.beta.shape
-        self._work = Work(
-            self._state.rows.numbers.copy(), np.empty(B, dtype=np.int64), np.empty((B, p)),
-            *np.zeros((2, B), dtype=np.bool_), *np.zeros((2, B)),
-        )  # fmt: skip
+        self.axes = len(models)
+        self._samples = np.zeros(self.axes, SAMPLE)
         arrays = [template.parts.window.window_arrays for template in templates]
-        self._windows = self._make_windows(arrays)
-        self._apart: dict[int, Learner] = {}
+        if config.device == "cpu":
+            self._windows: CompiledWindows | TorchWindows = CompiledWindows(self._state.rows, c, arrays, self._threads)
+        else:
+            from adaptive.fleet.in_torch import TorchWindows
+
+            self._windows = TorchWindows(self._state.rows, c, arrays, config.device)
+        self.apart: dict[int, Learner] = {}
         self._shells: dict[int, Learner] = {}
-        #: What frozen axes serve: their rows of a snapshot.
-        self._held: dict[int, tuple[Any, ...]] = {}
+        self.held: dict[int, LssvmInverse] = {}
         self._cache: FleetSnapshot | None = None
-        for i in range(B):
+        for i in range(self.axes):
             # Before its first sample an axis has no place: the single learner takes that one.
             self._set_apart(i, self._learner(i))
-
-    def _make_windows(self, starts: Sequence[WindowArrays]) -> CompiledWindows | TorchWindows:
-        rows, config = self._state.rows, self.config
-        if not config.in_torch:
-            return CompiledWindows(rows, self._c, starts, self._threads)
-        from adaptive.fleet.in_torch import TorchWindows
-
-        return TorchWindows(rows, self._c, starts, config.device)
-
-    # ---- samples in
-
-    @property
-    def axes(self) -> int:
-        """B."""
-        return len(self.bases)
 
     def step(self, seq: object, t_s: object, u_V: object, y_um: object, present: object = True) -> IntArray:
         """Take one sample of each axis that is ``present``; arguments are (B,) or one value for all.
@@ -87,91 +108,79 @@ class Fleet:
         Returns (B,) results: the number of the outcome in ``OUTCOMES``, NO_SAMPLE for an axis that is not present.
         Never raises on the values of samples; raises InputError on shapes.
         """
-        taken = self._given("present", present, np.bool_)
-        numbers = (("t_s", t_s), ("u_V", u_V), ("y_um", y_um))
-        sample = [self._given("seq", seq, np.int64), *(self._given(name, value, np.float64) for name, value in numbers)]
-        outcome = self._work.outcome
+        w = self._samples
+        for name, given in (("seq", seq), ("t_s", t_s), ("u_V", u_V), ("y_um", y_um), ("present", present)):
+            values = np.asarray(given)
+            if values.shape not in ((), (self.axes,)):
+                raise InputError(f"{name}: got shape {values.shape}, expected ({self.axes},) or one value for all")
+            w[name] = values
+        outcome = w["outcome"]
         outcome[:] = NO_SAMPLE
-        apart, together = [axis for axis in self._apart if taken[axis]], taken.copy()
-        together[list(self._apart)] = False
+        apart, together = [axis for axis in self.apart if w["present"][axis]], w["present"].copy()
+        together[list(self.apart)] = False
         inside = np.flatnonzero(together)
         if inside.size:
-            self._step_together(inside, Samples._make([*sample, self._may_check(inside)]))
+            self._step_together(inside)
             doubtful = np.flatnonzero(outcome == DOUBT).tolist()
             for axis in doubtful:
                 self._take_out(axis)
             apart += doubtful
         for axis in apart:
-            learner = self._apart[axis]
+            learner = self.apart[axis]
             if not learner.parts.intake.begins:
                 self._windows.write([axis])
-            said = learner.handle(Sample(*(part[axis].item() for part in sample)))
-            self._settle(axis, learner, said)
+            self._settle(axis, learner, learner.handle(Sample(*w[axis].item()[:4])))
         self._windows.write(list(islice(self._windows.unwritten, -(-self.axes // WRITTEN_WITHIN))))
         return outcome.copy()
 
     def warm(self) -> None:
         """Load or compile every step, so that no sample waits for the compiler."""
-        s, c, w, share, none = self._state.rows, self._c, self._work, self._threads.share, np.arange(0)
-        samples = Samples(none, w.targets, w.targets, w.targets, w.learns)
-        share(0, steps.take, none, s, c, samples, w)
+        s, c, w, share, none = self._state.rows, self._c, self._samples, self._threads.share, np.arange(0)
+        share(0, steps.take, none, s, c, w)
         share(0, steps.teach, none, self._windows.predict(none), s, c, w)
-        self._windows.let_go(none, 1.0)
-        self._windows.learn(none, Step(s.point[none], w.targets[none], w.weights[none], 0.0, False))
+        self._windows.let_go(none)
+        self._windows.learn(none, w)
         still = np.zeros((self.axes, 1))
         self.snapshot().feedforward(still, still, still, self.memory())
 
-    def _given(self, name: str, value: object, kind: type) -> Any:
-        given: Any = np.asarray(value, dtype=kind)
-        if given.ndim > 1 or (given.ndim == 1 and given.shape[0] != self.axes):
-            raise InputError(f"{name}: got shape {given.shape}, expected ({self.axes},) or one value for all")
-        return np.ascontiguousarray(np.broadcast_to(given, (self.axes,)))
-
-    def _may_check(self, inside: IntArray) -> Any:
-        """(B,) axes whose control trial may begin: as many as the configuration allows, the longest waiting first."""
-        may = np.zeros(self.axes, dtype=np.bool_)
+    def _let_check(self, inside: IntArray) -> None:
+        """Note whose control trial may begin: as many as the configuration allows, the longest waiting first."""
         waits = self._state.rows.numbers["front"]["until_control"]
         due = inside[waits[inside] <= 1]
-        if due.size:
-            room = self.config.checks - sum(one.parts.intake.controls for one in self._apart.values())
-            may[due[waits[due].argsort(kind="stable")[: max(room, 0)]]] = True
-        return may
+        room = self.config.checks - sum(one.parts.intake.controls for one in self.apart.values())
+        self._samples["controls"] = False
+        self._samples["controls"][due[waits[due].argsort(kind="stable")[: max(room, 0)]]] = True
 
-    def _step_together(self, inside: IntArray, samples: Samples) -> None:
-        s, c, w, config, share = self._state.rows, self._c, self._work, self.config.learner, self._threads.share
-        share(inside.size, steps.take, inside, s, c, samples, w)
-        axes = inside[w.outcome[inside] == TEACHES]
+    def _step_together(self, inside: IntArray) -> None:
+        s, c, w, share = self._state.rows, self._c, self._samples, self._threads.share
+        outcome = w["outcome"]
+        self._let_check(inside)
+        share(inside.size, steps.take, inside, s, c, w)
+        axes = inside[outcome[inside] == TEACHES]
         failed = axes[:0]
         if axes.size:
             share(axes.size, steps.teach, axes, self._windows.predict(axes), s, c, w)
-            fading = axes[w.lets_go[axes] & (w.outcome[axes] >= 0)]
+            fading, learning = axes[w["lets_go"][axes] & (outcome[axes] >= 0)], axes[w["learns"][axes]]
             if fading.size:
-                self._windows.let_go(fading, config.weights.before_change)
-            failed = self._learn(axes[w.learns[axes]])
+                self._windows.let_go(fading)
+            if learning.size:
+                status = self._windows.learn(learning, w)
+                learnt, refused = OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS)
+                outcome[learning] = np.where(status == ACCEPTED, learnt, refused)
+                failed = learning[status == ILL_CONDITIONED]
             self._cache = None
-        counted = inside[w.outcome[inside] >= 0]
-        s.counters[counted, w.outcome[counted]] += 1
-        for axis in axes[w.outcome[axes] == ODD].tolist():
+        counted = inside[outcome[inside] >= 0]
+        s.counters[counted, outcome[counted]] += 1
+        for axis in axes[outcome[axes] == ODD].tolist():
             learner = self._take_out(axis)
             track = learner.parts.intake.track
             pair = track.pair() if track is not None else None
             assert pair is not None
-            outcome = learner.teach(pair)
-            learner.parts.counters[outcome] += 1
-            self._settle(axis, learner, outcome)
+            said = learner.teach(pair)
+            learner.parts.counters[said] += 1
+            self._settle(axis, learner, said)
         for axis in failed.tolist():
             self._take_out(axis).parts.window.begin_healing()
-
-    def _learn(self, axes: IntArray) -> IntArray:
-        """One sample into the windows of ``axes``; returns those whose step was refused for numerics."""
-        if not axes.size:
-            return axes
-        s, w, c = self._state.rows, self._work, self.config.learner
-        step_s, fifo = c.learn_every * self.bases[0].dt_s, c.eviction == "fifo"
-        step = Step(s.point[axes], w.targets[axes], w.weights[axes], step_s, fifo)
-        status: IntArray = self._windows.learn(axes, step)
-        w.outcome[axes] = np.where(status == ACCEPTED, OUTCOMES.index(gates.LEARNT), OUTCOMES.index(gates.NUMERICS))
-        return np.asarray(axes[status == ILL_CONDITIONED])
 
     # ---- in and out of the batch
 
@@ -184,8 +193,8 @@ class Fleet:
         return self._shells[axis]
 
     def _set_apart(self, axis: int, learner: Learner) -> Learner:
-        self._apart[axis] = learner
-        self._cache = None
+        self.apart[axis] = learner
+        self._note(axis, learner)
         return learner
 
     def _take_out(self, axis: int) -> Learner:
@@ -193,19 +202,21 @@ class Fleet:
 
     def _settle(self, axis: int, learner: Learner, outcome: str) -> None:
         """Note what a single learner said to a sample, and take it back into the batch where it is ordinary."""
-        self._work.outcome[axis] = OUTCOMES.index(outcome)
-        self._cache = None
+        self._samples["outcome"][axis] = OUTCOMES.index(outcome)
+        self._note(axis, learner)
         if learner.parts.ordinary:
-            del self._apart[axis]
+            del self.apart[axis]
             arrays = learner.parts.window.window_arrays
             self._windows.put(axis, arrays)
             if arrays is not self._windows.arrays(axis):
                 del self._shells[axis]
             self._state.load(axis, learner.parts.state_dict(arrays=False) | {"frozen": learner.frozen})
 
-    def export_axis(self, axis: int) -> StateDict:
-        """The whole state of an axis, as of ``Learner.state_dict``."""
-        return self.learner_of(axis).state_dict()
+    def _note(self, axis: int, learner: Learner) -> None:
+        """Note the figures of an axis that is apart, for reports on all."""
+        self._cache = None
+        self._state.rows.counters[axis] = [learner.parts.counters[name] for name in OUTCOMES]
+        self._state.rows.numbers["judgement"]["short_V2"][axis] = learner.parts.judgement.short_V2
 
     def load_axis(self, axis: int, state: StateDict, anew: bool = False) -> None:
         """Continue an axis from the state of a single learner of the same model and configuration.
@@ -220,15 +231,15 @@ class Fleet:
         if given.config != self.config.learner:
             raise ModelFileError(f"axis {axis}: the state is of another configuration of the learner")
         self._shells.pop(axis, None)
-        self._held.pop(axis, None)
         self._windows.put(axis, given.parts.window.window_arrays)
         learner = self._learner(axis)
         learner.resume(state, arrays=False)
-        self._state.rows.numbers["frozen"][axis] = learner.frozen
         if anew:
             learner.resync()
         # Its next sample shows whether it is ordinary.
         self._set_apart(axis, learner)
+        self.held.pop(axis, None)
+        self.freeze([axis], learner.frozen)
 
     def freeze(self, axes: Iterable[int], frozen: bool = True) -> None:
         """Stop the learning of some axes and keep what they serve; with ``frozen=False`` let them learn again.
@@ -236,47 +247,39 @@ class Fleet:
         Their samples are still tracked and judged.
         """
         for axis in axes:
+            learner = self.learner_of(axis)
+            (learner.freeze if frozen else learner.thaw)()
             self._state.rows.numbers["frozen"][axis] = frozen
-            if axis in self._apart:
-                (self._apart[axis].freeze if frozen else self._apart[axis].thaw)()
-            if not frozen:
-                self._held.pop(axis, None)
+            if frozen:
+                self.held.setdefault(axis, learner.snapshot())
+            else:
+                self.held.pop(axis, None)
         self._cache = None
-        self.snapshot()
 
-    @property
-    def frozen(self) -> IntArray:
-        """The axes that do not learn."""
-        return np.flatnonzero(self._state.rows.numbers["frozen"])
+    # ---- snapshots out
 
-    # ---- models out
+    def model_of(self, axis: int) -> LssvmInverse:
+        """The model of an axis as it is served, immutable."""
+        return self.held.get(axis) or self.learner_of(axis).snapshot()
 
     def snapshot(self) -> FleetSnapshot:
         """The models of all axes as they stand, immutable; the same object while nothing was learnt."""
         if self._cache is None:
-            apart = {axis: learner.snapshot() for axis, learner in self._apart.items()}
+            models = {axis: learner.snapshot() for axis, learner in self.apart.items()} | self.held
             rows, samples = self._state.rows, self._windows.samples()
-            self._cache = snapshot_of(self.bases, rows, self._c, samples, apart, self._threads)
-            learnt = self._cache.learnt
-            for axis in self.frozen.tolist():
-                held = self._held.setdefault(axis, tuple(part[axis].copy() for part in learnt))
-                for part, kept in zip(learnt, held, strict=True):
-                    part[axis] = kept
+            self._cache = snapshot_of(self.bases, rows, self._c, samples, models, self._threads)
         return self._cache
 
     def memory(self) -> FloatArray:
         """(B, m) hysteresis memory with which each axis' served model goes on from its last sample."""
-        s = self._state.rows
+        s, identified = self._state.rows, self._state.rows.numbers["judgement"]["fallback"].copy()
+        for axis, model in self.held.items():
+            moved = not np.array_equal(s.frames[axis], model.features.arrays.frame)
+            identified[axis] = moved and model.features == self.bases[axis].features
         out = np.empty_like(s.memory)
-        identified, snapshot = s.numbers["judgement"]["fallback"].copy(), self.snapshot()
-        for axis in self._held:
-            f = self.bases[axis].features
-            identified[axis] = tuple(snapshot.linear[axis, :2]) == (f.gain, f.offset_um)
         steps.memory_now(s, self._c, identified, out)
-        for axis, learner in self._apart.items():
-            kept = learner.memory_for(learner.snapshot())
-            if kept is not None and axis in self._held:
-                kept = learner.parts.intake.memory_now(bool(identified[axis]))
+        for axis, learner in self.apart.items():
+            kept = learner.memory_for(self.held.get(axis) or learner.snapshot())
             out[axis] = learner.memory() if kept is None else kept
         return out
 
@@ -285,35 +288,21 @@ class Fleet:
     def learner_of(self, axis: int) -> Learner:
         """An axis as a single learner, to look into: its own where it is apart, else a copy."""
         self._windows.write([axis])
-        if axis in self._apart:
-            return self._apart[axis]
+        if axis in self.apart:
+            return self.apart[axis]
         learner = self._learner(axis)
         learner.resume(self._state.read(axis), arrays=False)
         return learner
 
-    def counters(self, axis: int) -> dict[str, int]:
-        """Samples of an axis by outcome, and events; see `Learner.counters`."""
-        return self.learner_of(axis).counters()
-
     def outcomes(self) -> IntArray:
         """(B, outcomes) samples by outcome, in the order of ``OUTCOMES``."""
-        out = self._state.rows.counters.copy()
-        for axis, learner in self._apart.items():
-            out[axis] = [learner.parts.counters[name] for name in OUTCOMES]
-        return out
+        return self._state.rows.counters.copy()
 
     def rms_error_pct(self) -> FloatArray:
         """(B,) rms error of the last 0.1 s, percent of the voltage span."""
-        out = self._state.rows.numbers["judgement"]["short_V2"].copy()
-        for axis, learner in self._apart.items():
-            out[axis] = learner.parts.judgement.short_V2
-        return np.asarray(100.0 * np.sqrt(out) / self._c.axis["span_V"], dtype=np.float64)
+        mean_V2 = self._state.rows.numbers["judgement"]["short_V2"]
+        return np.asarray(100.0 * np.sqrt(mean_V2) / self._c.axis["span_V"], dtype=np.float64)
 
     def troubles(self) -> dict[int, str]:
         """Names of what keeps axes from learning, by axis; see `Learner.trouble`. Such an axis is apart."""
-        return {axis: one.trouble for axis, one in sorted(self._apart.items()) if one.trouble}
-
-    @property
-    def apart(self) -> tuple[int, ...]:
-        """The axes that are not ordinary at present."""
-        return tuple(sorted(self._apart))
+        return {axis: one.trouble for axis, one in sorted(self.apart.items()) if one.trouble}

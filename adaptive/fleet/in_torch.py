@@ -17,7 +17,6 @@ from torch import Tensor
 
 from adaptive.fleet import windows
 from adaptive.fleet.state import Fixed, Rows
-from adaptive.fleet.windows import Step
 from adaptive.online.kernel_window import LEAST_FADED, NOWHERE, SAME
 from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
@@ -83,38 +82,39 @@ class TorchWindows:
         column = self._column(at, self._to(self._rows.point[axes]))
         return np.asarray(((column * self._all["V"][at, ws.ALPHA]).sum(1) + self._all["F"][at, ws.BETA]).cpu())
 
-    def learn(self, axes: IntArray, step: Step) -> IntArray:
-        """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
-        s, at, points, turns = self._rows, self._to(axes), self._to(step.points), self._rows.numbers["window"]
+    def learn(self, axes: IntArray, w: Any) -> IntArray:
+        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn` and ``fade``."""
+        s, at, turns, config = self._rows, self._to(axes), self._rows.numbers["window"], self._fixed.config[0]
+        points = self._to(s.point[axes])
         column, count = self._column(at, points), self._all["C"][at, ws.COUNT]
         value, nearest = torch.where(self._slots < count[:, None], column, -1.0).max(1)
         room = (count < self._slots.numel()) & (value < SAME)
-        if step.fifo:
+        if config["fifo"]:
             held = np.arange(s.born.shape[1]) < count.cpu().numpy()[:, None]
             nearest = self._to(np.where(held, s.born[axes], np.iinfo(np.int64).max).argmin(1))
         slots = torch.where(room, count, nearest)
-        targets, weights = self._to(step.targets), self._to(step.weights)
+        targets, weights = self._to(w["target_V"][axes]), self._to(w["weight"][axes])
         good = self._exchange(at, slots, points, targets, weights, column, True)
         status = np.full(axes.size, ACCEPTED)
         done, slot = axes[good], slots.cpu().numpy()[good]
         turns["clock"][done] += 1
-        s.born[done, slot], s.own[done, slot] = turns["clock"][done], step.weights[good]
-        half_life_s = float(self._fixed.config["weights"]["half_life_s"][0])
-        if half_life_s > 0.0 and done.size:
+        s.born[done, slot], s.own[done, slot] = turns["clock"][done], w["weight"][done]
+        if config["weights"]["half_life_s"] > 0.0 and done.size:
             slot = turns["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
-            share = 0.5 ** ((turns["clock"][done] - s.born[done, slot]) * step.step_s / half_life_s)
+            age_s = (turns["clock"][done] - s.born[done, slot]) * config["window_s"]
+            share = 0.5 ** (age_s / config["weights"]["half_life_s"])
             faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, LEAST_FADED))
-            self._alone(done[~faded], windows.fade, s, self._fixed, step.step_s)
+            self._alone(done[~faded], windows.fade)
         rest = ~good
         said = np.empty(int(rest.sum()), dtype=np.int64)
-        alone = step._replace(points=step.points[rest], targets=step.targets[rest], weights=step.weights[rest])
-        self._alone(axes[rest], windows.learn, s, self._fixed, alone, said)
+        self._alone(axes[rest], windows.learn, w, said)
         status[rest] = said
         return status
 
-    def let_go(self, axes: IntArray, most: float) -> None:
+    def let_go(self, axes: IntArray) -> None:
         """`ResidualWindow.let_go` of each axis."""
         s, r, slots = self._rows, self._rows.numbers["window"], np.arange(self._rows.born.shape[1])
+        most = float(self._fixed.config["weights"]["before_change"][0])
         old = (s.born[axes] <= r["changed"][axes, None]) & (s.own[axes] > most) & (slots >= r["next"][axes, None])
         old &= slots < self._all["C"][self._to(axes), ws.COUNT].cpu().numpy()[:, None]
         found, slot = old.any(1), old.argmax(1)
@@ -122,14 +122,14 @@ class TorchWindows:
         at, slot = axes[found], slot[found]
         good = self._reweight(at, slot, np.full(at.size, most))
         r["next"][at[good]], s.own[at[good], slot[good]] = slot[good] + 1, most
-        self._alone(at[~good], windows.let_go, s, most)
+        self._alone(at[~good], windows.let_go)
 
     def _alone(self, axes: IntArray, work: Callable[..., None], *arguments: object) -> None:
         """Steps of some axes by the processor's compiled code, on copies that are taken over."""
         copies = {axis: self.arrays(axis) for axis in axes.tolist()}
         for axis, arrays in copies.items():
             self._handles[axis] = ws.handle_of(arrays)
-        work(0, axes.size, self._handles, axes, *arguments)
+        work(0, axes.size, self._handles, axes, self._rows, self._fixed, *arguments)
         for axis, arrays in copies.items():
             self.put(axis, arrays)
 

@@ -21,7 +21,7 @@ from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
 from adaptive.online.gates import LEARNT, PASSED, REASONS
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
 from adaptive.online.learner import MARK_S, Learner, swing_of
-from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict
+from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, parted
 
 #: Results of a sample, by their number in a fleet.
 OUTCOMES: Final = (LEARNT, PASSED, *REASONS)
@@ -34,7 +34,7 @@ _ARRAYS: Final = {
     "readings": "front.track.y_um", "good": "front.track.good", "motion": "front.track.motion",
     "memory": "front.track.memory", "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta",
     "covariance": "filter.covariance", "domain": "domain", "point": "point", "born": "window.born",
-    "own": "window.own_weights", "mark_ages": "mark_ages", "confirmed_ages": "confirmed_ages",
+    "own": "window.own_weights",
 }  # fmt: skip
 #: Numbers of an ordinary learner that are the same as others.
 _ALIASES: Final = {
@@ -54,15 +54,8 @@ def _numbers(state: StateDict) -> StateDict:
 
 def _record(numbers: StateDict) -> np.dtype[Any]:
     """The record that holds flat numbers, nested by their names."""
-    fields: dict[str, Any] = {}
-    for name, value in numbers.items():
-        group, _, rest = name.partition(".")
-        if rest:
-            fields.setdefault(group, {})[rest] = value
-        else:
-            fields[name] = type(value)
-    kinds = [(name, _record(kind) if isinstance(kind, dict) else kind) for name, kind in fields.items()]
-    return np.dtype(kinds, align=True)
+    fields = parted(numbers).items()
+    return np.dtype([(name, type(of[""]) if "" in of else _record(of)) for name, of in fields], align=True)
 
 
 def _leaves(kind: np.dtype[Any], group: str = "", at: int = 0) -> Iterator[tuple[str, np.dtype[Any], int]]:
@@ -93,8 +86,9 @@ class Rows(NamedTuple):
     """What changes: the first index is the axis. Names are those of the single learner, but for:
 
     numbers : a record for each axis, nested as the names of a learner's state are. frames : (B, 3) offset, 1/gain and
-    dead band of the frame that is served. marks, mark_covariances : (B, 4, ...), see ``MARKS``. delay : (B, D + 2, p)
-    ring of past estimates; one more than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
+    dead band of the frame that is served. marks : (B, 4, 1 + p, p) estimates and covariances, see ``MARKS``; ages :
+    when they were made. basis : (B, p) of the instant to learn. delay : (B, D + 2, p) ring of past estimates; one more
+    than is looked at, so that the last can be taken back. pasts : (B, 2, ...) known
     places of the stage, the older one first: motion, voltage before, voltages and readings over the lag, memory, as of
     `adaptive.online.track.Past`; past_from : voltages written before each; past_voltages : ring of all voltages.
     counters : (B, OUTCOMES).
@@ -113,11 +107,10 @@ class Rows(NamedTuple):
     beta: FloatArray
     covariance: FloatArray
     marks: FloatArray
-    mark_covariances: FloatArray
-    mark_ages: IntArray
-    confirmed_ages: IntArray
+    ages: IntArray
     delay: FloatArray
     domain: FloatArray
+    basis: FloatArray
     point: FloatArray
     born: IntArray
     own: FloatArray
@@ -171,7 +164,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
-             "mark_every": max(1, round(MARK_S / step_s))}  # fmt: skip
+             "mark_every": max(1, round(MARK_S / step_s)), "window_s": config.learn_every * dt_s,
+             "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
     for base, template, number in zip(bases, templates, numbers, strict=True):
@@ -217,8 +211,8 @@ class FleetState:
         B, state = len(bases), _ordinary(bases[0], config)
         p, marks, lag = state["filter.beta"].size, len(MARKS), state["front.track.u_V"].size - 2
         likes = {name: state[path] for name, path in _ARRAYS.items()} | {
-            "frames": np.zeros(3), "marks": np.zeros((marks, p)), "mark_covariances": np.zeros((marks, p, p)),
-            "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2),
+            "frames": np.zeros(3), "marks": np.zeros((marks, 1 + p, p)), "ages": np.zeros(marks, dtype=np.int64),
+            "delay": np.zeros((delay_steps + 2, p)), "past_voltages": np.zeros(MOST_BRIDGED + 2), "basis": np.zeros(p),
             "past_from": np.zeros(2, dtype=np.int64), "counters": np.zeros(len(OUTCOMES), dtype=np.int64),
             "pasts": np.zeros((2, 4 + 2 * lag + state["front.track.memory"].size)),
         }  # fmt: skip
@@ -229,7 +223,8 @@ class FleetState:
         self._numbers = _flat(s.numbers)[list(numbers)]
         self._fields = {path: getattr(s, name) for name, path in _ARRAYS.items()}
         for j, mark in enumerate(MARKS):
-            self._fields |= {f"{mark}.beta": s.marks[:, j], f"{mark}.covariance": s.mark_covariances[:, j]}
+            self._fields |= {f"{mark}.beta": s.marks[:, j, 0], f"{mark}.covariance": s.marks[:, j, 1:]}
+        self._fields |= {"mark_ages": s.ages[:, :2], "confirmed_ages": s.ages[:, 2:]}
         parts: dict[str, Any] = {
             "motion": slice(3), "u_before_V": 3, "lag_V": slice(4, 4 + lag), "lag_um": slice(4 + lag, 4 + 2 * lag),
             "memory": slice(4 + 2 * lag, None),

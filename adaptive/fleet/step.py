@@ -8,7 +8,7 @@ ordinary one changes nothing and is left to a single learner.
 from __future__ import annotations
 
 from math import isfinite
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -44,36 +44,13 @@ _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
 )
 
 
-class Samples(NamedTuple):
-    """(B,) samples. controls : axes whose control trial may begin now."""
-
-    seq: IntArray
-    t_s: FloatArray
-    u_V: FloatArray
-    y_um: FloatArray
-    controls: BoolArray
-
-
-class _Sample(NamedTuple):
-    seq: int
-    t_s: float
-    u_V: float
-    y_um: float
-
-
-class Work(NamedTuple):
-    """Scratch and results, (B, ...). kept : numbers to return to. outcome : of the sample, or a number from above.
-
-    basis (B, p) : of the instant to learn. lets_go, learns : steps that the windows are to make, of ``targets`` in V.
-    """
-
-    kept: Any
-    outcome: IntArray
-    basis: FloatArray
-    lets_go: BoolArray
-    learns: BoolArray
-    targets: FloatArray
-    weights: FloatArray
+#: A sample of an axis, and what is made of it. controls : whether the control trial of the axis may begin now.
+#: outcome : of the sample, or a number from above. lets_go, learns : steps that the window is to make, of target_V.
+SAMPLE: Final = np.dtype([
+    ("seq", np.int64), ("t_s", np.float64), ("u_V", np.float64), ("y_um", np.float64), ("present", np.bool_),
+    ("controls", np.bool_), ("outcome", np.int64), ("lets_go", np.bool_), ("learns", np.bool_),
+    ("target_V", np.float64), ("weight", np.float64),
+], align=True)  # fmt: skip
 
 
 @compiled
@@ -120,7 +97,7 @@ def _lags(s: Rows, c: Fixed, b: int, y_um: float) -> bool:
 
 
 @compiled
-def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
+def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
     """`Intake.take` of an ordinary sample: TEACHES where it may go on, DOUBT, or the gate that refuses it."""
     front, f, a = s.numbers[b].front, c.axis[b], c.config[0].admission
     g, dt_s = front.gates, c.config[0].dt_s
@@ -129,8 +106,10 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
         refused = gates.OUT_OF_RANGE
     if refused != "":
         # A sample in its place whose reading cannot be used advances the place of the single learner.
-        without: Any = _Sample(sample.seq, sample.t_s, sample.u_V, 0.0)
-        return DOUBT if gates.check_sample(a, g, without, dt_s) == "" else _number_of(refused)
+        y_um, sample["y_um"] = sample.y_um, 0.0
+        without = gates.check_sample(a, g, sample, dt_s)
+        sample["y_um"] = y_um
+        return DOUBT if without == "" else _number_of(refused)
     if sample.seq != g.seq + 1:
         return DOUBT
     gates.watch_voltage(a, g, sample.u_V, f.span_V)
@@ -144,7 +123,7 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any, control: bool) -> int:
         return DOUBT
     gates.watch_innovation(a, g, innovation)
     front["until_control"] -= 1
-    return DOUBT if known and f.tells and front.until_control <= 0 and control else TEACHES
+    return DOUBT if known and f.tells and front.until_control <= 0 and sample.controls else TEACHES
 
 
 @compiled
@@ -181,16 +160,15 @@ def _instant(s: Rows, b: int) -> tuple[int, int, bool, bool]:
 
 
 @compiled
-def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, given: Samples, w: Work) -> None:
-    """Intake of one sample of each of ``axes``; the first gates of what it teaches."""
+def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, w: Any) -> None:
+    """Intake of one sample of each of ``axes``, in records as `SAMPLE`; the first gates of what it teaches."""
     config, slots = c.config[0], s.voltages.shape[1]
     for k in range(lo, hi):
         b = axes[k]
-        w.kept[b] = s.numbers[b]
-        sample: Any = _Sample(given.seq[b], given.t_s[b], given.u_V[b], given.y_um[b])
-        w.outcome[b] = _admit(s, c, b, sample, given.controls[b])
-        if w.outcome[b] != TEACHES:
-            s.numbers[b] = w.kept[b]
+        kept, sample = s.numbers[b : b + 1].copy(), w[b]
+        sample["outcome"] = _admit(s, c, b, sample)
+        if sample.outcome != TEACHES:
+            s.numbers[b] = kept[0]
             continue
         _advance(s, c, b, sample.u_V, sample.y_um)
         now, at, good, _ = _instant(s, b)
@@ -202,65 +180,65 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, given: Samples, w:
             refused = gates.GLITCH
         due = now % config.filter_every == 0 or now % config.learn_every == 0
         if not due or (refused != "" and refused != gates.SATURATED):
-            w.outcome[b] = _number_of(refused if refused != "" else gates.PASSED)
+            sample["outcome"] = _number_of(refused if refused != "" else gates.PASSED)
             continue
-        fill(motion[0], motion[1], motion[2], s.memory[b], _map(c, b, s.frames), w.basis[b], s.point[b])
+        fill(motion[0], motion[1], motion[2], s.memory[b], _map(c, b, s.frames), s.basis[b], s.point[b])
 
 
 @compiled
-def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fixed, w: Work) -> None:
+def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fixed, w: Any) -> None:
     """What the samples of ``axes`` teach, all but the steps of the windows; ``kernel_V`` : their predictions, V."""
     config, p, d = c.config[0], s.beta.shape[1], s.point.shape[1]
     basis, kernel, gain, row = np.empty(p), np.empty(d), np.empty(p), np.empty(p)
     for k in range(lo, hi):
         b = axes[k]
-        r, f, h, motion = s.numbers[b], c.axis[b], w.basis[b], s.motion[b]
+        t, r, f, h, motion = w[b], s.numbers[b], c.axis[b], s.basis[b], s.motion[b]
         now, at, _, near_bad = _instant(s, b)
         u, before = s.voltages[b, at], s.voltages[b, (now - 1) % s.voltages.shape[1]]
         saturated = gates.check_pair(config.admission, u, before, motion[0]) != ""
-        w.kept[b] = r
-        w.lets_go[b] = w.learns[b] = False
-        w.outcome[b] = _SATURATED if saturated else _number_of(gates.PASSED)
+        kept = s.numbers[b : b + 1].copy()
+        t["lets_go"] = t["learns"] = False
+        t["outcome"] = _SATURATED if saturated else _number_of(gates.PASSED)
         served, count = r.front.track.served, r.front.track.smoother.count
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
-        w.weights[b] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
+        t["weight"] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
         if now % config.filter_every == 0:
             target = u - kernel_V[k]
             if not isfinite(target):
-                w.outcome[b] = _NUMERICS
+                t["outcome"] = _NUMERICS
                 continue
             fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
             _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
             frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
             if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
-                s.numbers[b] = w.kept[b]
-                w.outcome[b] = ODD
+                s.numbers[b] = kept[0]
+                t["outcome"] = ODD
                 continue
             if saturated:
                 continue
             if r.frozen:
-                w.outcome[b] = _FROZEN
+                t["outcome"] = _FROZEN
                 continue
-            weight = w.weights[b]
+            weight = t.weight
             said = update(
                 config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
                 target, not rests, weight, gain, row,
             )  # fmt: skip
             if said == "outlier":
-                w.outcome[b] = _OUTLIER
+                t["outcome"] = _OUTLIER
                 continue
             if said == "burst":
                 r.window["changed"], r.window["next"] = r.window.clock, 0
-            w.lets_go[b] = r.judgement.valid and r.window.next != NOWHERE
+            t["lets_go"] = r.judgement.valid and r.window.next != NOWHERE
             if rests:
                 shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
                 served["offset_um"] += shift_um
                 s.frames[b, 0] = served.offset_um
             else:
                 _leave_rest(r.rest)
-            w.outcome[b] = _UNEXCITED if rests else _LEARNT
+            t["outcome"] = _UNEXCITED if rests else _LEARNT
         if now % config.learn_every == 0 and not (saturated or rests or r.frozen) and r.judgement.valid:
-            w.learns[b], w.targets[b] = True, u - dot(h, s.beta[b], p)
+            t["learns"], t["target_V"] = True, u - dot(h, s.beta[b], p)
             for i in range(3):
                 s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
                 s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
@@ -312,12 +290,15 @@ def _finds_fault(
     if fault:
         return True
     if j.judged % config.mark_every == 0 and j.short_V2 < (0.5 * config.valid_enter * span_V) ** 2:
-        _mark(s, b)
+        # A good estimate becomes the next mark; see `Parts.judge`.
+        _move_mark(s, b, 1, 0)
+        _mark_now(s, b, 1)
+        if s.ages[b, 2] < s.ages[b, 0]:
+            _move_mark(s, b, 0, 2)
     if confirms:
-        newer = int(s.confirmed_ages[b, 1] >= s.confirmed_ages[b, 0])
-        _copy_mark(s, b, 2 + newer, 2)
-        s.marks[b, 3], s.mark_covariances[b, 3] = s.beta[b], s.covariance[b]
-        s.confirmed_ages[b, 0], s.confirmed_ages[b, 1] = s.confirmed_ages[b, newer], j.judged
+        if s.ages[b, 3] >= s.ages[b, 2]:
+            _move_mark(s, b, 3, 2)
+        _mark_now(s, b, 3)
     if places:
         if r.confirmed:
             _count_again(r.front.following)
@@ -326,19 +307,14 @@ def _finds_fault(
 
 
 @compiled
-def _mark(s: Rows, b: int) -> None:
-    """A good estimate becomes the next mark; see `Parts.judge`."""
-    _copy_mark(s, b, 1, 0)
-    s.marks[b, 1], s.mark_covariances[b, 1] = s.beta[b], s.covariance[b]
-    s.mark_ages[b, 0], s.mark_ages[b, 1] = s.mark_ages[b, 1], s.numbers[b].judgement.judged
-    if s.confirmed_ages[b, 0] < s.mark_ages[b, 0]:
-        _copy_mark(s, b, 0, 2)
-        s.confirmed_ages[b, 0] = s.mark_ages[b, 0]
+def _move_mark(s: Rows, b: int, source: int, target: int) -> None:
+    s.marks[b, target], s.ages[b, target] = s.marks[b, source], s.ages[b, source]
 
 
 @compiled
-def _copy_mark(s: Rows, b: int, source: int, target: int) -> None:
-    s.marks[b, target], s.mark_covariances[b, target] = s.marks[b, source], s.mark_covariances[b, source]
+def _mark_now(s: Rows, b: int, target: int) -> None:
+    s.marks[b, target, 0], s.marks[b, target, 1:] = s.beta[b], s.covariance[b]
+    s.ages[b, target] = s.numbers[b].judgement.judged
 
 
 @compiled

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -43,19 +43,6 @@ class Threads:
             one.result()
 
 
-class Step(NamedTuple):
-    """One sample for each of k windows: points (k, d), targets in V and noise weights (k,).
-
-    step_s : time between two steps. fifo : whether the oldest sample makes way.
-    """
-
-    points: FloatArray
-    targets: FloatArray
-    weights: FloatArray
-    step_s: float
-    fifo: bool
-
-
 @compiled
 def _predict(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, out: FloatArray) -> None:
     for k in range(lo, hi):
@@ -63,29 +50,32 @@ def _predict(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, out: 
 
 
 @compiled
-def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step: Step, out: IntArray) -> None:
+def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, w: Any, out: IntArray) -> None:
     """`ResidualWindow.learn` and ``fade`` of each axis."""
+    config = c.config[0]
     for k in range(lo, hi):
         b = axes[k]
         A, r = arrays_of(handles[b]), s.numbers[b].window
         empty = A.C[COUNT] == 0
-        status = window.learn(A, r, step.points[k], step.targets[k], step.weights[k], s.born[b], s.own[b], step.fifo)
+        status = window.learn(A, r, s.point[b], w[b].target_V, w[b].weight, s.born[b], s.own[b], config.fifo)
         # An empty window has nothing that a new factorisation could mend.
         out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
-        window.fade(A, r, c.config[0].weights, step.step_s, s.born[b], s.own[b])
+        window.fade(A, r, config.weights, config.window_s, s.born[b], s.own[b])
 
 
 @compiled
-def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, step_s: float) -> None:
+def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
     """`ResidualWindow.fade` of each axis."""
+    config = c.config[0]
     for k in range(lo, hi):
         b = axes[k]
-        window.fade(arrays_of(handles[b]), s.numbers[b].window, c.config[0].weights, step_s, s.born[b], s.own[b])
+        window.fade(arrays_of(handles[b]), s.numbers[b].window, config.weights, config.window_s, s.born[b], s.own[b])
 
 
 @compiled
-def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, most: float) -> None:
+def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
     """`ResidualWindow.let_go` of each axis."""
+    most = c.config[0].weights.before_change
     for k in range(lo, hi):
         b = axes[k]
         window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b], s.own[b])
@@ -141,14 +131,14 @@ class CompiledWindows:
         self._threads.share(axes.size, _predict, self._handles, axes, self._rows, out)
         return out
 
-    def learn(self, axes: IntArray, step: Step) -> IntArray:
-        """(k,) status of one step of each window; see `ResidualWindow.learn` and ``fade``."""
+    def learn(self, axes: IntArray, w: Any) -> IntArray:
+        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn` and ``fade``."""
         self.write(axes.tolist())
         out = np.empty(axes.size, dtype=np.int64)
-        self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, step, out)
+        self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, w, out)
         return out
 
-    def let_go(self, axes: IntArray, most: float) -> None:
+    def let_go(self, axes: IntArray) -> None:
         """`ResidualWindow.let_go` of each axis."""
         self.write(axes.tolist())
-        self._threads.share(axes.size, let_go, self._handles, axes, self._rows, most)
+        self._threads.share(axes.size, let_go, self._handles, axes, self._rows, self._fixed)

@@ -16,8 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig

@@ -15,6 +15,7 @@ from pathlib import Path
 from adaptive.errors import DehystError
 from adaptive.fleet.fleet import Fleet
 from adaptive.types import StateDict, prefixed, under
+from service.config.settings import LEARN
 from service.storage.checkpoint import SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.output import atomic_write
 from service.storage.segments import claim
@@ -37,6 +38,8 @@ class FleetCheckpoints:
         self._axis, self._due_s = 0, time.monotonic()
         self._writer = ThreadPoolExecutor(1, "checkpoints-fleet")
         self._writing: list[Future[None]] = []
+        #: Why the last file was refused.
+        self.error = ""
         self.counts = {"written": 0, "errors": 0, "restored": 0, "refused": 0}
 
     def restore(self, axes: Iterable[int]) -> list[int]:
@@ -48,10 +51,13 @@ class FleetCheckpoints:
             try:
                 meta, state = decode_checkpoint(self._path(axis).read_bytes())
                 meta.refuse_unless(stage, self._name(axis), dt_s)
-                self._fleet.load_axis(axis, under("learner.", state), anew=True)
+                learner = under("learner.", state)
+                # Of a service with competing models, the one that learns.
+                self._fleet.load_axis(axis, under(f"model.{LEARN}.", learner) or learner, anew=True)
                 restored.append(axis)
-            except (OSError, DehystError):
+            except (OSError, DehystError) as error:
                 self.counts["refused"] += 1
+                self.error = f"{self._path(axis)}: {error}"
         self.counts["restored"] += len(restored)
         return restored
 

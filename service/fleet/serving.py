@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from adaptive.compiled import compiled
 from adaptive.errors import DehystError
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.fleet.snapshot import FleetSnapshot
 from adaptive.fleet.state import OUTCOMES
 from adaptive.inverse_model import LssvmInverse
@@ -30,12 +29,13 @@ from service.config.settings import LEARN, ServeConfig
 from service.fleet.checkpoints import FleetCheckpoints
 from service.fleet.settings import FleetSettings
 from service.fleet.wire import REFUSED, FleetMessage, decode_fleet, encode_fleet
-from service.operating.server import FREEZE, THAW, Journal, answer_to
-from service.operating.verbs import decode_request, take
+from service.operating.server import FREEZE, THAW, Journal, OperationsServer
+from service.operating.verbs import Outcome, Request, take
 from service.protocol.container import JSON, fields_of, to_json
+from service.protocol.delta import FollowedState, encode_delta
 from service.protocol.errors import FieldError, ServiceError
 from service.protocol.keys import Keys
-from service.protocol.model import encode_model
+from service.protocol.model import model_parts
 from service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
 from service.runtime.session import open_service
 from service.server.query_answers import guarded
@@ -50,6 +50,8 @@ _WORST, _STATUS_S = 10, 1.0
 #: Returns axes to their checkpoints. Most axes that are written before an operator is answered.
 ROLLBACK: Final = "rollback"
 _WRITTEN_AT_ONCE: Final = 16
+#: Most axes whose models are followed at a time.
+_MOST_FOLLOWED: Final = 64
 
 
 def load_fleet(settings: FleetSettings) -> Fleet:
@@ -80,38 +82,30 @@ def answer(
     snapshot: FleetSnapshot, tracked: FloatArray, limits: Limits, query: FleetMessage, seq: int
 ) -> tuple[bytes, int]:
     """The payload of the reply to a query, and the number of its points that were refused. Pure."""
-    axes, asked, k, q = len(tracked), query.axes, query.rows, query.parts
-    here = slice(query.first, min(query.first + asked, axes))
-    known = max(here.stop - here.start, 0)
-    if q["memory"] is not None and q["memory"].shape[1] != snapshot.memory_size:
-        raise FieldError("columns", q["memory"].shape[1], f"{snapshot.memory_size}, the size of a memory")
-    given = np.stack([q[name][:, :known].T for name in ("y_um", "v_um_per_s", "a_um_per_s2")])
+    q, numbers = query.parts, query.first + np.arange(query.axes)
+    unknown = numbers >= len(tracked)
+    at = np.where(unknown, 0, numbers)
+    if q["memory"] is not None and q["memory"].shape[1] != tracked.shape[1]:
+        raise FieldError("columns", q["memory"].shape[1], f"{tracked.shape[1]}, the size of a memory")
+    given = np.stack([q[name].T for name in ("y_um", "v_um_per_s", "a_um_per_s2")])
     refused = ~np.isfinite(given).all(0) | ~((given[0] >= limits.y_min_um) & (given[0] <= limits.y_max_um))
-    memory = tracked.copy()
-    if q["memory"] is not None and known:
-        sound = np.isfinite(q["memory"][:known]).all(1)
+    memory = tracked[at]
+    if q["memory"] is not None:
+        sound = np.isfinite(q["memory"]).all(1)
         refused |= ~sound[:, None]
-        memory[here][sound] = q["memory"][:known][sound]
+        memory[sound] = q["memory"][sound]
     # From its first refused point on, an axis' memory would be unknown.
-    refused = np.logical_or.accumulate(refused, axis=1)
-    motion = np.zeros((3, axes, k))
-    motion[:, here] = np.where(refused, 0.0, given)
-    said = snapshot.feedforward(motion[0], motion[1], motion[2], memory)
-    u, std = np.full((2, asked, k), np.nan)
-    flags = np.zeros((asked, k), dtype=np.uint8)
-    u[:known], std[:known] = said.u_V[here], said.std_V[here]
-    before = np.full(asked, np.nan) if q["u_before_V"] is None else q["u_before_V"]
-    step_V = limits.slew_V_per_s * snapshot.bases[0].dt_s
-    _limit_all(u[:known], said.inside[here], before, limits.u_min_V, limits.u_max_V, step_V, flags)
-    after = np.full((asked, snapshot.memory_size), np.nan)
-    after[:known] = np.where(refused[:, -1:], memory[here], said.memory[here])
-    unanswered = np.ones((asked, k), dtype=np.bool_)
-    unanswered[:known] = refused
-    u[unanswered], std[unanswered], flags[unanswered] = np.nan, np.nan, REFUSED
-    reply = encode_fleet(
-        FLEET_REPLY, query.first, snapshot_seq=[seq], u_V=u.T, std_V=std.T, memory=after, flags=flags.T
-    )
-    return reply, int(unanswered.sum())
+    refused = np.logical_or.accumulate(refused | unknown[:, None], axis=1)
+    y_um, v_um_per_s, a_um_per_s2 = np.where(refused, 0.0, given)
+    u, std, inside, after = snapshot.feedforward(y_um, v_um_per_s, a_um_per_s2, memory, at)
+    flags = np.zeros(refused.shape, dtype=np.uint8)
+    before = np.full(query.axes, np.nan) if q["u_before_V"] is None else q["u_before_V"]
+    _limit_all(u, inside, before, limits.u_min_V, limits.u_max_V, limits.slew_V_per_s * snapshot.bases[0].dt_s, flags)
+    u[refused], std[refused], flags[refused] = np.nan, np.nan, REFUSED
+    after = np.where(refused[:, -1:], memory, after)
+    after[unknown] = np.nan
+    parts = {"snapshot_seq": [seq], "u_V": u.T, "std_V": std.T, "memory": after, "flags": flags.T}
+    return encode_fleet(FLEET_REPLY, query.first, **parts), int(refused.sum())
 
 
 @compiled
@@ -134,13 +128,20 @@ class FleetService:
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self._fleet = load_fleet(self.settings)
         self._checkpoints = None
-        self._journal = Journal(self.settings.checkpoints)
+        self._durable = False
+        self._operations = OperationsServer(
+            self.keys, self.instance, self, Journal(self.settings.checkpoints), lambda *_: None,
+            settle=lambda: self._durable, replayed=False,
+        )  # fmt: skip
         if self.settings.checkpoints is not None:
             folder, period_s = self.settings.checkpoints, self.settings.checkpoint_s
             self._checkpoints = FleetCheckpoints(self._fleet, folder, config.stage, self.instance, period_s)
             self._checkpoints.restore(range(self.settings.axes))
-        self._newest = self._fleet.snapshot(), self._fleet.memory(), -1
+        self._renew(-1)
         self._published = self._newest[0].linear
+        #: The axes that are followed: publisher, state, and whether somebody subscribed lately.
+        self._followed: dict[int, tuple[Any, FollowedState, bool]] = {}
+        self._session: Any = None
         self._queue: queue.Queue[FleetMessage | Callable[[], None]] = queue.Queue()
         self._counts = dict.fromkeys(_COUNTED, 0)
         self._counting = threading.Lock()
@@ -150,13 +151,13 @@ class FleetService:
     def __enter__(self) -> FleetService:
         config, keys = self.config, self.keys
         with ExitStack() as ending:
-            session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
+            self._session = session = open_service(config.listen, config.connect, config.zenoh_config, config.lease_s)
             ending.callback(session.close)
             publisher = session.declare_publisher(keys.model)
             ending.callback(publisher.undeclare)
             if self._checkpoints is not None:
                 ending.callback(self._checkpoints.close)
-            thread = threading.Thread(target=self._run, args=(session, publisher), name="learn-fleet")
+            thread = threading.Thread(target=self._run, args=(publisher,), name="learn-fleet")
             thread.start()
             ending.callback(self._stop, thread)
             for entity in (
@@ -164,7 +165,7 @@ class FleetService:
                 session.declare_queryable(keys.feedforward, self._answers(keys.feedforward, self._feedforward)),
                 session.declare_queryable(keys.model, self._in_turn(keys.model, self._model)),
                 session.declare_queryable(keys.status, self._in_turn(keys.status, self._status_reply)),
-                session.declare_queryable(keys.operate, self._in_turn(keys.operate, self._operate)),
+                session.declare_queryable(keys.operate, self._in_turn(keys.operate, self._operations.handle)),
                 # Last, because alive means callable.
                 session.liveliness().declare_token(keys.alive(self.instance)),
             ):
@@ -231,7 +232,7 @@ class FleetService:
 
     # ---- the thread that learns
 
-    def _run(self, session: zenoh.Session, publisher: Any) -> None:
+    def _run(self, publisher: Any) -> None:
         handled, told_s, changed_s = 0, 0.0, 0.0
         while not self._stopping.is_set():
             try:
@@ -241,7 +242,7 @@ class FleetService:
             if isinstance(item, FleetMessage):
                 before, handled = handled // self.settings.snapshot_every, handled + self._learn(item)
                 if handled // self.settings.snapshot_every > before:
-                    self._newest = self._fleet.snapshot(), self._fleet.memory(), int(item.parts["seq"].max())
+                    self._renew(int(item.parts["seq"].max()))
                 if self._checkpoints is not None:
                     self._checkpoints.write_due()
             elif item is not None:
@@ -249,10 +250,15 @@ class FleetService:
             now_s = time.monotonic()
             if now_s - told_s >= _STATUS_S:
                 told_s = now_s
-                session.put(self.keys.status, to_json(self.status()), encoding=JSON)
+                self._session.put(self.keys.status, to_json(self.status()), encoding=JSON)
             if now_s - changed_s >= 1.0 / self.settings.model_hz:
                 changed_s = now_s
                 self._publish_changes(publisher)
+                self._publish_followed()
+
+    def _renew(self, seq: int) -> None:
+        """Answer from the models as they stand after sample ``seq``."""
+        self._newest = self._fleet.snapshot(), self._fleet.memory(), seq
 
     def _learn(self, batch: FleetMessage) -> int:
         """Take all samples of a message; returns their number."""
@@ -280,11 +286,24 @@ class FleetService:
             changes = encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, frames=frames, beta=beta)
             publisher.put(changes)
 
-    def _axis_of(self, payload: bytes) -> int | None:
-        """The axis that a request names; None for none. Raises InputError."""
-        if not payload:
-            return None
-        return self._checked(fields_of(payload).get("axis"), "axis")
+    def _publish_followed(self) -> None:
+        """Send what has changed of the models of single axes to those that follow them."""
+        memory = self._fleet.memory() if self._followed else None
+        for axis, (publisher, before, lately) in list(self._followed.items()):
+            follows = publisher.matching_status.matching
+            # Just after it was declared, a publisher may not know of its subscribers yet.
+            if not (follows or lately):
+                publisher.undeclare()
+                del self._followed[axis]
+                continue
+            now, message = before.replaced(self._state_of(axis, memory, before))
+            self._followed[axis] = publisher, now, follows
+            if message is not None:
+                publisher.put(encode_delta(message))
+
+    def _state_of(self, axis: int, memory: Any, like: FollowedState | None = None) -> FollowedState:
+        model = self._fleet.model_of(axis)
+        return FollowedState.of(*model_parts(LEARN, model, memory[axis]), model.seq, like)
 
     def _checked(self, axis: object, field: str) -> int:
         if isinstance(axis, bool) or not isinstance(axis, int) or not 0 <= axis < self.settings.axes:
@@ -292,20 +311,30 @@ class FleetService:
         return axis
 
     def _model(self, payload: bytes) -> bytes:
-        axis = self._axis_of(payload)
-        if axis is None:
-            raise FieldError("axis", "nothing", 'JSON with the number of one axis, {"axis": 0}')
-        learner = self._fleet.learner_of(axis)
-        model = learner.snapshot()
-        return encode_model(LEARN, model, model.seq, self._fleet.memory()[axis])
+        """The whole model of an axis; with "changes" the one that the next change changes."""
+        fields = fields_of(payload)
+        axis = self._checked(fields.get("axis"), "axis")
+        if axis not in self._followed or not fields.get("changes"):
+            state = self._state_of(axis, self._fleet.memory())
+            if not fields.get("changes"):
+                return state.payload()
+            if len(self._followed) >= _MOST_FOLLOWED:
+                raise ServiceError(f"{_MOST_FOLLOWED} axes are followed already: ask for whole models, or later")
+            self._followed[axis] = self._session.declare_publisher(f"{self.keys.model_delta}/{axis}"), state, True
+        return self._followed[axis][1].payload()
 
     def _status_reply(self, payload: bytes) -> bytes:
-        axis = self._axis_of(payload)
-        return to_json(self.status() if axis is None else self.axis_status(axis))
+        axis = fields_of(payload).get("axis")
+        return to_json(self.status() if axis is None else self.axis_status(self._checked(axis, "axis")))
 
-    def _operate(self, payload: bytes) -> bytes:
-        """A verb of the operator for the axes that it names."""
-        request, fleet, kept = decode_request(payload), self._fleet, self._checkpoints
+    @property
+    def background(self) -> tuple[str, ...]:
+        """Verbs that start background work: none."""
+        return ()
+
+    def apply(self, request: Request) -> Outcome:
+        """Carry out a verb of the operator for the axes that it names; see `service.operating.verbs.Verbs`."""
+        kept = self._checkpoints
         verbs = (FREEZE, THAW) if kept is None else (FREEZE, THAW, ROLLBACK)
         if request.verb not in verbs:
             raise FieldError("verb", repr(request.verb), f"one of {', '.join(verbs)}")
@@ -315,19 +344,17 @@ class FleetService:
         if request.verb == ROLLBACK and kept is not None:
             axes = kept.restore(axes)
             if not axes:
-                raise ServiceError("none of these axes has a checkpoint that fits")
+                raise ServiceError(f"none of these axes has a checkpoint that fits; {kept.error}")
         else:
-            fleet.freeze(axes, request.verb == FREEZE)
+            self._fleet.freeze(axes, request.verb == FREEZE)
         # So many at once would hold up the samples; the others are written in their turn.
-        durable = kept is not None and len(axes) <= _WRITTEN_AT_ONCE and kept.write(axes)
-        newest = fleet.snapshot()
-        self._newest = newest, fleet.memory(), int(newest.seq.max())
-        self._journal.write({"who": request.who, "verb": request.verb, "arguments": {"axes": axes}, "ok": True})
-        return answer_to(request, self.keys, self.instance, self._newest[2], durable, 0, {"axes": axes})
+        self._durable = kept is not None and len(axes) <= _WRITTEN_AT_ONCE and kept.write(axes)
+        self._renew(int(self._fleet.snapshot().seq.max()))
+        return self._newest[2], {"axes": axes}
 
     def status(self) -> dict[str, Any]:
         """The summary: counts, and the worst axes first."""
-        fleet = self._fleet
+        fleet, kept = self._fleet, self._checkpoints
         errors, troubles, outcomes = fleet.rms_error_pct(), fleet.troubles(), fleet.outcomes()
         # An axis in trouble is worse than any that learns.
         order = sorted(range(fleet.axes), key=lambda axis: (axis not in troubles, -errors[axis]))
@@ -338,8 +365,9 @@ class FleetService:
             "seq": self._newest[2], "samples": counts,
             "gates": {name: int(n) for name, n in zip(OUTCOMES, outcomes.sum(0), strict=True)},
             "rms_error_pct": {"median": float(np.median(errors)), "max": float(errors.max())},
-            "apart": len(fleet.apart), "in_trouble": len(troubles), "frozen": fleet.frozen.tolist(),
-            "checkpoints": self._checkpoints.counts if self._checkpoints is not None else None,
+            "apart": len(fleet.apart), "in_trouble": len(troubles), "frozen": sorted(fleet.held),
+            "checkpoints": None if kept is None else {**kept.counts, "error": kept.error},
+            "operations": self._operations.counters(), "followed": len(self._followed),
             "worst": [{"axis": axis, "rms_error_pct": float(errors[axis]), "trouble": troubles.get(axis, "")}
                       for axis in order[:_WORST]],
         }  # fmt: skip

@@ -6,7 +6,6 @@ point, then those of the next. A value that is not finite concerns its axis alon
 
 from __future__ import annotations
 
-import math
 import struct
 from typing import Any, Final, NamedTuple
 
@@ -95,16 +94,12 @@ def decode_fleet(kind: int, data: bytes) -> FleetMessage:
     ):
         if not good:
             raise FieldError(name, value, expected)
-    sizes, at = {"k": rows, "B": axes, "m": columns, "1": 1, "2": 2}, begin
-    shapes = [tuple(sizes[letter] for letter in letters) for _, _, letters in there]
-    counts = [math.prod(shape) for shape in shapes]
-    bytes_of = [count * np.dtype(dtype).itemsize for count, (_, dtype, _) in zip(counts, there, strict=True)]
-    check_length(data, at + sum(bytes_of))
+    sizes = {"k": rows, "B": axes, "m": columns, "1": 1, "2": 2}
+    layout = np.dtype([(name, dtype, tuple(sizes[letter] for letter in letters)) for name, dtype, letters in there])
+    check_length(data, begin + layout.itemsize)
+    body = np.frombuffer(data, layout, 1, begin)[0]
     parts: dict[str, Any] = {name: None for name, _, _ in _LAYOUT[kind]}
-    for (name, dtype, _), shape, count, size in zip(there, shapes, counts, bytes_of, strict=True):
-        values = np.frombuffer(data, dtype=dtype, count=count, offset=at).reshape(shape)
-        parts[name] = values.astype(values.dtype.newbyteorder("="))
-        at += size
+    parts |= {name: body[name].astype(body[name].dtype.newbyteorder("=")) for name, _, _ in there}
     for number in parts["seq"].tolist() if "seq" in parts else ():
         check_seq("seq", number)
     return FleetMessage(first, axes, rows, parts)

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 import zenoh
 
 from adaptive.errors import DehystError
-from service.operating.verbs import MAX_BYTES, Request, Verbs, decode_request
+from service.operating.verbs import MAX_BYTES, Outcome, Request, decode_request
 from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
@@ -203,6 +203,15 @@ def answer_to(
     return to_json(answer)
 
 
+class Commands(Protocol):
+    """What carries out the commands: the verbs of an axis, or a fleet; see `Verbs`."""
+
+    @property
+    def background(self) -> tuple[str, ...]: ...
+
+    def apply(self, request: Request) -> Outcome: ...
+
+
 class OperationsServer:
     """The queryable ``.../operate`` of one axis and the thread behind it.
 
@@ -216,19 +225,21 @@ class OperationsServer:
     samples : count of all samples when the last command was applied.
     tell : tells the standbys of a freeze or thaw, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
+    replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
     """
 
     def __init__(
         self,
         keys: Keys,
         instance: str,
-        verbs: Verbs,
+        verbs: Commands,
         journal: Journal,
         note: Callable[[str, str], None],
         role: Callable[[], str] = lambda: "primary",
         samples: Callable[[], int] = lambda: 0,
         tell: Callable[[str, str], int] = lambda _verb, _who: 0,
         settle: Callable[[], bool] = lambda: False,
+        replayed: bool = True,
     ) -> None:
         self._keys = keys
         self._instance = instance
@@ -244,6 +255,7 @@ class OperationsServer:
         self._turned_away: deque[tuple[bytes, str]] = deque()
         self._more_turned_away = 0
         self._counting = threading.Lock()
+        self._replayed = replayed
         self._counts = {"done": 0, "refused": 0}
         self._queue: queue.Queue[tuple[zenoh.Query, bytes | None] | None] = queue.Queue(_WAITING)
         self._thread: threading.Thread | None = None
@@ -285,7 +297,7 @@ class OperationsServer:
                 self._note("internal_error", f"{self._keys.operate}: {type(error).__name__}: {error}")
             raise
         self._counts["done"] += 1
-        journaled = self._write(request, seq=seq)
+        journaled = self._write(request, seq=seq) and self._replayed
         standbys = self._tell(request.verb, request.who) if request.verb in (FREEZE, THAW) else 0
         settled = request.verb not in self._verbs.background and self._settle()
         return answer_to(request, self._keys, self._instance, seq, journaled or settled, standbys, result)

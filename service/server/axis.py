@@ -576,6 +576,11 @@ class Axis:
 
     def restore(self, state: StateDict) -> None:
         """Continue from ``state``. Raises ModelFileError if it does not fit; the axis is then unchanged."""
+        if not any(name.startswith("sequence.") for name in state):
+            raise ModelFileError(
+                "it holds a learner alone, as the file of an axis of a fleet does; serve it by a [fleet], or remove it "
+                "to begin with the model file"
+            )
         self._check_state(state)
         try:
             sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from adaptive.errors import InputError, ModelFileError
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import NO_SAMPLE, Fleet
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.fleet.state import OUTCOMES
+from adaptive.fleet.step import NO_SAMPLE
 from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
@@ -120,7 +120,7 @@ def test_each_axis_equals_the_single_learner(models: list[LssvmInverse]) -> None
     u, y = samples(10_000)
     compare(fleet, singles, 0, u, y, 250)
     for axis, single in enumerate(singles):
-        got, expected = fleet.counters(axis), single.counters()
+        got, expected = fleet.learner_of(axis).counters(), single.counters()
         # When a step is refined depends on the last bits.
         rounding = ("window_residuals_exceeded", "window_refinements")
         assert {n: v for n, v in got.items() if n not in rounding} == {
@@ -206,10 +206,10 @@ def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(mo
     # A sample takes them back into the batch: what is found there is found by the fleet's own check. Outcomes are
     # compared alone: a frozen axis serves what it served before, a single learner its confirmed estimate.
     compare(fleet, singles, at, u[:, at : at + 1], y[:, at : at + 1], 2, gaps=False)
-    assert fleet.apart == ()
+    assert fleet.apart == {}
     compare(fleet, singles, at + 1, u[:, at + 1 : at + 11], y[:, at + 1 : at + 11], 11, gaps=False)
     for axis, single in enumerate(singles):
-        assert fleet.counters(axis)["distrusts"] == single.counters()["distrusts"] == int(axis in (1, 2))
+        assert fleet.learner_of(axis).counters()["distrusts"] == single.counters()["distrusts"] == int(axis in (1, 2))
         beta = fleet.learner_of(axis).parts.filter.beta
         np.testing.assert_allclose(beta, single.parts.filter.beta, rtol=0.0, atol=ALIKE)
         np.testing.assert_allclose(beta, learnt[axis], rtol=0.0, atol=0.01 * models[axis].span_V)
@@ -219,7 +219,7 @@ def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(mo
         singles[axis].thaw()
     compare(fleet, singles, at + 11, u[:, at + 11 :], y[:, at + 11 :], 50)
     assert fleet.troubles() == {}
-    assert [fleet.counters(axis)["begun_again"] for axis in range(4)] == [0, 0, 0, 0]
+    assert [fleet.learner_of(axis).counters()["begun_again"] for axis in range(4)] == [0, 0, 0, 0]
 
 
 def test_a_model_that_leaves_its_envelope_ends_in_the_identified_one_as_in_a_single_learner(
@@ -233,9 +233,9 @@ def test_a_model_that_leaves_its_envelope_ends_in_the_identified_one_as_in_a_sin
     beta[0] += 0.6 * models[1].span_V
     doctor(fleet, singles, 1, beta)
     compare(fleet, singles, at, u[:, at : at + 50], y[:, at : at + 50], 51, gaps=False)
-    assert fleet.counters(1)["begun_again"] == 0
+    assert fleet.learner_of(1).counters()["begun_again"] == 0
     compare(fleet, singles, at + 50, u[:, at + 50 : at + 150], y[:, at + 50 : at + 150], 101, gaps=False)
-    assert [fleet.counters(axis)["begun_again"] for axis in range(4)] == [0, 1, 0, 0]
+    assert [fleet.learner_of(axis).counters()["begun_again"] for axis in range(4)] == [0, 1, 0, 0]
     assert fleet.troubles() == {1: MODEL_LEFT_ENVELOPE}
     fleet.freeze([1], False)
     singles[1].thaw()
@@ -275,7 +275,7 @@ def test_a_refused_step_is_the_single_learners_and_costs_no_other_axis(models: l
     refused = [single.counters()["window_ill_conditioned"] for single in singles]
     assert refused[1] > 0
     assert refused[0] == refused[2] == refused[3] == 0
-    assert [fleet.counters(axis)["window_ill_conditioned"] for axis in range(4)] == refused
+    assert [fleet.learner_of(axis).counters()["window_ill_conditioned"] for axis in range(4)] == refused
 
 
 def test_axes_with_twelve_inputs_equal_single_learners() -> None:
@@ -290,25 +290,25 @@ def test_axes_with_twelve_inputs_equal_single_learners() -> None:
     compare(fleet, singles, 0, u, y, 100)
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInverse], backend: str) -> None:
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInverse], device: str) -> None:
     config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
-    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    fleet = Fleet(models, FleetConfig(config, device))
     singles = [Learner(model, config) for model in models]
     u, y = samples(1500)
     compare(fleet, singles, 0, u[:, :700], y[:, :700], 100)
     # Out of the fleet, and into it: the axes change places with the single learners.
-    out = [Learner.from_state(fleet.export_axis(axis)) for axis in range(4)]
+    out = [Learner.from_state(fleet.learner_of(axis).state_dict()) for axis in range(4)]
     for axis, single in enumerate(singles):
         fleet.load_axis(axis, single.state_dict())
     compare(fleet, out, 700, u[:, 700:], y[:, 700:], 100)
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], backend: str) -> None:
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], device: str) -> None:
     weights, solver = WeightConfig(half_life_s=0.3, acceleration=1.0), SolverConfig(form="inverse")
     config = LearnerConfig(window=60, eviction="fifo", weights=weights, solver=solver)
-    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    fleet = Fleet(models, FleetConfig(config, device))
     singles = [Learner(model, config) for model in models]
     u, y = samples(1200)
     compare(fleet, singles, 0, u, y, 100)
@@ -329,7 +329,8 @@ def test_axes_that_begin_as_one_window_learn_apart(models: list[LssvmInverse], s
         fleet.step(k, k * DT, u[0, k], np.where(np.arange(900) == 3, y[0, k], 1.01 * y[0, k]), present)
         for axis, single in moving.items():
             single.handle(Sample(k, k * DT, float(u[0, k]), float(y[0, k] if axis == 3 else 1.01 * y[0, k])))
-    begun, states = Learner(models[0], config).state_dict(), [fleet.export_axis(axis) for axis in (3, 899, 2, 898)]
+    begun = Learner(models[0], config).state_dict()
+    states = [fleet.learner_of(axis).state_dict() for axis in (3, 899, 2, 898)]
     for name in ("window.PR", "window.P", "window.R", "window.V"):
         for axis, state in zip(moving, states, strict=False):
             if name in state:
@@ -366,15 +367,17 @@ def test_bad_values_are_refused_for_their_axis_alone(models: list[LssvmInverse])
     assert (fleet.outcomes() - before).sum() == 4
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_a_frozen_axis_learns_nothing(models: list[LssvmInverse], backend: str) -> None:
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+def test_a_frozen_axis_learns_nothing(models: list[LssvmInverse], device: str) -> None:
     config = LearnerConfig(window=60, solver=SolverConfig(form="inverse"))
-    fleet = Fleet(models, FleetConfig(config, backend=backend))  # type: ignore[arg-type]
+    fleet = Fleet(models, FleetConfig(config, device))
     u, y = samples(1200)
     for k in range(600):
         fleet.step(k, k * DT, u[:, k], y[:, k])
-    before = fleet.snapshot()
+    learnt = fleet.snapshot()
     fleet.freeze([2])
+    before = fleet.snapshot()
+    np.testing.assert_allclose(before.linear, learnt.linear, rtol=1e-14)
     # Its stage changes, so that the identified model would be served, and the axis is apart for a while.
     y[2, 650:] = 0.5 * y[2, 650:]
     apart = False
@@ -385,13 +388,16 @@ def test_a_frozen_axis_learns_nothing(models: list[LssvmInverse], backend: str) 
     changed = [not np.array_equal(before.linear[axis], after.linear[axis]) for axis in range(4)]
     assert changed[1:] == [True, False, True]
     assert apart
-    assert fleet.counters(2)["frozen"] > 0
+    assert fleet.learner_of(2).counters()["frozen"] > 0
     # To the last bit, stated deviations too.
     at_um, memory = np.full((4, 1), 40.0), before.rest_memory()
     answers = [one.feedforward(at_um, 0.0 * at_um, 0.0 * at_um, memory) for one in (before, after)]
     assert answers[0].u_V[2] == answers[1].u_V[2]
     assert answers[0].std_V[2] == answers[1].std_V[2]
     assert before.valid[2] == after.valid[2]
+    # Its model on demand is what it serves.
+    alone = fleet.model_of(2).feedforward(at_um[2], 0.0 * at_um[2], 0.0 * at_um[2], memory[2])
+    assert alone.u_V[0] == answers[1].u_V[2, 0]
     fleet.freeze([2], False)
     assert fleet.snapshot().feedforward(at_um, 0.0 * at_um, 0.0 * at_um, memory).std_V[2] != answers[1].std_V[2]
 
@@ -402,9 +408,9 @@ def test_what_does_not_fit_is_refused_by_name(models: list[LssvmInverse]) -> Non
     with pytest.raises(InputError, match=r"u_V: got shape \(3,\), expected \(4,\)"):
         fleet.step(0, 0.0, [1.0, 2.0, 3.0], 0.0)
     with pytest.raises(ModelFileError, match="axis 1: the state is of another model"):
-        fleet.load_axis(1, fleet.export_axis(0))
+        fleet.load_axis(1, fleet.learner_of(0).state_dict())
     other = replace(models[1], features=replace(models[1].features, dt_s=2e-3))
     with pytest.raises(InputError, match=r"models\[1\].dt_s: got 0.002, expected 0.001"):
         Fleet([models[0], other], config)
-    with pytest.raises(InputError, match="'inverse', which backend 'torch' has"):
-        FleetConfig(LearnerConfig(window=60), backend="torch")
+    with pytest.raises(InputError, match="'inverse', which device 'cpu:0' has"):
+        FleetConfig(LearnerConfig(window=60), "cpu:0")

@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 import zenoh
 
-from adaptive.errors import InputError
-from adaptive.fleet.config import FleetConfig
-from adaptive.fleet.fleet import Fleet
+from adaptive.errors import InputError, ModelFileError
+from adaptive.fleet.fleet import Fleet, FleetConfig
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import Learner
 from adaptive.types import Sample, prefixed, under
-from service.config.settings import parse_config
+from service.answers.guard import Limits
+from service.client.follower import Follower
+from service.config.learner import learner_config
+from service.config.settings import AxisConfig, parse_config
 from service.fleet import wire
 from service.fleet.checkpoints import FleetCheckpoints
 from service.operating.remote import operate
@@ -29,9 +31,11 @@ from service.protocol.errors import RefusedError
 from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import LIMITED_VOLTAGE
+from service.protocol.samples import SampleBatch
 from service.runtime.session import open_client
+from service.server.axis_loading import load_axis
 from service.storage.checkpoint import CheckpointMeta, decode_checkpoint, encode_checkpoint
-from service.storage.model_file import BundleMeta, write_bundle
+from service.storage.model_file import Bundle, BundleMeta, write_bundle
 from tests.service.conftest import ServeProcess, make_models, unused_port
 
 DT_S, AXES = 1e-3, 64
@@ -101,6 +105,28 @@ def eventually(condition: Callable[[], Any]) -> Any:
         assert time.monotonic() < until, "did not come true in time"
         time.sleep(0.05)
     return value
+
+
+def follow_one_axis(session: zenoh.Session) -> None:
+    """An axis is followed as a model of a service is: its kernel part comes as changes, with fingerprints."""
+    limits, of, key = Limits(0.0, 10.0, 2000.0), b'{"axis": 9, "changes": true}', f"{KEYS.model_delta}/9"
+    follower = Follower(session, key, "lssvm_adaptive", lambda: ask(session, KEYS.model, of), limits, deltas=True)
+    changed = follower.changes
+    assert changed is not None
+    before = follower.model.state_dict()
+    for first in range(1801, 2401, 20):
+        send(session, samples(*motion(first, 20)))
+        eventually(lambda: status(session)["samples"]["waiting"] < 100)
+    eventually(lambda: status(session)["seq"] == 2400)
+    assert status(session)["followed"] == 1
+    now = decode_model(ask(session, KEYS.model, b'{"axis": 9}')).model.state_dict()
+    for name in ("support", "alpha", "beta"):
+        eventually(lambda name=name: np.array_equal(follower.model.state_dict()[name], now[name]))  # type: ignore[misc]
+        assert not np.array_equal(before[name], now[name])
+    assert changed.changes > 0
+    assert (changed.lost, changed.mismatches, changed.repairs, changed.refused) == (0, 0, 0, 0)
+    follower.close()
+    eventually(lambda: status(session)["followed"] == 0)
 
 
 @pytest.mark.e2e
@@ -175,6 +201,7 @@ def test_a_fleet_learns_answers_and_refuses_axis_by_axis(service: ServeProcess) 
         model = decode_model(ask(session, KEYS.model, b'{"axis": 9}')).model
         assert model.features.gain == pytest.approx(GAINS[9], rel=0.05)  # type: ignore[attr-defined]
         assert len(list(session.liveliness().get(f"{KEYS.base}/alive/*"))) == 1
+        follow_one_axis(session)
     code, last, complaints = service.stop()
     assert (code, complaints) == (0, "")
     assert last["fleet"]["samples"]["points_refused"] == 3
@@ -259,11 +286,19 @@ def test_an_operator_freezes_axes_and_takes_them_back(tmp_path: Path) -> None:
                     operate(session, KEYS, "freeze", "alice", wrong)
             with pytest.raises(RefusedError, match="one of freeze, thaw, rollback"):
                 operate(session, KEYS, "select", "alice", {"axes": [1]})
+            assert status(session)["operations"] == {"done": 2, "refused": 5, "unlogged": 0}
     finally:
         process.kill()
     lines = (tmp_path / "kept" / "operations.jsonl").read_text(encoding="utf-8").splitlines()
-    said = [{name: json.loads(line)[name] for name in ("who", "verb", "arguments")} for line in lines]
-    assert said[-1] == {"who": "alice", "verb": "freeze", "arguments": {"axes": [9, 5]}}
+    said = [json.loads(line) for line in lines]
+    done = [{name: one[name] for name in ("who", "verb", "arguments", "seq")} for one in said if one["ok"]]
+    assert done[-1] == {"who": "alice", "verb": "freeze", "arguments": {"axes": [9, 5]}, "seq": 599}
+    # Refused ones too, with the reason, as by a service of one axis.
+    refused = [(one["verb"], one["arguments"], one["error"]) for one in said if not one["ok"]]
+    assert refused[0][:2] == ("freeze", {"axes": [64]})
+    assert refused[-1][:2] == ("select", {"axes": [1]})
+    assert "one of freeze, thaw, rollback" in refused[-1][2]
+    assert len(refused) == 5
     process = ServeProcess(path, port)
     try:
         with open_client(process.endpoint) as session:
@@ -299,11 +334,40 @@ def test_an_axis_continues_from_the_file_of_a_service_of_one_axis(tmp_path: Path
     fleet = Fleet([base] * 3, FleetConfig(config))
     kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
     assert kept.restore(range(3)) == [1]
-    assert fleet.counters(1) == single.counters()
+    assert fleet.learner_of(1).counters() == single.counters()
     kept.close()
     # And back.
     restored = Learner.from_state(under("learner.", decode_checkpoint((tmp_path / "axis-0001.ckpt").read_bytes())[1]))
     np.testing.assert_array_equal(restored.parts.filter.beta, single.parts.filter.beta)
+
+
+def test_an_axis_continues_from_the_file_of_a_service_with_competing_models(tmp_path: Path) -> None:
+    """It takes the model that learns, under the same settings; what does not fit is named with its file."""
+    models = make_models()
+    limits = Limits(0.0, 10.0, 2000.0)
+    axis = load_axis(
+        "mirror",
+        AxisConfig("axis-0001", Path("x.npz"), limits, learner={"window": 60}),
+        bundle=Bundle(models, BundleMeta("mirror", "axis-0001", DT_S, y_min_um=0.0, y_max_um=90.0)),
+    )
+    seq, t_s, u_V, y_um = motion(0, 300)
+    axis.handle(SampleBatch(seq, t_s, u_V[:, 0], y_um[:, 0]))
+    assert len(str(axis.state_dict()["learner.names"]).split(",")) > 1
+    meta = CheckpointMeta("mirror", "axis-0001", DT_S, 299, 300, 0.0, "i1")
+    (tmp_path / "axis-0001.ckpt").write_bytes(b"".join(map(bytes, encode_checkpoint(meta, axis.state_dict()))))
+    # The way back is refused, because such a service keeps more than a learner.
+    base = models["lssvm_adaptive"]
+    assert isinstance(base, LssvmInverse)
+    with pytest.raises(ModelFileError, match=r"as the file of an axis of a fleet does; serve it by a \[fleet\]"):
+        axis.restore(prefixed("learner.", Learner(base).state_dict()))
+    for window, restored in ((60, [1]), (70, [])):
+        fleet = Fleet([base] * 3, FleetConfig(learner_config({"window": window}, limits, "learner")))
+        kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
+        assert kept.restore(range(3)) == restored
+        kept.close()
+        if restored:
+            assert fleet.learner_of(1).counters()["learnt"] > 0
+    assert "axis-0001.ckpt: axis 1: the state is of another configuration of the learner" in kept.error
 
 
 def parts_of(kind: int, rng: np.random.Generator) -> dict[str, Any]:
