@@ -455,7 +455,9 @@ def review(
             fit, held = less, held_less
             found, index = [], 0
             continue
-        looks, _ = search.looks(less, {f.name for f in less.model.causes} | {cause.name})
+        # Beside one of a set that shows only its sum, the other one is no rival of a third cause.
+        beside = search.catalogue.same_set({f.name for f in less.model.causes})
+        looks, _ = search.looks(less, beside | {cause.name})
         rivals = search.refit(less, looks, 4, 0.5 * gain)
         cost = search.cost(fit, held, less)
         polished = (search.polish(c, less) for c in rivals[:2])
