@@ -202,7 +202,8 @@ def diagnose(
         taught_um=taught_um,
         explained=explained,
         defects=recording_defects(doubles, floor.sigma_um, grid.step_um, dropped, data.n),
-        left=where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um),
+        left=(*where_left((on_test or (nominal, extended))[1], shown_mask, floor.sigma_um), *changing(search)),
+        unsteady=tuple(cause.name for cause in search.unsteady),
         on_test=on_test,
         catalogue=options.catalogue,
     )
@@ -283,6 +284,19 @@ def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float]
         values[name] = value
         spans[name] = (value - half, value + half)
     return values, spans
+
+
+def changing(search: Search) -> tuple[str, ...]:
+    """Sentences on the causes whose size changes from stretch to stretch."""
+    out = []
+    for cause in search.unsteady:
+        names = " or ".join(sorted(search.catalogue.same_set({cause.name}))).replace("_", " ")
+        low, high = np.quantile(cause.stretches.sizes, (0.1, 0.9))
+        out.append(
+            f"stretches: {names} would remove {100 * cause.share:.0f} % of it, but has {low:.2g} to {high:.2g} of its "
+            f"size in single stretches of the record: it is another error that looks like it"
+        )
+    return tuple(out)
 
 
 #: Share of the explainable squared error from which named causes explain a recording, or a part of it.

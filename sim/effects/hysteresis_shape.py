@@ -69,6 +69,7 @@ class HysteresisShape(CauseModel):
     """
 
     test_answers_to_others: bool = True
+    approximates: bool = True
     #: Voltage (V) that the stage had been driven to and back before the recording; 0 where it was relaxed.
     before_V: float = 0.0
 

@@ -82,6 +82,8 @@ class CauseModel:
     must_be_seen: bool = False
     #: So smooth in time that it imitates the rest of many others: where its test is not excited, it must explain most.
     imitates_others: bool = False
+    #: It approximates a class of stages, each stretch with another error: its size may differ between stretches.
+    approximates: bool = False
     #: Another drive can show it: False for what somebody has to do to the stage.
     shown_by_a_drive: bool = True
     #: It is shown by driving another axis, recorded or not.

@@ -16,6 +16,7 @@ from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
+from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
 from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_new_columns
 from sim.fitting.fit_data import ActsOn
 from sim.fitting.parallel import side_by_side
@@ -54,6 +55,9 @@ class Thresholds:
     #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative.
     close_share: float = 0.02
     close_sigmas: float = 2.5
+    #: Largest spread of a cause's size between the stretches that excite it, where at least so many excite it.
+    most_spread: float = 0.28
+    fewest_stretches: int = 6
 
 
 def first_fits(
@@ -133,6 +137,18 @@ class AcceptedCause:
     gain: float
 
 
+@dataclass(frozen=True)
+class UnsteadyCause:
+    """A cause that is not named because its size changes from stretch to stretch.
+
+    ``share``: what it removes of the held-out squared error of all other causes together.
+    """
+
+    name: str
+    share: float
+    stretches: StretchSizes
+
+
 @dataclass
 class Search:
     """The greedy search. `run` returns the accepted model."""
@@ -156,6 +172,8 @@ class Search:
     nominal_p: FloatArray | None = None
     #: Held-out squared error of the nominal stage (µm²).
     nominal_um2: float = 0.0
+    #: Causes that the review dropped because their size changes from stretch to stretch.
+    unsteady: list[UnsteadyCause] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.causes = self.causes or self.catalogue.forms
@@ -405,6 +423,22 @@ class Search:
                 return better, self.held(better)
         return fit, held
 
+    def stretches(self, fit: ModelFit, less: ModelFit) -> StretchSizes:
+        """The size by stretch of the cause of ``fit`` that ``less`` lacks."""
+        return sizes_by_stretch(less.residual_um * self.mask, fit.residual_um * self.mask, self.parts, self.sigma_um)
+
+    def steady(self, cause: CauseModel, stretches: StretchSizes) -> bool:
+        """Whether nothing speaks against one size of the cause in all stretches."""
+        few = stretches.sizes.size < self.thresholds.fewest_stretches
+        return few or cause.approximates or stretches.spread <= self.thresholds.most_spread
+
+    def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
+        """The fit to convergence, with a freer form of one of its causes where that explains more."""
+        fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, 12, 1e-5), self.mask)
+        held = self.held(fit)
+        freer = self._with_freer_form(fit)
+        return (freer.fit, freer.held) if freer is not None and freer.cost < held.sse_um2 else (fit, held)
+
     def without(self, fit: ModelFit, index: int) -> ModelFit:
         """The model without one cause, calibrated again."""
         where = fit.model.slice_of(index)
@@ -440,7 +474,8 @@ class ReviewedCause:
 def review(
     search: Search, fit: ModelFit, held: HeldOut, steps: dict[str, AcceptedCause]
 ) -> tuple[ModelFit, HeldOut, list[ReviewedCause]]:
-    """Remove each cause once more: drop it if idle, replace it if another explains more, collect its rivals."""
+    """Remove each cause once more: drop it if idle or if its size changes from stretch to stretch
+    (`Search.unsteady`), replace it if another explains more, collect its rivals."""
     thresholds = search.thresholds
     found: list[ReviewedCause] = []
     index = swaps = 0
@@ -455,7 +490,15 @@ def review(
             fit, held = less, held_less
             found, index = [], 0
             continue
-        looks, _ = search.looks(less, {f.name for f in less.model.causes} | {cause.name})
+        stretches = search.stretches(fit, less)
+        if not search.steady(cause, stretches):
+            search.unsteady.append(UnsteadyCause(cause.name, gain / held_less.sse_um2, stretches))
+            fit, held = search.filled(less)
+            found, index = [], 0
+            continue
+        # Beside one of a set that shows only its sum, the other one is no rival of a third cause.
+        beside = search.catalogue.same_set({f.name for f in less.model.causes})
+        looks, _ = search.looks(less, beside | {cause.name})
         rivals = search.refit(less, looks, 4, 0.5 * gain)
         cost = search.cost(fit, held, less)
         polished = (search.polish(c, less) for c in rivals[:2])

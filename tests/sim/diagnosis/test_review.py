@@ -1,0 +1,166 @@
+"""The review of accepted causes: what is dropped, and what may take the place of a cause."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adaptive.types import FloatArray
+from sim.diagnosis.diagnose import changing
+from sim.diagnosis.search.held_out import HeldOut, Split
+from sim.diagnosis.search.screening import ScreenedCause
+from sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
+from sim.diagnosis.search.stretches import sizes_by_stretch
+from sim.fitting.stage_model import CauseModel, ModelFit
+
+#: Twelve stretches of two blocks of ten samples.
+PARTS = Split(np.arange(25) * 10, np.repeat(np.arange(12) % 4, 2))
+SIGMA_UM = 0.1
+
+
+def held(per_stretch_um2: FloatArray) -> HeldOut:
+    blocks = np.repeat(per_stretch_um2 / 2.0, 2)
+    return HeldOut(blocks, float(blocks.sum()))
+
+
+def changed(per_stretch_um: FloatArray) -> FloatArray:
+    return np.repeat(per_stretch_um, 20)
+
+
+def test_neighbouring_blocks_of_one_fold_are_a_stretch() -> None:
+    parts = Split(np.array([0, 5, 10, 15, 20, 25]), np.array([0, 0, 1, 0, 0]))
+    np.testing.assert_array_equal(parts.stretch_sums(np.array([1.0, 2.0, 4.0, 8.0, 16.0])), [3.0, 4.0, 24.0])
+
+
+@given(st.lists(st.floats(-1.0, 3.0), min_size=12, max_size=12), st.floats(1e-3, 1e3), st.integers(0, 11))
+def test_each_stretch_that_excites_a_cause_has_its_own_size(sizes: list[float], scale: float, quiet: int) -> None:
+    """What is left without the cause is ``sizes`` times what the cause changes; quiet stretches say nothing."""
+    change = np.tile([1.0, -1.0], 120) * scale * changed(np.where(np.arange(12) < quiet, 1e-3, 1.0))
+    without = change * changed(np.array(sizes))
+    said = sizes_by_stretch(without, without - change, PARTS, 1e-6 * scale)
+    np.testing.assert_allclose(said.sizes, sizes[quiet:], atol=1e-9)
+    assert said.spread == pytest.approx(np.sqrt(np.mean(np.square(np.array(sizes[quiet:]) - 1.0))), abs=1e-4)
+
+
+def test_white_noise_alone_gives_no_spread() -> None:
+    random = np.random.default_rng(3)
+    change = 0.25 * SIGMA_UM * np.sign(random.standard_normal(24_000))
+    parts = Split(np.arange(25) * 1000, PARTS.fold)
+    noise = SIGMA_UM * random.standard_normal(change.size)
+    said = sizes_by_stretch(change + noise, noise, parts, SIGMA_UM)
+    assert said.sizes.size == 12
+    assert np.std(said.sizes) > 0.05
+    assert said.spread < 0.05
+
+
+def test_what_is_below_the_noise_everywhere_says_nothing() -> None:
+    said = sizes_by_stretch(changed(np.full(12, 0.06)), changed(np.full(12, 0.03)), PARTS, SIGMA_UM)
+    assert (said.sizes.size, said.spread) == (0, 0.0)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Two causes and nothing to simulate."""
+
+    causes: tuple[CauseModel, ...]
+
+    def parameters_of(self, p: FloatArray, index: int) -> FloatArray:
+        return p
+
+
+@dataclass(frozen=True)
+class Fit:
+    model: Model
+    residual_um: FloatArray
+    held: HeldOut
+    p: FloatArray = field(default_factory=lambda: np.zeros(1))
+
+    def without_signals(self) -> Fit:
+        return self
+
+
+@dataclass
+class Reviewed(Search):
+    """A search over made-up fits. ``size``: each cause by stretch (µm); each is fitted with a size of 1."""
+
+    size: dict[str, FloatArray] = field(default_factory=dict)
+    skipped: list[set[str]] = field(default_factory=list)
+
+    def fit_of(self, causes: tuple[CauseModel, ...]) -> ModelFit:
+        names = {c.name for c in causes}
+        left = np.zeros(12)
+        for name, size in self.size.items():
+            left = left + size - (name in names)
+        return cast(ModelFit, Fit(Model(causes), changed(left), held(np.square(left) + 0.01)))
+
+    def without(self, fit: ModelFit, index: int) -> ModelFit:
+        return self.fit_of((*fit.model.causes[:index], *fit.model.causes[index + 1 :]))
+
+    def held(self, fit: ModelFit) -> HeldOut:
+        return cast(Fit, fit).held
+
+    def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
+        return fit, self.held(fit)
+
+    def cost(self, fit: ModelFit, held: HeldOut, base: ModelFit) -> float:
+        return held.sse_um2
+
+    def looks(self, fit: ModelFit, skip: set[str]) -> tuple[list[ScreenedCause], list[CauseModel]]:
+        self.skipped.append(skip)
+        return [], []
+
+    def refit(self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float) -> list[CauseCandidate]:
+        return []
+
+
+def reviewed(size: dict[str, FloatArray], approximates: bool = False) -> tuple[Reviewed, list[str]]:
+    mask = np.ones(240, dtype=np.bool_)
+    search = Reviewed(mask, PARTS, SIGMA_UM, Thresholds(), 0, lambda *_: None, size=size)
+    fit = search.fit_of(tuple(replace(CauseModel(), name=name, approximates=approximates) for name in size))
+    steps = {name: AcceptedCause(name, 0.001, 0.5) for name in size}
+    _, _, found = review(search, fit, search.held(fit), steps)
+    return search, [one.name for one in found]
+
+
+#: The same on the whole, but hardly there in half of the stretches.
+CHANGING = np.tile([0.4, 1.6], 6)
+
+
+def test_a_cause_whose_size_changes_with_the_stretch_is_not_named_and_said() -> None:
+    search, named = reviewed({"rate_dependence": CHANGING})
+    assert named == []
+    assert [c.name for c in search.unsteady] == ["rate_dependence"]
+    (sentence,) = changing(search)
+    assert "rate dependence" in sentence
+    assert "0.4 to 1.6" in sentence
+
+
+@pytest.mark.parametrize(("size", "approximates"), [(np.tile([0.9, 1.1], 6), False), (CHANGING, True)])
+def test_a_cause_of_one_size_stays_and_so_does_an_approximation(size: FloatArray, approximates: bool) -> None:
+    search, named = reviewed({"rate_dependence": size}, approximates)
+    assert named == ["rate_dependence"]
+    assert not search.unsteady
+    assert changing(search) == ()
+
+
+def test_of_few_stretches_nothing_is_concluded() -> None:
+    few = np.concatenate([CHANGING[:4], np.ones(8)])
+    fit = changed(np.concatenate([np.ones(4), np.zeros(8)]))
+    said = sizes_by_stretch(fit * changed(few), fit * changed(few - 1.0), PARTS, 1e-3)
+    search, _ = reviewed({"creep": np.ones(12)})
+    assert (said.sizes.size, said.spread) == (4, pytest.approx(0.6, abs=1e-3))
+    assert search.steady(CauseModel(), said)
+
+
+def test_the_other_one_of_a_set_is_no_rival_of_a_third_cause() -> None:
+    """Actuator curve and sensor polynomial show only their sum: both would be named for one curve."""
+    search, named = reviewed({"asymmetry": np.ones(12), "mains_hum": np.ones(12)})
+    assert named == ["asymmetry", "mains_hum"]
+    of_asymmetry, of_hum = search.skipped
+    assert "sensor_nonlinearity" not in of_asymmetry
+    assert {"asymmetry", "sensor_nonlinearity"} <= of_hum
