@@ -17,6 +17,7 @@ from sim.diagnosis.search.screening import ScreenedCause
 from sim.diagnosis.search.search import AcceptedCause, CauseCandidate, Search, Thresholds, review
 from sim.diagnosis.search.stretches import sizes_by_stretch
 from sim.fitting.stage_model import CauseModel, ModelFit
+from sim.readings.sight import Sight
 
 #: Twelve stretches of two blocks of ten samples.
 PARTS = Split(np.arange(25) * 10, np.repeat(np.arange(12) % 4, 2))
@@ -118,9 +119,11 @@ class Reviewed(Search):
         return []
 
 
-def reviewed(size: dict[str, FloatArray], approximates: bool = False) -> tuple[Reviewed, list[str]]:
+def reviewed(
+    size: dict[str, FloatArray], approximates: bool = False, sights: dict[str, Sight] | None = None
+) -> tuple[Reviewed, list[str]]:
     mask = np.ones(240, dtype=np.bool_)
-    search = Reviewed(mask, PARTS, SIGMA_UM, Thresholds(), 0, lambda *_: None, size=size)
+    search = Reviewed(mask, PARTS, SIGMA_UM, Thresholds(), 0, lambda *_: None, size=size, sights=sights or {})
     fit = search.fit_of(tuple(replace(CauseModel(), name=name, approximates=approximates) for name in size))
     steps = {name: AcceptedCause(name, 0.001, 0.5) for name in size}
     _, _, found = review(search, fit, search.held(fit), steps)
@@ -146,6 +149,13 @@ def test_a_cause_of_one_size_stays_and_so_does_an_approximation(size: FloatArray
     assert named == ["rate_dependence"]
     assert not search.unsteady
     assert changing(search) == ()
+
+
+@pytest.mark.parametrize(("seen", "named"), [(True, ["creep"]), (None, []), (False, [])])
+def test_what_its_own_test_sees_stays_whatever_its_size(seen: bool | None, named: list[str]) -> None:
+    """As the creep of a measured stack, of which no form is exact."""
+    _, found = reviewed({"creep": CHANGING}, sights={"creep": Sight(seen, "")})
+    assert found == named
 
 
 def test_of_few_stretches_nothing_is_concluded() -> None:
