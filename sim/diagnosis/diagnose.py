@@ -8,6 +8,7 @@ import numpy as np
 from scipy import stats
 
 from adaptive.errors import InputError
+from adaptive.lapack import one_thread
 from adaptive.types import BoolArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.next_experiment import Rival, next_experiment
@@ -98,6 +99,7 @@ def diagnose_prepared(
     return diagnose(prepared.data, prepared.mask, options, progress, prepared.notes, prepared.dropped, prepared.test)
 
 
+@one_thread
 def diagnose(
     data: FitData,
     mask: BoolArray | None = None,
