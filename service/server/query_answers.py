@@ -140,11 +140,12 @@ class QueryAnswers:
         self._long.short_begins()
         try:
             check_parameters(query.parameters)
-            if query.payload is None:
+            payload = query.payload
+            if payload is None:
                 raise FieldError("payload", "none", "a feedforward query")
-            size = len(query.payload)
+            size = len(payload)
             # To copy a megabyte takes as long as to answer ten points: the other thread does it.
-            data = query.payload.to_bytes() if size <= _COPIED_BYTES else None
+            data = payload.to_bytes() if size <= _COPIED_BYTES else None
             points = min(size // _POINT_BYTES, MAX_COUNT) if data is None else points_of(data)
             if points > SHORT:
                 self._hand_on(query, data, points)
