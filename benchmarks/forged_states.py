@@ -31,7 +31,7 @@ from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.common import Domain
 from baselines.linear import LinearInverse, LinearParameters
 from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters
-from benchmarks.fuzz_targets import models as small_models
+from benchmarks.small_models import small_models
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.failover.standby_model import StandbyModel

@@ -18,8 +18,9 @@ import numpy as np
 import psutil
 
 from adaptive.errors import DehystError
-from benchmarks.fuzz_targets import models, seeds
+from benchmarks.fuzz_targets import seeds
 from benchmarks.mutations import mutated
+from benchmarks.small_models import small_models
 from lab.testbed.identified_stage import Rig, write_service_config
 from service.client.client import Client
 from service.protocol.errors import ServiceError
@@ -42,7 +43,7 @@ def bombard(out: Path, duration_s: float, rate_hz: float, seed: int) -> dict[str
     numbers."""
     out.mkdir(parents=True, exist_ok=True)
     model, config = out / "x.npz", out / "serve.toml"
-    write_bundle(model, models(), BundleMeta(_STAGE, _AXIS, 1e-3, y_min_um=0.0, y_max_um=90.0))
+    write_bundle(model, small_models(), BundleMeta(_STAGE, _AXIS, 1e-3, y_min_um=0.0, y_max_um=90.0))
     with Rig(out) as rig:
         axis = {"name": _AXIS, "model": model, "u_min_V": 0.0, "u_max_V": 10.0, "slew_V_per_s": 2000.0}
         write_service_config(config, _STAGE, axis, listen=[rig.endpoint])

@@ -16,11 +16,9 @@ from dataclasses import replace
 import numpy as np
 
 from adaptive.errors import InputError, ModelFileError
-from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
-from adaptive.types import InverseModel
-from baselines.common import Domain
-from baselines.linear import LinearInverse, LinearParameters
+from benchmarks.forged_states import edited, make_axis, recording
+from benchmarks.small_models import small_models
 from service.failover.role_control import Claims
 from service.failover.state_transfer import join_parts
 from service.operating.verbs import Request, decode_request, encode_request
@@ -40,24 +38,6 @@ Target = Callable[[bytes], None]
 EXPECTED = (InputError, ModelFileError)
 
 
-def models() -> dict[str, InverseModel]:
-    """A linear model and a small LSSVM with memory, of a stage of 11 µm/V that moves 90 µm."""
-    features = FeatureMap(
-        1e-3, 0.0, 90.0, 1e3, 1e5, thresholds_um=(1.0, 5.0), arc_lengths_um=(3.0,), time_constants_s=(0.1,),
-        kernel_plays=(0,), asymmetric=True,
-    )  # fmt: skip
-    rng = np.random.default_rng(5)
-    beta = np.zeros(features.basis_size)
-    beta[:2] = 4.0, 4.09
-    lssvm = LssvmInverse(
-        "lssvm_adaptive", features, beta, rng.uniform(-1.0, 1.0, (20, features.kernel_size)),
-        0.01 * rng.normal(size=20), np.ones(features.kernel_size), 1e4,
-        domain=np.array([0.0, 90.0, -2e4, 2e4, -1e7, 1e7]), noise_variance=1e-6, kernel_variance=1e-4,
-    )  # fmt: skip
-    line = LinearInverse(LinearParameters(11.0, 1.0), 1e-3, Domain(0.0, 90.0, 1e4), 0.05)
-    return {"linear": line, "lssvm_adaptive": lssvm}
-
-
 def _refusing(decode: Callable[[bytes], object]) -> Target:
     def target(data: bytes) -> None:
         with contextlib.suppress(*EXPECTED):
@@ -68,7 +48,7 @@ def _refusing(decode: Callable[[bytes], object]) -> Target:
 
 def _answering() -> Target:
     """A query through the whole service: decoded and answered by a model."""
-    lssvm = models()["lssvm_adaptive"]
+    lssvm = small_models()["lssvm_adaptive"]
     memory = lssvm.rest_memory(0.0)
 
     def target(data: bytes) -> None:
@@ -108,7 +88,7 @@ def _framed_checkpoint(data: bytes) -> None:
 
 def _changing() -> Target:
     """A payload of kind 7, taken by a follower's state of a model: decoded, added, and made a model."""
-    model = models()["lssvm_adaptive"]
+    model = small_models()["lssvm_adaptive"]
     base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", model, 5, model.rest_memory(1.0)))
     message = base.message()
 
@@ -152,8 +132,6 @@ def _claims() -> Target:
 
 def _state() -> Target:
     """A valid state with entries replaced: an axis refuses it, or takes it and learns and answers from it."""
-    from benchmarks.forged_states import edited, make_axis, recording
-
     axis = make_axis(alone=True)
     axis.handle(recording(0, 400))
     state = axis.state_dict()
@@ -201,7 +179,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
 
 def _changes() -> list[bytes]:
     """Changes of the small LSSVM: of its linear part, of its kernel part, and a whole model."""
-    old = models()["lssvm_adaptive"]
+    old = small_models()["lssvm_adaptive"]
     assert isinstance(old, LssvmInverse)
     memory = old.rest_memory(1.0)
     base = wire_delta.FollowedState.decode(wire_model.encode_model("lssvm_adaptive", old, 5, memory))
@@ -222,10 +200,10 @@ def seeds(target: str) -> list[bytes]:
     query = [
         wire_query.encode_query(40.0, 0.0),
         wire_query.encode_query(y, v, a, [1.0, 2.0], "lssvm_adaptive", 7, 1.5),
-        wire_query.encode_query(y, v, a, models()["lssvm_adaptive"].rest_memory(3.0)),
+        wire_query.encode_query(y, v, a, small_models()["lssvm_adaptive"].rest_memory(3.0)),
         wire_query.encode_query(y, v, a, pending=wire_query.Pending(3, y, 0.1 * y)),
     ]
-    sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in models().items()]
+    sent = [wire_model.encode_model(name, m, 5, m.rest_memory(1.0)) for name, m in small_models().items()]
     framed = []
     for payload in sent:
         size = struct.unpack_from("<I", payload, 16)[0]
