@@ -150,9 +150,10 @@ def test_the_loop_that_counts_deadlines_runs_with_the_model_and_without(endpoint
         assert told["refused"] == 0
         assert (told["models"] > 0) == bool(model)
         assert told["point_us"] == sorted(told["point_us"])
-    done = subprocess.run([program, "0.5"], capture_output=True, text=True, timeout=30, check=False)
-    assert done.returncode == 2
-    assert done.stdout.startswith("usage")
+    for wrong in (["0.5"], ["--nope", "0.5", "2000"]):
+        done = subprocess.run([program, *wrong], capture_output=True, text=True, timeout=30, check=False)
+        assert done.returncode == 2
+        assert done.stdout.startswith("usage")
 
 
 def test_where_nobody_serves_the_error_says_what_to_check(native: ctypes.CDLL, endpoint: str) -> None:

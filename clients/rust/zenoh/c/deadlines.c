@@ -59,16 +59,20 @@ static void sleep_until(struct timespec due, long less_us) {
 }
 
 int main(int argc, char **argv) {
-    int receivers = 0, realtime = 0, core = 0, warm = 0;
+    int receivers = 0, realtime = 0, core = 0, warm = 0, unknown = 0;
     for (; argc > 1 && !strncmp(argv[1], "--", 2); argc--, argv++) {
-        receivers |= !strcmp(argv[1], "--receivers"), realtime |= !strcmp(argv[1], "--realtime");
-        core |= !strcmp(argv[1], "--core"), warm |= !strcmp(argv[1], "--warm");
+        int *way = !strcmp(argv[1], "--receivers") ? &receivers
+                   : !strcmp(argv[1], "--realtime") ? &realtime
+                   : !strcmp(argv[1], "--core")     ? &core
+                   : !strcmp(argv[1], "--warm")     ? &warm
+                                                    : &unknown;
+        *way = 1;
     }
     double lasts_s = argc > 1 ? atof(argv[1]) : 0.0, rate_Hz = argc > 2 ? atof(argv[2]) : 0.0;
     long turns = lround(lasts_s * rate_Hz);
     double *point_us = turns > 0 ? malloc((size_t)turns * sizeof *point_us) : NULL;
     double *late_us = turns > 0 ? malloc((size_t)turns * sizeof *late_us) : NULL;
-    if ((argc != 3 && argc != 9) || !point_us || !late_us) {
+    if (unknown || (argc != 3 && argc != 9) || !point_us || !late_us) {
         printf("usage: deadlines [--receivers] [--realtime] [--core] [--warm] SECONDS RATE_HZ "
                "[ENDPOINT STAGE AXIS MODEL CENTRE_UM SWING_UM]\n");
         return 2;
