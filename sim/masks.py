@@ -20,3 +20,9 @@ def samples_since(moved: BoolArray, before: int = 0) -> NDArray[np.int64]:
     moves = np.flatnonzero(moved)
     last[moves] = moves
     return np.asarray(np.arange(moved.size) - np.maximum.accumulate(last))
+
+
+def samples_until(moved: BoolArray) -> NDArray[np.int64]:
+    """(n,) samples until the next True in ``moved`` (n,); n where none follows."""
+    n = moved.size
+    return np.asarray(samples_since(np.ascontiguousarray(moved[::-1]), before=2 * n)[::-1].clip(max=n))

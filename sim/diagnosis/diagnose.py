@@ -119,13 +119,14 @@ def diagnose(
     options = options or Options()
     mask = usable(data, np.ones(data.n, dtype=np.bool_) if mask is None else mask, options.nominal)
     data = with_nominal_kind(options.nominal, data)
-    grid = converter_grid(data.y_um[mask])
-    floor = noise_floor(data)
-    coarse = grid.step_um > 2.0 * floor.sigma_um
-    floor = NoiseFloor(max(floor.sigma_um, grid.step_um / np.sqrt(12.0)), floor.source)
     progress("calibrating the nominal stage", 0.02)
     nominal = calibrate_nominal(options.nominal, data, mask)
     mask = settled(mask, nominal, data)
+    grid = converter_grid(data.y_um[mask])
+    # A mode that the nominal stage has still rings in the rests of the readings, and less in what it leaves of them.
+    floor = min(noise_floor(data), noise_floor(data, nominal.residual_um), key=lambda f: f.sigma_um)
+    coarse = grid.step_um > 2.0 * floor.sigma_um
+    floor = NoiseFloor(max(floor.sigma_um, grid.step_um / np.sqrt(12.0)), floor.source)
     nominal = with_other_axis(nominal, mask)
     data = nominal.model.data
     doubles = repeated_readings(data.y_um, floor.sigma_um, grid.step_um)

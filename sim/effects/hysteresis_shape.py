@@ -21,7 +21,7 @@ from sim.effects.mechanics import MECHANICAL_HYSTERESIS
 from sim.effects.resonance import RESONANCE
 from sim.fitting.dynamics import ForceLoop, ForceStops, RestoringForce
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
-from sim.fitting.hysteresis_loops import plays_nested
+from sim.fitting.hysteresis_loops import path_lag, plays_nested
 from sim.fitting.stage_model import CauseModel, Guess
 from sim.readings.cycles import loop_widths
 from sim.readings.sight import Sight
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 
 SHAPE_PLAYS = 10
+#: Powers of the voltage that `path_lag` goes to.
+PATH_POWERS = 5
 
 
 @block
@@ -65,7 +67,7 @@ class HysteresisShape(CauseModel):
     ``variant`` "restoring", for a nominal stage that is linear: stops of the displacement in the restoring force.
     Thresholds lie twice as dense as the chapter's (2.38) up to half the swing, beyond which only the first rise
     from rest could tell them apart. ``variant`` "fine": denser still; "slanted": with weights that go with the
-    voltage as well.
+    voltage as well; "local": beside plays, an operator that remembers the travelled path alone (`path_lag`).
     """
 
     test_answers_to_others: bool = True
@@ -76,7 +78,7 @@ class HysteresisShape(CauseModel):
     def radii_V(self, data: FitData) -> FloatArray:
         top = max(abs(data.u_high_V), abs(data.u_low_V), data.swing_V)
         steps = np.concatenate([np.arange(1, 14), np.arange(15, 26, 2)])
-        if self.variant in ("fine", "slanted"):
+        if self.variant in ("fine", "slanted", "local"):
             steps = np.concatenate([[0.5], np.arange(1.0, 13.1, 0.5), np.arange(15, 26, 2)])
         return np.asarray(steps / 26.0 * top)
 
@@ -102,8 +104,18 @@ class HysteresisShape(CauseModel):
         g = data.range_um / max(data.swing_V, 1e-9)
         names = [f"w{j + 1}_um_per_V" for j in range(self.radii_V(data).size)]
         names += [f"x{j + 1}_um_per_V" for j in range(self.slanted_V(data).size)]
-        return tuple(
+        plays = tuple(
             ModelParameter(name, "µm/V", 0.0, -0.5 * g, 0.5 * g, 0.02 * g, ActsOn.STATIC, True) for name in names
+        )
+        return plays + (self._path_parameters(data.range_um) if self.variant == "local" else ())
+
+    def _path_parameters(self, r: float) -> tuple[ModelParameter, ...]:
+        """The rate of `path_lag` per half swing, its start, and its weights, which all act through the rate."""
+        low, usual, high = (math.log(rate) for rate in (0.3, 2.5, 20.0))
+        return (
+            ModelParameter("log_path_rate", "1", usual, low, high, 0.1, ActsOn.STATIC),
+            ModelParameter("path_start_um", "µm", 0.0, -0.3 * r, 0.3 * r, 0.01 * r, ActsOn.STATIC),
+            *(ModelParameter(f"path{j + 1}_um", "µm", 0.0, -r, r, 0.01 * r, ActsOn.STATIC) for j in range(PATH_POWERS)),
         )
 
     def slanted_V(self, data: FitData) -> FloatArray:
@@ -119,10 +131,15 @@ class HysteresisShape(CauseModel):
         return [replace(self, before_V=share * data.u_high_V) for share in (0.5, 1.0)]
 
     def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
-        if left_floors <= 1.5 or self.variant:
+        if left_floors <= 1.5 or self.variant not in ("", "fine"):
             return None
-        fine = replace(self, variant="fine")
-        return fine, [np.zeros(len(fine.parameters(data)))]
+        finer = replace(self, variant="fine" if not self.variant else "local")
+        start = np.array([s.neutral for s in finer.parameters(data)])
+        if not self.variant:
+            return finer, [start]
+        start[: p.size] = p
+        at = p.size
+        return finer, [np.where(np.arange(start.size) == at, math.log(rate), start) for rate in (1.5, 4.0)]
 
     def freer(self) -> CauseModel | None:
         return replace(self, variant="slanted") if self.variant in ("", "fine") else None
@@ -135,10 +152,25 @@ class HysteresisShape(CauseModel):
         radii_V = self.radii_V(data)
         u = u_V if self.before_V == 0.0 else np.concatenate([[self.before_V], u_V])
         out = plays_nested(u, radii_V, np.ascontiguousarray(p[: radii_V.size]))
-        if np.any(p[radii_V.size :]):
+        further = np.ascontiguousarray(p[radii_V.size :])
+        if self.variant in ("slanted", "local") and np.any(further[self.variant == "local" :]):
             x = (u - 0.5 * (data.u_low_V + data.u_high_V)) / max(0.5 * data.swing_V, 1e-12)
-            out = out + x * plays_nested(u, self.slanted_V(data), np.ascontiguousarray(p[radii_V.size :]))
+            if self.variant == "slanted":
+                out = out + x * plays_nested(u, self.slanted_V(data), further)
+            else:
+                out = out + path_lag(x, math.exp(float(further[0])), float(further[1]), further[2:])
         return np.asarray(out[-u_V.size :])
+
+    def loop_um(self, u_V: FloatArray, added_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        """Each play lags behind its weight times the voltage, and the travelled path behind its goal."""
+        count = self.radii_V(data).size
+        x = (u_V - 0.5 * (data.u_low_V + data.u_high_V)) / max(0.5 * data.swing_V, 1e-12)
+        goal_um = float(p[:count].sum()) * u_V
+        if self.variant == "slanted":
+            goal_um = goal_um + x * u_V * float(p[count:].sum())
+        elif self.variant == "local":
+            goal_um = goal_um + np.polynomial.polynomial.polyval(x, np.append(0.0, p[count + 2 :]))
+        return np.asarray(goal_um - added_um)
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         """Height of the additional loop at mid-swing, and the sum of the play weights.

@@ -142,21 +142,31 @@ class RateDependence(CauseModel):
     def static(
         self, u_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, nominal: FloatArray, data: FitData
     ) -> FloatArray | None:
-        if not np.any(p[:3]):
-            return None
-        corner_V_per_s, rate_lag_s = self._paced(p)
-        rate = filtered_rate(u_V, float(np.exp(-data.dt_s / rate_lag_s)) if rate_lag_s > 0.0 else 0.0, data.dt_s)
-        pace = np.log10(1.0 + rate / corner_V_per_s)
         if self.variant != "width":
+            if not np.any(p[:3]):
+                return None
             radii, factor, added = self._growth(data)
+            pace = self._pace(u_V, p, data)
             return np.asarray(grown_plays(u_V, radii, np.ascontiguousarray(p[:3]), 1.0 + factor * pace, added * pace))
-        out = -(p[0] * h_um + p[2] * w_um) * pace
+        if not np.any(p[1:3]):
+            return None
+        pace = self._pace(u_V, p, data)
+        out = -p[2] * w_um * pace
         if p[1] != 0.0 and data.nominal_kind == "bouc_wen":
             slope, beta, gamma = loop_numbers(nominal)
             # The loop diverges if the driving term changes its sign.
             pace = np.maximum(pace, -0.9 / p[1]) if p[1] > 0.0 else np.minimum(pace, -0.9 / p[1])
             out -= bouc_wen_paced(u_V, slope, beta, gamma, float(h_um[0]), pace, float(p[1])) - h_um
         return np.asarray(out)
+
+    def on_loop(self, u_V: FloatArray, loop_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray | None:
+        return None if self.variant != "width" or p[0] == 0.0 else -p[0] * loop_um * self._pace(u_V, p, data)
+
+    def _pace(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
+        """(n,) decades of the rate above the corner."""
+        corner_V_per_s, rate_lag_s = self._paced(p)
+        rate = filtered_rate(u_V, float(np.exp(-data.dt_s / rate_lag_s)) if rate_lag_s > 0.0 else 0.0, data.dt_s)
+        return np.asarray(np.log10(1.0 + rate / corner_V_per_s))
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         v0, _ = self._paced(p)

@@ -43,7 +43,9 @@ class Saturation(CauseModel):
         if int(beyond.sum()) < 20:
             return False
         slopes = []
-        for side in (data.u_V > p[0], data.u_V < p[1]):
+        # Of a staircase, a single level may lie beyond the limit: the nearest one below it counts as well.
+        near_V = 0.01 * data.swing_V
+        for side in (data.u_V > p[0] - near_V, data.u_V < p[1] + near_V):
             u, y = data.u_V[side], data.y_um[side]
             if u.size >= 20 and float(np.ptp(u)) > 0.005 * data.swing_V:
                 u = u - u.mean()
@@ -81,6 +83,8 @@ def seen(readings: Readings) -> Sight:
     u, y = readings.felt_V, data.y_um
     du, dy = np.diff(u), np.diff(y)
     slow = (np.abs(du) < 0.02 * data.swing_V) & (np.abs(du) > 1e-7 * data.swing_V) & readings.mask[1:]
+    # After a step the felt voltage creeps on, and what the readings do there is the lag's.
+    slow &= (data.rate_V_per_s[1:] > 0.0) & (np.abs(np.diff(data.u_V)) < 0.02 * data.swing_V)
     count = 40
     where = np.clip(((u[1:] - data.u_low_V) / max(data.swing_V, 1e-12) * count).astype(int), 0, count - 1)
     power = np.bincount(where[slow], du[slow] ** 2, count)
@@ -115,6 +119,29 @@ def seen(readings: Readings) -> Sight:
     return Sight(False, "up to the ends of the range the readings follow the voltage")
 
 
+def in_steps(readings: Readings) -> Sight:
+    """Steps between rests near an end of the range that hardly move the readings. A loop leaves half of a step and
+    more."""
+    data, rests = readings.data, readings.rests
+    u = np.array([r.level_V for r in rests])
+    y = np.array([float(np.mean(data.y_um[r.first : r.last])) for r in rests])
+    far = np.abs(np.diff(u)) > 0.03 * data.swing_V
+    if int(far.sum()) < 6:
+        return Sight(None, "fewer than six steps between rests")
+    slope = np.diff(y)[far] / np.diff(u)[far]
+    slope /= float(np.median(slope))
+    low, high = np.minimum(u[1:], u[:-1])[far], np.maximum(u[1:], u[:-1])[far]
+    for at_end, words in (
+        (low > data.u_low_V + 0.75 * data.swing_V, "top"),
+        (high < data.u_low_V + 0.25 * data.swing_V, "bottom"),
+    ):
+        flat = at_end & (slope < 0.15)
+        if int(flat.sum()) >= 2:
+            share = float(np.max(np.abs(slope[flat])))
+            return Sight(True, f"{int(flat.sum())} steps near the {words} move the readings {share:.2g} times as usual")
+    return Sight(None, "no step near the ends of the range is much smaller than the others")
+
+
 SATURATION = Kind(
     name="saturation",
     place=Place.RAILS,
@@ -129,9 +156,9 @@ SATURATION = Kind(
     tells_apart="a sensor that ends is told apart by a monitor of the voltage",
     source="-30 to 130 V at the actuator behind a tenfold amplifier (E-503 class data sheet range)",
     cause=Cause(
-        sign="flat tops of the readings while the voltage moves",
+        sign="flat tops of the readings while the voltage moves; or steps near an end that hardly move them",
         forms=(Saturation(),),
-        tests=(seen,),
+        tests=(seen, in_steps),
         in_library=in_library,
         picture=pictures.over_voltage,
     ),

@@ -95,9 +95,11 @@ def seen(readings: Readings) -> Sight:
     data = readings.data
     sizes, speeds = _steps(readings)
     words = []
+    judged: list[str] = []
     for x, v, what in ((sizes, speeds, "steps"), (*_motions(readings), "motions")):
         if x.size < 3 or float(np.max(x)) < 1.6 * float(np.min(x)):
             continue
+        judged.append(what)
         # The largest ones decide: small steps may stay below the limit.
         upper = x > 0.4 * float(np.max(x))
         if int(upper.sum()) < 3 or float(np.ptp(np.log(x[upper]))) < 0.3:
@@ -111,6 +113,9 @@ def seen(readings: Readings) -> Sight:
             return Sight(True, words[-1])
     if not words:
         return Sight(None, "no steps or fast motions of several sizes")
+    if sizes.size and "steps" not in judged:
+        # Steps ask for the greatest speed: what is slower says nothing about a limit above it.
+        return Sight(None, f"{words[0]}; {sizes.size} faster steps do not differ enough in size")
     return Sight(False, "; ".join(words))
 
 
@@ -127,7 +132,8 @@ def _steps(readings: Readings) -> tuple[FloatArray, FloatArray]:
             continue
         if float(moved[k - near : k].sum() + moved[k + 1 : k + after].sum()) > 1e-3 * data.swing_V:
             continue
-        y = data.y_um[k - 1 : k + after]
+        # A reading may come before its step by the recorder's clock.
+        y = data.y_um[k - near : k + after]
         speed = np.abs(y[width:] - y[:-width]) / (width * data.dt_s)
         sizes.append(float(moved[k]))
         speeds.append(float(np.max(speed)))

@@ -15,9 +15,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
-from sim.masks import samples_since
+from sim.masks import samples_since, samples_until
 
 T = TypeVar("T")
+
+#: A rest ends so long before the drive moves again, s: where the recorder's clock is fast, readings come early (3.5 ms
+#: after a minute at 57 ppm), and a single one of them on the edge of a step would count as noise.
+EARLY_S = 0.02
 
 
 class LastResultCache(threading.local):
@@ -201,11 +205,12 @@ class FitData:
         return self._derived.get("rate", lambda: np.abs(np.diff(self.u_V, prepend=self.u_V[0])) / self.dt_s)
 
     def standing(self, settle_s: float = 0.3) -> BoolArray:
-        """(n,) True where the voltages of both axes have been constant for ``settle_s``."""
+        """(n,) True where the voltages of both axes have been constant for ``settle_s``, and for `EARLY_S` more."""
         still = self.rate_V_per_s <= 1e-9 * max(self.swing_V, 1e-30) / self.dt_s
         if self.u2_V is not None:
             still &= np.abs(np.diff(self.u2_V, prepend=self.u2_V[0])) == 0.0
-        return np.asarray(still & (samples_since(~still) >= settle_s / self.dt_s))
+        settled = samples_since(~still) >= settle_s / self.dt_s
+        return np.asarray(still & settled & (samples_until(~still) > EARLY_S / self.dt_s))
 
     @property
     def warmth_K(self) -> FloatArray | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from adaptive.compiled import compiled
@@ -40,6 +42,38 @@ def bouc_wen_paced(
         push = max(slope * (1.0 + gain * pace[k]), 1e-12)
         h = hysteresis_step(h, du, push, beta, gamma)
         out[k] = h
+    return out
+
+
+@compiled
+def path_lag(z: FloatArray, rate: float, start: float, weights: FloatArray) -> FloatArray:
+    """(n,) w of dw = rate |dz| (f(z) - w) with f(z) = sum_j weights_j z^j, j from 1: a lag over the travelled path.
+
+    A Duhem model whose memory is local (Coleman and Hodgdon 1986). ``start``: w less f at the first sample. Steps of
+    ``z`` above 0.04 are divided.
+    """
+    n, m = z.shape[0], weights.shape[0]
+    out = np.empty(n)
+    w = start
+    goal = 0.0
+    for j in range(m - 1, -1, -1):
+        goal = (goal + weights[j]) * z[0]
+    w += goal
+    out[0] = w
+    for k in range(1, n):
+        gap = z[k] - z[k - 1]
+        if gap != 0.0:
+            count = int(abs(gap) / 0.04) + 1
+            step = gap / count
+            keep = math.exp(-rate * abs(step))
+            at = z[k - 1] + 0.5 * step
+            for _ in range(count):
+                goal = 0.0
+                for j in range(m - 1, -1, -1):
+                    goal = (goal + weights[j]) * at
+                w = goal + (w - goal) * keep
+                at += step
+        out[k] = w
     return out
 
 

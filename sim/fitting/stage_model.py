@@ -172,6 +172,15 @@ class CauseModel:
         """(n,) µm added to the static displacement, or None."""
         return None
 
+    def loop_um(self, u_V: FloatArray, added_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray | None:
+        """(n,) the loop in ``added_um``, what `static` returned: what it lags by, like h of (2.2); None for no loop."""
+        return None
+
+    def on_loop(self, u_V: FloatArray, loop_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray | None:
+        """(n,) µm added to the static displacement by what acts on the loops of the nominal stage and of all causes
+        together, or None."""
+        return None
+
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system
 
@@ -298,25 +307,26 @@ class StageModel:
                 h, w = kept.h_um, kept.w_um
             else:
                 h, w = self.nominal.static(drive, mine, inner)
-            extra = [e for cause, q in pairs if (e := cause.static(drive, h, w, q, mine, inner)) is not None]
-            static = w + sum(extra) if extra else w
+            static = w + sum(extra) if (extra := self._added(drive, h, w, p, inner)) else w
         else:
             h, w, own, static = kept.h_um, kept.w_um, kept.nominal_p, kept.static_um
         if start <= ActsOn.DYNAMICS or kept is None:
+            # The kept static displacement is that without a start: a later simulation adds it again.
             began = self.nominal.start_um(mine)
+            driven = static
             if began != 0.0:
-                static = static.copy()
-                static[0] += began
+                driven = static.copy()
+                driven[0] += began
             back = next((r for cause, q in pairs if (r := cause.restoring(q, s)) is not None), None)
             system = self.dynamics(p)
-            moved = respond(static, system, inner.dt_s, back)
+            moved = respond(driven, system, inner.dt_s, back)
             for cause, q in pairs:
                 # With hysteresis in the force superposition does not hold.
                 change = cause.changed_dynamics(system, q) if back is None else None
                 if change is not None:
-                    moved = changed_midway(static, moved, system, change, inner.dt_s)
+                    moved = changed_midway(driven, moved, system, change, inner.dt_s)
             for cause, q in pairs:
-                more = cause.added_motion(drive, static, q, inner, system)
+                more = cause.added_motion(drive, driven, q, inner, system)
                 if more is not None:
                     moved = moved + more
             if substeps > 1:
@@ -335,6 +345,24 @@ class StageModel:
             reading = cause.reading(reading, q, s)
         reading = reading + self.nominal.offset_um(mine)
         return Signals(drive, h, w, own, static, moved, motion, reading)
+
+    def _added(
+        self, drive_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, inner: FitData
+    ) -> list[FloatArray]:
+        """What the causes add to the static displacement."""
+        added, loop_um = [], h_um
+        for i, cause in enumerate(self.causes):
+            q = self.parameters_of(p, i)
+            one = cause.static(drive_V, h_um, w_um, q, self.parameters_of(p, -1), inner)
+            if one is not None:
+                added.append(one)
+                more = cause.loop_um(drive_V, one, q, inner)
+                loop_um = loop_um if more is None else loop_um + more
+        for i, cause in enumerate(self.causes):
+            one = cause.on_loop(drive_V, loop_um, self.parameters_of(p, i), inner)
+            if one is not None:
+                added.append(one)
+        return added
 
     def dynamics(self, p: FloatArray) -> Dynamics:
         """The mechanics: those of the nominal stage and what the causes add."""

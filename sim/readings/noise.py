@@ -39,13 +39,17 @@ def repeated_period(u_V: FloatArray) -> int:
     return lag if same else 0
 
 
-def noise_floor(data: FitData) -> NoiseFloor:
-    """The noise floor from repeated periods, else from windows at rest (spread about a line), else from differences."""
+def noise_floor(data: FitData, y_um: FloatArray | None = None) -> NoiseFloor:
+    """The noise floor from repeated periods, else from windows at rest (spread about a line), else from differences.
+
+    ``y_um`` (n,): what to look at in place of the readings, such as what a model leaves of them.
+    """
+    y_um = data.y_um if y_um is None else y_um
     period = repeated_period(data.u_V)
     others = [u for u in (data.u2_V, data.u3_V) if u is not None]
     if period and all(repeated_period(u) == period for u in others):
         # With more than two periods, leave out the first one: the stage still settles.
-        y = data.y_um[period:] if data.n >= 3 * period else data.y_um
+        y = y_um[period:] if data.n >= 3 * period else y_um
         # Median over blocks: the beginning of a first period from rest differs by more than noise.
         d = y[period:] - y[:-period]
         block = max(8, d.size // 100)
@@ -56,17 +60,17 @@ def noise_floor(data: FitData) -> NoiseFloor:
     whole = [int(s) for s in starts if quiet[s : s + window].all()]
     if len(whole) >= 4:
         t = np.linspace(-1.0, 1.0, window)
-        pieces = np.array([data.y_um[s : s + window] for s in whole])
+        pieces = np.array([y_um[s : s + window] for s in whole])
         pieces = pieces - pieces.mean(axis=1, keepdims=True)
         pieces -= (pieces @ t)[:, None] * t / (t @ t)
         variance = np.sum(pieces**2, axis=1) / (window - 2)
-        return NoiseFloor(max(float(np.sqrt(np.median(variance))), _of_whole_rests(data, quiet)), "rests")
+        return NoiseFloor(max(float(np.sqrt(np.median(variance))), _of_whole_rests(data, y_um, quiet)), "rests")
     # Fourth differences remove the motion in the smoothest quarter of the record.
-    d = np.diff(data.y_um, n=4) / np.sqrt(70.0)
+    d = np.diff(y_um, n=4) / np.sqrt(70.0)
     return NoiseFloor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")
 
 
-def _of_whole_rests(data: FitData, quiet: BoolArray) -> float:
+def _of_whole_rests(data: FitData, y_um: FloatArray, quiet: BoolArray) -> float:
     """Standard deviation (µm) in whole rests of at least a second about a line and the logarithm of time; 0 if few.
 
     Windows of a tenth of a second miss noise that is correlated over longer. The logarithm takes creep out.
@@ -77,7 +81,7 @@ def _of_whole_rests(data: FitData, quiet: BoolArray) -> float:
             continue
         t = np.arange(1, b - a + 1) * data.dt_s
         columns = np.stack([np.ones(b - a), t, np.log(t + 0.3), np.log(t + 3.0)])
-        left = data.y_um[a:b] - np.linalg.lstsq(columns.T, data.y_um[a:b], rcond=None)[0] @ columns
+        left = y_um[a:b] - np.linalg.lstsq(columns.T, y_um[a:b], rcond=None)[0] @ columns
         spreads.append(float(np.sqrt(left @ left / (b - a - 4))))
     return float(np.median(spreads)) if len(spreads) >= 3 else 0.0
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from adaptive.types import BoolArray, FloatArray
 from baselines.prandtl_ishlinskii.operators import play_run
-from sim.fitting.fit_data import DerivedArrays, FitData
+from sim.fitting.fit_data import EARLY_S, DerivedArrays, FitData
 from sim.fitting.lags import lag_ends
-from sim.masks import runs, samples_since
+from sim.masks import runs, samples_since, samples_until
 
 T = TypeVar("T")
 
@@ -28,6 +28,10 @@ _RADII = np.array([0.02, 0.05, 0.09, 0.14, 0.2, 0.27, 0.35, 0.45, 0.6, 0.8])
 #: Lags (s) and whole-sample latencies among which the quasi-static description chooses.
 _LAGS_S = (0.0, 1e-3, 2.5e-3, 5e-3, 10e-3)
 _LATE = (0, 1, 3, 6)
+#: Largest lateness that is looked for, samples.
+_MOST_LATE = 40
+#: A motion over fewer samples is a step.
+_STEP_SAMPLES = 30.0
 
 
 @dataclass(frozen=True)
@@ -83,10 +87,11 @@ class Readings:
 
     @cached_property
     def still(self) -> BoolArray:
-        """(n,) True where no drive has changed for `SETTLE_S`."""
+        """(n,) True where the drive has not changed for `SETTLE_S` and does not for another `EARLY_S`."""
         data = self.data
         moved = data.rate_V_per_s > 1e-6 * data.swing_V / data.dt_s
-        return np.asarray(samples_since(moved) >= SETTLE_S / data.dt_s) & self.mask
+        quiet = (samples_since(moved) >= SETTLE_S / data.dt_s) & (samples_until(moved) > EARLY_S / data.dt_s)
+        return np.asarray(quiet) & self.mask
 
     @cached_property
     def alone(self) -> BoolArray:
@@ -230,28 +235,57 @@ class Readings:
 
     @cached_property
     def lateness(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Time (s), lateness of the readings and its standard error (samples) in half-second windows of fast motion."""
+        """Time (s), lateness of the readings and its standard error (samples) in half-second windows of fast motion.
+
+        A lateness changes the readings by itself times the speed. Steps are over sooner than that holds: there, the
+        whole samples that leave the smallest error are taken off first.
+        """
         data = self.data
-        speed = np.gradient(self.memory_um)
         window = max(50, round(0.5 / data.dt_s))
-        rows: list[tuple[float, float, float]] = []
-        for first in range(0, data.n - window + 1, window):
-            part = slice(first, first + window)
-            use = self.mask[part]
-            if not use.any():
-                continue
-            v, r = speed[part], self.left_um[part]
-            v, r = (v - v[use].mean()) * use, (r - r[use].mean()) * use
-            power = float(v @ v)
-            if power <= 0.0 or float(np.max(np.abs(v))) < 20.0 * self.sigma_um:
-                continue
-            shift = -float(v @ r) / power
-            left = r + shift * v
-            # About twenty neighbouring samples of the remaining error go together.
-            error = float(np.sqrt(left @ left / power / max(1, window // 20)))
-            rows.append(((first + 0.5 * window) * data.dt_s, shift, max(error, 1e-3)))
-        found = np.array(rows).reshape(-1, 3)
-        return found[:, 0], found[:, 1], found[:, 2]
+        # Windows overlap by half, and fade: a step at the edge of one would show in the readings or in the description
+        # alone.
+        step = window // 2
+        first = np.arange(0, data.n - window + 1, step)
+
+        def windows(x: FloatArray, rows: BoolArray) -> FloatArray:
+            return np.asarray(np.lib.stride_tricks.sliding_window_view(x, window)[first[rows]])
+
+        every = np.ones(first.size, dtype=np.bool_)
+        weights = windows(self.mask.astype(np.float64), every) * np.hanning(window)
+        sums = np.maximum(weights.sum(axis=1), 1e-9)[:, None]
+
+        def centred(x: FloatArray, rows: BoolArray) -> FloatArray:
+            part = windows(x, rows)
+            return np.asarray((part - (part * weights[rows]).sum(axis=1, keepdims=True) / sums[rows]) * weights[rows])
+
+        speed = np.gradient(self.memory_um)
+        index = np.arange(data.n)
+
+        def late_by(whole: int, rows: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Lateness, squared error that is left, and power of the speed in each window of ``rows``."""
+            at = np.clip(index - whole, 0, data.n - 1)
+            v, r = centred(speed[at], rows), centred(data.y_um - self.memory_um[at], rows)
+            power = np.maximum(np.sum(v * v, axis=1), 1e-300)
+            part = -np.sum(v * r, axis=1) / power
+            return whole + part, np.sum(np.square(r + part[:, None] * v), axis=1), power
+
+        fast = np.max(np.abs(centred(speed, every)), axis=1, initial=0.0) >= 20.0 * self.sigma_um
+        if not fast.any():
+            return np.empty(0), np.empty(0), np.empty(0)
+        shift, left, power = late_by(0, fast)
+        # Over how many samples the motion of a window goes on.
+        lasts = power**2 / np.maximum(np.sum(centred(speed, fast) ** 4, axis=1), 1e-300)
+        least = np.where(lasts < _STEP_SAMPLES, left, 0.0)
+        for whole in (k for k in range(-_MOST_LATE, _MOST_LATE + 1) if k):
+            other = late_by(whole, fast)
+            better = (other[1] < least) & (np.abs(other[0] - whole) < 1.0)
+            shift = np.where(better, other[0], shift)
+            left, power = np.where(better, other[1], left), np.where(better, other[2], power)
+            least = np.minimum(least, np.where(better, left, least))
+        # About twenty neighbouring samples of the remaining error go together.
+        error = np.sqrt(left / power / max(1, window // 20))
+        t_s = np.asarray((first[fast] + 0.5 * (window - 1)) * data.dt_s)
+        return t_s, np.asarray(shift), np.asarray(np.maximum(error, 1e-3))
 
 
 def _ridge(columns: FloatArray, target: FloatArray) -> FloatArray:

@@ -97,7 +97,12 @@ def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolA
         linear = np.array([s.linear for s in parameters])
         neutral = np.array([s.neutral for s in parameters])
         start[base.p.size :] = np.where(linear, neutral, guess)
-    return calibrate(model, start, mask, 8, 2e-3, known=base.columns())
+    fit = calibrate(model, start, mask, 8, 2e-3, known=base.columns())
+    if fit.sse_um2 <= base.sse_um2:
+        return fit
+    # It ended worse than without the cause: what the cause shares with the base (a lag) had to move with it.
+    start[base.p.size :] = [s.neutral for s in model.causes[-1].parameters(model.data)]
+    return min(fit, calibrate(model, start, mask, 8, 2e-3), key=lambda f: f.sse_um2)
 
 
 def _first_joint_fit(cause: CauseModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
@@ -398,20 +403,27 @@ class Search:
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The candidate with a finer model of the same cause, if there is one and it costs less."""
-        left = np.sqrt(accepted.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
-        own = accepted.fit.p[len(base.p) :]
-        found = accepted.cause.refined(own, float(left), base.model.data)
+        """The candidate with the finer model of the same cause that costs least, if one costs less."""
+        best, finer = accepted, self._refined(accepted, base)
+        while finer is not None:
+            best = min(best, finer, key=lambda c: c.cost)
+            finer = self._refined(finer, base)
+        return best
+
+    def _refined(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate | None:
+        """The candidate with the next finer model of the same cause; None if there is none or none is needed."""
+        left = np.sqrt(candidate.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
+        own = candidate.fit.p[len(base.p) :]
+        found = candidate.cause.refined(own, float(left), base.model.data)
         if found is None:
-            return accepted
+            return None
         cause, starts = found
         model = base.model.with_cause(cause)
-        beside = accepted.fit.p[: len(base.p)]
+        beside = candidate.fit.p[: len(base.p)]
         fits = [calibrate(model, np.concatenate([beside, start]), self.mask, 10, 1e-3) for start in starts]
         fit = with_new_columns(min(fits, key=lambda f: f.sse_um2), self.mask)
         held = self.held(fit)
-        cost = self.cost(fit, held, base)
-        return CauseCandidate(cause, fit, held, cost) if cost < accepted.cost else accepted
+        return CauseCandidate(cause, fit, held, self.cost(fit, held, base))
 
     def fitted_again(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
         """The fit with what its causes find anew beside all causes found since."""

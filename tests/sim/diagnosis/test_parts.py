@@ -16,12 +16,13 @@ from sim.diagnosis.prepare import prepare
 from sim.diagnosis.search.held_out import split
 from sim.effects import effect, simulate
 from sim.effects.hysteresis_shape import HysteresisShape
+from sim.effects.rate_dependence import RateDependence
 from sim.effects.stick_slip import friction
 from sim.effects.timing import resample
 from sim.fitting.calibration import calibrate
 from sim.fitting.dynamics import Dynamics, respond
-from sim.fitting.fit_data import FitData
-from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced
+from sim.fitting.fit_data import ActsOn, FitData
+from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
 from sim.fitting.stage_model import StageModel
 from sim.readings.noise import (
     converter_grid,
@@ -65,6 +66,72 @@ def test_loop_does_not_depend_on_how_a_monotone_way_is_cut(levels: list[float]) 
     half[::2], half[1::2] = u, 0.5 * (u[1:] + u[:-1])
     coarse = bouc_wen_loop(u, 5.0, 0.9, 0.95, 0.0)
     np.testing.assert_allclose(bouc_wen_loop(half, 5.0, 0.9, 0.95, 0.0)[::2], coarse, atol=1e-9)
+
+
+def test_path_lag_is_its_differential_equation() -> None:
+    """w against a fine integration of dw = rate |dz| (f(z) - w), through reversals."""
+    z = np.array([-1.0, 0.6, -0.4, 1.0, 0.2, 0.3])
+    rate, weights, start = 2.3, np.array([2.0, -0.7, 0.4]), 0.5
+
+    def goal(at: float) -> float:
+        return float(np.polynomial.polynomial.polyval(at, np.append(0.0, weights)))
+
+    w = goal(z[0]) + start
+    expected = [w]
+    for a, b in pairwise(z):
+        way = np.sign(b - a)
+        run = solve_ivp(
+            lambda s, w, a=a, way=way: rate * (goal(a + way * s) - w), (0, abs(b - a)), [w], rtol=1e-9, atol=1e-12
+        )
+        w = float(run.y[0, -1])
+        expected.append(w)
+    np.testing.assert_allclose(path_lag(z, rate, start, weights), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("variant", ["", "slanted", "local"])
+def test_the_loop_of_a_shape_opens_and_its_reversible_part_does_not_count(variant: str) -> None:
+    """Up and down: what a shape adds less its loop is one curve of the voltage."""
+    u = np.concatenate([np.linspace(0.0, 8.0, 400), np.linspace(8.0, 0.0, 400)[1:]] * 2)
+    data = FitData(DT, u, 10.0 * u)
+    shape = HysteresisShape(variant=variant)
+    rng = np.random.default_rng(3)
+    p = np.array([s.neutral + s.step * rng.normal() for s in shape.parameters(data)])
+    added = shape.static(u, u, u, p, p, data)
+    assert added is not None
+    loop = shape.loop_um(u, added, p, data)
+    curve = (added + loop)[799:]
+    np.testing.assert_allclose(curve[:399], curve[-399:][::-1], atol=1e-9)
+    assert float(np.ptp(loop)) > 0.1
+
+
+def test_a_rate_dependence_widens_the_loops_of_the_causes_beside_it() -> None:
+    """Of a nominal stage without a loop, plays beside it have one."""
+    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 5.0 * np.arange(4000) * DT)
+    data = FitData(DT, u, 10.0 * u)
+    both = StageModel(data, BoucWenStage("zero"), (RateDependence(), HysteresisShape()))
+    p = np.array([s.neutral for s in both.parameters])
+    p[: both.n_nominal][[s.name == "alpha" for s in both.parameters[: both.n_nominal]]] = 0.0
+    p[both.slice_of(1)] = 0.5
+    alone = both.simulate(p)
+    p[both.slice_of(0).start] = 0.1
+    wider = both.simulate(p).static_um - alone.static_um
+    loop = HysteresisShape().loop_um(u, alone.static_um - alone.w_um, p[both.slice_of(1)], data)
+    moving = np.abs(wider) > 1e-6
+    assert float(np.ptp(wider)) > 0.1
+    assert np.all(wider[moving] * loop[moving] < 0.0)
+
+
+def test_a_simulation_from_a_later_block_gives_what_a_whole_one_gives() -> None:
+    """Columns are differences of such simulations; the start, far from equilibrium, must not count twice."""
+    u = _steps(4002)
+    data = FitData(DT, u, 10.0 * u)
+    model = StageModel(data, BoucWenStage("zero", free_memory=True))
+    at = {s.name: i for i, s in enumerate(model.parameters)}
+    p = np.array([s.neutral for s in model.parameters])
+    p[at["start_um"]] = 3.0
+    kept = model.simulate(p)
+    p[at["tau_s"]] *= 1.1
+    np.testing.assert_allclose(model.simulate(p, ActsOn.DYNAMICS, kept).reading_um, model.simulate(p).reading_um)
 
 
 def test_lag_with_a_fraction_of_a_sample_of_delay() -> None:
@@ -145,6 +212,26 @@ def test_noise_floor_sees_noise_and_not_creep() -> None:
     floor = noise_floor(FitData(DT, u, y))
     assert floor.source == "rests"
     assert floor.sigma_um == pytest.approx(0.005, rel=0.05)
+
+
+def test_noise_floor_of_readings_that_come_before_their_steps() -> None:
+    """A recorder's clock that runs 60 ppm fast: after a minute the readings show a step 7 samples early."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(0.0, 8.0, 40), 3000)
+    y = 10.0 * np.interp(np.arange(u.size) * (1.0 + 60e-6), np.arange(u.size), u) + 0.004 * rng.normal(size=u.size)
+    floor = noise_floor(FitData(DT, u, y))
+    assert floor.source == "rests"
+    assert 0.0038 < floor.sigma_um < 0.0042
+
+
+def test_noise_floor_of_what_a_model_leaves() -> None:
+    rng = np.random.default_rng(2)
+    u = np.repeat([0.0, 5.0, 2.0, 7.0, 0.0, 3.0], 2000)
+    noise = 0.004 * rng.normal(size=u.size)
+    ringing = np.sin(2.0 * np.pi * 60.0 * np.arange(u.size) * DT)
+    data = FitData(DT, u, 10.0 * u + ringing + noise)
+    assert noise_floor(data).sigma_um > 0.5
+    assert 0.0038 < noise_floor(data, noise).sigma_um < 0.0042
 
 
 def test_noise_floor_of_repeated_periods() -> None:

@@ -6,12 +6,13 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from adaptive.types import FloatArray
 from sim.diagnosis.witnesses import witnesses
 from sim.effects import CAUSES
 from sim.effects.timing import slips_are_borne_out
-from sim.fitting.fit_data import FitData
+from sim.fitting.fit_data import EARLY_S, FitData
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
 from tests.hidden.excitation import FS_HZ, excitation
@@ -149,12 +150,46 @@ def test_slips_must_be_borne_out_by_the_lateness_of_the_readings() -> None:
     assert not slips_are_borne_out(Readings(FitData(DT, u, wandering), whole, SIGMA_UM), ((20_000, 1),))
 
 
+@pytest.mark.parametrize("ppm", [60.0, -60.0])
+def test_a_clock_shows_in_the_steps_of_a_staircase(ppm: float) -> None:
+    """Readings that come up to seven samples early or late are no linear change of a step."""
+    rng = np.random.default_rng(6)
+    u = np.repeat(rng.uniform(0.0, 8.0, 40), 3000)
+    lagged = lfilter([1.0 - np.exp(-DT / 1.3e-3)], [1.0, -np.exp(-DT / 1.3e-3)], 10.0 * u)
+    at = np.arange(u.size)
+    y = np.interp(at * (1.0 + 1e-6 * ppm), at, lagged) + SIGMA_UM * rng.normal(size=u.size)
+    found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+    assert found["timing"].seen is True, found["timing"].words
+    assert found["slew_limit"].seen is not True, found["slew_limit"].words
+
+
+def test_what_is_slower_than_the_steps_says_nothing_about_a_limit_of_the_slew() -> None:
+    """Steps of one size ask for more speed than the sine; a limit between both cannot be excluded."""
+    t = np.arange(16_000) * DT
+    u = np.concatenate([np.tile(np.repeat([0.0, 5.0], 2000), 4), 2.5 - 2.5 * np.cos(2.0 * np.pi * (2.0 + t / 2.0) * t)])
+    for steps, seen in ((0, None), (3, False)):
+        u[2000 * np.arange(steps)[:, None] + np.arange(2000)] *= np.array([0.3, 0.6, 0.45])[:steps, None]
+        y = 10.0 * u + SIGMA_UM * np.random.default_rng(0).normal(size=u.size)
+        found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+        assert found["slew_limit"].seen is seen, found["slew_limit"].words
+
+
+def test_a_staircase_with_one_level_beyond_the_limit_shows_a_saturation() -> None:
+    levels = [0.0, 2.0, 4.0, 6.6, 8.0, 6.6, 4.0, 2.0, 0.0]
+    u = np.repeat(np.tile(levels, 2), 2000).astype(np.float64)
+    noise = SIGMA_UM * np.random.default_rng(1).normal(size=u.size)
+    for top, seen in ((6.7, True), (9.0, None)):
+        y = 10.0 * np.minimum(u, top) + noise
+        found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+        assert found["saturation"].seen is seen, found["saturation"].words
+
+
 def test_rests_and_cycles_are_found_where_they_are() -> None:
     u = np.concatenate([np.zeros(2000), np.linspace(0, 5, 1000), np.linspace(5, 0, 1000), np.full(3000, 0.0)])
     readings = Readings(FitData(DT, u, 10.0 * u), np.ones(u.size, dtype=np.bool_), SIGMA_UM)
     (cycle,) = readings.cycles
     assert np.abs(np.array([cycle.start, cycle.top, cycle.stop]) - [2000, 2999, 3999]).max() <= 1
     first, last = readings.rests
-    settled = round(0.15 / DT)
-    assert np.abs(np.array([first.last, last.first, last.last]) - [2001, 3999 + settled, u.size]).max() <= 1
+    settled, early = round(0.15 / DT), round(EARLY_S / DT)
+    assert np.abs(np.array([first.last, last.first, last.last]) - [2001 - early, 3999 + settled, u.size]).max() <= 1
     assert first.level_V == last.level_V == 0.0
