@@ -135,11 +135,9 @@ class HysteresisShape(CauseModel):
             return None
         finer = replace(self, variant="fine" if not self.variant else "local")
         start = np.array([s.neutral for s in finer.parameters(data)])
-        if not self.variant:
-            return finer, [start]
-        start[: p.size] = p
-        at = p.size
-        return finer, [np.where(np.arange(start.size) == at, math.log(rate), start) for rate in (1.5, 4.0)]
+        if self.variant == "fine":
+            start[: p.size] = p
+        return finer, [start]
 
     def freer(self) -> CauseModel | None:
         return replace(self, variant="slanted") if self.variant in ("", "fine") else None
