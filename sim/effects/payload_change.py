@@ -44,6 +44,31 @@ def loaded(system: Dynamics, ratio: float) -> Dynamics:
     return replace(system, modes_hz=tuple(modes))
 
 
+#: Frequencies, relative to the known mode, between which a payload may have moved it, and how near two peaks may lie.
+_LOWEST, _HIGHEST, _NEAR = 0.4, 1.6, 0.015
+_PEAKS = 3
+
+
+def _ratios_that_ring(data: FitData) -> list[float]:
+    """Payload ratios that move the known mode to the highest peaks in the spectrum of the readings' differences.
+
+    A mode that is hardly damped answers in a band of its damping: steps of the ratio would miss it.
+    """
+    from scipy.signal import welch  # a simulated stage does not wait for it
+
+    if not data.known_modes_hz:
+        return []
+    f_hz, power = welch(np.diff(data.y_um), 1.0 / data.dt_s, nperseg=min(data.n - 1, round(4.0 / data.dt_s)))
+    share = f_hz / data.known_modes_hz[0]
+    open_ = (share > _LOWEST) & (share < _HIGHEST) & (np.abs(share - 1.0) > _NEAR)
+    out: list[float] = []
+    while open_.any() and len(out) < _PEAKS:
+        peak = share[open_][np.argmax(power[open_])]
+        out.append(float(peak**-2.0 - 1.0))
+        open_ &= np.abs(share - peak) > _NEAR * peak
+    return out
+
+
 @dataclass(frozen=True)
 class PayloadChange(CauseModel):
     """A payload M: the known mode lies at f0 sqrt(m/(m+M)). Negative if a payload was removed.
@@ -53,6 +78,7 @@ class PayloadChange(CauseModel):
     """
 
     fast: bool = True
+    takes_over: bool = True
     shown_by_a_drive: bool = False
 
     def missing(self, data: FitData) -> str:
@@ -78,6 +104,17 @@ class PayloadChange(CauseModel):
             return [[np.array([r])] for r in ratios]
         t = data.duration_s
         return [[np.array([r, share * t])] for r in (-0.3, -0.1, 0.1, 0.3, 1.0) for share in (0.25, 0.5, 0.75)]
+
+    def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
+        """The numbers of the stage file, which the calibration has bent to the moved mode, and each mode that rings."""
+        stated = np.array(
+            [0.0 if n.startswith("log_") else 1.0 if "." in n else p for n, p in zip(names, nominal, strict=True)]
+        )
+        ringing = _ratios_that_ring(data)
+        if self.variant != "midway":
+            return [np.append(stated, r) for r in ringing]
+        t = data.duration_s
+        return [np.append(stated, (r, share * t)) for r in ringing for share in np.arange(0.1, 0.95, 0.1)]
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system if self.variant == "midway" else loaded(system, float(p[0]))

@@ -39,6 +39,11 @@ def repeated_period(u_V: FloatArray) -> int:
     return lag if same else 0
 
 
+#: Spread of the usual window at rest, in that of the calmest tenth, from which on a mode rings there: 1.0 to 1.4 for
+#: white, correlated and pink noise.
+_RINGS = 2.0
+
+
 def noise_floor(data: FitData, y_um: FloatArray | None = None) -> NoiseFloor:
     """The noise floor from repeated periods, else from windows at rest (spread about a line), else from differences.
 
@@ -63,8 +68,12 @@ def noise_floor(data: FitData, y_um: FloatArray | None = None) -> NoiseFloor:
         pieces = np.array([y_um[s : s + window] for s in whole])
         pieces = pieces - pieces.mean(axis=1, keepdims=True)
         pieces -= (pieces @ t)[:, None] * t / (t @ t)
-        variance = np.sum(pieces**2, axis=1) / (window - 2)
-        return NoiseFloor(max(float(np.sqrt(np.median(variance))), _of_whole_rests(data, y_um, quiet)), "rests")
+        spread = np.sqrt(np.sum(pieces**2, axis=1) / (window - 2))
+        usual, least = float(np.median(spread)), float(np.quantile(spread, 0.1))
+        if usual > _RINGS * least:
+            # A mode rings on in the rests: where it has died down, the noise is left.
+            return NoiseFloor(least, "rests")
+        return NoiseFloor(max(usual, _of_whole_rests(data, y_um, quiet)), "rests")
     # Fourth differences remove the motion in the smoothest quarter of the record.
     d = np.diff(y_um, n=4) / np.sqrt(70.0)
     return NoiseFloor(float(np.quantile(_spread(d, max(8, d.size // 200)), 0.25)), "differences")

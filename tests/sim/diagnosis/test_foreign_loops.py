@@ -17,7 +17,7 @@ from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
 from tests.hidden.foreign.cases import single
 from tests.hidden.foreign.record import Case, Rig
-from tests.hidden.foreign.score import recording_of
+from tests.hidden.foreign.score import nominal_of, recording_of
 
 #: Elasto-slide elements that begin relaxed and a bent sensor, at 500 Hz: a sample is longer than the stage's lag.
 CURVED = single(18)
@@ -42,6 +42,13 @@ EQUAL_LAGS = Case(
     {"amplifier_lag": {"tau_s": 3.4e-3}},
 )
 SHORT_LAG = single(260)
+#: A mode that hardly damps, moved far from where the stage file has it: it rings in every rest.
+LOADED = Case(
+    "single",
+    4,
+    replace(OWN_LOOP, drive="staircase", fs_hz=2000.0, duration_s=15.0, lag_s=0.0),
+    {"payload_change": {"known_Hz": 93.7, "damping": 0.008, "ratio": 0.57, "from_share": 0.0}},
+)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
 
@@ -58,6 +65,14 @@ def test_the_memory_at_the_start_is_chosen_by_fits_that_have_converged() -> None
     chosen, _ = first_fits(shape, start, base, prepared.mask)
     assert isinstance(chosen, HysteresisShape)
     assert chosen.before_V == 0.0
+
+
+def test_a_payload_is_looked_for_where_the_stage_rings() -> None:
+    said = diagnose_prepared(prepare(recording_of(LOADED), nominal=nominal_of(LOADED)))
+    assert [cause.name for cause in said.causes] == ["payload_change"]
+    assert abs(said.causes[0].parameters["payload_ratio"] - 0.57) < 0.01
+    assert said.extended_heldout_um < 2.0 * LOADED.rig.sigma_um
+    assert said.noise_floor_um < 2.0 * LOADED.rig.sigma_um
 
 
 def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
