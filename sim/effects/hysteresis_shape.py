@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 
 SHAPE_PLAYS = 10
-#: Powers of the voltage that `path_lag` goes to.
-PATH_POWERS = 5
+#: Number of odd powers of the voltage in `path_lag`. Even ones would take over an asymmetry.
+PATH_POWERS = 3
 
 
 @block
@@ -115,7 +115,10 @@ class HysteresisShape(CauseModel):
         return (
             ModelParameter("log_path_rate", "1", usual, low, high, 0.1, ActsOn.STATIC),
             ModelParameter("path_start_um", "µm", 0.0, -0.3 * r, 0.3 * r, 0.01 * r, ActsOn.STATIC),
-            *(ModelParameter(f"path{j + 1}_um", "µm", 0.0, -r, r, 0.01 * r, ActsOn.STATIC) for j in range(PATH_POWERS)),
+            *(
+                ModelParameter(f"path{2 * j + 1}_um", "µm", 0.0, -r, r, 0.01 * r, ActsOn.STATIC)
+                for j in range(PATH_POWERS)
+            ),
         )
 
     def slanted_V(self, data: FitData) -> FloatArray:
@@ -167,7 +170,7 @@ class HysteresisShape(CauseModel):
         if self.variant == "slanted":
             goal_um = goal_um + x * u_V * float(p[count:].sum())
         elif self.variant == "local":
-            goal_um = goal_um + np.polynomial.polynomial.polyval(x, np.append(0.0, p[count + 2 :]))
+            goal_um = goal_um + x * np.polynomial.polynomial.polyval(x * x, p[count + 2 :])
         return np.asarray(goal_um - added_um)
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:

@@ -47,7 +47,7 @@ def bouc_wen_paced(
 
 @compiled
 def path_lag(z: FloatArray, rate: float, start: float, weights: FloatArray) -> FloatArray:
-    """(n,) w of dw = rate |dz| (f(z) - w) with f(z) = sum_j weights_j z^j, j from 1: a lag over the travelled path.
+    """(n,) w of dw = rate |dz| (f(z) - w) with odd f(z) = z sum_j weights_j z^(2 j): a lag over the travelled path.
 
     A Duhem model whose memory is local (Coleman and Hodgdon 1986). ``start``: w less f at the first sample. Steps of
     ``z`` above 0.04 are divided.
@@ -57,8 +57,8 @@ def path_lag(z: FloatArray, rate: float, start: float, weights: FloatArray) -> F
     w = start
     goal = 0.0
     for j in range(m - 1, -1, -1):
-        goal = (goal + weights[j]) * z[0]
-    w += goal
+        goal = goal * z[0] * z[0] + weights[j]
+    w += goal * z[0]
     out[0] = w
     for k in range(1, n):
         gap = z[k] - z[k - 1]
@@ -70,7 +70,8 @@ def path_lag(z: FloatArray, rate: float, start: float, weights: FloatArray) -> F
             for _ in range(count):
                 goal = 0.0
                 for j in range(m - 1, -1, -1):
-                    goal = (goal + weights[j]) * at
+                    goal = goal * at * at + weights[j]
+                goal *= at
                 w = goal + (w - goal) * keep
                 at += step
         out[k] = w

@@ -74,7 +74,7 @@ def test_path_lag_is_its_differential_equation() -> None:
     rate, weights, start = 2.3, np.array([2.0, -0.7, 0.4]), 0.5
 
     def goal(at: float) -> float:
-        return float(np.polynomial.polynomial.polyval(at, np.append(0.0, weights)))
+        return at * float(np.polynomial.polynomial.polyval(at * at, weights))
 
     w = goal(z[0]) + start
     expected = [w]
