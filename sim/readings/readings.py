@@ -237,8 +237,8 @@ class Readings:
     def lateness(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Time (s), lateness of the readings and its standard error (samples) in half-second windows of fast motion.
 
-        A lateness changes the readings by itself times the speed. Steps are over sooner than that holds: there, the
-        whole samples that leave the smallest error are taken off first.
+        Where the motion is smooth, readings that are late differ by the lateness times the speed. After a step
+        this does not hold: the whole samples that leave the smallest error are taken off first.
         """
         data = self.data
         window = max(50, round(0.5 / data.dt_s))
@@ -272,16 +272,17 @@ class Readings:
         fast = np.max(np.abs(centred(speed, every)), axis=1, initial=0.0) >= 20.0 * self.sigma_um
         if not fast.any():
             return np.empty(0), np.empty(0), np.empty(0)
-        shift, left, power = late_by(0, fast)
+        found = np.array(late_by(0, fast))
         # Over how many samples the motion of a window goes on.
-        lasts = power**2 / np.maximum(np.sum(centred(speed, fast) ** 4, axis=1), 1e-300)
-        least = np.where(lasts < _STEP_SAMPLES, left, 0.0)
-        for whole in (k for k in range(-_MOST_LATE, _MOST_LATE + 1) if k):
-            other = late_by(whole, fast)
-            better = (other[1] < least) & (np.abs(other[0] - whole) < 1.0)
-            shift = np.where(better, other[0], shift)
-            left, power = np.where(better, other[1], left), np.where(better, other[2], power)
-            least = np.minimum(least, np.where(better, left, least))
+        lasts = found[2] ** 2 / np.maximum(np.sum(centred(speed, fast) ** 4, axis=1), 1e-300)
+        short = lasts < _STEP_SAMPLES
+        steps = fast.copy()
+        steps[fast] = short
+        for whole in range(-_MOST_LATE, _MOST_LATE + 1) if short.any() else ():
+            other = np.array(late_by(whole, steps))
+            better = (other[1] < found[1, short]) & (np.abs(other[0] - whole) < 1.0)
+            found[:, short] = np.where(better, other, found[:, short])
+        shift, left, power = found
         # About twenty neighbouring samples of the remaining error go together.
         error = np.sqrt(left / power / max(1, window // 20))
         t_s = np.asarray((first[fast] + 0.5 * (window - 1)) * data.dt_s)
