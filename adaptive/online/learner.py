@@ -9,6 +9,7 @@ so that a change is learnt once and the old samples of the window stay valid.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 from typing import Any
@@ -205,10 +206,12 @@ CHECK_S = 0.004
 RAIL_S, RAIL_SHARE = 0.1, 0.05
 #: Time inside the envelope after which ``model_left_envelope`` ends, s.
 LEFT_S = 1.0
-#: The identified model may be served after this time on trial, s, if its own recent rms error is below this share of
-#: the span for each second on trial, and below this share in all. The last estimate was exact when readings were last
-#: trusted; it loses value with time.
-ALONE_S, ALONE_SHARE_PER_S, ALONE_SHARE = 0.3, 0.05, 0.02
+#: While readings are on trial the identified model is served if its own recent rms error is below so many times that by
+#: which the estimate has lately moved, and may have moved since. Where the estimate hardly moves, it is better by far.
+#: The error of the last estimate during a trial was 0.2 to 8 times as large as that (16 foreign stages).
+MOVES = 5.0
+#: Shares of the range at which that is compared, to and fro.
+COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 #: Number of newest samples on which old and new hyper-parameters are compared.
 NEWEST = 100
@@ -235,16 +238,21 @@ def time_outside(left_s: float, outside: bool, step_s: float) -> float:
     return max(left_s, 0.0) + step_s if outside else max(min(left_s, 0.0) - step_s, -LEFT_S)
 
 
-def swing_of(model: LssvmInverse) -> FloatArray:
-    """(p,) basis at three quarters of the range less that at one quarter, each reached from rest in one stroke."""
-    features = model.features
-    basis, kernel = np.empty((2, features.basis_size)), np.empty(features.kernel_size)
-    for row, share in zip(basis, (0.25, 0.75), strict=True):
+def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float = 0.0) -> FloatArray:
+    """(n, p) basis at ``shares`` of the range, each reached from rest in one stroke and passed with ``v_um_per_s``."""
+    rows, kernel = np.empty((len(shares), features.basis_size)), np.empty(features.kernel_size)
+    for row, share in zip(rows, shares, strict=True):
         y_um = features.offset_um + features.gain * (
             features.y_min_um + share * (features.y_max_um - features.y_min_um)
         )
-        features.fill(y_um, 0.0, 0.0, features.rest_memory(y_um), row, kernel)
-    swing: FloatArray = basis[1] - basis[0]
+        features.fill(y_um, v_um_per_s, 0.0, features.rest_memory(y_um), row, kernel)
+    return rows
+
+
+def swing_of(model: LssvmInverse) -> FloatArray:
+    """(p,) basis at three quarters of the range less that at one quarter."""
+    low, high = basis_over(model.features, (0.25, 0.75))
+    swing: FloatArray = high - low
     return swing
 
 
@@ -283,7 +291,8 @@ class Parts:
     check_every, check_s : samples between two checks of envelope, rails and sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
     left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
-    alone : whether readings have been on trial for so long that a good identified model is served.
+    alone : whether the identified model is served because readings are on trial.
+    moved_V, moved_s : how far the estimate had moved before that trial, V rms over the range, and within what time, s.
     rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
     confirmed : the filter's estimates from before readings that followed the drive, the older one first. mark_ages,
     confirmed_ages : number of errors judged when the marks were made.
@@ -326,11 +335,14 @@ class Parts:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.allowed_V = allowed_V
         self.swing = swing_of(base) if base.features.linear else np.empty(0)
+        v = base.features.v_scale_um_per_s
+        self.rows = np.concatenate([basis_over(base.features, COMPARED, way * v) for way in (-1.0, 1.0)])
         self.rail_s = 0.0
         self.railed = False
         self.left_s = 0.0
         self.left = False
         self.alone = False
+        self.moved_V, self.moved_s = 0.0, MARK_S
         self.counters = new_counters()
         self.events = dict.fromkeys(EVENTS, 0)
 
@@ -432,8 +444,8 @@ class Parts:
         """Update ``alone`` after a sample; returns whether it has changed."""
         on_trial_s, before = self.intake.distrusted_s, self.alone
         if on_trial_s or before:
-            limit_V = min(ALONE_SHARE_PER_S * on_trial_s, ALONE_SHARE) * self.filter.span_V
-            known = on_trial_s >= ALONE_S and self.judgement.frozen_V2 <= limit_V * limit_V
+            limit_V = MOVES * self.moved_V * max(1.0, on_trial_s / self.moved_s)
+            known = on_trial_s > 0.0 and self.judgement.frozen_V2 <= limit_V * limit_V
             # A model that may not judge the sensor has confirmed no reading, and so no estimate.
             self.alone = known or (on_trial_s > 0.0 and self.intake.tried_by_voltages)
         if self.alone and not before:
@@ -452,6 +464,10 @@ class Parts:
         ``undone``: unconfirmed jumps are taken back too; return to the estimate before the first of them.
         """
         self.filter.restore(self.proven_mark if undone else self.confirmed[0])
+        # Not the newer one that was confirmed: the fault itself may have moved it.
+        moves_V = [self.rows @ (self.filter.beta - beta) for beta, _ in (self.mark, self.next_mark)]
+        self.moved_V = max(sqrt(float(np.mean(move_V**2))) for move_V in moves_V)
+        self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s
         self.window.keep()
         self.events["distrusts"] += 1
 
@@ -598,6 +614,8 @@ class Parts:
             "left_s": self.left_s,
             "left": self.left,
             "alone": self.alone,
+            "moved_V": self.moved_V,
+            "moved_s": self.moved_s,
             "mark_ages": np.array(self.mark_ages),
             "confirmed_ages": np.array(self.confirmed_ages),
         }
@@ -618,6 +636,7 @@ class Parts:
         self.rail_s, self.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
         self.left_s, self.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
         self.alone = bool(state.get("alone", False))
+        self.moved_V, self.moved_s = float(state.get("moved_V", 0.0)), float(state.get("moved_s", MARK_S))
         self.mark_ages, self.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
         self.delay = Delay(self.delay.steps)
         self.delay.restore(np.asarray(state["delay"], dtype=np.float64))

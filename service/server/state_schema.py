@@ -108,6 +108,8 @@ RULES: Final = (
     Rule(r"front\.track\.switch", "", "i", low=0),
     Rule(r"smoother\.count", "", "i", low=0),
     Rule(r"rest\.(constant_V|u_V)", "", finite=False),
+    Rule(r"moved_V", "", low=0.0),
+    Rule(r"moved_s", "", low=1e-9),
     Rule(r"delay", "*,p|0"),
     Rule(r"point", "d", finite=False),
     Rule(r"((next|jump|proven)_)?(mark|confirmed\d)\.covariance", "p,p"),

@@ -13,7 +13,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning
 from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig, watch_reading
 from adaptive.online.glitch_or_jump import Circumstances
-from adaptive.online.learner import Learner
+from adaptive.online.learner import MOVES, Learner
 from adaptive.online.sensor_trust import (
     CREEP_PER_S,
     FOLLOWING_SLOPES,
@@ -855,21 +855,39 @@ def test_a_jump_that_motion_bore_out_stays(
 
 
 @pytest.mark.parametrize("fault", ["sign_rest", "stuck_1e-5"])
-def test_the_longer_without_readings_the_more_the_identified_model_is_served(
-    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], fault: str
+@pytest.mark.parametrize("share", [0.01, 0.12, 1.0])
+def test_the_identified_model_is_served_once_the_last_estimate_may_have_moved_as_far(
+    model: LssvmInverse, motions: dict[str, Recording], warm: dict[tuple[str, int], StateDict], fault: str, share: float
 ) -> None:
-    """At first the last estimate; then the identified one, where it was good; the learner's own when trust is back."""
+    """``share`` : by how much the estimate had moved before the fault, over the error of the identified model.
+
+    The learner's own model is served again when the readings are trusted again.
+    """
     at = ATS[0]
     u, clean = motions["tones"]
-    learner = Learner.from_state(warm["tones", at])
-    served = []
+    state = dict(warm["tones", at])
+    identified_V = float(np.sqrt(np.asarray(state["judgement.frozen_V2"])))
+    for name in ("confirmed0", "confirmed1", "next_mark", "mark"):
+        state[f"{name}.beta"] = np.array(state["confirmed0.beta"], dtype=np.float64)
+    state["mark.beta"][0] += share * identified_V
+    state["mark_ages"] = np.array([int(np.asarray(state["judgement.judged"])) - 50] * 2)
+    learner = Learner.from_state(state)
     y = wrong(fault, clean, at, range_of(model), 1500)
+    served: list[tuple[float, bool]] = []
     for k in range(at, at + 1500):
         feed(learner, (u, y), k, k + 1)
         if learner.distrusts:
-            served.append(np.array_equal(learner.snapshot().beta, model.beta))
-    assert not any(served[:250])
-    assert all(served[-300:])
+            on_trial_s = learner.parts.intake.distrusted_s
+            served.append((on_trial_s, np.array_equal(learner.snapshot().beta, model.beta)))
+    moved_s, moved_V = learner.parts.moved_s, learner.parts.moved_V
+    assert 0.1 <= moved_s < 0.5
+    assert moved_V > 0.9 * share * identified_V
+    error_V = float(np.sqrt(learner.parts.judgement.frozen_V2))
+    assert [alone for t_s, alone in served] == [
+        MOVES * moved_V * max(1.0, t_s / moved_s) >= error_V for t_s, _ in served
+    ]
+    assert served[10][1] == (share > 0.5)
+    assert served[-1][1] == (share > 0.1)
     feed(learner, (u, y), at + 1500, at + 1500 + BACK)
     assert not learner.distrusts
     assert not np.array_equal(learner.snapshot().beta, model.beta)
