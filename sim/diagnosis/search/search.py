@@ -90,19 +90,19 @@ def first_fits(
 
 
 def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
-    """From a linearised guess, or from beside neutral where that overshot."""
-    start = np.concatenate([base.p, guess])
-    if evaluate(model, clipped_to_bounds(model, start), mask).sse_um2 > base.sse_um2:
-        parameters = model.causes[-1].parameters(model.data)
-        linear = np.array([s.linear for s in parameters])
-        neutral = np.array([s.neutral for s in parameters])
-        start[base.p.size :] = np.where(linear, neutral, guess)
-    fit = calibrate(model, start, mask, 8, 2e-3, known=base.columns())
+    """From a linearised guess; and from beside neutral where that overshot."""
+    parameters = model.causes[-1].parameters(model.data)
+    neutral = np.array([s.neutral for s in parameters])
+    starts = [guess]
+    if evaluate(model, clipped_to_bounds(model, np.concatenate([base.p, guess])), mask).sse_um2 > base.sse_um2:
+        # Neither is safe: far off a fit may not find back, and at a bound (no creep) it may not find away.
+        starts.append(np.where([s.linear for s in parameters], neutral, guess))
+    fits = [calibrate(model, np.concatenate([base.p, p]), mask, 8, 2e-3, known=base.columns()) for p in starts]
+    fit = min(fits, key=lambda f: f.sse_um2)
     if fit.sse_um2 <= base.sse_um2:
         return fit
     # It ended worse than without the cause: what the cause shares with the base (a lag) had to move with it.
-    start[base.p.size :] = [s.neutral for s in model.causes[-1].parameters(model.data)]
-    return min(fit, calibrate(model, start, mask, 8, 2e-3), key=lambda f: f.sse_um2)
+    return min(fit, calibrate(model, np.concatenate([base.p, neutral]), mask, 8, 2e-3), key=lambda f: f.sse_um2)
 
 
 def _first_joint_fit(cause: CauseModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
