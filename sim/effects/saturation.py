@@ -36,9 +36,11 @@ class Saturation(CauseModel):
     """Saturation of the voltage at an upper and a lower limit."""
 
     unseen_is_absent: bool = True
+    imitates_others: bool = True
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        """Beyond the limit the readings hardly follow the command."""
+        """Beyond the limit the readings hardly follow the command. Of a staircase with a single level there, the fit
+        alone can tell."""
         beyond = (data.u_V > p[0]) | (data.u_V < p[1])
         if int(beyond.sum()) < 20:
             return False
@@ -50,7 +52,7 @@ class Saturation(CauseModel):
             if u.size >= 20 and float(np.ptp(u)) > 0.005 * data.swing_V:
                 u = u - u.mean()
                 slopes.append(abs(float(u @ y) / float(u @ u)))
-        return bool(slopes) and min(slopes) < 0.35 * abs(data.gain_um_per_V)
+        return not slopes or min(slopes) < 0.35 * abs(data.gain_um_per_V)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         low, high, swing = data.u_low_V, data.u_high_V, data.swing_V

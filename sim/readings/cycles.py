@@ -72,7 +72,11 @@ def mirrored_branches(readings: Readings) -> Sight:
     # The first cycle of a height need not close. Of three, the median does.
     asked = [kind for kind in kinds.values() if len(kind) >= 3] or [every]
     bend, error, height = (float(x) for x in max((np.median(kind, axis=0) for kind in asked), key=lambda m: abs(m[0])))
-    seen = abs(bend) > 4.0 * error and abs(bend) > 1.5e-4 * data.range_um
+    curved, sizeable = abs(bend) > 4.0 * error, abs(bend) > 1.5e-4 * data.range_um
+    tallest = max(float(np.median([m[2] for m in kind])) for kind in asked)
+    # Straight cycles exclude a bow only if they span the range, and a little bow is none of nothing.
+    straight = not curved and tallest > 0.9 * data.swing_V
+    seen = True if curved and sizeable else False if straight else None
     words = (
         f"of {len(every)} closed cycles, in those of {height:.3g} V the mean of the mirrored branches bends by "
         f"{bend:.2g} µm (noise {error:.1g})"

@@ -39,8 +39,11 @@ class Thresholds:
     #: Least share of the squared error above the noise floor that the first cause, and a further one, must remove.
     least_excess_first: float = 0.1
     least_excess_next: float = 0.25
-    #: A further cause that removes this share is accepted even if the model errors of earlier causes could explain it.
+    #: A further cause that removes this share is accepted even if the model errors of earlier causes could explain it;
+    #: and this one where less than twice the noise floor is left, but more than so much of it.
     nearly_all: float = 0.85
+    all_of_little: float = 0.95
+    little: float = 1.1
     #: Cost of one parameter, as a share of the squared error: of two equal causes the simpler one is preferred.
     cost_per_number: float = 0.002
     #: Number of linearised guesses that are fitted in full.
@@ -90,15 +93,20 @@ def first_fits(
 
 
 def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
-    """From a linearised guess; and from beside neutral where that overshot."""
+    """From a linearised guess, or from beside neutral where that overshot."""
     parameters = model.causes[-1].parameters(model.data)
     neutral = np.array([s.neutral for s in parameters])
     starts = [guess]
     if evaluate(model, clipped_to_bounds(model, np.concatenate([base.p, guess])), mask).sse_um2 > base.sse_um2:
-        # Neither is safe: far off a fit may not find back, and at a bound (no creep) it may not find away.
-        starts.append(np.where([s.linear for s in parameters], neutral, guess))
-    fits = [calibrate(model, np.concatenate([base.p, p]), mask, 8, 2e-3, known=base.columns()) for p in starts]
-    fit = min(fits, key=lambda f: f.sse_um2)
+        # At a bound (no creep) a fit may not find away: then from the guess after all.
+        starts = [np.where([s.linear for s in parameters], neutral, guess), guess]
+    fit: ModelFit | None = None
+    for own in starts:
+        other = calibrate(model, np.concatenate([base.p, own]), mask, 8, 2e-3, known=base.columns())
+        fit = other if fit is None else min(fit, other, key=lambda f: f.sse_um2)
+        if fit.sse_um2 < 0.98 * base.sse_um2:
+            return fit
+    assert fit is not None
     if fit.sse_um2 <= base.sse_um2:
         return fit
     # It ended worse than without the cause: what the cause shares with the base (a lag) had to move with it.
@@ -303,7 +311,9 @@ class Search:
             (0.5 if self.coarse else thresholds.least_of_floor) * float(floor.sum()),
         )
         # A model error of earlier causes is never explained almost completely by another cause.
-        if not first and whole > thresholds.nearly_all and float(now.sum()) > 2.0 * float(floor.sum()):
+        left = float(now.sum()) / float(floor.sum())
+        enough = thresholds.nearly_all if left > 2.0 else thresholds.all_of_little
+        if not first and whole > enough and left > thresholds.little:
             return True
         return gain > least and gain > need * excess and whole > 0.5 * need
 
@@ -324,7 +334,7 @@ class Search:
             accepted: CauseCandidate | None = None
             p = 1.0
             fitting = sorted((c for c in ranked if self.plausible(c)), key=self._with_witness)
-            for candidate in fitting[:3]:
+            for candidate in self._apart(fitting)[:3]:
                 best = self.polish(candidate, current)
                 gain = held.sse_um2 - best.held.sse_um2
                 p = p_value(looks, gain, self.seed + round_)
@@ -364,6 +374,15 @@ class Search:
             held = self.held(better)
             return CauseCandidate(freer, better, held, self.cost(better, held, fit))
         return None
+
+    def _apart(self, candidates: list[CauseCandidate]) -> list[CauseCandidate]:
+        """Without those that show only their sum with an earlier one: the second lag of two gets no further."""
+        out: list[CauseCandidate] = []
+        for one in candidates:
+            beside = self.catalogue.same_set({one.cause.name})
+            if all(other.cause.name == one.cause.name or other.cause.name not in beside for other in out):
+                out.append(one)
+        return out
 
     def _with_witness(self, candidate: CauseCandidate) -> float:
         """The cost, halved where the signature of the cause is seen: flexible forms imitate many causes."""

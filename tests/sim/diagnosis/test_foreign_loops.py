@@ -13,6 +13,7 @@ from sim.diagnosis.search.search import first_fits
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.fitting.calibration import with_new_columns
+from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
 from tests.hidden.foreign.cases import pair, single
@@ -56,6 +57,15 @@ LOADED = Case(
     replace(OWN_LOOP, drive="staircase", fs_hz=2000.0, duration_s=15.0, lag_s=0.0),
     {"payload_change": {"known_Hz": 93.7, "damping": 0.008, "ratio": 0.57, "from_share": 0.0}},
 )
+#: A staircase with one level beyond the amplifier's limit: there is no slope to be flat.
+ONE_LEVEL = Case(
+    "single",
+    704,
+    Rig(704000, "preisach", False, "staircase", "white", 500.0, 50.0, 8.0, 89.7, 2.9e-3, False, 0.5, 0.003, 3.0),
+    {"saturation": {"top_V": 7.5252310818518735}},
+)
+#: A bow that only cycles over the whole range pass, and there are two of them.
+BOW_BETWEEN = single(733)
 #: A second lag and a mode under a multisine: the response bends, and not clearly enough to measure the lag.
 UNCLEAR_LAG = pair(705)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
@@ -90,6 +100,20 @@ def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
     assert abs(lag_s - CURVED.rig.lag_s) < 0.1 * CURVED.rig.lag_s
     assert {c.name for c in said.causes} <= {"hysteresis_shape", "sensor_nonlinearity", "asymmetry"}
     assert said.extended_heldout_um < 1.5 * said.noise_floor_um
+
+
+def test_one_level_beyond_the_limit_shows_a_saturation() -> None:
+    said = diagnosed(ONE_LEVEL)
+    assert {"saturation"} <= {c.name for c in said.causes} <= {"saturation", "hysteresis_shape"}
+    limit = next(c for c in said.causes if c.name == "saturation").parameters["u_max_V"]
+    assert abs(limit - 7.525) < 0.02
+    assert said.extended_heldout_um < 1.25 * said.noise_floor_um
+
+
+def test_cycles_over_a_part_of_the_range_do_not_exclude_a_bow() -> None:
+    prepared = prepare(recording_of(BOW_BETWEEN), nominal="bouc_wen")
+    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    assert mirrored_branches(readings).seen is None
 
 
 def test_a_loop_with_weights_that_go_with_the_voltage_does_not_take_the_name_of_an_asymmetry_that_is_seen() -> None:
