@@ -537,6 +537,9 @@ def review(
         cost = search.cost(fit, held, less)
         polished = (search.polish(c, less) for c in rivals[:2])
         swap = next((c for c in polished if c.cost < 0.9 * cost), None)
+        if search.seen(cause):
+            # Another one may explain more without it, and is no reading of its signature.
+            swap = None
         if swap is not None and swaps < 2 and swap.cause.name not in steps and search.plausible(swap):
             swaps += 1
             before = steps[cause.name]
