@@ -11,7 +11,7 @@ from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
 from sim.effects import Chain, Effect, effect, simulate
 from sim.effects.base import Place
-from sim.fitting.calibration import calibrate
+from sim.fitting.calibration import calibrate, with_free_memory
 from sim.fitting.dynamics import Dynamics, respond
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
@@ -44,6 +44,9 @@ class BoucWenStage:
 
     def with_other_hold(self) -> BoucWenStage:
         return replace(self, hold="zero" if self.hold == "first" else "first")
+
+    def with_free_memory(self) -> BoucWenStage:
+        return self if self.free_memory else replace(self, free_memory=True)
 
     @property
     def substeps(self) -> int:
@@ -107,6 +110,9 @@ class LinearStage:
 
     def with_other_hold(self) -> LinearStage:
         return replace(self, hold="zero" if self.hold == "first" else "first")
+
+    def with_free_memory(self) -> LinearStage:
+        return self
 
     @property
     def substeps(self) -> int:
@@ -198,6 +204,9 @@ class FileStage:
 
     def with_other_hold(self) -> FileStage:
         return replace(self, hold="zero" if self.hold == "first" else "first")
+
+    def with_free_memory(self) -> FileStage:
+        return self
 
     @property
     def substeps(self) -> int:
@@ -367,20 +376,7 @@ def calibrate_nominal(kind: str | StageConfig, data: FitData, mask: BoolArray) -
             if best is None or fit.sse_um2 < best.sse_um2 * (0.95 if dearer else 1.0 - 1e-3):
                 best = fit
     assert best is not None
-    return _with_free_memory(calibrate(best.model, best.p, mask, 12, 1e-5), mask)
-
-
-def _with_free_memory(fit: ModelFit, mask: BoolArray) -> ModelFit:
-    """The fit with a free hysteresis memory at the start, where that explains more: a drive that begins at rest at
-    0 V may have been elsewhere before."""
-    nominal = fit.model.nominal
-    if not isinstance(nominal, BoucWenStage) or nominal.free_memory:
-        return fit
-    model = StageModel(fit.model.data, replace(nominal, free_memory=True))
-    start = np.concatenate([fit.p, [p.neutral for p in model.parameters[fit.p.size :]]])
-    free = calibrate(model, start, mask, 8, 1e-4)
-    # A small gain is another cause, imitated at the start.
-    return free if free.sse_um2 < 0.6 * fit.sse_um2 else fit
+    return with_free_memory(calibrate(best.model, best.p, mask, 12, 1e-5), mask)
 
 
 def with_other_axis(fit: ModelFit, mask: BoolArray, *, refit: bool = True) -> ModelFit:

@@ -183,3 +183,16 @@ def calibrate(
         return replace(now, free=free)
     chosen = list(kept.parameters)
     return replace(now, free=free, rows=rows[chosen], row_indices=tuple(free[i] for i in chosen))
+
+
+def with_free_memory(fit: ModelFit, mask: BoolArray) -> ModelFit:
+    """The fit with a free hysteresis memory at the start, where that explains more: a drive that begins at rest at
+    0 V may have been elsewhere before."""
+    nominal = fit.model.nominal.with_free_memory()
+    if nominal is fit.model.nominal:
+        return fit
+    model, own = replace(fit.model, nominal=nominal), fit.model.n_nominal
+    neutral = [p.neutral for p in model.parameters[own : model.n_nominal]]
+    free = calibrate(model, np.concatenate([fit.p[:own], neutral, fit.p[own:]]), mask, 8, 1e-4)
+    # A small gain is another cause, imitated at the start.
+    return free if free.sse_um2 < 0.6 * fit.sse_um2 else fit

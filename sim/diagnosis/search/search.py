@@ -17,7 +17,7 @@ from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
-from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_new_columns
+from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_free_memory, with_new_columns
 from sim.fitting.fit_data import ActsOn
 from sim.fitting.parallel import side_by_side
 from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
@@ -352,7 +352,7 @@ class Search:
                     current, held = freer.fit, freer.held
                     continue
             accepted = self._other_hold(self._with_refined_model(accepted, current), current)
-            accepted = self._off_bounds(accepted, current)
+            accepted = self._with_free_memory(self._off_bounds(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
             left_um2 = left_um2 + accepted.cause.model_error**2 * gone
@@ -420,6 +420,18 @@ class Search:
         other = with_new_columns(calibrate(fit.model, other.p, self.mask, 12, 1e-5), self.mask)
         held = self.held(other)
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+
+    def _with_free_memory(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
+        """The candidate with a free hysteresis memory at the start, if that explains more: a large cause can hide it."""
+        fit = with_free_memory(accepted.fit, self.mask)
+        if fit is accepted.fit:
+            return accepted
+        fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, 12, 1e-5), self.mask)
+        if self.nominal_p is not None:
+            more = fit.model.parameters[self.nominal_p.size : fit.model.n_nominal]
+            self.nominal_p = np.append(self.nominal_p, [s.neutral for s in more])
+        held = self.held(fit)
+        return replace(accepted, fit=fit, held=held, cost=self.cost(fit, held, base))
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the finer model of the same cause that costs least, if one costs less."""
