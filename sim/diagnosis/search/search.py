@@ -422,7 +422,7 @@ class Search:
         return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
 
     def _with_free_memory(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The candidate with a free hysteresis memory at the start, if that explains more: a large cause can hide it."""
+        """The candidate with a free memory at the start, if that explains more: a large cause can hide it."""
         fit = with_free_memory(accepted.fit, self.mask)
         if fit is accepted.fit:
             return accepted
