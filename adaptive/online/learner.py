@@ -207,9 +207,10 @@ RAIL_S, RAIL_SHARE = 0.1, 0.05
 #: Time inside the envelope after which ``model_left_envelope`` ends, s.
 LEFT_S = 1.0
 #: While readings are on trial the identified model is served if its own recent rms error is below so many times that by
-#: which the estimate has lately moved, and may have moved since. Where the estimate hardly moves, it is better by far.
-#: The error of the last estimate during a trial was 0.2 to 8 times as large as that (16 foreign stages).
-MOVES = 5.0
+#: which the estimate has lately moved, and may have moved since, and below this share of the span. Where the estimate
+#: hardly moves, it is better by far. Where the stage has just changed, the estimate has moved to where it belongs.
+#: The error of the last estimate during a trial was 0.2 to 8 times as large as its motion (16 foreign stages).
+MOVES, ALONE_SHARE = 5.0, 0.02
 #: Shares of the range at which that is compared, to and fro.
 COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
 
@@ -445,6 +446,7 @@ class Parts:
         on_trial_s, before = self.intake.distrusted_s, self.alone
         if on_trial_s or before:
             limit_V = MOVES * self.moved_V * max(1.0, on_trial_s / self.moved_s)
+            limit_V = min(limit_V, ALONE_SHARE * self.filter.span_V)
             known = on_trial_s > 0.0 and self.judgement.frozen_V2 <= limit_V * limit_V
             # A model that may not judge the sensor has confirmed no reading, and so no estimate.
             self.alone = known or (on_trial_s > 0.0 and self.intake.tried_by_voltages)

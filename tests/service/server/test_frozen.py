@@ -80,7 +80,11 @@ def test_frozen_is_frozen_to_the_last_bit(alone: bool, change: str) -> None:
     for name, memory in axis.newest.memories.items():
         np.testing.assert_array_equal(memory, other.newest.memories[name])
     axis.thaw("alice")
-    feed(axis, first + 500, 1500, "gain")
+    # The same stage moves more slowly: its gain, which the models do not know, is learnt.
+    for start in range(first + 500, first + 4500, STEP):
+        k = np.arange(start, start + STEP)
+        slow_um = 45.0 + 25.0 * np.sin(2.0 * np.pi * 0.5 * k * DT_S)
+        axis.handle(SampleBatch(k, k * DT_S, (slow_um - 1.0) / (11.0 * 0.95), slow_um))
     assert answers(axis, memories) != before
 
 
