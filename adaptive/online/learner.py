@@ -206,12 +206,12 @@ CHECK_S = 0.004
 RAIL_S, RAIL_SHARE = 0.1, 0.05
 #: Time inside the envelope after which ``model_left_envelope`` ends, s.
 LEFT_S = 1.0
-#: While readings are on trial the identified model is served if its own recent rms error is below so many times that by
-#: which the estimate has lately moved, and may have moved since, and below this share of the span. Where the estimate
-#: hardly moves, it is better by far. Where the stage has just changed, the estimate has moved to where it belongs.
-#: The error of the last estimate during a trial was 0.2 to 8 times as large as its motion (16 foreign stages).
+#: While readings are on trial, the identified model is served if its recent rms error is below ``MOVES`` times the
+#: recent motion of the estimate, and below this share of the span. An estimate that hardly moves is far better than
+#: the identified model. One that moved much may have followed a real change of the stage; the share covers that case.
+#: The error of the last estimate during a trial was 0.2 to 8 times its motion before (16 foreign stages).
 MOVES, ALONE_SHARE = 5.0, 0.02
-#: Shares of the range at which that is compared, to and fro.
+#: Shares of the range at which the motion of the estimate is taken, in both directions.
 COMPARED = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 #: Number of newest samples on which old and new hyper-parameters are compared.
@@ -447,9 +447,9 @@ class Parts:
         if on_trial_s or before:
             limit_V = MOVES * self.moved_V * max(1.0, on_trial_s / self.moved_s)
             limit_V = min(limit_V, ALONE_SHARE * self.filter.span_V)
-            known = on_trial_s > 0.0 and self.judgement.frozen_V2 <= limit_V * limit_V
+            known = self.judgement.frozen_V2 <= limit_V * limit_V
             # A model that may not judge the sensor has confirmed no reading, and so no estimate.
-            self.alone = known or (on_trial_s > 0.0 and self.intake.tried_by_voltages)
+            self.alone = on_trial_s > 0.0 and (known or self.intake.tried_by_voltages)
         if self.alone and not before:
             self.intake.reckon_by(self.intake.base)
         return self.alone != before
@@ -466,7 +466,7 @@ class Parts:
         ``undone``: unconfirmed jumps are taken back too; return to the estimate before the first of them.
         """
         self.filter.restore(self.proven_mark if undone else self.confirmed[0])
-        # Not the newer one that was confirmed: the fault itself may have moved it.
+        # The newer confirmed estimate is left out: the fault may have moved it already.
         moves_V = [self.rows @ (self.filter.beta - beta) for beta, _ in (self.mark, self.next_mark)]
         self.moved_V = max(sqrt(float(np.mean(move_V**2))) for move_V in moves_V)
         self.moved_s = max(1, self.judgement.judged - self.mark_ages[0]) * self.filter.step_s

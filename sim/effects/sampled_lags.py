@@ -63,7 +63,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
     lagged: bool | None = two.cost < 0.4 * one.cost and two.product > 5.0 * two.product_error
     if not lagged and two.cost < 0.8 * one.cost:
-        # Something bends the response as a second lag does, and not clearly: a lag is not excluded.
+        # A second lag improves the fit, but its size is not known: it is neither seen nor excluded.
         lagged = None
     if lagged and not delayed:
         late_s, late_error_s = float(two.p[1]), float(two.errors[1])

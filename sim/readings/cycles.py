@@ -74,7 +74,7 @@ def mirrored_branches(readings: Readings) -> Sight:
     bend, error, height = (float(x) for x in max((np.median(kind, axis=0) for kind in asked), key=lambda m: abs(m[0])))
     curved, sizeable = abs(bend) > 4.0 * error, abs(bend) > 1.5e-4 * data.range_um
     tallest = max(float(np.median([m[2] for m in kind])) for kind in asked)
-    # Straight cycles exclude a bow only if they span the range, and a little bow is none of nothing.
+    # Straight cycles exclude a bow only if they span the range. A bow that is too small to be named is not excluded.
     straight = not curved and tallest > 0.9 * data.swing_V
     seen = True if curved and sizeable else False if straight else None
     words = (

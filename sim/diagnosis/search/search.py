@@ -39,10 +39,11 @@ class Thresholds:
     #: Least share of the squared error above the noise floor that the first cause, and a further one, must remove.
     least_excess_first: float = 0.1
     least_excess_next: float = 0.25
-    #: A further cause that removes this share is accepted even if the model errors of earlier causes could explain it;
-    #: and this one where less than twice the noise floor is left, but more than so much of it.
+    #: A further cause that removes this share is accepted even if the model errors of earlier causes could explain it.
     nearly_all: float = 0.85
+    #: The same share where the squared error is below twice that of the noise floor ...
     all_of_little: float = 0.95
+    #: ... and above this many times that of the noise floor.
     little: float = 1.1
     #: Cost of one parameter, as a share of the squared error: of two equal causes the simpler one is preferred.
     cost_per_number: float = 0.002
@@ -96,17 +97,17 @@ def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolA
     """From a linearised guess, or from beside neutral where that overshot."""
     parameters = model.causes[-1].parameters(model.data)
     neutral = np.array([s.neutral for s in parameters])
-    starts = [guess]
-    if evaluate(model, clipped_to_bounds(model, np.concatenate([base.p, guess])), mask).sse_um2 > base.sse_um2:
-        # At a bound (no creep) a fit may not find away: then from the guess after all.
-        starts = [np.where([s.linear for s in parameters], neutral, guess), guess]
-    fit: ModelFit | None = None
-    for own in starts:
-        other = calibrate(model, np.concatenate([base.p, own]), mask, 8, 2e-3, known=base.columns())
-        fit = other if fit is None else min(fit, other, key=lambda f: f.sse_um2)
-        if fit.sse_um2 < 0.98 * base.sse_um2:
-            return fit
-    assert fit is not None
+
+    def fitted(own: FloatArray) -> ModelFit:
+        return calibrate(model, np.concatenate([base.p, own]), mask, 8, 2e-3, known=base.columns())
+
+    if evaluate(model, clipped_to_bounds(model, np.concatenate([base.p, guess])), mask).sse_um2 <= base.sse_um2:
+        fit = fitted(guess)
+    else:
+        fit = fitted(np.where([s.linear for s in parameters], neutral, guess))
+        if fit.sse_um2 >= 0.98 * base.sse_um2:
+            # A fit that starts at a bound (no creep) may stay there.
+            fit = min(fit, fitted(guess), key=lambda f: f.sse_um2)
     if fit.sse_um2 <= base.sse_um2:
         return fit
     # It ended worse than without the cause: what the cause shares with the base (a lag) had to move with it.
@@ -258,8 +259,13 @@ class Search:
 
     def polish(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The same cause fitted to convergence."""
-        fit = calibrate(candidate.fit.model, candidate.fit.p, self.mask, candidate.cause.iterations, 1e-5)
-        fit = with_new_columns(fit, self.mask)
+        return self._converged(candidate, candidate.fit, base, candidate.cause.iterations)
+
+    def _converged(
+        self, candidate: CauseCandidate, fit: ModelFit, base: ModelFit, iterations: int = 12
+    ) -> CauseCandidate:
+        """The candidate with ``fit``, after a calibration to convergence."""
+        fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, iterations, 1e-5), self.mask)
         held = self.held(fit)
         return replace(candidate, fit=fit, held=held, cost=self.cost(fit, held, base))
 
@@ -376,7 +382,7 @@ class Search:
         return None
 
     def _apart(self, candidates: list[CauseCandidate]) -> list[CauseCandidate]:
-        """Without those that show only their sum with an earlier one: the second lag of two gets no further."""
+        """Without those that the recording cannot tell from an earlier one, such as the second of two lags."""
         out: list[CauseCandidate] = []
         for one in candidates:
             beside = self.catalogue.same_set({one.cause.name})
@@ -396,9 +402,7 @@ class Search:
         other = calibrate(model, fit.p, self.mask, 4, 2e-3, known=fit.columns())
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
             return accepted
-        other = with_new_columns(calibrate(model, other.p, self.mask, 12, 1e-5), self.mask)
-        held = self.held(other)
-        return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+        return self._converged(accepted, other, base)
 
     def _off_bounds(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the nominal mechanics started anew where one of their numbers stands at its bound, if that
@@ -417,21 +421,17 @@ class Search:
         other = calibrate(fit.model, start, self.mask, 20, 1e-4)
         if other.sse_um2 > fit.sse_um2 * 0.99:
             return accepted
-        other = with_new_columns(calibrate(fit.model, other.p, self.mask, 12, 1e-5), self.mask)
-        held = self.held(other)
-        return replace(accepted, fit=other, held=held, cost=self.cost(other, held, base))
+        return self._converged(accepted, other, base)
 
     def _with_free_memory(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with a free memory at the start, if that explains more: a large cause can hide it."""
         fit = with_free_memory(accepted.fit, self.mask)
         if fit is accepted.fit:
             return accepted
-        fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, 12, 1e-5), self.mask)
         if self.nominal_p is not None:
             more = fit.model.parameters[self.nominal_p.size : fit.model.n_nominal]
             self.nominal_p = np.append(self.nominal_p, [s.neutral for s in more])
-        held = self.held(fit)
-        return replace(accepted, fit=fit, held=held, cost=self.cost(fit, held, base))
+        return self._converged(accepted, fit, base)
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the finer model of the same cause that costs least, if one costs less."""
@@ -547,11 +547,11 @@ def review(
         looks, _ = search.looks(less, beside | {cause.name})
         rivals = search.refit(less, looks, 4, 0.5 * gain)
         cost = search.cost(fit, held, less)
-        polished = (search.polish(c, less) for c in rivals[:2])
-        swap = next((c for c in polished if c.cost < 0.9 * cost), None)
-        if search.seen(cause):
-            # Another one may explain more without it, and is no reading of its signature.
-            swap = None
+        swap = None
+        # Another cause may explain more in the place of one that is seen, but does not account for its signature.
+        if not search.seen(cause):
+            polished = (search.polish(c, less) for c in rivals[:2])
+            swap = next((c for c in polished if c.cost < 0.9 * cost), None)
         if swap is not None and swaps < 2 and swap.cause.name not in steps and search.plausible(swap):
             swaps += 1
             before = steps[cause.name]
