@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from adaptive.types import FloatArray
 from sim.fitting.lags import slow_poles
@@ -55,31 +56,50 @@ class RestsOverTime:
 def rests_over_time(readings: Readings) -> RestsOverTime:
     """What the rests show: motion after each step in proportion to it, motion in time alone, and in proportion to u.
 
-    Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the voltage; both drifts are
-    a line and exponentials in time. The standard errors come from leaving out one rest in turn.
+    Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the readings: they step as the
+    stage does, and a step over a steep part of the loop is larger than its voltage. Both drifts are a line and
+    exponentials in time. The standard errors come from leaving out one rest in turn.
     """
     data = readings.data
     long_enough = [r for r in readings.rests if (r.last - r.first) * data.dt_s >= 0.5]
     if len(long_enough) < 4:
         return RestsOverTime(f"{len(long_enough)} rests of half a second or more; four are needed")
-    t, y, of = readings.bins(max(0.02, data.duration_s / 4000.0))
+    # Creep by the logarithm of time, and a part of it that is faster or slower than that.
+    found = _moved(readings, 1)
+    creep = found.creep
+    if creep is not None and creep.value > _SIGMAS * creep.error:
+        # Where there is creep, what its two shapes leave of it must not count as a drift. Elsewhere a third shape
+        # would only make the errors larger.
+        found = replace(_moved(readings, 2), creep=creep)
+    stepped = any(
+        float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
+        for r in long_enough
+    )
+    return found if stepped else replace(found, creep=None)
+
+
+def _moved(readings: Readings, degree: int) -> RestsOverTime:
+    """The motion of the rests. ``degree``: of the polynomial over log tau that the weights of creep's lags may be."""
+    data = readings.data
+    t, y, index = readings.bins(max(0.02, data.duration_s / 4000.0))
+    of = index.astype(np.int64)
     thin = max(1, round(0.01 / data.dt_s))
-    u = np.ascontiguousarray(data.u_V[::thin])
-    poles = np.asarray(slow_poles(u, thin * data.dt_s / np.array(_TAUS_S)))
-    grid_s = thin * data.dt_s * np.arange(u.size)
-    level = np.interp(t, grid_s, u)
+    whole = data.n // thin
+    moved = data.y_um[: whole * thin].reshape(whole, thin).mean(axis=1)
+    poles = np.asarray(slow_poles(moved, thin * data.dt_s / np.array(_TAUS_S)))
+    grid_s = thin * data.dt_s * np.arange(whole)
+    # A gain acts on the height of each rest: not on the voltage, which gives two heights on a loop, nor on what
+    # still moves in the rest, which is to be explained.
+    height = np.bincount(of, y)[of] / np.bincount(of)[of] - float(moved.min())
     x = t / data.duration_s
-    gain = max(abs(data.gain_um_per_V), 1e-12)
     per_decade = _per_decade(data.slowest_s)
-    # Creep by the logarithm of time, and the part of it that is faster or slower than that.
-    law = np.array([np.ones(poles.shape[0]), np.linspace(-1.0, 1.0, poles.shape[0])]) @ poles
-    creep_um = 0.02 / float(per_decade.sum()) * gain * np.array([np.interp(t, grid_s, row) for row in law])
-    span = float(np.ptp(level))
+    weights = 0.02 / float(per_decade.sum()) * legvander(np.linspace(-1.0, 1.0, poles.shape[0]), degree).T
     # One unit of each column is a size that a stage can have, so that one ridge fits all.
     drifts = np.array([x, np.exp(-5.0 * x), np.exp(-20.0 * x)])
-    columns = [*creep_um, *(0.01 * data.range_um * drifts)]
-    if span > 0.1 * data.swing_V:
-        columns += [*(0.02 * gain * (level - data.u_low_V) * drifts[:2])]
+    columns = [np.interp(t, grid_s, row) for row in weights @ poles]
+    columns += [*(0.01 * data.range_um * drifts)]
+    if float(np.ptp(height)) > 0.1 * data.range_um:
+        columns += [*(0.02 * height * drifts[:2])]
     rows = np.array(columns)
     grams, slopes = [], []
     for i in np.unique(of):
@@ -88,12 +108,14 @@ def rests_over_time(readings: Readings) -> RestsOverTime:
         y[inside] -= y[inside].mean()
         grams.append(rows[:, inside] @ rows[:, inside].T)
         slopes.append(rows[:, inside] @ y[inside])
+    shapes = degree + 1
     decade = np.zeros(rows.shape[0])
-    decade[:2] = 0.02, 0.02 * float(np.linspace(-1.0, 1.0, poles.shape[0]) @ per_decade) / float(per_decade.sum())
+    decade[:shapes] = weights @ per_decade
     functionals = {"creep": decade}
     first, last = float(x.min()), float(x.max())
     middle = 0.5 * (first + last)
-    for name, at, unit, count in (("thermal_drift", 2, 0.01 * data.range_um, 3), ("gain_drift", 5, 0.02, 2)):
+    drift_at = (("thermal_drift", shapes, 0.01 * data.range_um, 3), ("gain_drift", shapes + 3, 0.02, 2))
+    for name, at, unit, count in drift_at:
         if at >= rows.shape[0]:
             continue
         for part, (begin, end) in {"": (first, last), ".early": (first, middle), ".late": (middle, last)}.items():
@@ -103,17 +125,13 @@ def rests_over_time(readings: Readings) -> RestsOverTime:
             row[at : at + count] = unit * np.array(change[:count])
             functionals[name + part] = row
     values, errors = _jackknife(grams, slopes, functionals, float(np.var(y)))
-    stepped = any(
-        float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
-        for r in long_enough
-    )
     found: dict[str, Change] = {}
     for name in ("thermal_drift", "gain_drift"):
         parts = [k for k in values if k.split(".")[0] == name]
         if parts:
             best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
             found[name] = Change(values[best], errors[best], _WHEN[best[len(name) + 1 :]])
-    creep = Change(values["creep"], errors["creep"]) if stepped else None
+    creep = Change(values["creep"], errors["creep"])
     return RestsOverTime("", creep, found["thermal_drift"], found.get("gain_drift"))
 
 

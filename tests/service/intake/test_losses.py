@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -82,6 +84,31 @@ def test_an_outage_that_is_over_has_no_name(outage_s: float) -> None:
         return Arrivals(received=EACH, lost=round(outage_s * 1e3) if back else 0)
 
     assert judged(come, 9.0) == []
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.floats(0.0, 3.0, allow_nan=False), st.integers(0, 60), st.booleans()), min_size=1, max_size=30
+    )
+)
+def test_samples_that_all_arrive_never_have_a_name_however_they_are_bunched(
+    looks: list[tuple[float, int, bool]],
+) -> None:
+    """``looks``: pause before each look, samples since the one before it, and whether they come twice."""
+    axis, losses = make_axis(), SampleLosses()
+    now_s, first = 100.0, 0
+    for pause_s, n, twice in looks:
+        now_s += pause_s
+        if n:
+            batch = recording(first, n)
+            for _ in range(1 + twice):
+                axis.handle(batch)
+            first += n
+        counts = axis.counts
+        lost = axis.sequence.lost
+        losses.look(now_s, Arrivals(counts.samples["received"], counts.refused, counts.foreign, lost=lost))
+        assert losses.trouble == ""
 
 
 def test_a_stage_that_restarts_its_count_has_no_name() -> None:

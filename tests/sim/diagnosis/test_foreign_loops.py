@@ -10,12 +10,14 @@ import pytest
 from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
 from sim.diagnosis.nominal import calibrate_nominal
 from sim.diagnosis.search.search import first_fits
+from sim.effects.gain_drift import in_rests
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.fitting.calibration import with_new_columns
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
+from sim.readings.slow_motion import rests_over_time
 from tests.hidden.foreign.cases import pair, single
 from tests.hidden.foreign.record import Case, Rig
 from tests.hidden.foreign.score import nominal_of, recording_of
@@ -148,3 +150,16 @@ def test_a_response_that_bends_unclearly_does_not_exclude_a_lag() -> None:
     prepared = prepare(recording_of(UNCLEAR_LAG), nominal="bouc_wen")
     readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
     assert second_lag(readings).seen is None
+
+
+@pytest.mark.parametrize("seed", [741, 760])
+def test_creep_on_a_loop_whose_steps_differ_is_not_seen_as_a_drift_of_the_gain(seed: int) -> None:
+    """A step over a steep part of the loop is larger than its voltage, and creeps by more."""
+    case = single(seed)
+    assert case.hidden == ("creep",)
+    prepared = prepare(recording_of(case), nominal="bouc_wen")
+    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    assert in_rests(readings).seen is not True
+    found = rests_over_time(readings).creep
+    assert found is not None
+    assert found.value > 10.0 * found.error
