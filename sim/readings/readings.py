@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from adaptive.types import BoolArray, FloatArray
+from adaptive.types import BoolArray, FloatArray, IntArray
 from baselines.prandtl_ishlinskii.operators import play_run
 from sim.fitting.fit_data import EARLY_S, DerivedArrays, FitData
 from sim.fitting.lags import lag_ends
@@ -220,7 +220,7 @@ class Readings:
         gain = cross[good] / power_u[good]
         return Response(f[good], gain, coherence[good], len(kept))
 
-    def bins(self, width_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def bins(self, width_s: float) -> tuple[FloatArray, FloatArray, IntArray]:
         """Means over bins of about ``width_s`` inside the rests: time (s), reading (µm) and index of the rest."""
         t: list[float] = []
         y: list[float] = []
@@ -231,7 +231,7 @@ class Readings:
                 t.append((first + 0.5 * (width - 1)) * self.data.dt_s)
                 y.append(float(np.mean(self.data.y_um[first : first + width])))
                 of.append(i)
-        return np.array(t), np.array(y), np.array(of, dtype=np.float64)
+        return np.array(t), np.array(y), np.array(of, dtype=np.int64)
 
     @cached_property
     def lateness(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,51 +56,68 @@ class RestsOverTime:
 def rests_over_time(readings: Readings) -> RestsOverTime:
     """What the rests show: motion after each step in proportion to it, motion in time alone, and in proportion to u.
 
-    Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the readings: they step as the
-    stage does, and a step over a steep part of the loop is larger than its voltage. Both drifts are a line and
-    exponentials in time. The standard errors come from leaving out one rest in turn.
+    Each rest has a free level, so that no loop matters. Creep is a sum of slow lags of the readings, not of the
+    voltage: a step over a steep part of the loop is larger than its voltage, and creeps by more. Both drifts are a
+    line and exponentials in time. The standard errors come from leaving out one rest in turn.
     """
     data = readings.data
     long_enough = [r for r in readings.rests if (r.last - r.first) * data.dt_s >= 0.5]
     if len(long_enough) < 4:
         return RestsOverTime(f"{len(long_enough)} rests of half a second or more; four are needed")
-    # Creep by the logarithm of time, and a part of it that is faster or slower than that.
-    found = _moved(readings, 1)
-    creep = found.creep
-    if creep is not None and creep.value > _SIGMAS * creep.error:
-        # Where there is creep, what its two shapes leave of it must not count as a drift. Elsewhere a third shape
-        # would only make the errors larger.
-        found = replace(_moved(readings, 2), creep=creep)
+    rests = _motion_of_rests(readings)
+    values, errors = _jackknife(rests, -1)
+    creep = Change(values["creep"], errors["creep"])
+    if creep.value > _SIGMAS * creep.error:
+        # What two shapes leave of the creep would count as a drift. Where none is seen, a third shape would only make
+        # the errors larger.
+        values, errors = _jackknife(rests, None)
+    drifts: dict[str, Change] = {}
+    for name in ("thermal_drift", "gain_drift"):
+        parts = [k for k in values if k.split(".")[0] == name]
+        if parts:
+            best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
+            drifts[name] = Change(values[best], errors[best], _WHEN[best[len(name) + 1 :]])
     stepped = any(
         float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
         for r in long_enough
     )
-    return found if stepped else replace(found, creep=None)
+    return RestsOverTime("", creep if stepped else None, drifts["thermal_drift"], drifts.get("gain_drift"))
 
 
-def _moved(readings: Readings, degree: int) -> RestsOverTime:
-    """The motion of the rests. ``degree``: of the polynomial over log tau that the weights of creep's lags may be."""
+@dataclass(frozen=True)
+class _Rests:
+    """Normal equations of each rest, (rests, m, m) and (rests, m); what is asked of their solution, (m,) by name.
+
+    The last column is the third shape of creep. ``variance``: of the readings within the rests, µm².
+    """
+
+    grams: FloatArray
+    slopes: FloatArray
+    functionals: dict[str, FloatArray]
+    variance: float
+
+
+def _motion_of_rests(readings: Readings) -> _Rests:
     data = readings.data
-    t, y, index = readings.bins(max(0.02, data.duration_s / 4000.0))
-    of = index.astype(np.int64)
+    t, y, of = readings.bins(max(0.02, data.duration_s / 4000.0))
     thin = max(1, round(0.01 / data.dt_s))
-    whole = data.n // thin
-    moved = data.y_um[: whole * thin].reshape(whole, thin).mean(axis=1)
-    poles = np.asarray(slow_poles(moved, thin * data.dt_s / np.array(_TAUS_S)))
-    grid_s = thin * data.dt_s * np.arange(whole)
-    # A gain acts on the height of each rest: not on the voltage, which gives two heights on a loop, nor on what
-    # still moves in the rest, which is to be explained.
-    height = np.bincount(of, y)[of] / np.bincount(of)[of] - float(moved.min())
-    x = t / data.duration_s
+    n = data.n // thin
+    reading = data.y_um[: n * thin].reshape(n, thin).mean(axis=1)
+    lags = np.asarray(slow_poles(reading, thin * data.dt_s / np.array(_TAUS_S)))
+    # Over log tau the weights of the lags are constant (creep by the logarithm of time), a line, and a parabola.
     per_decade = _per_decade(data.slowest_s)
-    weights = 0.02 / float(per_decade.sum()) * legvander(np.linspace(-1.0, 1.0, poles.shape[0]), degree).T
+    weights = 0.02 / float(per_decade.sum()) * legvander(np.linspace(-1.0, 1.0, lags.shape[0]), 2).T
+    creep = [np.interp(t, thin * data.dt_s * np.arange(n), row) for row in weights @ lags]
+    # A gain acts on the height of the stage. On a loop the voltage does not give it, and the reading of each moment
+    # would explain itself: hence the mean of each rest.
+    height = np.bincount(of, y)[of] / np.bincount(of)[of] - float(reading.min())
+    x = t / data.duration_s
     # One unit of each column is a size that a stage can have, so that one ridge fits all.
-    drifts = np.array([x, np.exp(-5.0 * x), np.exp(-20.0 * x)])
-    columns = [np.interp(t, grid_s, row) for row in weights @ poles]
-    columns += [*(0.01 * data.range_um * drifts)]
+    in_time = np.array([x, np.exp(-5.0 * x), np.exp(-20.0 * x)])
+    columns = [*creep[:2], *(0.01 * data.range_um * in_time)]
     if float(np.ptp(height)) > 0.1 * data.range_um:
-        columns += [*(0.02 * height * drifts[:2])]
-    rows = np.array(columns)
+        columns += [*(0.02 * height * in_time[:2])]
+    rows = np.array([*columns, creep[2]])
     grams, slopes = [], []
     for i in np.unique(of):
         inside = of == i
@@ -108,15 +125,13 @@ def _moved(readings: Readings, degree: int) -> RestsOverTime:
         y[inside] -= y[inside].mean()
         grams.append(rows[:, inside] @ rows[:, inside].T)
         slopes.append(rows[:, inside] @ y[inside])
-    shapes = degree + 1
     decade = np.zeros(rows.shape[0])
-    decade[:shapes] = weights @ per_decade
+    decade[:2] = weights[:2] @ per_decade
     functionals = {"creep": decade}
     first, last = float(x.min()), float(x.max())
     middle = 0.5 * (first + last)
-    drift_at = (("thermal_drift", shapes, 0.01 * data.range_um, 3), ("gain_drift", shapes + 3, 0.02, 2))
-    for name, at, unit, count in drift_at:
-        if at >= rows.shape[0]:
+    for name, at, unit, count in (("thermal_drift", 2, 0.01 * data.range_um, 3), ("gain_drift", 5, 0.02, 2)):
+        if at >= len(columns):
             continue
         for part, (begin, end) in {"": (first, last), ".early": (first, middle), ".late": (middle, last)}.items():
             row = np.zeros(rows.shape[0])
@@ -124,15 +139,7 @@ def _moved(readings: Readings, degree: int) -> RestsOverTime:
             change += [math.exp(-20.0 * end) - math.exp(-20.0 * begin)]
             row[at : at + count] = unit * np.array(change[:count])
             functionals[name + part] = row
-    values, errors = _jackknife(grams, slopes, functionals, float(np.var(y)))
-    found: dict[str, Change] = {}
-    for name in ("thermal_drift", "gain_drift"):
-        parts = [k for k in values if k.split(".")[0] == name]
-        if parts:
-            best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
-            found[name] = Change(values[best], errors[best], _WHEN[best[len(name) + 1 :]])
-    creep = Change(values["creep"], errors["creep"])
-    return RestsOverTime("", creep, found["thermal_drift"], found.get("gain_drift"))
+    return _Rests(np.array(grams), np.array(slopes), functionals, float(np.var(y)))
 
 
 def _per_decade(slowest_s: float) -> FloatArray:
@@ -143,20 +150,18 @@ def _per_decade(slowest_s: float) -> FloatArray:
     return np.asarray(rise @ z / float(z @ z))
 
 
-def _jackknife(
-    grams: list[FloatArray], slopes: list[FloatArray], functionals: dict[str, FloatArray], variance: float
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Each functional of the least-squares solution, and its standard error by leaving out one rest in turn."""
-    gram, slope = np.sum(np.array(grams), axis=0), np.sum(np.array(slopes), axis=0)
-    ridge = 1e-3 * variance * np.eye(gram.shape[0])
+def _jackknife(rests: _Rests, end: int | None) -> tuple[dict[str, float], dict[str, float]]:
+    """What is asked of the solution for the columns before ``end``; standard errors by leaving out one rest in turn."""
+    grams, slopes = rests.grams[:, :end, :end], rests.slopes[:, :end]
+    gram, slope = grams.sum(axis=0), slopes.sum(axis=0)
+    ridge = 1e-3 * rests.variance * np.eye(gram.shape[0])
     solved = np.linalg.solve(gram + ridge, slope)
-    pairs = zip(grams, slopes, strict=True)
-    without = np.array([np.linalg.solve(gram - g + ridge, slope - s) for g, s in pairs])
+    without = np.array([np.linalg.solve(gram - g + ridge, slope - s) for g, s in zip(grams, slopes, strict=True)])
     n = without.shape[0]
     values, errors = {}, {}
-    for name, row in functionals.items():
-        values[name] = float(row @ solved)
-        each = without @ row
+    for name, row in rests.functionals.items():
+        values[name] = float(row[:end] @ solved)
+        each = without @ row[:end]
         errors[name] = float(np.sqrt((n - 1) / n * np.sum(np.square(each - each.mean()))))
     return values, errors
 
