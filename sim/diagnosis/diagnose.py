@@ -304,6 +304,8 @@ def changing(search: Search) -> tuple[str, ...]:
 
 #: Share of the explainable squared error from which named causes explain a recording, or a part of it.
 EXPLAINED, IN_PART = 0.8, 0.1
+#: Noise floors up to which an error may be noise, for noise that is correlated over longer than a rest.
+MOST_NOISE = 10.0
 #: Share of the held-out squared error that must go on a test recording for the causes to carry over.
 CARRIES_OVER = 0.04
 
@@ -340,8 +342,9 @@ def verdict_of(
             if explained >= IN_PART:
                 return "partly"
         return "unexplained"
-    # What a black box cannot predict either is noise, whatever its colour.
-    return "unexplained" if structured and nominal_um > 1.1 * ceiling_um else "adequate"
+    # What a black box cannot predict either is noise, whatever its colour; but not far above the noise of the rests.
+    predictable = nominal_um > 1.1 * ceiling_um or nominal_um > MOST_NOISE * floor_um
+    return "unexplained" if structured and predictable else "adequate"
 
 
 def not_excited(search: Search, floor: NoiseFloor) -> tuple[str, ...]:

@@ -178,6 +178,8 @@ class LinearStage:
 
 #: Relative spread of the mode frequencies of one type of stage; a larger difference is a payload.
 MODE_SPREAD = 0.015
+#: Damping ratio below which a mode rings.
+LIGHT = 0.5
 #: Calibration scales the other numbers of the actuator by at most this factor, up or down.
 SCALE = 2.0
 
@@ -216,6 +218,12 @@ class FileStage:
     def has_loop(self) -> bool:
         """Whether the actuator has hysteresis."""
         return any(e.name not in ("linear_actuator", "dac", "creep", "amplifier_lag") for e in self.before)
+
+    @property
+    def has_lag(self) -> bool:
+        """Whether amplifier, mechanics or sensor lag behind by more than a lightly damped mode does."""
+        lags = any(e.name in ("amplifier_lag", "sensor_lag") for e in (*self.before, *self.behind))
+        return lags or any(damping >= LIGHT for _, damping in self.modes_hz)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         span = 1.0 / SCALE
@@ -358,9 +366,14 @@ def with_nominal_kind(kind: str | StageConfig, data: FitData) -> FitData:
         linear = kind == "linear"
         return replace(data, input_is_linear=linear, nominal_kind=kind, has_mode=linear)
     stage = file_stage(kind)
-    known = tuple(f for f, damping in stage.modes_hz if damping < 0.5)
+    known = tuple(f for f, damping in stage.modes_hz if damping < LIGHT)
     return replace(
-        data, input_is_linear=not stage.has_loop, nominal_kind="stage", known_modes_hz=known, has_mode=bool(known)
+        data,
+        input_is_linear=not stage.has_loop,
+        nominal_kind="stage",
+        known_modes_hz=known,
+        has_mode=bool(known),
+        has_lag=stage.has_lag,
     )
 
 
@@ -428,6 +441,7 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
         nominal_kind=home.data.nominal_kind,
         known_modes_hz=home.data.known_modes_hz,
         has_mode=home.data.has_mode,
+        has_lag=home.data.has_lag,
         scales_from=home.data.scales,
     )
     nominal = home.nominal

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,11 @@ from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
 from sim.fitting.dynamics import Dynamics
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess
+from sim.readings.ringing import SIGMAS, ringing
+from sim.readings.sight import Sight
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Readings
 
 # Its step in the simulation: that of the modes, with more mass.
 
@@ -44,29 +50,9 @@ def loaded(system: Dynamics, ratio: float) -> Dynamics:
     return replace(system, modes_hz=tuple(modes))
 
 
-#: Frequencies, relative to the known mode, between which a payload may have moved it, and how near two peaks may lie.
-_LOWEST, _HIGHEST, _NEAR = 0.4, 1.6, 0.015
-_PEAKS = 3
-
-
-def _ratios_that_ring(data: FitData) -> list[float]:
-    """Payload ratios that move the known mode to the highest peaks in the spectrum of the readings' differences.
-
-    A mode that is hardly damped answers in a band of its damping: steps of the ratio would miss it.
-    """
-    from scipy.signal import welch  # a simulated stage does not wait for it
-
-    if not data.known_modes_hz:
-        return []
-    f_hz, power = welch(np.diff(data.y_um), 1.0 / data.dt_s, nperseg=min(data.n - 1, round(4.0 / data.dt_s)))
-    share = f_hz / data.known_modes_hz[0]
-    open_ = (share > _LOWEST) & (share < _HIGHEST) & (np.abs(share - 1.0) > _NEAR)
-    out: list[float] = []
-    while open_.any() and len(out) < _PEAKS:
-        peak = share[open_][np.argmax(power[open_])]
-        out.append(float(peak**-2.0 - 1.0))
-        open_ &= np.abs(share - peak) > _NEAR * peak
-    return out
+def _ratio(known_hz: float, now_hz: float) -> float:
+    """The payload, relative to the moving mass, that moves the mode from ``known_hz`` to ``now_hz``."""
+    return (known_hz / now_hz) ** 2 - 1.0
 
 
 @dataclass(frozen=True)
@@ -106,15 +92,22 @@ class PayloadChange(CauseModel):
         return [[np.array([r, share * t])] for r in (-0.3, -0.1, 0.1, 0.3, 1.0) for share in (0.25, 0.5, 0.75)]
 
     def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        """The numbers of the stage file, which the calibration has bent to the moved mode, and each mode that rings."""
+        """The mode of the stage file, which the calibration has bent to the moved one, and the frequency that rings."""
         stated = np.array(
             [0.0 if n.startswith("log_") else 1.0 if "." in n else p for n, p in zip(names, nominal, strict=True)]
         )
-        ringing = _ratios_that_ring(data)
+        found = ringing(data)
+        if found is None or not found.f_hz.size:
+            return []
         if self.variant != "midway":
-            return [np.append(stated, r) for r in ringing]
-        t = data.duration_s
-        return [np.append(stated, (r, share * t)) for r in ringing for share in np.arange(0.1, 0.95, 0.1)]
+            return [np.append(stated, _ratio(data.known_modes_hz[0], found.level().f_hz))]
+        change = found.change()
+        if change is None:
+            return []
+        k, before, after = change
+        middle_s = 0.5 * (found.begin_s + found.end_s)
+        ratio = _ratio(before.f_hz, after.f_hz)
+        return [np.append(stated, (ratio, t)) for t in np.linspace(middle_s[k - 1], middle_s[k], 9)]
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
         return system if self.variant == "midway" else loaded(system, float(p[0]))
@@ -132,6 +125,37 @@ def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | No
     return InLibrary((PAYLOAD_CHANGE.clipped(payload_ratio=v["payload_ratio"]),))
 
 
+# Its signature in the readings.
+
+
+def seen(readings: Readings) -> Sight:
+    """The stage rings at another frequency than the one that is known, or at another one from some moment on."""
+    found = ringing(readings.data)
+    if found is None:
+        return Sight(None, "no stage file states the mode")
+    if not found.f_hz.size:
+        return Sight(None, "the mode does not ring long enough to tell its frequency")
+    known_hz = readings.data.known_modes_hz[0]
+    count, change = found.f_hz.size, found.change()
+    if change is not None:
+        k, before, after = change
+        words = (
+            f"the stage rings at {before.f_hz:.4g} ± {1.96 * before.error_hz:.1g} Hz until {found.end_s[k - 1]:.3g} s, "
+            f"and at {after.f_hz:.4g} ± {1.96 * after.error_hz:.1g} Hz from {found.begin_s[k]:.3g} s on"
+        )
+        return Sight(True, words)
+    level = found.level()
+    words = f"in {count} stretches the stage rings at {level.f_hz:.4g} ± {1.96 * level.error_hz:.1g} Hz"
+    words += f" where {known_hz:.4g} Hz is stated"
+    apart = abs(level.f_hz - known_hz)
+    if apart > max(SIGMAS * level.error_hz, 0.01 * known_hz):
+        return Sight(True, words)
+    # A payload that is put on late needs stretches before and after.
+    half_s = 0.5 * readings.data.duration_s
+    throughout = min(int(np.sum(found.end_s < half_s)), int(np.sum(found.begin_s > half_s))) >= 2
+    return Sight(False if throughout and level.error_hz < 2e-3 * known_hz else None, words)
+
+
 PAYLOAD_CHANGE = Kind(
     name="payload_change",
     place=Place.MECHANICS,
@@ -145,6 +169,8 @@ PAYLOAD_CHANGE = Kind(
     tells_apart="a change of stiffness moves the DC gain too",
     source="-30 % of f0 when the mass doubles: f0 sqrt(m/(m+M))",
     cause=Cause(
+        sign="the stage rings at another frequency than the known mode, or at another one from some moment on",
+        tests=(seen,),
         forms=(PayloadChange(), PayloadChange(variant="midway")),
         in_library=in_library,
         picture=pictures.frequency_response,

@@ -27,7 +27,7 @@ ComplexArray = NDArray[np.complex128]
 class LagsOfResponse:
     """What the response shows. ``missing``: what it lacks to show anything; then nothing else is given.
 
-    ``late``: a straight part of the phase; ``lagged``: a second lag. Each with its words.
+    ``late``: a straight part of the phase; ``lagged``: a lag beside the stage's own. Each with its words.
     """
 
     missing: str
@@ -38,15 +38,17 @@ class LagsOfResponse:
 
 
 def lags_of_response(readings: Readings) -> LagsOfResponse:
-    """A delay by its phase in proportion to frequency; a second lag by its arctangent and its fall in gain.
+    """A delay by its phase in proportion to frequency; a further lag by its arctangent and its fall in gain.
 
-    The stage's own lag is allowed for; a latency of up to one sample belongs to the recorder.
+    The stage's own lag is allowed for, and the rise below a mode that a stage file states; a latency of up to one
+    sample belongs to the recorder.
     """
     data = readings.data
     response = readings.response
     if response is None or response.f_hz.size < 12:
         return LagsOfResponse("the voltage has too little power above 5 Hz for a frequency response")
-    f, gain, sigma = _below_modes(response)
+    f, gain, sigma = _below_modes(response, data.known_modes_hz)
+    own = int(data.has_lag)
     # What happens within a sample is exact for one lag or two, but not for the modes and the loop above them.
     low = f <= 0.6 * response.f_hz[-1]
     if f.size < 10 or f[-1] < 4.0 * f[0] or int(low.sum()) < 10:
@@ -57,13 +59,13 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     delayed = late_s > 1.8 * data.dt_s + 5.0 * late_error_s and free.cost < 0.8 * latched.cost
     # A lag beside a delay is judged with the delay left free.
     latest_s = 0.05 if delayed else 1.5 * data.dt_s
-    one, two = (_fit(f, gain, sigma, data.dt_s, lags=n, latest_s=latest_s) for n in (1, 2))
-    lag_s, longer_s = float(np.min(two.p[4:])), float(np.max(two.p[4:]))
-    lag_error_s = two.product_error / longer_s
+    one, two = (_fit(f, gain, sigma, data.dt_s, lags=n, latest_s=latest_s) for n in (own, own + 1))
+    lag_s = float(np.min(two.p[4:]))
+    lag_error_s = two.product_error / two.product * lag_s
     # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
     lagged: bool | None = two.cost < 0.4 * one.cost and two.product > 5.0 * two.product_error
     if not lagged and two.cost < 0.8 * one.cost:
-        # A second lag improves the fit, but its size is not known: it is neither seen nor excluded.
+        # A further lag improves the fit, but its size is not known: it is neither seen nor excluded.
         lagged = None
     if lagged and not delayed:
         late_s, late_error_s = float(two.p[1]), float(two.errors[1])
@@ -72,7 +74,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
         f"{1.96e3 * late_error_s:.1g} ms"
     )
     lag_words = (
-        f"up to {f[-1]:.3g} Hz a second lag of {1e3 * lag_s:.3g} ± {1.96e3 * lag_error_s:.1g} ms lowers the "
+        f"up to {f[-1]:.3g} Hz a {'second ' * own}lag of {1e3 * lag_s:.3g} ± {1.96e3 * lag_error_s:.1g} ms lowers the "
         f"misfit of the response to {100 * two.cost / max(one.cost, 1e-300):.0f} %"
     )
     # A little more than the recorder's latch is not decided.
@@ -86,33 +88,36 @@ def second_lag(readings: Readings) -> Sight:
     return Sight(None, found.missing) if found.missing else Sight(found.lagged, found.lag_words)
 
 
-def _below_modes(response: Response) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """The response up to half the frequency of its largest peak, where it has one."""
+def _below_modes(response: Response, known_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """The response up to half the frequency of its largest peak, where it has one; of a stage whose mode is known,
+    without the rise towards the peak."""
     f, size = response.f_hz, np.abs(response.gain)
     low = float(np.median(size[: max(3, f.size // 10)]))
     peak = int(np.argmax(size))
     top = 0.5 * float(f[peak]) if size[peak] > 1.5 * low and f[peak] > 4.0 * f[0] else float(f[-1])
     keep = f <= top
-    return f[keep], response.gain[keep], response.sigma[keep]
+    rise = 1.0 / (1.0 - np.square(f[keep] / (2.0 * top))) if known_hz and top < f[-1] else 1.0
+    return f[keep], response.gain[keep] / rise, response.sigma[keep]
 
 
 class _Fitted:
     """Parameters (log gain, latency, lags), their standard errors, and the squared misfit.
 
-    ``product``, ``product_error``: of two lags, s².
+    ``product``, ``product_error``: of the lags, s for one and s² for two.
     """
 
     def __init__(self, p: FloatArray, cover: FloatArray, cost: float) -> None:
         self.p, self.cost = p, cost
         self.errors = np.sqrt(np.maximum(np.diag(cover), 0.0))
         row = np.zeros(p.size)
-        row[4:] = p[4:][::-1]
+        row[4:] = [np.prod(np.delete(p[4:], i)) for i in range(p.size - 4)]
         self.product = float(np.prod(p[4:]))
         self.product_error = float(np.sqrt(max(float(row @ cover @ row), 0.0)))
 
 
 def _fit(f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float) -> _Fitted:
-    """The better fit of a voltage that is held over each sample and of one that runs straight to the next."""
+    """The better fit of a voltage that is held over each sample and of one that runs straight to the next; without a
+    lag, by one that is shorter than can be seen."""
     both = (_fit_hold(f, gain, sigma, dt_s, lags, latest_s, straight) for straight in (False, True))
     return min(both, key=lambda fitted: fitted.cost)
 
@@ -141,9 +146,9 @@ def _fit_hold(
     best: optimize.OptimizeResult | None = None
     for first in (1e-3, 4e-3):
         # More than one start: the second lag hides behind the first.
-        start = np.array([start_gain, 0.0, 0.0, 0.0, first, *[0.3 * first] * (lags - 1)])
+        start = np.array([start_gain, 0.0, 0.0, 0.0, first if lags else 1.5e-6, *[0.3 * first] * (lags - 1)])
         low = [-50.0, -1.5 * dt_s, -0.3, -0.1, 1e-6, *[1e-6] * (lags - 1)]
-        high = [50.0, latest_s, 0.3, 0.1, 0.1, *[0.1] * (lags - 1)]
+        high = [50.0, latest_s, 0.3, 0.1, 0.1 if lags else 2e-6, *[0.1] * (lags - 1)]
         scale = [1.0, 1e-3, 0.1, 0.1, 1e-3, 1e-3][: start.size]
         solved = optimize.least_squares(misfit, start, bounds=(low, high), x_scale=scale)
         if best is None or solved.cost < best.cost:

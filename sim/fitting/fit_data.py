@@ -150,6 +150,8 @@ class FitData:
     known_modes_hz: tuple[float, ...] = ()
     #: The nominal stage has a lightly damped mode, stated or calibrated.
     has_mode: bool = False
+    #: The nominal stage has a lag of its own.
+    has_lag: bool = True
     #: Lowest static displacement and largest loop of the recording that was fitted, if this is another one.
     fitted_low_um: float | None = None
     fitted_loop_um: float | None = None

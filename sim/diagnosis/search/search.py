@@ -341,7 +341,7 @@ class Search:
             p = 1.0
             fitting = sorted((c for c in ranked if self.plausible(c)), key=self._with_witness)
             for candidate in self._apart(fitting)[:3]:
-                best = self.polish(candidate, current)
+                best = self._beside_finer(self.polish(candidate, current), current)
                 gain = held.sse_um2 - best.held.sse_um2
                 p = p_value(looks, gain, self.seed + round_)
                 if self.acceptable(best, held, left_um2, p, current):
@@ -441,11 +441,14 @@ class Search:
             finer = self._refined(finer, base)
         return best
 
+    def _left_floors(self, candidate: CauseCandidate) -> float:
+        """Held-out error of the candidate in noise floors."""
+        return float(np.sqrt(candidate.held.sse_um2 / max(1.0, float(self.mask.sum())))) / self.sigma_um
+
     def _refined(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate | None:
         """The candidate with the next finer model of the same cause; None if there is none or none is needed."""
-        left = np.sqrt(candidate.held.sse_um2 / max(1.0, float(self.mask.sum()))) / self.sigma_um
         own = candidate.fit.p[len(base.p) :]
-        found = candidate.cause.refined(own, float(left), base.model.data)
+        found = candidate.cause.refined(own, self._left_floors(candidate), base.model.data)
         if found is None:
             return None
         cause, starts = found
@@ -455,6 +458,23 @@ class Search:
         fit = with_new_columns(min(fits, key=lambda f: f.sse_um2), self.mask)
         held = self.held(fit)
         return CauseCandidate(cause, fit, held, self.cost(fit, held, base))
+
+    def _beside_finer(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
+        """The candidate with the next finer model of an earlier cause, if one costs less: while another cause was
+        missing, the finer model may have described no stretch that it was not fitted to."""
+        best, left = candidate, self._left_floors(candidate)
+        for i, cause in enumerate(base.model.causes):
+            where = base.model.slice_of(i)
+            found = cause.refined(candidate.fit.p[where], left, base.model.data)
+            if found is None:
+                continue
+            model, p = candidate.fit.model, candidate.fit.p
+            model = replace(model, causes=(*model.causes[:i], found[0], *model.causes[i + 1 :]))
+            for start in found[1]:
+                whole = np.concatenate([p[: where.start], start, p[where.stop :]])
+                fit = calibrate(model, whole, self.mask, candidate.cause.iterations, 1e-4)
+                best = min(best, self._converged(candidate, fit, base), key=lambda c: c.cost)
+        return best
 
     def fitted_again(self, fit: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut]:
         """The fit with what its causes find anew beside all causes found since."""

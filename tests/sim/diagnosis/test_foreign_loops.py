@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
-from sim.diagnosis.nominal import calibrate_nominal
+from sim.diagnosis.nominal import calibrate_nominal, with_nominal_kind
 from sim.diagnosis.search.search import first_fits
 from sim.effects.gain_drift import in_rests
 from sim.effects.hysteresis_shape import HysteresisShape
+from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.fitting.calibration import with_new_columns
+from sim.fitting.fit_data import FitData
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
+from sim.readings.ringing import ringing
 from sim.readings.slow_motion import rests_over_time
 from tests.hidden.foreign.cases import pair, single
 from tests.hidden.foreign.record import Case, Rig
@@ -73,6 +76,11 @@ ONE_LEVEL = Case(
     Rig(704000, "preisach", False, "staircase", "white", 500.0, 50.0, 8.0, 89.7, 2.9e-3, False, 0.5, 0.003, 3.0),
     {"saturation": {"top_V": 7.5252310818518735}},
 )
+#: A mode that moves midway, after which there are sines alone, on relays; and one that was loaded before, behind a lag.
+MOVED_MIDWAY = single(777)
+LOADED_AND_LAGGING = pair(778)
+#: A drift of half a percent under a multisine, on sixty plays that were used before.
+DRIFTING = single(783)
 #: A bow that only cycles over the whole range pass, and there are two of them.
 BOW_BETWEEN = single(733)
 #: A second lag and a mode under a multisine: the response bends, and not clearly enough to measure the lag.
@@ -101,6 +109,54 @@ def test_a_payload_is_looked_for_where_the_stage_rings() -> None:
     assert abs(said.causes[0].parameters["payload_ratio"] - 0.57) < 0.01
     assert said.extended_heldout_um < 2.0 * LOADED.rig.sigma_um
     assert said.noise_floor_um < 2.0 * LOADED.rig.sigma_um
+
+
+def sighted(case: Case) -> tuple[FitData, Readings]:
+    """The data of a case as the direct tests see them."""
+    prepared = prepare(recording_of(case), nominal=nominal_of(case))
+    data = with_nominal_kind(prepared.nominal, prepared.data)
+    return data, Readings(data, prepared.mask, noise_floor(data).sigma_um)
+
+
+def test_the_frequency_at_which_the_stage_rings_dates_and_weighs_a_payload() -> None:
+    own = MOVED_MIDWAY.effects["payload_change"]
+    data, readings = sighted(MOVED_MIDWAY)
+    assert payload_seen(readings).seen is True
+    found = ringing(data)
+    assert found is not None
+    change = found.change()
+    assert change is not None
+    k, before, after = change
+    assert abs(before.f_hz / own["known_Hz"] - 1.0) < 0.001
+    assert abs((before.f_hz / after.f_hz) ** 2 - 1.0 - own["ratio"]) < 0.015
+    at_s = own["from_share"] * MOVED_MIDWAY.rig.duration_s
+    assert found.begin_s[k - 1] < at_s < found.end_s[k]
+
+
+def test_a_payload_that_was_there_before_is_seen_against_the_stage_file_through_a_lag() -> None:
+    own = LOADED_AND_LAGGING.effects["payload_change"]
+    data, readings = sighted(LOADED_AND_LAGGING)
+    assert payload_seen(readings).seen is True
+    found = ringing(data)
+    assert found is not None
+    assert found.change() is None
+    assert abs(found.level().f_hz * np.sqrt(1.0 + own["ratio"]) / own["known_Hz"] - 1.0) < 0.002
+    # The stage of this file has no lag of its own: the first one is the sensor's.
+    assert second_lag(readings).seen is True
+
+
+@pytest.mark.parametrize("case", [MOVED_MIDWAY, LOADED_AND_LAGGING], ids=["white", "lagging"])
+def test_a_stage_that_rings_where_its_file_says_carries_no_payload(case: Case) -> None:
+    unloaded = replace(case, effects=case.effects | {"payload_change": case.effects["payload_change"] | {"ratio": 0.0}})
+    _, readings = sighted(unloaded)
+    assert payload_seen(readings).seen is False
+    assert payload_seen(sighted(WITH_A_BOW)[1]).seen is None
+
+
+def test_a_finer_shape_is_fitted_again_beside_a_drift_without_which_it_held_out_worse() -> None:
+    said = diagnosed(DRIFTING)
+    assert {cause.name for cause in said.causes} == {"hysteresis_shape", "thermal_drift"}
+    assert said.extended_heldout_um < 0.0015
 
 
 def test_a_lag_that_the_wrong_loop_drove_away_comes_back() -> None:
