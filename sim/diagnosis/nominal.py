@@ -231,7 +231,10 @@ class FileStage:
         modes: list[ModelParameter] = []
         for i, (_, damping) in enumerate(self.modes_hz):
             spread = math.log1p(MODE_SPREAD) if damping < 1.0 else math.log(3.0)
-            modes.append(ModelParameter(f"log_f{i + 1}_share", "1", 0.0, -spread, spread, 0.01, ActsOn.DYNAMICS))
+            # A payload moves the first mode that rings: it must be told by its name.
+            rings = sum(z < LIGHT for _, z in self.modes_hz[: i + 1])
+            name = f"log_f_of_ringing_{rings}" if damping < LIGHT else f"log_f{i + 1}_share"
+            modes.append(ModelParameter(name, "1", 0.0, -spread, spread, 0.01, ActsOn.DYNAMICS))
             if damping < 1.0:
                 modes.append(ModelParameter(f"log_z{i + 1}_share", "1", 0.0, -1.5, 1.5, 0.1, ActsOn.DYNAMICS))
         return (*own, *modes, *common_parameters(data))

@@ -66,6 +66,8 @@ class PayloadChange(CauseModel):
     fast: bool = True
     takes_over: bool = True
     shown_by_a_drive: bool = False
+    #: A payload throughout cannot be told from a stage whose mode is another one: the stated frequency is kept.
+    pins: tuple[str, ...] = ("log_f_of_ringing_1",)
 
     def missing(self, data: FitData) -> str:
         if self.variant == "midway":
@@ -171,7 +173,7 @@ PAYLOAD_CHANGE = Kind(
     cause=Cause(
         sign="the stage rings at another frequency than the known mode, or at another one from some moment on",
         tests=(seen,),
-        forms=(PayloadChange(), PayloadChange(variant="midway")),
+        forms=(PayloadChange(), PayloadChange(variant="midway", pins=())),
         in_library=in_library,
         picture=pictures.frequency_response,
     ),

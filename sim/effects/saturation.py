@@ -12,6 +12,7 @@ from sim import pictures
 from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess
+from sim.masks import samples_since
 from sim.readings.sight import Sight
 
 if TYPE_CHECKING:
@@ -80,45 +81,50 @@ def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | No
 
 
 def seen(readings: Readings) -> Sight:
-    """Flat tops: the slope of the readings over a voltage that moves, near the ends of its range."""
+    """Flat tops: the slope of the readings over a voltage that moves away from an end of its range.
+
+    On the way towards the end the readings still catch up with a lag. On the way back they stand still as long as the
+    command is beyond the limit; a loop leaves four tenths of the usual slope and more there.
+    """
     data = readings.data
+    count = 40
+    width_V = data.swing_V / count
     u, y = readings.felt_V, data.y_um
     du, dy = np.diff(u), np.diff(y)
-    slow = (np.abs(du) < 0.02 * data.swing_V) & (np.abs(du) > 1e-7 * data.swing_V) & readings.mask[1:]
-    # After a step the felt voltage creeps on, and what the readings do there is the lag's.
-    slow &= (data.rate_V_per_s[1:] > 0.0) & (np.abs(np.diff(data.u_V)) < 0.02 * data.swing_V)
-    count = 40
-    where = np.clip(((u[1:] - data.u_low_V) / max(data.swing_V, 1e-12) * count).astype(int), 0, count - 1)
-    power = np.bincount(where[slow], du[slow] ** 2, count)
-    travel = np.bincount(where[slow], np.abs(du[slow]), count)
-    slope = np.bincount(where[slow], (du * dy)[slow], count) / np.maximum(power, 1e-300)
-    visited = travel > 1.0 * data.swing_V / count
-    if int(visited.sum()) < 10:
-        return Sight(None, "the voltage moves too little")
-    usual = float(np.median(slope[visited]))
-    ends = []
-    shown = 0
-    for order, end in ((np.arange(count)[::-1], "top"), (np.arange(count), "bottom")):
-        edge = [int(i) for i in order if visited[i]]
-        outermost = data.u_high_V if end == "top" else data.u_low_V
-        at = data.u_low_V + (edge[0] + 0.5) / count * data.swing_V
-        if abs(at - outermost) > 0.1 * data.swing_V:
+    lag_s, moved = max(readings.lag_s, data.dt_s), np.diff(data.u_V)
+    fast = data.rate_V_per_s[1:] * lag_s > 0.5 * width_V
+    calm = samples_since(fast) * data.dt_s > max(10.0 * readings.lag_s, 0.02)
+    slow = calm & (data.rate_V_per_s[1:] > 0.0) & (np.abs(du) > 1e-7 * data.swing_V) & readings.mask[1:]
+    where = np.clip(((u[1:] - data.u_low_V) / max(width_V, 1e-12)).astype(int), 0, count - 1)
+    ends, shown = list[str](), 0
+    for end, toward, order in (("top", 1.0, np.arange(count)[::-1]), ("bottom", -1.0, np.arange(count))):
+        # Just after a turn the readings still catch up.
+        use = slow & (du * toward < 0.0) & (samples_since(moved * toward > 0.0) * data.dt_s > 5.0 * lag_s)
+        travel = np.bincount(where[use], np.abs(du[use]), count)
+        power = np.bincount(where[use], du[use] ** 2, count)
+        slope = np.bincount(where[use], (du * dy)[use], count) / np.maximum(power, 1e-300)
+        off = (dy - slope[where] * du) * du
+        error = np.sqrt(np.bincount(where[use], off[use] ** 2, count)) / np.maximum(power, 1e-300)
+        visited = travel > 0.5 * width_V
+        usual = float(np.median(slope[visited])) if visited.any() else 0.0
+        # Where the stage rings, its slope is not known.
+        edge = [int(i) for i in order if visited[i] and error[i] < 0.1 * usual]
+        # The voltage must move near this end, and over a good part of the range.
+        if len(edge) < 10 or abs(edge[0] - order[0]) > 0.1 * count:
             continue
-        shown += 1
-        flat = 0
-        while flat < len(edge) and slope[edge[flat]] < 0.3 * usual:
-            flat += 1
-        # Where the voltage reaches the limit at any speed, the slope falls over several bins.
-        if flat and np.max(slope[edge[flat + 1 : flat + 7]], initial=0.0) > 0.5 * usual:
-            limit = data.u_low_V + (edge[flat] + (1.0 if end == "top" else 0.0)) / count * data.swing_V
+        shown += abs(edge[0] - order[0]) <= 1
+        flat = next((i for i, at in enumerate(edge) if abs(slope[at]) > 0.2 * usual), len(edge))
+        if flat:
+            limit = data.u_low_V + (edge[flat - 1] + (0.0 if end == "top" else 1.0)) * width_V
             ends.append(
-                f"at the {end}, beyond {limit:.3g} V, the readings move {slope[edge[0]] / usual:.2g} times as usual"
+                f"at the {end}, beyond about {limit:.3g} V, the readings move {slope[edge[0]] / usual:.2g} times as "
+                "usual on the way back"
             )
     if ends:
         return Sight(True, "; ".join(ends))
     if not shown:
-        return Sight(None, "the voltage does not move near the ends of its range")
-    return Sight(False, "up to the ends of the range the readings follow the voltage")
+        return Sight(None, "the voltage does not move slowly near the ends of its range")
+    return Sight(False, "from the ends of the range on the readings follow the voltage")
 
 
 def in_steps(readings: Readings) -> Sight:

@@ -145,7 +145,8 @@ class CauseModel:
         return fit
 
     def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        """Start values of the nominal stage (parameters ``names``) and of this cause together; see `takes_over`."""
+        """Further start values of the nominal stage (parameters ``names``) and of this cause together: where a part of
+        the nominal stage gives way to it, a linearised guess beside the calibrated stage leads elsewhere."""
         return []
 
     def histories(self, data: FitData) -> list[CauseModel]:

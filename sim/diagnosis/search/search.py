@@ -90,6 +90,8 @@ def first_fits(
         return best.model.causes[-1], [best]
     if cause.fast:
         fits.append(_first_fit(other.with_cause(cause), base, guess, mask))
+    for start in _joint_starts(cause, base, guess.size):
+        fits += [calibrate(model.with_cause(cause), start, mask, 8, 2e-3) for model in (base.model, other)]
     return cause, fits
 
 
@@ -117,15 +119,18 @@ def _first_fit(model: StageModel, base: ModelFit, guess: FloatArray, mask: BoolA
 def _first_joint_fit(cause: CauseModel, base: ModelFit, guess: FloatArray, mask: BoolArray) -> ModelFit:
     """From the best of a grid in which a part of the nominal stage gives way to the cause."""
     model = base.model.with_cause(cause)
-    names = tuple(parameter.name for parameter in model.parameters[: model.n_nominal])
-    between = base.p[model.n_nominal :]
-    starts = [np.concatenate([base.p, guess])]
-    for p in cause.joint_starts(base.p[: model.n_nominal], names, model.data):
-        own = p.size - guess.size
-        starts.append(np.concatenate([p[:own], between, p[own:]]))
+    starts = [np.concatenate([base.p, guess]), *_joint_starts(cause, base, guess.size)]
     tried = [(evaluate(model, clipped_to_bounds(model, p), mask).sse_um2, i) for i, p in enumerate(starts)]
     order = [i for sse, i in sorted(tried) if np.isfinite(sse)][:2]
     return min((calibrate(model, starts[i], mask, 12, 2e-3) for i in order), key=lambda f: f.sse_um2)
+
+
+def _joint_starts(cause: CauseModel, base: ModelFit, size: int) -> list[FloatArray]:
+    """The joint starts of a cause with ``size`` parameters, with those of the causes of ``base`` in between."""
+    own = base.model.n_nominal
+    names = tuple(parameter.name for parameter in base.model.parameters[:own])
+    starts = cause.joint_starts(base.p[:own], names, base.model.data)
+    return [np.concatenate([p[:-size], base.p[own:], p[-size:]]) for p in starts]
 
 
 Progress = Callable[[str, float], None]

@@ -14,6 +14,7 @@ from sim.effects.gain_drift import in_rests
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
+from sim.effects.saturation import seen as saturation_seen
 from sim.fitting.calibration import with_new_columns
 from sim.fitting.fit_data import FitData
 from sim.readings.cycles import mirrored_branches
@@ -81,6 +82,10 @@ MOVED_MIDWAY = single(777)
 LOADED_AND_LAGGING = pair(778)
 #: A drift of half a percent under a multisine, on sixty plays that were used before.
 DRIFTING = single(783)
+#: The voltage's last 2 % are clipped on a loop that bends; and a payload that rings, where nothing is clipped.
+CLIPPED, RINGING = single(763), pair(614)
+#: A sensor's lag beside the stage's own: calibrated alone, the stage's stands at its bound.
+TWO_LAGS = single(792)
 #: A bow that only cycles over the whole range pass, and there are two of them.
 BOW_BETWEEN = single(733)
 #: A second lag and a mode under a multisine: the response bends, and not clearly enough to measure the lag.
@@ -151,6 +156,28 @@ def test_a_stage_that_rings_where_its_file_says_carries_no_payload(case: Case) -
     _, readings = sighted(unloaded)
     assert payload_seen(readings).seen is False
     assert payload_seen(sighted(WITH_A_BOW)[1]).seen is None
+
+
+def test_a_limit_is_seen_on_the_way_back_from_it_and_not_where_the_stage_rings() -> None:
+    assert saturation_seen(sighted(CLIPPED)[1]).seen is True
+    assert saturation_seen(sighted(RINGING)[1]).seen is not True
+
+
+def test_two_lags_are_told_apart_where_the_calibration_found_their_sum() -> None:
+    said = diagnosed(TWO_LAGS)
+    assert [cause.name for cause in said.causes] == ["sensor_lag"]
+    low_s, high_s = said.causes[0].intervals["tau_s"]
+    assert any(low_s < true_s < high_s for true_s in (TWO_LAGS.effects["sensor_lag"]["tau_s"], TWO_LAGS.rig.lag_s))
+    assert said.extended_heldout_um < 1.2 * said.noise_floor_um
+
+
+def test_a_payload_is_weighed_against_the_stated_frequency() -> None:
+    """Calibration may move a stated mode by 1.5 %, which a payload throughout cannot be told from."""
+    case = single(796)
+    said = diagnose_prepared(prepare(recording_of(case), nominal=nominal_of(case)))
+    low, high = next(cause.intervals["payload_ratio"] for cause in said.causes if cause.name == "payload_change")
+    assert low < case.effects["payload_change"]["ratio"] < high
+    assert high - low < 0.01
 
 
 def test_a_finer_shape_is_fitted_again_beside_a_drift_without_which_it_held_out_worse() -> None:
