@@ -304,7 +304,7 @@ def changing(search: Search) -> tuple[str, ...]:
 
 #: Share of the explainable squared error from which named causes explain a recording, or a part of it.
 EXPLAINED, IN_PART = 0.8, 0.1
-#: Noise floors up to which an error may be noise, for noise that is correlated over longer than a rest.
+#: Largest error, in noise floors, that may be noise: slow noise is smaller within a rest than over the record.
 MOST_NOISE = 10.0
 #: Share of the held-out squared error that must go on a test recording for the causes to carry over.
 CARRIES_OVER = 0.04
@@ -342,9 +342,9 @@ def verdict_of(
             if explained >= IN_PART:
                 return "partly"
         return "unexplained"
-    # What a black box cannot predict either is noise, whatever its colour; but not far above the noise of the rests.
-    predictable = nominal_um > 1.1 * ceiling_um or nominal_um > MOST_NOISE * floor_um
-    return "unexplained" if structured and predictable else "adequate"
+    # An error that a black box cannot predict is noise of some colour, unless it is far above the noise in the rests.
+    noise = nominal_um <= min(1.1 * ceiling_um, MOST_NOISE * floor_um)
+    return "unexplained" if structured and not noise else "adequate"
 
 
 def not_excited(search: Search, floor: NoiseFloor) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from adaptive.types import BoolArray, FloatArray
 from sim.effects import Chain, Effect, effect, simulate
 from sim.effects.base import Place
 from sim.fitting.calibration import calibrate, with_free_memory
-from sim.fitting.dynamics import Dynamics, respond
+from sim.fitting.dynamics import LIGHT, Dynamics, first_ringing, respond
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
 from sim.fitting.stage_model import ModelFit, NominalStage, StageModel
@@ -178,8 +178,6 @@ class LinearStage:
 
 #: Relative spread of the mode frequencies of one type of stage; a larger difference is a payload.
 MODE_SPREAD = 0.015
-#: Damping ratio below which a mode rings.
-LIGHT = 0.5
 #: Calibration scales the other numbers of the actuator by at most this factor, up or down.
 SCALE = 2.0
 
@@ -221,7 +219,7 @@ class FileStage:
 
     @property
     def has_lag(self) -> bool:
-        """Whether amplifier, mechanics or sensor lag behind by more than a lightly damped mode does."""
+        """Whether amplifier, sensor or a mode that does not ring lags behind."""
         lags = any(e.name in ("amplifier_lag", "sensor_lag") for e in (*self.before, *self.behind))
         return lags or any(damping >= LIGHT for _, damping in self.modes_hz)
 
@@ -229,11 +227,11 @@ class FileStage:
         span = 1.0 / SCALE
         own = [ModelParameter(path, "1", 1.0, span, SCALE, 0.05, ActsOn.STATIC) for path in self.calibrated]
         modes: list[ModelParameter] = []
+        ringing = first_ringing(self.modes_hz)
         for i, (_, damping) in enumerate(self.modes_hz):
             spread = math.log1p(MODE_SPREAD) if damping < 1.0 else math.log(3.0)
-            # A payload moves the first mode that rings: it must be told by its name.
-            rings = sum(z < LIGHT for _, z in self.modes_hz[: i + 1])
-            name = f"log_f_of_ringing_{rings}" if damping < LIGHT else f"log_f{i + 1}_share"
+            # A payload moves the first mode that rings, and keeps its stated frequency by this name.
+            name = "log_f_ringing_share" if i == ringing else f"log_f{i + 1}_share"
             modes.append(ModelParameter(name, "1", 0.0, -spread, spread, 0.01, ActsOn.DYNAMICS))
             if damping < 1.0:
                 modes.append(ModelParameter(f"log_z{i + 1}_share", "1", 0.0, -1.5, 1.5, 0.1, ActsOn.DYNAMICS))

@@ -16,7 +16,7 @@ import numpy as np
 from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place
-from sim.fitting.dynamics import Dynamics
+from sim.fitting.dynamics import Dynamics, first_ringing
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.stage_model import CauseModel, Guess
 from sim.readings.ringing import SIGMAS, ringing
@@ -42,11 +42,11 @@ def loaded(system: Dynamics, ratio: float) -> Dynamics:
     """
     slower = 1.0 / math.sqrt(1.0 + ratio)
     modes = list(system.modes_hz)
-    light = next((i for i, (_, damping) in enumerate(modes) if damping < 0.5), None)
-    if light is None:
+    at = first_ringing(system.modes_hz)
+    if at is None:
         return system
-    f_hz, damping = modes[light]
-    modes[light] = (f_hz * slower, damping * slower)
+    f_hz, damping = modes[at]
+    modes[at] = (f_hz * slower, damping * slower)
     return replace(system, modes_hz=tuple(modes))
 
 
@@ -66,8 +66,8 @@ class PayloadChange(CauseModel):
     fast: bool = True
     takes_over: bool = True
     shown_by_a_drive: bool = False
-    #: A payload throughout cannot be told from a stage whose mode is another one: the stated frequency is kept.
-    pins: tuple[str, ...] = ("log_f_of_ringing_1",)
+    #: Calibration may move the stated frequency, and a payload throughout does the same: the frequency stays as stated.
+    pins: tuple[str, ...] = ("log_f_ringing_share",)
 
     def missing(self, data: FitData) -> str:
         if self.variant == "midway":
@@ -94,13 +94,14 @@ class PayloadChange(CauseModel):
         return [[np.array([r, share * t])] for r in (-0.3, -0.1, 0.1, 0.3, 1.0) for share in (0.25, 0.5, 0.75)]
 
     def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
-        """The mode of the stage file, which the calibration has bent to the moved one, and the frequency that rings."""
-        stated = np.array(
-            [0.0 if n.startswith("log_") else 1.0 if "." in n else p for n, p in zip(names, nominal, strict=True)]
-        )
+        """The stage as its file states it, since calibration has bent it to the moved mode, with the payload that the
+        frequency of its ringing shows."""
         found = ringing(data)
         if found is None or not found.f_hz.size:
             return []
+        stated = np.array(
+            [0.0 if n.startswith("log_") else 1.0 if "." in n else p for n, p in zip(names, nominal, strict=True)]
+        )
         if self.variant != "midway":
             return [np.append(stated, _ratio(data.known_modes_hz[0], found.level().f_hz))]
         change = found.change()
@@ -152,7 +153,7 @@ def seen(readings: Readings) -> Sight:
     apart = abs(level.f_hz - known_hz)
     if apart > max(SIGMAS * level.error_hz, 0.01 * known_hz):
         return Sight(True, words)
-    # A payload that is put on late needs stretches before and after.
+    # Two stretches in each half must show the mode: in the others a payload might have been put on.
     half_s = 0.5 * readings.data.duration_s
     throughout = min(int(np.sum(found.end_s < half_s)), int(np.sum(found.begin_s > half_s))) >= 2
     return Sight(False if throughout and level.error_hz < 2e-3 * known_hz else None, words)

@@ -59,23 +59,24 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     delayed = late_s > 1.8 * data.dt_s + 5.0 * late_error_s and free.cost < 0.8 * latched.cost
     # A lag beside a delay is judged with the delay left free.
     latest_s = 0.05 if delayed else 1.5 * data.dt_s
-    one, two = (_fit(f, gain, sigma, data.dt_s, lags=n, latest_s=latest_s) for n in (own, own + 1))
-    lag_s = float(np.min(two.p[4:]))
-    lag_error_s = two.product_error / two.product * lag_s
+    fewer, more = (_fit(f, gain, sigma, data.dt_s, lags=n, latest_s=latest_s) for n in (own, own + 1))
+    lag_s = float(np.min(more.p[4:]))
+    lag_error_s = more.product_error / more.product * lag_s
     # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
-    lagged: bool | None = two.cost < 0.4 * one.cost and two.product > 5.0 * two.product_error
-    if not lagged and two.cost < 0.8 * one.cost:
+    lagged: bool | None = more.cost < 0.4 * fewer.cost and more.product > 5.0 * more.product_error
+    if not lagged and more.cost < 0.8 * fewer.cost:
         # A further lag improves the fit, but its size is not known: it is neither seen nor excluded.
         lagged = None
     if lagged and not delayed:
-        late_s, late_error_s = float(two.p[1]), float(two.errors[1])
+        late_s, late_error_s = float(more.p[1]), float(more.errors[1])
     words = (
         f"the phase from {f[0]:.2g} to {f[low][-1]:.3g} Hz has a straight part of {1e3 * late_s:.3g} ± "
         f"{1.96e3 * late_error_s:.1g} ms"
     )
     lag_words = (
-        f"up to {f[-1]:.3g} Hz a {'second ' * own}lag of {1e3 * lag_s:.3g} ± {1.96e3 * lag_error_s:.1g} ms lowers the "
-        f"misfit of the response to {100 * two.cost / max(one.cost, 1e-300):.0f} %"
+        f"up to {f[-1]:.3g} Hz a {'second lag' if own else 'lag'} of {1e3 * lag_s:.3g} ± "
+        f"{1.96e3 * lag_error_s:.1g} ms lowers the misfit of the response to "
+        f"{100 * more.cost / max(fewer.cost, 1e-300):.0f} %"
     )
     # A little more than the recorder's latch is not decided.
     late = True if delayed else None if late_s > 1.2 * data.dt_s else False
@@ -83,8 +84,10 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
 
 
 def apart(nominal: FloatArray, names: tuple[str, ...]) -> list[FloatArray]:
-    """Joint starts of the nominal stage and a lag (`CauseModel.joint_starts`): calibrated alone, the stage's own lag is
-    nearly the sum of both, and from two equal lags no fit finds which is the longer one."""
+    """A joint start (`CauseModel.joint_starts`) with a short lag of the stage and a long further one.
+
+    Calibrated alone, the stage's own lag is nearly the sum of both. A fit from there can end at two equal lags.
+    """
     if "tau_s" not in names:
         return []
     at = names.index("tau_s")
@@ -100,8 +103,10 @@ def second_lag(readings: Readings) -> Sight:
 
 
 def _below_modes(response: Response, known_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    """The response up to half the frequency of its largest peak, where it has one; of a stage whose mode is known,
-    without the rise towards the peak."""
+    """The response up to half the frequency of its largest peak, where it has one.
+
+    Where the stage's mode is known, the rise towards it is taken off.
+    """
     f, size = response.f_hz, np.abs(response.gain)
     low = float(np.median(size[: max(3, f.size // 10)]))
     peak = int(np.argmax(size))
@@ -127,8 +132,10 @@ class _Fitted:
 
 
 def _fit(f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float) -> _Fitted:
-    """The better fit of a voltage that is held over each sample and of one that runs straight to the next; without a
-    lag, by one that is shorter than can be seen."""
+    """The better fit of a voltage that is held over each sample and of one that runs straight to the next.
+
+    ``lags`` 0 is fitted as one lag that is too short to be seen.
+    """
     both = (_fit_hold(f, gain, sigma, dt_s, lags, latest_s, straight) for straight in (False, True))
     return min(both, key=lambda fitted: fitted.cost)
 

@@ -101,10 +101,10 @@ def seen(readings: Readings) -> Sight:
         # Just after a turn the readings still catch up.
         use = slow & (du * toward < 0.0) & (samples_since(moved * toward > 0.0) * data.dt_s > 5.0 * lag_s)
         travel = np.bincount(where[use], np.abs(du[use]), count)
-        power = np.bincount(where[use], du[use] ** 2, count)
-        slope = np.bincount(where[use], (du * dy)[use], count) / np.maximum(power, 1e-300)
+        power = np.maximum(np.bincount(where[use], du[use] ** 2, count), 1e-300)
+        slope = np.bincount(where[use], (du * dy)[use], count) / power
         off = (dy - slope[where] * du) * du
-        error = np.sqrt(np.bincount(where[use], off[use] ** 2, count)) / np.maximum(power, 1e-300)
+        error = np.sqrt(np.bincount(where[use], off[use] ** 2, count)) / power
         visited = travel > 0.5 * width_V
         usual = float(np.median(slope[visited])) if visited.any() else 0.0
         # Where the stage rings, its slope is not known.
@@ -112,6 +112,7 @@ def seen(readings: Readings) -> Sight:
         # The voltage must move near this end, and over a good part of the range.
         if len(edge) < 10 or abs(edge[0] - order[0]) > 0.1 * count:
             continue
+        # Further inside, a limit that is near the end would not show.
         shown += abs(edge[0] - order[0]) <= 1
         flat = next((i for i, at in enumerate(edge) if abs(slope[at]) > 0.2 * usual), len(edge))
         if flat:

@@ -277,6 +277,15 @@ class Dynamics:
     hold: str = "zero"
 
 
+#: Damping ratio below which a mode rings.
+LIGHT = 0.5
+
+
+def first_ringing(modes_hz: tuple[tuple[float, float], ...]) -> int | None:
+    """Index of the first mode (frequency, damping ratio) that rings; None if none does."""
+    return next((i for i, (_, damping) in enumerate(modes_hz) if damping < LIGHT), None)
+
+
 def _poles(system: Dynamics) -> list[complex]:
     poles: list[complex] = [complex(-1.0 / max(tau, 1e-9)) for tau in system.lags_s]
     for f_hz, damping in system.modes_hz:

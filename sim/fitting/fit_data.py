@@ -183,8 +183,8 @@ class FitData:
 
         return self._derived.get(("subdivided", substeps, hold), make)
 
-    def derived(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
-        """An array that depends on these data and ``key`` only; ``make()`` is called at the first use."""
+    def derived(self, key: Hashable, make: Callable[[], T]) -> T:
+        """A result that depends on these data and ``key`` only; ``make()`` is called at the first use."""
         return self._derived.get(key, make)
 
     @property

@@ -24,7 +24,7 @@ SIGMAS = 8.0
 _MOST_DAMPED, _KNOWN = 0.2, 0.01
 #: ... and between these shares of the frequency that is known beforehand.
 _LOWEST, _HIGHEST = 0.4, 1.7
-#: Standard errors count this many times, beside this share of the frequency: plays do not describe every loop.
+#: Plays do not describe every loop: a standard error is this many times the formal one, and this share of f besides.
 _TIMES, _MODEL_ERROR = 3.0, 0.003
 
 
@@ -68,14 +68,14 @@ class Ringing:
 
 
 def ringing(data: FitData) -> Ringing | None:
-    """At which frequency the first mode that a stage file states rings, by stretch; None if it states none.
+    """The frequency at which the first mode that a stage file states rings, by stretch; None if it states none."""
+    return data.derived("ringing", lambda: _ringing(data, data.known_modes_hz[0])) if data.known_modes_hz else None
 
-    Each stretch is an autoregression of the differenced readings on their past and on that of plays of the voltage
-    (ARX; Ljung, System Identification, 4.2): its lightly damped pole is the mode. No stage is fitted.
+
+def _ringing(data: FitData, known_hz: float) -> Ringing:
+    """In each stretch, the differenced readings are regressed on their past and on that of plays of the voltage (ARX;
+    Ljung, System Identification, 4.2). The least damped pole is the mode. No stage is fitted.
     """
-    if not data.known_modes_hz:
-        return None
-    known_hz = data.known_modes_hz[0]
     plays = np.asarray(play_run(data.u_V, _RADII * data.swing_V, np.full(_RADII.size, data.u_V[0]))).T
     # Some six samples a period: with more of them the noise hides the curvature that tells the frequency.
     thin = max(1, int(1.0 / (6.0 * known_hz * data.dt_s)))
@@ -104,7 +104,8 @@ def _mode(columns: FloatArray, target: FloatArray, dt_s: float) -> tuple[float, 
     if rank < _READINGS:
         return None
     left = target - scaled @ weights
-    poles = np.roots([1.0, *(-weights[:_READINGS] / size[:_READINGS])])
+    a = weights[:_READINGS] / size[:_READINGS]
+    poles = np.roots([1.0, *-a])
     poles = poles[poles.imag > 0.0]
     if not poles.size:
         return None
@@ -115,7 +116,6 @@ def _mode(columns: FloatArray, target: FloatArray, dt_s: float) -> tuple[float, 
     if damping[at] > _MOST_DAMPED:
         return None
     # The pole is a root of z^3 - a1 z^2 - a2 z - a3: dz/da_j = z^(3 - j) / (3 z^2 - 2 a1 z - a2).
-    a = weights[:_READINGS] / size[:_READINGS]
     steepness = 3.0 * pole**2 - 2.0 * a[0] * pole - a[1]
     moved = pole ** np.arange(_READINGS - 1, -1, -1) / steepness
     # d|rate| = Re(conj(rate) d rate) / |rate|, and d rate = dz / (z dt).

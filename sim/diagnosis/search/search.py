@@ -133,6 +133,13 @@ def _joint_starts(cause: CauseModel, base: ModelFit, size: int) -> list[FloatArr
     return [np.concatenate([p[:-size], base.p[own:], p[-size:]]) for p in starts]
 
 
+def _exchanged(fit: ModelFit, index: int, cause: CauseModel, own: FloatArray) -> tuple[StageModel, FloatArray]:
+    """The model with ``cause`` in place of ``causes[index]``, and its start with the parameters ``own`` of it."""
+    causes, where = fit.model.causes, fit.model.slice_of(index)
+    model = replace(fit.model, causes=(*causes[:index], cause, *causes[index + 1 :]))
+    return model, np.concatenate([fit.p[: where.start], own, fit.p[where.stop :]])
+
+
 Progress = Callable[[str, float], None]
 
 
@@ -377,10 +384,8 @@ class Search:
             freer = cause.freer()
             if freer is None:
                 continue
-            model = replace(fit.model, causes=(*fit.model.causes[:i], freer, *fit.model.causes[i + 1 :]))
-            where = fit.model.slice_of(i)
-            own = np.array([s.neutral for s in freer.parameters(model.data)])
-            start = np.concatenate([fit.p[: where.start], own, fit.p[where.stop :]])
+            own = np.array([s.neutral for s in freer.parameters(fit.model.data)])
+            model, start = _exchanged(fit, i, freer, own)
             better = with_new_columns(calibrate(model, start, self.mask, 10, 1e-4), self.mask)
             held = self.held(better)
             return CauseCandidate(freer, better, held, self.cost(better, held, fit))
@@ -465,19 +470,19 @@ class Search:
         return CauseCandidate(cause, fit, held, self.cost(fit, held, base))
 
     def _beside_finer(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate:
-        """The candidate with the next finer model of an earlier cause, if one costs less: while another cause was
-        missing, the finer model may have described no stretch that it was not fitted to."""
+        """The candidate with the next finer model of an earlier cause, if that costs less.
+
+        As long as this cause was missing, the finer model may have done worse in held-out stretches.
+        """
         best, left = candidate, self._left_floors(candidate)
         for i, cause in enumerate(base.model.causes):
-            where = base.model.slice_of(i)
-            found = cause.refined(candidate.fit.p[where], left, base.model.data)
+            found = cause.refined(candidate.fit.p[base.model.slice_of(i)], left, base.model.data)
             if found is None:
                 continue
-            model, p = candidate.fit.model, candidate.fit.p
-            model = replace(model, causes=(*model.causes[:i], found[0], *model.causes[i + 1 :]))
-            for start in found[1]:
-                whole = np.concatenate([p[: where.start], start, p[where.stop :]])
-                fit = calibrate(model, whole, self.mask, candidate.cause.iterations, 1e-4)
+            finer, starts = found
+            for own in starts:
+                model, start = _exchanged(candidate.fit, i, finer, own)
+                fit = calibrate(model, start, self.mask, candidate.cause.iterations, 1e-4)
                 best = min(best, self._converged(candidate, fit, base), key=lambda c: c.cost)
         return best
 

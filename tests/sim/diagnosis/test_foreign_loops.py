@@ -16,11 +16,10 @@ from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.effects.saturation import seen as saturation_seen
 from sim.fitting.calibration import with_new_columns
-from sim.fitting.fit_data import FitData
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
-from sim.readings.ringing import ringing
+from sim.readings.ringing import Ringing, ringing
 from sim.readings.slow_motion import rests_over_time
 from tests.hidden.foreign.cases import pair, single
 from tests.hidden.foreign.record import Case, Rig
@@ -94,6 +93,13 @@ UNCLEAR_LAG = pair(705)
 ONE_LAG = single(163)
 
 
+def readings_of(case: Case) -> Readings:
+    """A case as the direct tests see it."""
+    prepared = prepare(recording_of(case), nominal=nominal_of(case))
+    data = with_nominal_kind(prepared.nominal, prepared.data)
+    return Readings(data, prepared.mask, noise_floor(data).sigma_um)
+
+
 def diagnosed(case: Case) -> Diagnosis:
     return diagnose_prepared(prepare(recording_of(case), nominal="bouc_wen"))
 
@@ -116,19 +122,17 @@ def test_a_payload_is_looked_for_where_the_stage_rings() -> None:
     assert said.noise_floor_um < 2.0 * LOADED.rig.sigma_um
 
 
-def sighted(case: Case) -> tuple[FitData, Readings]:
-    """The data of a case as the direct tests see them."""
-    prepared = prepare(recording_of(case), nominal=nominal_of(case))
-    data = with_nominal_kind(prepared.nominal, prepared.data)
-    return data, Readings(data, prepared.mask, noise_floor(data).sigma_um)
+def rung(readings: Readings) -> Ringing:
+    """The stretches in which the stage rings, where they show a payload."""
+    assert payload_seen(readings).seen is True
+    found = ringing(readings.data)
+    assert found is not None
+    return found
 
 
 def test_the_frequency_at_which_the_stage_rings_dates_and_weighs_a_payload() -> None:
     own = MOVED_MIDWAY.effects["payload_change"]
-    data, readings = sighted(MOVED_MIDWAY)
-    assert payload_seen(readings).seen is True
-    found = ringing(data)
-    assert found is not None
+    found = rung(readings_of(MOVED_MIDWAY))
     change = found.change()
     assert change is not None
     k, before, after = change
@@ -140,10 +144,8 @@ def test_the_frequency_at_which_the_stage_rings_dates_and_weighs_a_payload() -> 
 
 def test_a_payload_that_was_there_before_is_seen_against_the_stage_file_through_a_lag() -> None:
     own = LOADED_AND_LAGGING.effects["payload_change"]
-    data, readings = sighted(LOADED_AND_LAGGING)
-    assert payload_seen(readings).seen is True
-    found = ringing(data)
-    assert found is not None
+    readings = readings_of(LOADED_AND_LAGGING)
+    found = rung(readings)
     assert found.change() is None
     assert abs(found.level().f_hz * np.sqrt(1.0 + own["ratio"]) / own["known_Hz"] - 1.0) < 0.002
     # The stage of this file has no lag of its own: the first one is the sensor's.
@@ -153,14 +155,13 @@ def test_a_payload_that_was_there_before_is_seen_against_the_stage_file_through_
 @pytest.mark.parametrize("case", [MOVED_MIDWAY, LOADED_AND_LAGGING], ids=["white", "lagging"])
 def test_a_stage_that_rings_where_its_file_says_carries_no_payload(case: Case) -> None:
     unloaded = replace(case, effects=case.effects | {"payload_change": case.effects["payload_change"] | {"ratio": 0.0}})
-    _, readings = sighted(unloaded)
-    assert payload_seen(readings).seen is False
-    assert payload_seen(sighted(WITH_A_BOW)[1]).seen is None
+    assert payload_seen(readings_of(unloaded)).seen is False
+    assert payload_seen(readings_of(WITH_A_BOW)).seen is None
 
 
 def test_a_limit_is_seen_on_the_way_back_from_it_and_not_where_the_stage_rings() -> None:
-    assert saturation_seen(sighted(CLIPPED)[1]).seen is True
-    assert saturation_seen(sighted(RINGING)[1]).seen is not True
+    assert saturation_seen(readings_of(CLIPPED)).seen is True
+    assert saturation_seen(readings_of(RINGING)).seen is not True
 
 
 def test_two_lags_are_told_apart_where_the_calibration_found_their_sum() -> None:
@@ -203,8 +204,7 @@ def test_one_level_beyond_the_limit_shows_a_saturation() -> None:
 
 
 def test_cycles_over_a_part_of_the_range_do_not_exclude_a_bow() -> None:
-    prepared = prepare(recording_of(BOW_BETWEEN), nominal="bouc_wen")
-    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    readings = readings_of(BOW_BETWEEN)
     assert mirrored_branches(readings).seen is None
 
 
@@ -222,16 +222,14 @@ def test_what_the_form_of_a_cause_leaves_is_not_another_cause(case: Case) -> Non
 
 @pytest.mark.parametrize(("case", "lagged"), [(EQUAL_LAGS, True), (SHORT_LAG, True), (ONE_LAG, False)])
 def test_a_second_lag_is_seen_in_the_response_as_the_recorder_samples_it(case: Case, lagged: bool) -> None:
-    prepared = prepare(recording_of(case), nominal="bouc_wen")
-    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    readings = readings_of(case)
     assert second_lag(readings).seen is lagged
     # What lags is not late: these readings are taken within a sample.
     assert lags_of_response(readings).late is False
 
 
 def test_a_response_that_bends_unclearly_does_not_exclude_a_lag() -> None:
-    prepared = prepare(recording_of(UNCLEAR_LAG), nominal="bouc_wen")
-    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    readings = readings_of(UNCLEAR_LAG)
     assert second_lag(readings).seen is None
 
 
@@ -240,8 +238,7 @@ def test_creep_on_a_loop_whose_steps_differ_is_not_seen_as_a_drift_of_the_gain(s
     """A step over a steep part of the loop is larger than its voltage, and creeps by more."""
     case = single(seed)
     assert case.hidden == ("creep",)
-    prepared = prepare(recording_of(case), nominal="bouc_wen")
-    readings = Readings(prepared.data, prepared.mask, noise_floor(prepared.data).sigma_um)
+    readings = readings_of(case)
     assert in_rests(readings).seen is not True
     found = rests_over_time(readings).creep
     assert found is not None
