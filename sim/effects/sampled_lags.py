@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
+from sim.effects.slew_limit import seen as speed_is_limited
 from sim.readings.sight import Sight
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     response = readings.response
     if response is None or response.f_hz.size < 12:
         return LagsOfResponse("the voltage has too little power above 5 Hz for a frequency response")
+    if readings.once(speed_is_limited).seen:
+        return LagsOfResponse("behind a limit of the speed the response depends on the size of the motion")
     f, gain, sigma = _below_modes(response, data.known_modes_hz)
     own = int(data.has_lag)
     # What happens within a sample is exact for one lag or two, but not for the modes and the loop above them.
@@ -63,7 +66,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     lag_s = float(np.min(more.p[4:]))
     lag_error_s = more.product_error / more.product * lag_s
     # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
-    lagged: bool | None = more.cost < 0.4 * fewer.cost and more.product > 5.0 * more.product_error
+    lagged: bool | None = more.cost < 0.5 * fewer.cost and more.product > 5.0 * more.product_error
     if not lagged and more.cost < 0.8 * fewer.cost:
         # A further lag improves the fit, but its size is not known: it is neither seen nor excluded.
         lagged = None

@@ -112,8 +112,9 @@ def seen(readings: Readings) -> Sight:
         # The voltage must move near this end, and over a good part of the range.
         if len(edge) < 10 or abs(edge[0] - order[0]) > 0.1 * count:
             continue
-        # Further inside, a limit that is near the end would not show.
-        shown += abs(edge[0] - order[0]) <= 1
+        # Further inside, a limit that is near the end would not show; and a mode that rings moves a flat top.
+        outer = [slope[i] > 0.35 * usual for i in edge if abs(i - order[0]) < count // 4]
+        shown += abs(edge[0] - order[0]) <= 1 and all(outer)
         flat = next((i for i, at in enumerate(edge) if abs(slope[at]) > 0.2 * usual), len(edge))
         if flat:
             limit = data.u_low_V + (edge[flat - 1] + (0.0 if end == "top" else 1.0)) * width_V
@@ -123,8 +124,9 @@ def seen(readings: Readings) -> Sight:
             )
     if ends:
         return Sight(True, "; ".join(ends))
-    if not shown:
-        return Sight(None, "the voltage does not move slowly near the ends of its range")
+    if shown < 2:
+        # A limit at the other end is not excluded by this one.
+        return Sight(None, "the voltage does not move slowly near both ends of its range")
     return Sight(False, "from the ends of the range on the readings follow the voltage")
 
 

@@ -8,7 +8,7 @@ them with calibrations. Readings that repeat are a defect of the recording (`sim
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -416,7 +416,27 @@ def fit_slips(cause: Slips, bare: StageModel, base: ModelFit, mask: BoolArray, k
         found = merge_close_slips(date_slips(after, y_um, there, mask))
         fit = fitted(fit.p, found, 4)
     # The sizes are free in the last fit: whole numbers then confirm that these are slips.
-    return fitted(fit.p, found or cause.found, 8, sizes_too=not known)
+    found = found or cause.found
+    fit = fitted(fit.p, found, 8, sizes_too=not known)
+    return fit if known else _without_small_ones(fit, found, own, lambda p, f: fitted(p, f, 8, sizes_too=True))
+
+
+def _without_small_ones(
+    fit: ModelFit, found: SlipList, own: int, fitted: Callable[[FloatArray, SlipList], ModelFit]
+) -> ModelFit:
+    """The fit without the slips that a wrong loop called for: beside a better one they shrink to nothing.
+
+    The others then become whole. If they do not, or the error doubles, ``fit`` stays.
+    """
+    fewer = fit
+    while True:
+        sizes = np.rint(fewer.p[own:]).astype(int)
+        kept = merge_close_slips(tuple((at, int(n)) for (at, _), n in zip(found, sizes, strict=True) if n))
+        if not kept or kept == found:
+            break
+        found, fewer = kept, fitted(fewer.p, kept)
+    whole = bool(np.all(np.abs(fewer.p[own:] - np.rint(fewer.p[own:])) < 0.4))
+    return fewer if whole and fewer.sse_um2 < 2.0 * fit.sse_um2 else fit
 
 
 def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:

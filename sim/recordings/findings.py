@@ -36,6 +36,8 @@ LONGER = 2
 #: Sine of the mean lead of the displacement above which the columns may be exchanged. Loops of stages have -0.05 to
 #: -0.3; a stage without hysteresis has 0.
 LARGEST_LEAD = 0.02
+#: Samples without any change that count as a rest of the command.
+LEAST_REST = 50
 #: Below this correlation the columns do not form a loop, and are not judged.
 LEAST_CORRELATION = 0.8
 #: Share of samples with the time of the one before from which the time has too few digits.
@@ -296,11 +298,27 @@ def roughness(x: FloatArray) -> float:
     return float(np.median(np.abs(np.diff(x, n=4))) / np.sqrt(70.0) / np.ptp(x))
 
 
+def _rests_under_noise(u: FloatArray, y: FloatArray) -> bool:
+    """Whether ``u`` stands exactly still, a hundredth of the time and more, where ``y`` moves by noise alone.
+
+    So a command rests under a sensor. Exchanged, it would be the other way round.
+    """
+    moved = np.diff(u, prepend=np.nan) != 0.0
+    first = np.flatnonzero(moved)
+    length = np.diff(np.append(first, u.size))
+    rests = [slice(int(a), int(a + n)) for a, n in zip(first, length, strict=True) if n >= LEAST_REST]
+    shaken = [r for r in rests if np.mean(np.diff(y[r]) == 0.0) < 0.5 and np.ptp(y[r]) < 0.01 * np.ptp(y)]
+    return sum(r.stop - r.start for r in shaken) > 0.01 * u.size
+
+
 def swapped(u: FloatArray, y: FloatArray) -> Literal["no", "likely", "certain"]:
     """Whether ``u`` and ``y`` look exchanged: a displacement cannot lead its voltage, and only a sensor is noisy."""
     good = np.isfinite(u) & np.isfinite(y)
     if np.count_nonzero(good) < 3 or np.ptp(u[good]) == 0.0 or np.ptp(y[good]) == 0.0:
         return "no"
     if abs(float(np.corrcoef(u[good], y[good])[0, 1])) < LEAST_CORRELATION or lead(u, y) < LARGEST_LEAD:
+        return "no"
+    if _rests_under_noise(u[good], y[good]):
+        # Beside a recorder whose clock runs fast, readings come before their steps.
         return "no"
     return "certain" if roughness(u) > 3.0 * roughness(y) else "likely"

@@ -510,6 +510,23 @@ def test_intervals_are_held_against_true_numbers() -> None:
     assert covered(case, [("creep", {"gain_per_decade": (0.0, 1.0)})]) == ()
 
 
+@pytest.mark.parametrize(("f_hz", "fs_hz"), [(400.0, 4000.0), (150.0, 500.0)])
+def test_the_true_damping_is_that_of_the_ring_down(f_hz: float, fs_hz: float) -> None:
+    """The trapezoidal rule damps less than was stated, by more than the width of a good interval."""
+    case = Case("single", 0, rig(fs_hz=fs_hz), {"resonance": {"f_Hz": f_hz, "damping": 0.02}})
+    fine_hz = fs_hz * case.rig.over
+    hit = np.zeros(int(0.2 * fine_hz))
+    hit[0] = 1.0
+    y = effects.modes(hit, [f_hz], [0.02], [1.0], fine_hz)[4:]
+    # y[k] = 2 r cos(phi) y[k - 1] - r² y[k - 2] in a free motion, and the pole is fs (ln r + j phi).
+    (b, a), *_ = np.linalg.lstsq(np.stack([y[1:-1], y[:-2]], axis=1), y[2:], rcond=None)
+    pole = fine_hz * complex(0.5 * np.log(-a), np.arccos(b / (2.0 * np.sqrt(-a))))
+    true = true_numbers(case)["resonance"]
+    assert true["f0_hz"] == pytest.approx((abs(pole) / (2.0 * np.pi),), rel=1e-6)
+    assert true["damping"] == pytest.approx((-pole.real / abs(pole),), rel=1e-5)
+    assert abs(true["damping"][0] / 0.02 - 1.0) > 0.0005
+
+
 def test_the_dead_time_of_a_record_is_the_stated_one() -> None:
     """The delay and the early reading; a held voltage steps at its sample, not before it."""
     for straight in (False, True):

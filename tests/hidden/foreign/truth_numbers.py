@@ -26,6 +26,15 @@ def _timing(own: dict[str, float]) -> dict[str, tuple[float, ...]]:
     return {"lost_samples": (own["slips"] * own["sign"],)}
 
 
+def _pole(f_hz: float, damping: float, fs_hz: float) -> complex:
+    """The pole that the generator's trapezoidal rule with its pre-warped frequency gives a mode, in rad/s.
+
+    The rule keeps the frequency, but not the damping: at a tenth of ``fs_hz`` it damps 6 % less than was stated.
+    """
+    warped = 2.0 * fs_hz * np.tan(np.pi * f_hz / fs_hz) * complex(-damping, np.sqrt(1.0 - damping**2))
+    return complex(2.0 * fs_hz * np.arctanh(warped / (2.0 * fs_hz)))
+
+
 def true_numbers(case: Case) -> TrueNumbers:
     """Counterparts for causes whose reported number has the same meaning here. Others (weights of plays, bends of a
     curve in the diagnosis' own polynomials, growth per decade of another law) have none."""
@@ -41,7 +50,8 @@ def true_numbers(case: Case) -> TrueNumbers:
                 out[name] = {"gain": (own["total"],)}
             case "resonance":
                 if "second_Hz" not in own:
-                    out[name] = {"f0_hz": (own["f_Hz"],), "damping": (own["damping"],)}
+                    pole = _pole(own["f_Hz"], own["damping"], rig.fs_hz * rig.over)
+                    out[name] = {"f0_hz": (abs(pole) / (2.0 * np.pi),), "damping": (-pole.real / abs(pole),)}
             case "payload_change":
                 # Its moment has no counterpart: during a rest nothing shows it.
                 out[name] = {"payload_ratio": (own["ratio"],)}

@@ -83,6 +83,12 @@ LOADED_AND_LAGGING = pair(778)
 DRIFTING = single(783)
 #: The voltage's last 2 % are clipped on a loop that bends; and a payload that rings, where nothing is clipped.
 CLIPPED, RINGING = single(763), pair(614)
+#: The top of a raster is clipped while a sensor's bow is slow at the bottom: a limit shows at neither end.
+SLOW_BOTTOM = single(820)
+#: A limit of the speed beside a late reading: both bend the response, and neither is a lag.
+SLEWED_AND_LATE = pair(816)
+#: Slips beside a loop of another class, which calls for slips of its own as long as it is not named.
+SLIPPED = single(829)
 #: A sensor's lag beside the stage's own: calibrated alone, the stage's stands at its bound.
 TWO_LAGS = single(792)
 #: A bow that only cycles over the whole range pass, and there are two of them.
@@ -162,6 +168,21 @@ def test_a_stage_that_rings_where_its_file_says_carries_no_payload(case: Case) -
 def test_a_limit_is_seen_on_the_way_back_from_it_and_not_where_the_stage_rings() -> None:
     assert saturation_seen(readings_of(CLIPPED)).seen is True
     assert saturation_seen(readings_of(RINGING)).seen is not True
+
+
+def test_one_end_without_a_limit_does_not_exclude_one_at_the_other() -> None:
+    assert saturation_seen(readings_of(SLOW_BOTTOM)).seen is None
+
+
+def test_a_response_behind_a_limit_of_the_speed_shows_no_lag() -> None:
+    readings = readings_of(SLEWED_AND_LATE)
+    assert second_lag(readings).seen is None
+    assert "limit of the speed" in second_lag(readings).words
+
+
+def test_slips_that_a_wrong_loop_called_for_are_dropped_beside_a_better_one() -> None:
+    said = diagnosed(SLIPPED)
+    assert {cause.name for cause in said.causes} == {"timing", "hysteresis_shape"}
 
 
 def test_two_lags_are_told_apart_where_the_calibration_found_their_sum() -> None:

@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from sim.recordings import Recording, check, repaired, require_usable
+from sim.recordings.findings import LARGEST_LEAD, lead
+from tests.hidden.foreign.cases import pair
+from tests.hidden.foreign.score import recording_of
 
 DT = 0.001
 
@@ -172,6 +175,14 @@ def test_swapped_columns_are_refused_and_right_ones_are_not() -> None:
         require_usable(exchanged, check(exchanged))
     negative = replace(base, y_um=-base.y_um)
     assert "swapped" not in kinds(negative)
+
+
+def test_a_command_that_rests_under_a_noisy_sensor_is_not_exchanged_where_the_clock_lets_readings_lead() -> None:
+    ahead = recording_of(pair(820))
+    assert lead(ahead.u_V, ahead.y_um) > LARGEST_LEAD
+    assert "swapped" not in kinds(ahead)
+    on_time = recording_of(pair(820).without("timing"))
+    assert "swapped" in kinds(replace(on_time, u_V=on_time.y_um, y_um=on_time.u_V))
 
 
 def test_jitter_and_wrong_units() -> None:
