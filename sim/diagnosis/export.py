@@ -140,7 +140,7 @@ def _settling(fit: ModelFit) -> int:
     """Number of first samples to leave out, because a simulated stage starts at rest at 0 V and this one did not."""
     u = fit.model.data.u_V
     nominal = fit.model.nominal
-    free_memory = isinstance(nominal, BoucWenStage) and nominal.free_memory
+    free_memory = isinstance(nominal, BoucWenStage | FileStage) and nominal.free_memory
     at_rest = abs(float(u[0])) < 1e-3 * fit.model.data.swing_V and not free_memory
     return 0 if at_rest else fit.model.data.n // 5
 

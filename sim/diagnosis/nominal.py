@@ -15,7 +15,7 @@ from sim.fitting.calibration import calibrate, with_free_memory
 from sim.fitting.dynamics import LIGHT, Dynamics, first_ringing, respond
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
-from sim.fitting.stage_model import ModelFit, NominalStage, StageModel
+from sim.fitting.stage_model import INITIAL_STATE, ModelFit, NominalStage, StageModel
 from sim.stage.config import StageConfig
 
 
@@ -197,6 +197,8 @@ class FileStage:
     calibrated: tuple[str, ...]
     hold: str = "zero"
     name: str = "stage"
+    #: Where the stage came from before the first sample is a parameter.
+    free_memory: bool = False
     _unit: Chain = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -206,7 +208,7 @@ class FileStage:
         return replace(self, hold="zero" if self.hold == "first" else "first")
 
     def with_free_memory(self) -> FileStage:
-        return self
+        return replace(self, free_memory=True) if self.has_loop and not self.free_memory else self
 
     @property
     def substeps(self) -> int:
@@ -235,12 +237,18 @@ class FileStage:
             modes.append(ModelParameter(name, "1", 0.0, -spread, spread, 0.01, ActsOn.DYNAMICS))
             if damping < 1.0:
                 modes.append(ModelParameter(f"log_z{i + 1}_share", "1", 0.0, -1.5, 1.5, 0.1, ActsOn.DYNAMICS))
-        return (*own, *modes, *common_parameters(data))
+        before = (ModelParameter("before_share", "1", 0.0, -1.0, 1.0, 0.1, ActsOn.STATIC),) if self.free_memory else ()
+        return (*own, *modes, *common_parameters(data), *before)
 
     def starts(self, data: FitData) -> list[FloatArray]:
         p = np.array([s.neutral for s in self.parameters(data)])
-        p[-2] = data.y_um[0]
+        p[self._offset] = data.y_um[0]
         return [p]
+
+    @property
+    def _offset(self) -> int:
+        """Index of the offset; the latch comes next."""
+        return len(self.calibrated) + sum(2 if damping < 1.0 else 1 for _, damping in self.modes_hz)
 
     def effects(self, p: FloatArray) -> list[Effect]:
         """The file's effects with the calibrated numbers, modes as ``resonance``. The latch belongs to the recorder."""
@@ -263,13 +271,27 @@ class FileStage:
 
     def static(self, drive_V: FloatArray, p: FloatArray, data: FitData) -> tuple[FloatArray, FloatArray]:
         # The reading at t_k does not depend on u_k: one sample later it shows what u_k has done.
-        w = simulate(self.actuator(p), np.append(drive_V, drive_V[-1]), data.dt_s)[1:]
+        actuator = self.actuator(p)
+        past = self._past_V(actuator, float(p[-1]), drive_V, data) if self.free_memory else drive_V[:0]
+        w = simulate(actuator, np.concatenate([past, drive_V, drive_V[-1:]]), data.dt_s)[past.size + 1 :]
         slope = float(np.ptp(w)) / max(float(np.ptp(drive_V)), 1e-12) * math.copysign(1.0, data.gain_um_per_V)
         h = slope * (drive_V - drive_V[0]) - (w - w[0]) if self.has_loop else np.zeros_like(w)
         return np.ascontiguousarray(h), np.ascontiguousarray(w)
 
+    def _past_V(self, actuator: Chain, share: float, drive_V: FloatArray, data: FitData) -> FloatArray:
+        """The voltage before the first sample: up or down and back, as slowly as the amplifier's lag asks for.
+
+        What remains of a small excursion goes with its square, so the excursion goes with the root of ``share``.
+        """
+        if share == 0.0:
+            return drive_V[:0]
+        lag_s = sum(e.values["tau_s"] for e in actuator if e.name == "amplifier_lag")
+        n = 1 + math.ceil(10.0 * lag_s / data.dt_s)
+        there_V = drive_V[0] + math.copysign(math.sqrt(abs(share)), share) * data.swing_V
+        return np.repeat([there_V, drive_V[0]], n)
+
     def dynamics(self, p: FloatArray, data: FitData) -> Dynamics:
-        return Dynamics((), self.modes(p), float(p[-1]) * data.dt_s, self.hold)
+        return Dynamics((), self.modes(p), float(p[self._offset + 1]) * data.dt_s, self.hold)
 
     def modes(self, p: FloatArray) -> tuple[tuple[float, float], ...]:
         """Frequency (Hz) and damping ratio of each mode, calibrated."""
@@ -289,7 +311,7 @@ class FileStage:
         return simulate(self._unit, later, data.dt_s, other_um=data.other_um)
 
     def offset_um(self, p: FloatArray) -> float:
-        return float(p[-2])
+        return float(p[self._offset])
 
     def start_um(self, p: FloatArray) -> float:
         return 0.0
@@ -421,7 +443,7 @@ def with_other_axis(fit: ModelFit, mask: BoolArray, *, refit: bool = True) -> Mo
 # A fitted model on another recording of the same stage.
 
 #: Parameters that belong to one recording: the sensor's offset, and what happened before the first sample.
-OF_ONE_RECORDING = ("offset_um", "h0", "start_um")
+OF_ONE_RECORDING = ("offset_um", *INITIAL_STATE)
 
 
 def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> ModelFit:
@@ -446,8 +468,8 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
         scales_from=home.data.scales,
     )
     nominal = home.nominal
-    if isinstance(nominal, BoucWenStage):
-        nominal = replace(nominal, free_memory=nominal.free_memory or not begins_at_rest(data))
+    if isinstance(nominal, BoucWenStage) and not begins_at_rest(data):
+        nominal = nominal.with_free_memory()
     model = StageModel(there, nominal, home.causes)
     known = {parameter.name: fit.p[i] for i, parameter in enumerate(home.parameters[: home.n_nominal])}
     own_parameters = model.parameters[: model.n_nominal]

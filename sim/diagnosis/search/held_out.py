@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
 from sim.fitting.fit_data import FitData
-from sim.fitting.stage_model import ModelFit
+from sim.fitting.stage_model import INITIAL_STATE, ModelFit
 from sim.readings.noise import monitor_noise_V
 
 IntArray = NDArray[np.int64]
@@ -71,10 +71,6 @@ class HeldOut:
 
     per_block_um2: FloatArray
     sse_um2: float
-
-
-#: Parameters of the initial state: only the first samples determine them, so they cannot be held out.
-INITIAL_STATE = ("start_um", "h0")
 
 
 def unit_columns(fit: ModelFit, mask: BoolArray, past: bool = True) -> FloatArray:

@@ -89,6 +89,8 @@ SLOW_BOTTOM = single(820)
 SLEWED_AND_LATE = pair(816)
 #: Slips beside a loop of another class, which calls for slips of its own as long as it is not named.
 SLIPPED = single(829)
+#: The stage file's own loop, used before the record, under a payload; and with a clipped voltage besides.
+USED_AND_LOADED, USED_AND_CLIPPED = single(701), pair(818)
 #: A sensor's lag beside the stage's own: calibrated alone, the stage's stands at its bound.
 TWO_LAGS = single(792)
 #: A bow that only cycles over the whole range pass, and there are two of them.
@@ -200,6 +202,14 @@ def test_a_payload_is_weighed_against_the_stated_frequency() -> None:
     low, high = next(cause.intervals["payload_ratio"] for cause in said.causes if cause.name == "payload_change")
     assert low < case.effects["payload_change"]["ratio"] < high
     assert high - low < 0.01
+
+
+@pytest.mark.parametrize("case", [USED_AND_LOADED, USED_AND_CLIPPED], ids=["payload", "saturation_too"])
+def test_the_stage_of_a_file_may_have_moved_before_the_record(case: Case) -> None:
+    """Its loop does not begin relaxed then; a loop of another shape would imitate that."""
+    said = diagnose_prepared(prepare(recording_of(case), nominal=nominal_of(case)))
+    assert {cause.name for cause in said.causes} == set(case.hidden)
+    assert said.extended_heldout_um < 1.25 * max(said.noise_floor_um, case.rig.sigma_um)
 
 
 def test_a_finer_shape_is_fitted_again_beside_a_drift_without_which_it_held_out_worse() -> None:
