@@ -128,6 +128,8 @@ _BLOCK = 8
 _FIRST = 100
 #: Least distance of two slips, samples: a shift that is soon taken back is a model error.
 _SHORTEST = 64
+#: Rounds in which slips of size zero are dropped; each is a calibration.
+_ROUNDS_OF_DROPPING = 3
 #: Slips in order: first sample, and number of samples lost (negative: gained).
 SlipList = tuple[tuple[int, int], ...]
 IntArray = NDArray[np.int64]
@@ -418,21 +420,21 @@ def fit_slips(cause: Slips, bare: StageModel, base: ModelFit, mask: BoolArray, k
     # The sizes are free in the last fit: whole numbers then confirm that these are slips.
     found = found or cause.found
     fit = fitted(fit.p, found, 8, sizes_too=not known)
-    return fit if known else _without_small_ones(fit, found, own, lambda p, f: fitted(p, f, 8, sizes_too=True))
+    return fit if known else without_small_slips(fit, found, own, lambda p, f: fitted(p, f, 8, sizes_too=True))
 
 
-def _without_small_ones(
+def without_small_slips(
     fit: ModelFit, found: SlipList, own: int, fitted: Callable[[FloatArray, SlipList], ModelFit]
 ) -> ModelFit:
     """The fit without the slips that a wrong loop called for: beside a better one they shrink to nothing.
 
-    The others then become whole. If they do not, or the error doubles, ``fit`` stays.
+    The others then become whole. If they do not within a few rounds, or the error doubles, ``fit`` stays.
     """
     fewer = fit
-    while True:
+    for _ in range(_ROUNDS_OF_DROPPING):
         sizes = np.rint(fewer.p[own:]).astype(int)
         kept = merge_close_slips(tuple((at, int(n)) for (at, _), n in zip(found, sizes, strict=True) if n))
-        if not kept or kept == found:
+        if not kept or len(kept) == len(found):
             break
         found, fewer = kept, fitted(fewer.p, kept)
     whole = bool(np.all(np.abs(fewer.p[own:] - np.rint(fewer.p[own:])) < 0.4))

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.effects.timing import SlipList, best_slip_move, date_slips, find_slips, merge_close_slips
+from sim.effects.timing import (
+    SlipList,
+    best_slip_move,
+    date_slips,
+    find_slips,
+    merge_close_slips,
+    without_small_slips,
+)
 
 N = 6000
 NOISE_UM = 0.005
@@ -89,3 +99,24 @@ def test_healthy_readings_do_not_slip() -> None:
     y_um, there, model = slipped((), np.random.default_rng(5)), np.ones(N, dtype=np.bool_), motion()[:N]
     assert find_slips(y_um, model, there) == ()
     assert best_slip_move((), y_um, model, there)[1] < 40.0 * NOISE_UM**2
+
+
+def test_dropping_slips_ends_where_their_sizes_change_with_every_fit() -> None:
+    fits: list[SlipList] = []
+
+    def fitted(p: FloatArray, kept: SlipList) -> Any:
+        fits.append(kept)
+        # The largest of the sizes changes in every fit; the next slip shrinks to nothing.
+        sizes = np.array([7.0 + len(fits), *(float(size) for _, size in kept[1:-1]), 0.1])[: len(kept)]
+        return SimpleNamespace(p=sizes, sse_um2=1.0)
+
+    found = tuple((1000 * i, 2) for i in range(1, 9))
+    first = fitted(np.zeros(0), found)
+    fits.clear()
+    fit = without_small_slips(first, found, 0, fitted)
+    assert [len(kept) for kept in fits] == [7, 6, 5]
+    assert fit.p.size == 5
+    fits.clear()
+    steady = SimpleNamespace(p=np.array([9.0, 3.0]), sse_um2=1.0)
+    assert without_small_slips(steady, ((1000, 2), (2000, 3)), 0, fitted) is steady
+    assert not fits
