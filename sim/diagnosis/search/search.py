@@ -457,14 +457,15 @@ class Search:
 
     def _refined(self, candidate: CauseCandidate, base: ModelFit) -> CauseCandidate | None:
         """The candidate with the next finer model of the same cause; None if there is none or none is needed."""
-        own = candidate.fit.p[len(base.p) :]
+        # The last cause is the candidate's. Earlier ones may be finer than those of ``base``.
+        last = len(candidate.fit.model.causes) - 1
+        own = candidate.fit.p[candidate.fit.model.slice_of(last)]
         found = candidate.cause.refined(own, self._left_floors(candidate), base.model.data)
         if found is None:
             return None
         cause, starts = found
-        model = base.model.with_cause(cause)
-        beside = candidate.fit.p[: len(base.p)]
-        fits = [calibrate(model, np.concatenate([beside, start]), self.mask, 10, 1e-3) for start in starts]
+        finer = [_exchanged(candidate.fit, last, cause, start) for start in starts]
+        fits = [calibrate(model, p, self.mask, 10, 1e-3) for model, p in finer]
         fit = with_new_columns(min(fits, key=lambda f: f.sse_um2), self.mask)
         held = self.held(fit)
         return CauseCandidate(cause, fit, held, self.cost(fit, held, base))
