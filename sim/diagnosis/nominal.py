@@ -69,7 +69,13 @@ class BoucWenStage:
         if not self.free_memory:
             return own
         r = data.range_um
-        start = ModelParameter("start_um", "µm", 0.0, -2.0 * r, 2.0 * r, 0.05 * r, ActsOn.DYNAMICS)
+        most = 2.0 * r
+        if begins_at_rest(data):
+            # The first 20 ms are not judged then: a start would be free to grow until the end of its tail fits. It is
+            # no larger than what moves there.
+            first = data.y_um[: max(4, round(0.02 / data.dt_s))]
+            most = float(np.ptp(first)) + 1e-5 * r
+        start = ModelParameter("start_um", "µm", 0.0, -most, most, min(0.05 * r, 0.5 * most), ActsOn.DYNAMICS)
         return (*own, ModelParameter("h0", "1", 0.0, -1.0, 1.0, 0.1, ActsOn.STATIC), start)
 
     def starts(self, data: FitData) -> list[FloatArray]:

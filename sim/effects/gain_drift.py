@@ -58,6 +58,10 @@ class GainDrift(SlowChange):
             for j in range(self.spans(data))
         )
 
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        fitted = self.agrees(readings.once(rests_over_time).gain, p, readings.data)
+        return "" if fitted is None else f"the fit by {100.0 * fitted:.3g} %"
+
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if self.variant == "temperature":
             return x_um if data.warmth_K is None else x_um * (1.0 + p[0] * data.warmth_K)

@@ -1,4 +1,5 @@
-"""What the forms of both drifts share: a slow change in time, finer at first where that explains more."""
+"""What the forms of both drifts share: a slow change in time, finer at first where that explains more, and seen by the
+rests in the same size."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ from adaptive.types import FloatArray
 from sim.fitting.drifts import Drift, spline
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel
+from sim.readings.slow_motion import Change
 
 #: Knots (shares of the duration) for a change that is fast at first: a temperature settles as the root of time.
 _EARLY = np.array([0.0, 0.02, 0.045, 0.08, 0.13, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
@@ -27,6 +29,16 @@ class SlowChange(Drift):
             return None
         equal = np.linspace(0.0, 1.0, p.size + 1)
         return replace(self, variant="early"), [np.interp(_EARLY[1:], equal, np.append(0.0, p))]
+
+    def agrees(self, change: Change | None, p: FloatArray, data: FitData) -> float | None:
+        """What the fit ``p`` changes in the part of the record in which the rests show ``change``; None where they do
+        not agree."""
+        if self.variant == "temperature" or change is None:
+            return None
+        course = self.course(p, data)
+        begin, end = (min(round(t / data.dt_s), data.n - 1) for t in (change.begin_s, change.end_s))
+        fitted = float(course[end] - course[begin])
+        return fitted if change.agrees(fitted) else None
 
     def course(self, p: FloatArray, data: FitData) -> FloatArray:
         """(n,) cubic spline in time through 0 at the start and the values ``p`` at the later knots."""

@@ -59,6 +59,10 @@ class ThermalDrift(SlowChange):
             for j in range(self.spans(data))
         )
 
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        fitted = self.agrees(readings.once(rests_over_time).shift, p, readings.data)
+        return "" if fitted is None else f"the fit moves them by {fitted:.3g} µm"
+
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         if self.variant == "temperature":
             return x_um if data.warmth_K is None else x_um + p[0] * data.warmth_K

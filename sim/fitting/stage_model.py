@@ -127,6 +127,10 @@ class CauseModel:
         """False where the readings speak against what this form has found."""
         return True
 
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        """How a number of a direct test, too faint to count alone, agrees with the fit ``p``; empty if it does not."""
+        return ""
+
     def line_hz(self, p: FloatArray) -> float | None:
         """Frequency of the permanent line that the form is; None for any other.
 

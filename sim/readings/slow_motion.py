@@ -30,6 +30,13 @@ class Change:
     value: float
     error: float
     when: str = ""
+    #: When that part begins and ends, s.
+    begin_s: float = 0.0
+    end_s: float = 0.0
+
+    def agrees(self, value: float) -> bool:
+        """Whether ``value`` is this change, within one error. From 2.5 errors on: a smaller change agrees with many."""
+        return abs(self.value) > 2.5 * self.error and abs(self.value - value) < self.error
 
     def seen(self, value: float, least: float, usual: float) -> bool | None:
         """Whether ``value`` (this one, or its size) counts as seen; None between, and where the error is as large as a
@@ -76,7 +83,8 @@ def rests_over_time(readings: Readings) -> RestsOverTime:
         parts = [k for k in values if k.split(".")[0] == name]
         if parts:
             best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
-            drifts[name] = Change(values[best], errors[best], _WHEN[best[len(name) + 1 :]])
+            part = best[len(name) + 1 :]
+            drifts[name] = Change(values[best], errors[best], _WHEN[part], *rests.parts_s[part])
     stepped = any(
         float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
         for r in long_enough
@@ -88,13 +96,15 @@ def rests_over_time(readings: Readings) -> RestsOverTime:
 class _Rests:
     """Normal equations of each rest, (rests, m, m) and (rests, m); what is asked of their solution, (m,) by name.
 
-    The last column is the third shape of creep. ``variance``: of the readings within the rests, µm².
+    The last column is the third shape of creep. ``variance``: of the readings within the rests, µm². ``parts_s``: begin
+    and end of the parts of the record in which a change is asked for.
     """
 
     grams: FloatArray
     slopes: FloatArray
     functionals: dict[str, FloatArray]
     variance: float
+    parts_s: dict[str, tuple[float, float]]
 
 
 def _motion_of_rests(readings: Readings) -> _Rests:
@@ -130,16 +140,18 @@ def _motion_of_rests(readings: Readings) -> _Rests:
     functionals = {"creep": decade}
     first, last = float(x.min()), float(x.max())
     middle = 0.5 * (first + last)
+    parts = {"": (first, last), "early": (first, middle), "late": (middle, last)}
     for name, at, unit, count in (("thermal_drift", 2, 0.01 * data.range_um, 3), ("gain_drift", 5, 0.02, 2)):
         if at >= len(columns):
             continue
-        for part, (begin, end) in {"": (first, last), ".early": (first, middle), ".late": (middle, last)}.items():
+        for part, (begin, end) in parts.items():
             row = np.zeros(rows.shape[0])
             change = [end - begin, math.exp(-5.0 * end) - math.exp(-5.0 * begin)]
             change += [math.exp(-20.0 * end) - math.exp(-20.0 * begin)]
             row[at : at + count] = unit * np.array(change[:count])
-            functionals[name + part] = row
-    return _Rests(np.array(grams), np.array(slopes), functionals, float(np.var(y)))
+            functionals[f"{name}.{part}"] = row
+    parts_s = {part: (begin * data.duration_s, end * data.duration_s) for part, (begin, end) in parts.items()}
+    return _Rests(np.array(grams), np.array(slopes), functionals, float(np.var(y)), parts_s)
 
 
 def _per_decade(slowest_s: float) -> FloatArray:

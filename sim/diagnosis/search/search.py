@@ -7,7 +7,7 @@ replaces those that are not needed, and collects rivals that explain the recordi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -293,6 +293,20 @@ class Search:
         model = candidate.fit.model
         return cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
 
+    def agreement(self, candidate: CauseCandidate) -> str:
+        """How a number of the direct test, too faint to count alone, agrees with the fit."""
+        if self.readings is None:
+            return ""
+        model = candidate.fit.model
+        own = model.parameters_of(candidate.fit.p, len(model.causes) - 1)
+        return candidate.cause.agreement(own, self.readings)
+
+    def _with_agreement(self, candidate: CauseCandidate) -> None:
+        """A faint number of the direct test that agrees with the accepted fit is seen."""
+        sight, agreement = self.sights.get(candidate.cause.name), self.agreement(candidate)
+        if sight is not None and sight.seen is None and agreement:
+            self.sights[candidate.cause.name] = Sight(True, f"{sight.words}; {agreement}")
+
     def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
         """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
         thresholds = self.thresholds
@@ -315,7 +329,8 @@ class Search:
         clean = now > 2.0 * left_um2
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
         sight = self.sights.get(best.cause.name)
-        if sight is not None and sight.seen is None and best.cause.imitates_others and whole < thresholds.nearly_all:
+        faint = sight is not None and sight.seen is None and best.cause.imitates_others
+        if faint and whole < thresholds.nearly_all and not self.agreement(best):
             return False
         if not seen and gain < thresholds.least_of_nominal * self.nominal_um2 and whole < thresholds.least_whole:
             return False
@@ -352,8 +367,7 @@ class Search:
             accepted: CauseCandidate | None = None
             p = 1.0
             fitting = sorted((c for c in ranked if self.plausible(c)), key=self._with_witness)
-            for candidate in self._apart(fitting)[:3]:
-                best = self._beside_finer(self.polish(candidate, current), current)
+            for best in self._to_convergence(self._apart(fitting)[:3], current):
                 gain = held.sse_um2 - best.held.sse_um2
                 p = p_value(looks, gain, self.seed + round_)
                 if self.acceptable(best, held, left_um2, p, current):
@@ -361,6 +375,7 @@ class Search:
                     break
             if accepted is None:
                 break
+            self._with_agreement(accepted)
             # A freer form imitates what it stands beside: it does not take over a signature that the readings show.
             sight = self.sights.get(accepted.cause.name)
             if sight is None or sight.seen is not True:
@@ -377,6 +392,20 @@ class Search:
             current, held = accepted.fit, accepted.held
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
+
+    def _to_convergence(self, candidates: list[CauseCandidate], base: ModelFit) -> Iterator[CauseCandidate]:
+        """Each candidate fitted to convergence; then, if none of them is taken, each in its finer models.
+
+        A coarse sum of plays may do worse in held-out stretches than no plays at all.
+        """
+        fitted = []
+        for candidate in candidates:
+            fitted.append(self._beside_finer(self.polish(candidate, base), base))
+            yield fitted[-1]
+        for candidate in fitted:
+            finer = self._with_refined_model(candidate, base)
+            if finer is not candidate:
+                yield finer
 
     def _with_freer_form(self, fit: ModelFit) -> CauseCandidate | None:
         """The model with the first of its causes that has a freer form in that form; None if none has."""
