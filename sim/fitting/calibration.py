@@ -55,7 +55,10 @@ def evaluate(model: StageModel, p: FloatArray, mask: BoolArray) -> ModelFit:
 
 @dataclass(frozen=True)
 class DampingRule:
-    """How the damping of a Levenberg-Marquardt search follows its steps: / 5 after a success, x 10 after a failure.
+    """How the damping of a Levenberg-Marquardt search follows its steps: / 5 after a success, x 10 after each of three
+    failures and x 100 after every further one.
+
+    A start far from its minimum needs a damping of 10 and more; with x 10 alone, as many trials ended at 0.1.
 
     ``least`` and ``least_after_failure`` are lower limits; ``rcond`` is that of the least-squares solution.
     """
@@ -81,13 +84,13 @@ def damped_step(
     move (m,) and returns its squared error with its result. Returns the first better result, or None after
     ``attempts``, and the damping for the next step.
     """
-    for _ in range(attempts):
+    for failures in range(attempts):
         solved = np.linalg.lstsq(gram + np.diag(size * damping), slope, rcond=rule.rcond)[0]
         move = np.asarray(solved, dtype=np.float64)
         there, result = trial(move)
         if np.isfinite(there) and there < sse:
             return result, max(damping * 0.2, rule.least)
-        damping = max(damping * 10.0, rule.least_after_failure)
+        damping = max(damping * (10.0 if failures < 3 else 100.0), rule.least_after_failure)
     return None, damping
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from sim.diagnosis import Diagnosis, diagnose_prepared, prepare
-from sim.diagnosis.nominal import calibrate_nominal, with_nominal_kind
+from sim.diagnosis.nominal import BoucWenStage, calibrate_nominal, with_nominal_kind
 from sim.diagnosis.search.search import first_fits
 from sim.effects.gain_drift import in_rests
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.effects.saturation import seen as saturation_seen
+from sim.effects.thermal_drift import in_rests as drift_in_rests
 from sim.fitting.calibration import with_new_columns
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
@@ -97,6 +98,10 @@ TWO_LAGS = single(792)
 BOW_BETWEEN = single(733)
 #: A second lag and a mode under a multisine: the response bends, and not clearly enough to measure the lag.
 UNCLEAR_LAG = pair(705)
+#: A drift that four rests show faintly, beside a lag.
+FAINT = pair(834)
+#: Stick slip on a stage that begins at rest.
+BEGINS_AT_REST = pair(836)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
 
@@ -262,6 +267,28 @@ def test_a_second_lag_is_seen_in_the_response_as_the_recorder_samples_it(case: C
 def test_a_response_that_bends_unclearly_does_not_exclude_a_lag() -> None:
     readings = readings_of(UNCLEAR_LAG)
     assert second_lag(readings).seen is None
+
+
+def test_a_faint_drift_of_the_rests_counts_as_seen_where_the_fit_has_its_size() -> None:
+    sight = drift_in_rests(readings_of(FAINT))
+    assert sight.seen is None
+    said = diagnosed(FAINT)
+    named = {cause.name: cause for cause in said.causes}
+    assert set(FAINT.hidden) <= set(named) <= set(FAINT.hidden) | FAINT.allowed
+    witness = named["thermal_drift"].witness
+    assert witness is not None
+    assert witness.seen is True
+    assert witness.words.startswith(sight.words)
+
+
+def test_a_start_that_is_not_judged_is_no_larger_than_what_moves_in_it() -> None:
+    """Free to grow until the end of its tail fits, it bent the fit that a further cause needs."""
+    prepared = prepare(recording_of(BEGINS_AT_REST), nominal="bouc_wen")
+    data = prepared.data
+    start = BoucWenStage("zero", free_memory=True).parameters(data)[-1]
+    first = data.y_um[data.t_s - data.t_s[0] < 0.02]
+    assert start.name == "start_um"
+    assert start.high == pytest.approx(np.ptp(first), rel=0.3)
 
 
 @pytest.mark.parametrize("seed", [741, 760])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from adaptive.errors import InputError
+from adaptive.types import FloatArray
 from sim.diagnosis.nominal import BoucWenStage
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.search.held_out import split
@@ -19,7 +20,7 @@ from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.rate_dependence import RateDependence
 from sim.effects.stick_slip import friction
 from sim.effects.timing import resample
-from sim.fitting.calibration import calibrate
+from sim.fitting.calibration import DampingRule, calibrate, damped_step
 from sim.fitting.dynamics import Dynamics, respond
 from sim.fitting.fit_data import ActsOn, FitData
 from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
@@ -31,6 +32,7 @@ from sim.readings.noise import (
     repeated_period,
     repeated_readings,
 )
+from sim.readings.slow_motion import Change
 from sim.recordings import Recording
 from tests.sim.diagnosis.plays import plays
 
@@ -203,6 +205,29 @@ def test_calibration_finds_the_librarys_bouc_wen_stage() -> None:
     assert got["rise_per_V"] == pytest.approx(1.9, rel=1e-2)
     assert got["tau_s"] == pytest.approx(8e5 / 3.5244e8, rel=1e-2)
     assert got["offset_um"] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("longest", "found"), [(0.2, True), (0.01, False)])
+def test_six_trials_reach_a_step_of_a_tenth(longest: float, found: bool) -> None:
+    """Far from its minimum only a short step lowers the error; there a fit must not give up."""
+    rule = DampingRule(least=1e-9, least_after_failure=1e-5, rcond=1e-13)
+    tried: list[float] = []
+
+    def trial(move: FloatArray) -> tuple[float, float]:
+        tried.append(abs(float(move[0])))
+        return (0.5 if tried[-1] < longest else 2.0), tried[-1]
+
+    better, _ = damped_step(np.ones((1, 1)), np.ones(1), np.ones(1), 1e-6, rule, 6, 1.0, trial)
+    assert len(tried) == 6
+    assert (better == tried[-1]) is found
+
+
+def test_a_change_agrees_from_two_and_a_half_errors_on() -> None:
+    faint, clear = Change(0.24, 0.1), Change(-0.26, 0.1)
+    assert not faint.agrees(0.24)
+    assert clear.agrees(-0.2)
+    assert not clear.agrees(-0.37)
+    assert not clear.agrees(0.26)
 
 
 def test_noise_floor_sees_noise_and_not_creep() -> None:
