@@ -55,10 +55,7 @@ def evaluate(model: StageModel, p: FloatArray, mask: BoolArray) -> ModelFit:
 
 @dataclass(frozen=True)
 class DampingRule:
-    """How the damping of a Levenberg-Marquardt search follows its steps: / 5 after a success, x 10 after each of three
-    failures and x 100 after every further one.
-
-    A start far from its minimum needs a damping of 10 and more; with x 10 alone, as many trials ended at 0.1.
+    """How the damping of a Levenberg-Marquardt search follows its steps: / 5 after a success, x 10 after a failure.
 
     ``least`` and ``least_after_failure`` are lower limits; ``rcond`` is that of the least-squares solution.
     """
@@ -84,17 +81,20 @@ def damped_step(
     move (m,) and returns its squared error with its result. Returns the first better result, or None after
     ``attempts``, and the damping for the next step.
     """
-    for failures in range(attempts):
+    for _ in range(attempts):
         solved = np.linalg.lstsq(gram + np.diag(size * damping), slope, rcond=rule.rcond)[0]
         move = np.asarray(solved, dtype=np.float64)
         there, result = trial(move)
         if np.isfinite(there) and there < sse:
             return result, max(damping * 0.2, rule.least)
-        damping = max(damping * (10.0 if failures < 3 else 100.0), rule.least_after_failure)
+        damping = max(damping * 10.0, rule.least_after_failure)
     return None, damping
 
 
 _RULE = DampingRule(least=1e-9, least_after_failure=1e-5, rcond=1e-13)
+#: Trials with fresh columns before a fit ends: from the least damping to 10. Fits far from their minimum, where only
+#: short steps lower the error, gave up at 0.1.
+_ATTEMPTS = 8
 
 
 def calibrate(
@@ -163,7 +163,7 @@ def calibrate(
             return there.sse_um2, there
 
         better, damping = damped_step(
-            part, slope[moving], np.diag(gram)[moving], damping, _RULE, 6 if fresh else 2, now.sse_um2, moved
+            part, slope[moving], np.diag(gram)[moving], damping, _RULE, _ATTEMPTS if fresh else 2, now.sse_um2, moved
         )
         if better is None:
             if fresh or not np.any(nonlinear):

@@ -367,7 +367,7 @@ class Search:
             accepted: CauseCandidate | None = None
             p = 1.0
             fitting = sorted((c for c in ranked if self.plausible(c)), key=self._with_witness)
-            for best in self._to_convergence(self._apart(fitting)[:3], current):
+            for best in self._to_convergence(self._apart(fitting), current):
                 gain = held.sse_um2 - best.held.sse_um2
                 p = p_value(looks, gain, self.seed + round_)
                 if self.acceptable(best, held, left_um2, p, current):
@@ -394,18 +394,20 @@ class Search:
         return current, held, steps
 
     def _to_convergence(self, candidates: list[CauseCandidate], base: ModelFit) -> Iterator[CauseCandidate]:
-        """Each candidate fitted to convergence; then, if none of them is taken, each in its finer models.
+        """The first three candidates fitted to convergence; then, if none is taken, three causes in finer models.
 
         A coarse sum of plays may do worse in held-out stretches than no plays at all.
         """
         fitted = []
-        for candidate in candidates:
+        for candidate in candidates[:3]:
             fitted.append(self._beside_finer(self.polish(candidate, base), base))
             yield fitted[-1]
-        for candidate in fitted:
-            finer = self._with_refined_model(candidate, base)
-            if finer is not candidate:
-                yield finer
+        first_of: dict[str, CauseCandidate] = {}
+        for candidate in [*fitted, *candidates[3:]]:
+            first_of.setdefault(candidate.cause.name, candidate)
+        coarse = list(first_of.values())[:3]
+        finer = [self._with_refined_model(candidate, base) for candidate in coarse]
+        yield from sorted((f for f, c in zip(finer, coarse, strict=True) if f is not c), key=self._with_witness)
 
     def _with_freer_form(self, fit: ModelFit) -> CauseCandidate | None:
         """The model with the first of its causes that has a freer form in that form; None if none has."""
