@@ -67,9 +67,15 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     lag_error_s = more.product_error / more.product * lag_s
     # Two nearly equal lags are not known apart, but their product is, and it is nothing where there is one.
     lagged: bool | None = more.cost < 0.5 * fewer.cost and more.product > 5.0 * more.product_error
-    if not lagged and more.cost < 0.8 * fewer.cost:
-        # A further lag improves the fit, but its size is not known: it is neither seen nor excluded.
+    if not lagged and (
+        more.cost < 0.8 * fewer.cost
+        or _fit(f, gain, sigma, data.dt_s, own + 1, latest_s, least_s=0.5 * data.dt_s).cost < 1.2 * fewer.cost
+    ):
+        # A further lag improves the fit, but its size is not known, or lags of half a sample would not show: it is
+        # neither seen nor excluded.
         lagged = None
+    # Two lags bend the phase almost like one with a delay.
+    either = delayed and lagged and _fit(f, gain, sigma, data.dt_s, own + 1, 1.5 * data.dt_s).cost < 1.25 * more.cost
     if lagged and not delayed:
         late_s, late_error_s = float(more.p[1]), float(more.errors[1])
     words = (
@@ -82,7 +88,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
         f"{100 * more.cost / max(fewer.cost, 1e-300):.0f} %"
     )
     # A little more than the recorder's latch is not decided.
-    late = True if delayed else None if late_s > 1.2 * data.dt_s else False
+    late = None if either else True if delayed else None if late_s > 1.2 * data.dt_s else False
     return LagsOfResponse("", late, words, lagged, lag_words)
 
 
@@ -134,18 +140,33 @@ class _Fitted:
         self.product_error = float(np.sqrt(max(float(row @ cover @ row), 0.0)))
 
 
-def _fit(f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float) -> _Fitted:
+def _fit(
+    f: FloatArray,
+    gain: ComplexArray,
+    sigma: FloatArray,
+    dt_s: float,
+    lags: int,
+    latest_s: float,
+    least_s: float = 1e-6,
+) -> _Fitted:
     """The better fit of a voltage that is held over each sample and of one that runs straight to the next.
 
-    ``lags`` 0 is fitted as one lag that is too short to be seen.
+    ``lags`` 0 is fitted as one lag that is too short to be seen. ``least_s`` is the shortest lag.
     """
-    both = (_fit_hold(f, gain, sigma, dt_s, lags, latest_s, straight) for straight in (False, True))
+    both = (_fit_hold(f, gain, sigma, dt_s, lags, (least_s, latest_s), straight) for straight in (False, True))
     return min(both, key=lambda fitted: fitted.cost)
 
 
 def _fit_hold(
-    f: FloatArray, gain: ComplexArray, sigma: FloatArray, dt_s: float, lags: int, latest_s: float, straight: bool
+    f: FloatArray,
+    gain: ComplexArray,
+    sigma: FloatArray,
+    dt_s: float,
+    lags: int,
+    limits_s: tuple[float, float],
+    straight: bool,
 ) -> _Fitted:
+    """``limits_s``: the shortest lag and the longest latency."""
     from scipy import optimize  # a simulated stage does not wait for it
 
     turn = np.exp(-2j * np.pi * f * dt_s)
@@ -165,10 +186,12 @@ def _fit_hold(
         return np.asarray(both)
 
     best: optimize.OptimizeResult | None = None
+    least_s, latest_s = limits_s
     for first in (1e-3, 4e-3):
         # More than one start: the second lag hides behind the first.
         start = np.array([start_gain, 0.0, 0.0, 0.0, first if lags else 1.5e-6, *[0.3 * first] * (lags - 1)])
-        low = [-50.0, -1.5 * dt_s, -0.3, -0.1, 1e-6, *[1e-6] * (lags - 1)]
+        low = np.array([-50.0, -1.5 * dt_s, -0.3, -0.1, least_s, *[least_s] * (lags - 1)])
+        start = np.maximum(start, 1.01 * low)
         high = [50.0, latest_s, 0.3, 0.1, 0.1 if lags else 2e-6, *[0.1] * (lags - 1)]
         scale = [1.0, 1e-3, 0.1, 0.1, 1e-3, 1e-3][: start.size]
         solved = optimize.least_squares(misfit, start, bounds=(low, high), x_scale=scale)

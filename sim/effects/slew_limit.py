@@ -84,6 +84,9 @@ def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | No
 
 # Its signature in the readings.
 
+#: Exponent from which on the speed goes with the size: 0.76 and more without a limit, 0.9 and more in nine of ten.
+_PROPORTIONAL = 0.9
+
 
 def seen(readings: Readings) -> Sight:
     """The greatest speed of the readings over the size of a step, or over the speed that a motion asks for.
@@ -96,6 +99,7 @@ def seen(readings: Readings) -> Sight:
     sizes, speeds = _steps(readings)
     words = []
     judged: list[str] = []
+    open_ = False
     for x, v, what in ((sizes, speeds, "steps"), (*_motions(readings), "motions")):
         if x.size < 3 or float(np.max(x)) < 1.6 * float(np.min(x)):
             continue
@@ -111,8 +115,12 @@ def seen(readings: Readings) -> Sight:
         words.append(f"the greatest speed of {x.size} {what} ({top:.3g} V/s) goes with their size to the {slope:.2g}")
         if slope < 0.7:
             return Sight(True, words[-1])
+        open_ = open_ or slope < _PROPORTIONAL
     if not words:
         return Sight(None, "no steps or fast motions of several sizes")
+    if open_:
+        # The largest steps may just have reached a limit.
+        return Sight(None, "; ".join(words))
     if sizes.size and "steps" not in judged:
         # Steps ask for the greatest speed: what is slower says nothing about a limit above it.
         return Sight(None, f"{words[0]}; {sizes.size} faster steps do not differ enough in size")

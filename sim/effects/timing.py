@@ -449,35 +449,55 @@ def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | No
 # Its signature in the readings.
 
 
+#: Passes in which the clock error that was found is taken off and the lateness is asked again.
+_PASSES = 6
+
+
 def seen(readings: Readings) -> Sight:
     """The time by which the readings are late, in windows of fast motion: its change over the record.
 
     A clock error makes it grow in proportion to time; lost or doubled samples make it jump by whole samples.
     """
+    from scipy import stats  # a simulated stage does not wait for it
+
     data = readings.data
     t, d, e = readings.lateness
     if t.size < 6:
         return Sight(None, "too few stretches of fast motion to date the readings")
-    columns = np.stack([np.ones_like(t), t]) / e
-    solved = np.linalg.lstsq(columns.T, d / e, rcond=None)[0]
-    left = d / e - solved @ columns
-    cover = np.linalg.pinv(columns @ columns.T) * max(1.0, float(left @ left) / max(1, t.size - 2))
-    ppm, sigma = 1e6 * solved[1] * data.dt_s, 1e6 * float(np.sqrt(cover[1, 1])) * data.dt_s
+    to_ppm = 1e6 * data.dt_s
+    off, slope, sigma = 0.0, *_trend(t, d, e)
+    now = readings
+    for _ in range(_PASSES):
+        # The description of late readings takes a part of their lateness over, all of it where the motion is a sine:
+        # the median of the slopes between windows is taken off the readings, and they are described again.
+        step = float(stats.theilslopes(d, t).slope)
+        if abs(step) < 1.96 * sigma:
+            break
+        other = readings.with_readings(np.asarray(resample(data.y_um, (off + step) * data.dt_s, 0.0)))
+        if float(np.std(other.left_um)) > float(np.std(now.left_um)):
+            # What is taken off was not late: the description is worse.
+            break
+        off, now = off + step, other
+        t, d, e = now.lateness
+        slope, sigma = _trend(t, d, e)
+    ppm, sigma = to_ppm * (off + slope), to_ppm * sigma
     words = f"the readings' lateness changes by {ppm:.3g} ± {1.96 * sigma:.2g} ppm over {t.size} stretches of motion"
     half = t < 0.5 * (t[0] + t[-1])
-    parts = [_trend(t[p], d[p], e[p]) * 1e6 * data.dt_s for p in (half, ~half) if int(p.sum()) >= 4]
+    parts = [to_ppm * (off + _trend(t[p], d[p], e[p])[0]) for p in (half, ~half) if int(p.sum()) >= 4]
     steady = len(parts) == 2 and all(abs(part - ppm) < 0.5 * abs(ppm) for part in parts)
-    if abs(ppm) > 5.0 * sigma and abs(ppm) > 12.0 and steady:
+    if off != 0.0 and abs(ppm) > 5.0 * sigma and abs(ppm) > 12.0 and steady:
         return Sight(True, words)
     # Slips have dates of their own and are judged by whole samples; without a trend nothing is decided here.
     return Sight(None, words)
 
 
-def _trend(t: FloatArray, d: FloatArray, e: FloatArray) -> float:
-    """Weighted slope of d over t."""
-    w = 1.0 / e**2
-    x = t - float(w @ t) / float(w.sum())
-    return float(w @ (x * d)) / max(float(w @ (x * x)), 1e-300)
+def _trend(t: FloatArray, d: FloatArray, e: FloatArray) -> tuple[float, float]:
+    """Weighted slope of d over t, and its standard error by what a line leaves."""
+    columns = np.stack([np.ones_like(t), t]) / e
+    solved = np.linalg.lstsq(columns.T, d / e, rcond=None)[0]
+    left = d / e - solved @ columns
+    cover = np.linalg.pinv(columns @ columns.T) * max(1.0, float(left @ left) / max(1, t.size - 2))
+    return float(solved[1]), float(np.sqrt(cover[1, 1]))
 
 
 def slips_are_borne_out(readings: Readings, slips: tuple[tuple[int, int], ...]) -> bool:

@@ -7,7 +7,7 @@ readings on plays of the voltage; it takes the loop out of the readings before a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -80,6 +80,10 @@ class Readings:
     def __init__(self, data: FitData, mask: BoolArray, sigma_um: float) -> None:
         self.data, self.mask, self.sigma_um = data, mask, sigma_um
         self._results = DerivedArrays()
+
+    def with_readings(self, y_um: FloatArray) -> Readings:
+        """The same drive with other readings (n,)."""
+        return Readings(replace(self.data, y_um=y_um), self.mask, self.sigma_um)
 
     def once(self, look: Callable[[Readings], T]) -> T:
         """``look(self)``, computed at its first use: several direct tests share it."""

@@ -56,11 +56,16 @@ class Thresholds:
     least_whole: float = 0.6
     #: The excess that a cause must remove is this many times smaller where its signature is seen.
     seen_eases: float = 4.0
-    #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative.
+    #: A rival within this share of the gain, or within this many standard errors, is reported as an alternative ...
     close_share: float = 0.02
     close_sigmas: float = 2.5
+    #: ... where its error is at most this many times the accepted one.
+    close_error: float = 2.0
     #: Largest spread of a cause's size between the stretches that excite it, where at least so many excite it.
     most_spread: float = 0.28
+    #: The same where its signature is seen: no form is exact on a measured stage, but one that vanishes in some
+    #: stretches stands for another effect.
+    most_spread_seen: float = 1.0
     fewest_stretches: int = 6
 
 
@@ -194,8 +199,8 @@ class Search:
     #: The forms of the catalogue, with what is found anew in each residual.
     causes: tuple[CauseModel, ...] = ()
     first_looks: list[ScreenedCause] = field(default_factory=list)
-    #: Parameters of the nominal stage calibrated without causes.
-    nominal_p: FloatArray | None = None
+    #: The nominal stage calibrated without causes.
+    nominal: ModelFit | None = None
     #: Held-out squared error of the nominal stage (µm²).
     nominal_um2: float = 0.0
     #: Causes that the review dropped because their size changes from stretch to stretch.
@@ -353,7 +358,7 @@ class Search:
     def run(self, nominal: ModelFit) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Add causes to the calibrated nominal stage, one per round, until none is acceptable."""
         current, held = nominal, self.held(nominal)
-        self.nominal_p, self.nominal_um2 = nominal.p, held.sse_um2
+        self.nominal, self.nominal_um2 = nominal, held.sse_um2
         left_um2 = np.zeros_like(held.per_block_um2)
         steps: list[AcceptedCause] = []
         for round_ in range(self.thresholds.most_causes):
@@ -469,9 +474,9 @@ class Search:
         fit = with_free_memory(accepted.fit, self.mask)
         if fit is accepted.fit:
             return accepted
-        if self.nominal_p is not None:
-            more = fit.model.parameters[self.nominal_p.size : fit.model.n_nominal]
-            self.nominal_p = np.append(self.nominal_p, [s.neutral for s in more])
+        if self.nominal is not None:
+            more = fit.model.parameters[self.nominal.p.size : fit.model.n_nominal]
+            self.nominal = replace(self.nominal, p=np.append(self.nominal.p, [s.neutral for s in more]))
         return self._converged(accepted, fit, base)
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
@@ -533,12 +538,11 @@ class Search:
         return sizes_by_stretch(less.residual_um * self.mask, fit.residual_um * self.mask, self.parts, self.sigma_um)
 
     def steady(self, cause: CauseModel, stretches: StretchSizes) -> bool:
-        """Whether nothing speaks against one size of the cause in all stretches, or its signature is seen without it.
-
-        No form is exact on a measured stage: the creep of a real stack spreads by 0.30.
-        """
+        """Whether nothing speaks against one size of the cause in all stretches: the creep of a real stack spreads by
+        0.30."""
         few = stretches.sizes.size < self.thresholds.fewest_stretches
-        return few or cause.approximates or self.seen(cause) or stretches.spread <= self.thresholds.most_spread
+        most = self.thresholds.most_spread_seen if self.seen(cause) else self.thresholds.most_spread
+        return few or cause.approximates or stretches.spread <= most
 
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""
@@ -551,11 +555,12 @@ class Search:
         """The model without one cause, calibrated again."""
         where = fit.model.slice_of(index)
         start = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
-        if fit.model.causes[index].takes_over and self.nominal_p is not None:
+        less = calibrate(fit.model.without_cause(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
+        if self.nominal is not None and (fit.model.causes[index].takes_over or less.sse_um2 > self.nominal.sse_um2):
             # It changed the nominal stage too much: start from that calibrated alone.
-            start[: fit.model.n_nominal] = self.nominal_p
-            return calibrate(fit.model.without_cause(index), start, self.mask, 12, 1e-4)
-        return calibrate(fit.model.without_cause(index), start, self.mask, 5, 3e-3, known=fit.columns(where))
+            start[: fit.model.n_nominal] = self.nominal.p
+            return calibrate(less.model, start, self.mask, 12, 1e-4)
+        return less
 
 
 # The review: each accepted cause is removed once more and must be worth its place.
@@ -638,6 +643,7 @@ def _rivals(
     for rival in rivals:
         lost, sigmas = worse_by(rival.held, held)
         close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
+        close = close and rival.held.sse_um2 < thresholds.close_error**2 * held.sse_um2
         own = rival.fit.model.parameters_of(rival.fit.p, len(rival.fit.model.causes) - 1)
         # A permanent narrow line cannot be confused with another cause.
         if rival.cause.line_hz(own) is not None:
