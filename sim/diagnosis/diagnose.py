@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
 
 from adaptive.errors import InputError
 from adaptive.lapack import one_thread
 from adaptive.types import BoolArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
+from sim.diagnosis.intervals import numbers, parameter_errors
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.nominal import (
     begins_at_rest,
@@ -227,8 +227,9 @@ def rms_um(fit: ModelFit, mask: BoolArray) -> float:
 def named(search: Search, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]) -> tuple[NamedCause, ...]:
     """The accepted causes with their numbers, and the share of the error that each removed when it was added."""
     causes = []
+    errors = parameter_errors(extended, search)
     for i, one in enumerate(found):
-        values, spans = numbers(extended, i, search)
+        values, spans = numbers(errors, i)
         also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data))
         # One voltage and one sensor show the sum of these: the other one of a set is always possible.
         also = (*also, *sorted(search.catalogue.same_set({one.name}) - {one.name, *also}))
@@ -251,49 +252,6 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
             )
         )
     return tuple(causes)
-
-
-def numbers(fit: ModelFit, index: int, search: Search) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """The reported numbers of one cause with 95 % intervals.
-
-    The covariance is estimated from sums over blocks, so correlated errors are allowed for; and from the spread between
-    fits that leave one fold out in turn, so an error of the model that differs from motion to motion is. The wider of
-    both counts.
-    """
-    parameters = fit.model.parameters
-    free = [i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high]
-    scale = np.array([parameters[i].step for i in free])
-    rows = fit.model.jacobian(fit.p, fit.signals, free) * scale[:, None] * search.mask
-    bread = np.linalg.pinv(rows @ rows.T, rcond=1e-12)
-    scores = search.parts.blocks(rows * fit.residual_um)
-    cover = bread @ (scores @ scores.T) @ bread * scale[:, None] * scale[None, :]
-    # Directions that one fold alone determines keep the value from the whole record, as in `held_out`.
-    size = np.sqrt(np.maximum(np.diag(rows @ rows.T), 1e-300))
-    unit = rows / size[:, None]
-    moves = []
-    for k in range(search.parts.n_folds):
-        inside = search.parts.samples(k)
-        kept = unit[:, ~inside] @ unit[:, ~inside].T + 1e-4 * np.eye(len(free))
-        moves.append(np.linalg.solve(kept, unit[:, ~inside] @ fit.residual_um[~inside]) / size * scale)
-    spread = np.array(moves) - np.mean(moves, axis=0)
-    folds = search.parts.n_folds
-    where = fit.model.slice_of(index)
-    at = {j: row for row, j in enumerate(free)}
-    values: dict[str, float] = {}
-    spans: dict[str, tuple[float, float]] = {}
-    for name, (value, gradient) in (
-        fit.model.causes[index].reported(fit.model.parameters_of(fit.p, index), fit.model.data).items()
-    ):
-        g = np.zeros(len(free))
-        for k, slope in enumerate(gradient):
-            if where.start + k in at:
-                g[at[where.start + k]] = slope
-        half = 1.96 * float(np.sqrt(max(float(g @ cover @ g), 0.0)))
-        jackknife = float(np.sqrt((folds - 1) / folds * np.sum(np.square(spread @ g))))
-        half = max(half, float(stats.t.ppf(0.975, folds - 1)) * jackknife)
-        values[name] = value
-        spans[name] = (value - half, value + half)
-    return values, spans
 
 
 def changing(search: Search) -> tuple[str, ...]:

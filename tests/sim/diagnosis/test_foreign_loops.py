@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,9 @@ from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
 from sim.effects.saturation import seen as saturation_seen
+from sim.effects.slew_limit import seen as slew_seen
 from sim.effects.thermal_drift import in_rests as drift_in_rests
+from sim.effects.timing import seen as timing_seen
 from sim.fitting.calibration import with_new_columns
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
@@ -102,6 +105,16 @@ UNCLEAR_LAG = pair(705)
 FAINT = pair(834)
 #: Stick slip on a stage that begins at rest.
 BEGINS_AT_REST = pair(836)
+#: A fast clock: under sines the description of late readings takes their lateness over; and beside creep.
+FAST_CLOCK, FAST_CLOCK_BESIDE_CREEP = single(867), pair(820)
+#: No clock error, but a loop that is described badly: a rate dependence, and stick slip.
+NO_CLOCK = (single(672), single(833))
+#: A limit that only the largest steps reach.
+JUST_REACHED = single(851)
+#: A mode that a payload has moved rings in every rest, beside a lag of two samples that the response is too narrow for.
+RINGS_BESIDE_A_LAG = pair(852)
+#: Two lags: on a loop of the stage's own class, and on relays.
+TWO_LAGS_NO_DELAY = (pair(851), single(860))
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
 
@@ -267,6 +280,47 @@ def test_a_second_lag_is_seen_in_the_response_as_the_recorder_samples_it(case: C
 def test_a_response_that_bends_unclearly_does_not_exclude_a_lag() -> None:
     readings = readings_of(UNCLEAR_LAG)
     assert second_lag(readings).seen is None
+
+
+@pytest.mark.parametrize(("case", "ppm"), [(FAST_CLOCK, 190.2), (FAST_CLOCK_BESIDE_CREEP, 73.9)])
+def test_a_clock_error_is_seen_when_what_the_description_took_over_is_taken_off(case: Case, ppm: float) -> None:
+    assert case.effects["timing"]["ppm"] == pytest.approx(ppm, abs=0.1)
+    sight = timing_seen(readings_of(case))
+    assert sight.seen is True
+    said = re.search(r"changes by (-?[\d.]+)", sight.words)
+    assert said is not None
+    assert -float(said[1]) == pytest.approx(ppm, abs=10.0)
+
+
+@pytest.mark.parametrize("case", NO_CLOCK)
+def test_lateness_that_describes_the_readings_worse_is_no_clock_error(case: Case) -> None:
+    assert timing_seen(readings_of(case)).seen is None
+
+
+def test_a_limit_that_steps_may_just_have_reached_is_not_excluded() -> None:
+    assert slew_seen(readings_of(JUST_REACHED)).seen is None
+
+
+def test_a_response_that_a_lag_of_half_a_sample_would_not_bend_does_not_exclude_one() -> None:
+    assert second_lag(readings_of(RINGS_BESIDE_A_LAG)).seen is None
+
+
+@pytest.mark.parametrize("case", TWO_LAGS_NO_DELAY)
+def test_two_lags_are_not_seen_as_a_delay(case: Case) -> None:
+    found = lags_of_response(readings_of(case))
+    assert found.lagged is True
+    assert found.late is None
+
+
+def test_a_lag_is_found_below_what_rang_until_the_payload_was_found() -> None:
+    record = recording_of(RINGS_BESIDE_A_LAG)
+    first = record.part(0, round(0.4 * len(record)))
+    said = diagnose_prepared(prepare(first, nominal=nominal_of(RINGS_BESIDE_A_LAG)))
+    named = {cause.name: cause for cause in said.causes}
+    assert set(RINGS_BESIDE_A_LAG.hidden) <= set(named) <= set(RINGS_BESIDE_A_LAG.hidden) | RINGS_BESIDE_A_LAG.allowed
+    low, high = named["amplifier_lag"].intervals["tau_s"]
+    assert low < RINGS_BESIDE_A_LAG.effects["amplifier_lag"]["tau_s"] < high
+    assert said.noise_floor_um < 4.0 * RINGS_BESIDE_A_LAG.rig.sigma_um
 
 
 def test_a_faint_drift_of_the_rests_counts_as_seen_where_the_fit_has_its_size() -> None:
