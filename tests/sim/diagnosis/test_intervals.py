@@ -1,0 +1,94 @@
+"""The intervals of named numbers: what correlated noise, differing motions and the form of the loop contribute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from adaptive.types import FloatArray
+from sim.diagnosis.intervals import ParameterErrors, numbers, parameter_errors
+from sim.diagnosis.search.held_out import Split
+from sim.diagnosis.search.search import Search
+from sim.fitting.fit_data import FitData
+from sim.fitting.stage_model import CauseModel, ModelFit
+from sim.readings.readings import Readings
+
+N = 2000
+PARTS = Split(np.arange(21) * 100, np.arange(20) % 4)
+
+
+@dataclass(frozen=True)
+class Gain(CauseModel):
+    """One number, reported as its double."""
+
+    name: str = "gain"
+
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        return {"twice": (2.0 * float(p[0]), np.array([2.0]))}
+
+
+def fit_of(cause: CauseModel, p: float, row: FloatArray, residual_um: FloatArray) -> ModelFit:
+    """A linear model of one number whose column is ``row`` (n,)."""
+    bounds = SimpleNamespace(low=-10.0, high=10.0, step=0.1)
+    model = SimpleNamespace(
+        parameters=(bounds,),
+        causes=(cause,),
+        data=None,
+        jacobian=lambda p, signals, free: row[None, :],
+        slice_of=lambda index: slice(0, 1),
+        parameters_of=lambda p, index: p,
+    )
+    fit = SimpleNamespace(model=model, p=np.array([p]), free=(0,), signals=None, residual_um=residual_um)
+    return cast(ModelFit, fit)
+
+
+def errors_of(cause: CauseModel, freer: float) -> ParameterErrors:
+    fit = fit_of(cause, 1.0, np.ones(N), np.zeros(N))
+    return ParameterErrors(fit, np.array([0]), np.array([[0.01]]), np.zeros((4, 1)), np.array([freer]))
+
+
+@pytest.mark.parametrize(("freer", "low", "high"), [(0.0, 0.0, 0.0), (0.7, 0.0, 1.4), (-0.3, -0.6, 0.0)])
+def test_an_interval_reaches_to_the_number_beside_a_loop_of_free_form(freer: float, low: float, high: float) -> None:
+    values, spans = numbers(errors_of(Gain(), freer), 0)
+    half = 1.96 * 2.0 * 0.1
+    assert values["twice"] == 2.0
+    assert spans["twice"] == pytest.approx((2.0 + low - half, 2.0 + high + half))
+
+
+def test_a_loop_shape_is_not_compared_with_itself() -> None:
+    _, spans = numbers(errors_of(replace(Gain(), approximates=True), 0.7), 0)
+    assert spans["twice"] == pytest.approx((2.0 - 0.392, 2.0 + 0.392))
+
+
+def test_folds_that_differ_count_by_their_spread() -> None:
+    """The jackknife in closed form: moves of ±d give a standard error of d sqrt(3) over four folds."""
+    moves = np.array([[0.1], [-0.1], [0.1], [-0.1]])
+    _, spans = numbers(replace(errors_of(Gain(), 0.0), moves=moves), 0)
+    half = 3.182446 * 2.0 * np.sqrt(0.75 * 0.04)
+    assert spans["twice"] == pytest.approx((2.0 - half, 2.0 + half))
+
+
+def test_what_a_loop_of_another_form_took_from_a_number_is_given_back() -> None:
+    """y = c x + w play(x), fitted by c x alone: c is off by what x has of the play, and the freer loop says so."""
+    t = np.arange(N) / 1000.0
+    u = np.sin(2.0 * np.pi * 1.5 * t) * (1.0 + t)
+    play, s = np.empty(N), float(u[0])
+    for k in range(N):
+        s = min(max(s, u[k] - 0.6), u[k] + 0.6)
+        play[k] = s
+    noise = 1e-4 * np.random.default_rng(1).standard_normal(N)
+    x = np.gradient(u)
+    y = 0.3 * x + 0.05 * play + noise
+    c = float(x @ y / (x @ x))
+    assert abs(c - 0.3) > 0.05
+    fit = fit_of(Gain(), c, x, y - c * x)
+    mask = np.ones(N, dtype=np.bool_)
+    search = SimpleNamespace(mask=mask, parts=PARTS, readings=Readings(FitData(1e-3, u, y), mask, 1e-4))
+    errors = parameter_errors(fit, cast(Search, search))
+    assert c + errors.freer[0] == pytest.approx(0.3, abs=0.02)
+    low, high = numbers(errors, 0)[1]["twice"]
+    assert low < 0.6 < high
