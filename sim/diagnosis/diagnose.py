@@ -181,7 +181,9 @@ def diagnose(
     verdict = verdict_of(causes, *held_um, ceiling_um, floor.sigma_um, explained)
     partial: tuple[str, ...] = ()
     if verdict == "unexplained" and causes:
-        partial, causes = tuple(c.name for c in causes), ()
+        partial, causes = tuple(c.name for c in causes if c.index >= 0), tuple(c for c in causes if c.index < 0)
+        # What the readings themselves show (a coarse grid) stands, whatever else there is.
+        verdict = "partly" if causes else verdict
     missing = not_excited(search, floor)
     progress("simulating the next experiment", 0.95)
     is_named = verdict in ("effects", "partly")

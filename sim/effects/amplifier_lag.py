@@ -10,7 +10,7 @@ from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from sim.effects.holds import first_order
-from sim.effects.sampled_lags import apart, second_lag
+from sim.effects.sampled_lags import apart, is_of_the_recorder, second_lag
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.lags import lag_ends
 from sim.fitting.stage_model import CauseModel, Guess, single_guesses
@@ -52,6 +52,9 @@ class AmplifierLag(CauseModel):
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         return (ModelParameter("tau_s", "s", 0.0, 0.0, 0.03, max(1e-4, 0.1 * data.dt_s), ActsOn.DRIVE),)
+
+    def plausible(self, p: FloatArray, data: FitData) -> bool:
+        return not is_of_the_recorder(float(p[0]), data)
 
     def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
         return apart(nominal, names)

@@ -18,6 +18,7 @@ from sim.effects.slew_limit import seen as speed_is_limited
 from sim.readings.sight import Sight
 
 if TYPE_CHECKING:
+    from sim.fitting.fit_data import FitData
     from sim.readings.readings import Readings, Response
 
 
@@ -103,6 +104,11 @@ def apart(nominal: FloatArray, names: tuple[str, ...]) -> list[FloatArray]:
     start = nominal.copy()
     start[at] *= 0.2
     return [np.append(start, 0.8 * nominal[at])]
+
+
+def is_of_the_recorder(tau_s: float, data: FitData) -> bool:
+    """Whether a lag is too short to be told from the recorder's latch and hold."""
+    return tau_s < 0.15 * data.dt_s
 
 
 def second_lag(readings: Readings) -> Sight:

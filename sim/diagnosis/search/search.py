@@ -203,6 +203,8 @@ class Search:
     nominal: ModelFit | None = None
     #: Held-out squared error of the nominal stage (µm²).
     nominal_um2: float = 0.0
+    #: What the form of each accepted cause may leave over, per block (µm²).
+    left_um2: dict[str, FloatArray] = field(default_factory=dict)
     #: Causes that the review dropped because their size changes from stretch to stretch.
     unsteady: list[UnsteadyCause] = field(default_factory=list)
 
@@ -357,15 +359,22 @@ class Search:
 
     def run(self, nominal: ModelFit) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Add causes to the calibrated nominal stage, one per round, until none is acceptable."""
-        current, held = nominal, self.held(nominal)
+        held = self.held(nominal)
         self.nominal, self.nominal_um2 = nominal, held.sse_um2
-        left_um2 = np.zeros_like(held.per_block_um2)
+        return self.extended(nominal, held)
+
+    def extended(self, current: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
+        """Add causes to a fit, but none that the review dropped."""
         steps: list[AcceptedCause] = []
-        for round_ in range(self.thresholds.most_causes):
+        dropped = {cause.name for cause in self.unsteady}
+        for round_ in range(len(current.model.causes), self.thresholds.most_causes):
             self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.thresholds.most_causes)
-            looks, _ = self.looks(current, self.catalogue.same_set({f.name for f in current.model.causes}))
-            if round_ == 0:
-                self.first_looks = looks
+            names = {f.name for f in current.model.causes}
+            left_um2 = np.zeros_like(held.per_block_um2)
+            for name in names & self.left_um2.keys():
+                left_um2 += self.left_um2[name]
+            looks, _ = self.looks(current, self.catalogue.same_set(names) | dropped)
+            self.first_looks = self.first_looks or looks
             ranked = self.refit(
                 current, looks, self.thresholds.refits, 0.3 * self.thresholds.least_gain * current.sse_um2
             )
@@ -393,7 +402,7 @@ class Search:
             accepted = self._with_free_memory(self._off_bounds(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
-            left_um2 = left_um2 + accepted.cause.model_error**2 * gone
+            self.left_um2[accepted.cause.name] = accepted.cause.model_error**2 * gone
             current, held = accepted.fit, accepted.held
             steps.append(AcceptedCause(accepted.cause.name, p, share))
         return current, held, steps
@@ -448,7 +457,7 @@ class Search:
         other = calibrate(model, fit.p, self.mask, 4, 2e-3, known=fit.columns())
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
             return accepted
-        return self._converged(accepted, other, base)
+        return self._unless_it_holds_out_worse(accepted, other, base)
 
     def _off_bounds(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the nominal mechanics started anew where one of their numbers stands at its bound, if that
@@ -467,17 +476,23 @@ class Search:
         other = calibrate(fit.model, start, self.mask, 20, 1e-4)
         if other.sse_um2 > fit.sse_um2 * 0.99:
             return accepted
-        return self._converged(accepted, other, base)
+        return self._unless_it_holds_out_worse(accepted, other, base)
+
+    def _unless_it_holds_out_worse(self, accepted: CauseCandidate, fit: ModelFit, base: ModelFit) -> CauseCandidate:
+        """The candidate with ``fit``, which explains more, unless it does clearly worse in held-out stretches."""
+        other = self._converged(accepted, fit, base)
+        return other if other.cost < 1.2 * accepted.cost else accepted
 
     def _with_free_memory(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with a free memory at the start, if that explains more: a large cause can hide it."""
         fit = with_free_memory(accepted.fit, self.mask)
         if fit is accepted.fit:
             return accepted
-        if self.nominal is not None:
+        other = self._unless_it_holds_out_worse(accepted, fit, base)
+        if other is not accepted and self.nominal is not None:
             more = fit.model.parameters[self.nominal.p.size : fit.model.n_nominal]
             self.nominal = replace(self.nominal, p=np.append(self.nominal.p, [s.neutral for s in more]))
-        return self._converged(accepted, fit, base)
+        return other
 
     def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the finer model of the same cause that costs least, if one costs less."""
@@ -606,7 +621,9 @@ def review(
         stretches = search.stretches(fit, less)
         if not search.steady(cause, stretches):
             search.unsteady.append(UnsteadyCause(cause.name, gain / held_less.sse_um2, stretches))
-            fit, held = search.filled(less)
+            # It may have stood in the place of another cause.
+            fit, held, more = search.extended(*search.filled(less))
+            steps |= {step.name: step for step in more}
             found, index = [], 0
             continue
         # Beside one of a set that shows only its sum, the other one is no rival of a third cause.

@@ -96,8 +96,8 @@ def test_two_hidden_effects_are_both_named_and_run_as_a_stage() -> None:
     assert np.sqrt(np.mean(np.square(free_run - data.y_um))) < 0.05
 
 
-def test_a_butterfly_is_unexplained() -> None:
-    """A ferroelectric butterfly: displacement goes with the square of a switching polarisation."""
+def butterfly() -> tuple[FloatArray, FloatArray]:
+    """Voltage and reading of a ferroelectric: displacement goes with the square of a switching polarisation."""
     t = np.arange(20_000) * DT
     u = 8.0 * np.sin(2.0 * np.pi * 0.5 * t) * np.interp(t, [0.0, 2.0, 12.0, 20.0], [1.0, 1.0, 0.5, 1.0])
     p, polarisation = 0.0, np.empty(u.size)
@@ -107,9 +107,20 @@ def test_a_butterfly_is_unexplained() -> None:
         p += abs(rise) * 1.1 * (target - p)
         polarisation[k] = p
     y = 40.0 * polarisation**2 + 0.6 * u * polarisation + 0.005 * np.random.default_rng(0).standard_normal(u.size)
-    diagnosis = diagnose(FitData(DT, u, y))
+    return u, y
+
+
+def test_a_butterfly_is_unexplained() -> None:
+    diagnosis = diagnose(FitData(DT, *butterfly()))
     assert diagnosis.verdict == "unexplained"
     assert diagnosis.causes == ()
+
+
+def test_a_coarse_grid_is_named_whatever_else_is_unexplained() -> None:
+    u, y = butterfly()
+    diagnosis = diagnose(FitData(DT, u, 0.05 * np.round(y / 0.05)))
+    assert diagnosis.verdict == "partly"
+    assert [cause.name for cause in diagnosis.causes] == ["quantisation"]
 
 
 def test_the_same_recording_gives_the_same_report() -> None:

@@ -81,6 +81,7 @@ class Fit:
     residual_um: FloatArray
     held: HeldOut
     p: FloatArray = field(default_factory=lambda: np.zeros(1))
+    sse_um2: float = 1.0
 
     def without_signals(self) -> Fit:
         return self
@@ -187,6 +188,11 @@ def test_what_leaves_more_than_twice_the_error_is_no_alternative(
     steps = {"hysteresis_shape": AcceptedCause("hysteresis_shape", 0.001, 0.9)}
     _, _, (found,) = review(search, fit, search.held(fit), steps)
     assert found.alternatives == alternatives
+
+
+def test_what_a_dropped_cause_may_have_stood_for_is_looked_for_without_it() -> None:
+    search, _ = reviewed({"rate_dependence": CHANGING})
+    assert search.skipped == [{"rate_dependence"}]
 
 
 def test_of_few_stretches_nothing_is_concluded() -> None:
