@@ -45,6 +45,18 @@ def _silent(stage: str, share: float) -> None:
     return None
 
 
+def _forwards(progress: Progress) -> Progress:
+    """The same progress, which stands still while the search starts again."""
+    most = 0.0
+
+    def told(stage: str, share: float) -> None:
+        nonlocal most
+        most = max(most, share)
+        progress(stage, most)
+
+    return told
+
+
 @dataclass(frozen=True)
 class Options:
     """How to diagnose. ``nominal``: "bouc_wen" (the chapter's stage), "linear", or the stage of a stage file;
@@ -116,7 +128,7 @@ def diagnose(
     of the stage; held-out errors and the verdict are then its own. Raises InputError if the recording cannot be
     diagnosed.
     """
-    options = options or Options()
+    options, progress = options or Options(), _forwards(progress)
     mask = usable(data, np.ones(data.n, dtype=np.bool_) if mask is None else mask, options.nominal)
     data = with_nominal_kind(options.nominal, data)
     progress("calibrating the nominal stage", 0.02)
