@@ -10,7 +10,6 @@ from adaptive.errors import InputError
 from adaptive.lapack import one_thread
 from adaptive.types import BoolArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
-from sim.diagnosis.intervals import numbers, parameter_errors
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.nominal import (
     begins_at_rest,
@@ -22,6 +21,7 @@ from sim.diagnosis.nominal import (
 from sim.diagnosis.prepare import Prepared
 from sim.diagnosis.result import FOLDS, TEST, Diagnosis, NamedCause
 from sim.diagnosis.search.held_out import HeldOut, split
+from sim.diagnosis.search.intervals import numbers, parameter_errors
 from sim.diagnosis.search.search import Progress, ReviewedCause, Search, Thresholds, review
 from sim.diagnosis.unexplained import black_box_error, black_box_on_other, where_left
 from sim.diagnosis.witnesses import witnesses
@@ -241,7 +241,7 @@ def rms_um(fit: ModelFit, mask: BoolArray) -> float:
 def named(search: Search, extended: ModelFit, held: HeldOut, found: list[ReviewedCause]) -> tuple[NamedCause, ...]:
     """The accepted causes with their numbers, and the share of the error that each removed when it was added."""
     causes = []
-    errors = parameter_errors(extended, search)
+    errors = parameter_errors(extended, search.mask, search.parts, search.readings)
     for i, one in enumerate(found):
         values, spans = numbers(errors, i)
         also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data))

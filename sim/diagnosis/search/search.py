@@ -15,6 +15,7 @@ import numpy as np
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
+from sim.diagnosis.search.intervals import across_zero, parameter_errors
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
 from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_free_memory, with_new_columns
@@ -67,6 +68,8 @@ class Thresholds:
     #: stretches stands for another effect.
     most_spread_seen: float = 1.0
     fewest_stretches: int = 6
+    #: Least share of the error that a cause must remove whose numbers may all be zero: a loop's form has such numbers.
+    least_about_zero: float = 0.25
 
 
 def first_fits(
@@ -559,6 +562,10 @@ class Search:
         most = self.thresholds.most_spread_seen if self.seen(cause) else self.thresholds.most_spread
         return few or cause.approximates or stretches.spread <= most
 
+    def may_be_zero(self, fit: ModelFit, index: int) -> bool:
+        """Whether the intervals of all numbers of a cause hold zero."""
+        return across_zero(parameter_errors(fit, self.mask, self.parts, self.readings), index)
+
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""
         fit = with_new_columns(calibrate(fit.model, fit.p, self.mask, 12, 1e-5), self.mask)
@@ -602,8 +609,8 @@ class ReviewedCause:
 def review(
     search: Search, fit: ModelFit, held: HeldOut, steps: dict[str, AcceptedCause]
 ) -> tuple[ModelFit, HeldOut, list[ReviewedCause]]:
-    """Remove each cause once more: drop it if idle or if its size changes from stretch to stretch
-    (`Search.unsteady`), replace it if another explains more, collect its rivals."""
+    """Remove each cause once more: drop it if idle, if it removes little and its numbers may be zero, or if its size
+    changes from stretch to stretch (`Search.unsteady`); replace it if another explains more; collect its rivals."""
     thresholds = search.thresholds
     found: list[ReviewedCause] = []
     index = swaps = 0
@@ -613,8 +620,10 @@ def review(
         held_less = search.held(less)
         gain = held_less.sse_um2 - held.sse_um2
         keep = thresholds.least_gain / (thresholds.seen_eases if search.seen(cause) else 1.0)
-        keep = keep if cause.line_hz(fit.model.parameters_of(fit.p, index)) is None else 0.0
-        if gain <= keep * held_less.sse_um2:
+        is_line = cause.line_hz(fit.model.parameters_of(fit.p, index)) is not None
+        small = not is_line and gain <= thresholds.least_about_zero * held_less.sse_um2
+        idle = gain <= (0.0 if is_line else keep * held_less.sse_um2)
+        if idle or (small and search.may_be_zero(fit, index)):
             fit, held = less, held_less
             found, index = [], 0
             continue

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.diagnosis.intervals import ParameterErrors, numbers, parameter_errors
+from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
 from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.search import Search
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.readings import Readings
@@ -87,8 +86,23 @@ def test_what_a_loop_of_another_form_took_from_a_number_is_given_back() -> None:
     assert abs(c - 0.3) > 0.05
     fit = fit_of(Gain(), c, x, y - c * x)
     mask = np.ones(N, dtype=np.bool_)
-    search = SimpleNamespace(mask=mask, parts=PARTS, readings=Readings(FitData(1e-3, u, y), mask, 1e-4))
-    errors = parameter_errors(fit, cast(Search, search))
+    errors = parameter_errors(fit, mask, PARTS, Readings(FitData(1e-3, u, y), mask, 1e-4))
     assert c + errors.freer[0] == pytest.approx(0.3, abs=0.02)
     low, high = numbers(errors, 0)[1]["twice"]
     assert low < 0.6 < high
+
+
+@pytest.mark.parametrize(("freer", "held"), [(0.0, False), (-0.7, False), (-0.9, True)])
+def test_a_number_may_be_zero_where_its_interval_holds_zero(freer: float, held: bool) -> None:
+    """1 ± 0.196, and as far as the number beside a freer loop."""
+    assert across_zero(errors_of(Gain(), freer), 0) is held
+
+
+@dataclass(frozen=True)
+class Silent(Gain):
+    def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+        return {}
+
+
+def test_a_cause_without_numbers_is_not_nothing() -> None:
+    assert not across_zero(errors_of(Silent(), 0.0), 0)

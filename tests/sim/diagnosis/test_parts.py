@@ -15,6 +15,7 @@ from adaptive.types import FloatArray
 from sim.diagnosis.nominal import BoucWenStage
 from sim.diagnosis.prepare import prepare
 from sim.diagnosis.search.held_out import split
+from sim.diagnosis.search.screening import ScreenedCause, p_value
 from sim.effects import effect, simulate
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.rate_dependence import RateDependence
@@ -330,3 +331,27 @@ def test_the_reported_height_of_a_loop_is_that_of_its_branches() -> None:
     assert y is not None
     down, up = 1500, 2500  # the middle of the last two branches: both at 5 V
     assert shape.reported(p, data)["width_um"][0] == pytest.approx(y[down] - y[up], abs=1e-6)
+
+
+def look_of(slopes: FloatArray) -> ScreenedCause:
+    """A guess of unit norm with these inner products, block by block."""
+    return ScreenedCause(0, np.zeros(1), float(slopes.sum()) ** 2, slopes[None, :], np.eye(1))
+
+
+def test_slow_noise_seldom_beats_chance() -> None:
+    """Noise that keeps its sign for four blocks: with single blocks, a fifth of it would pass at level 0.01."""
+    random = np.random.default_rng(4)
+    looks = [look_of(np.repeat(random.standard_normal(20), 4)) for _ in range(200)]
+    passed = [p_value([look], look.gain_um2, 0, 199) <= 0.01 for look in looks]
+    assert np.mean(passed) <= 0.03
+    steady = look_of(1.0 + 0.3 * random.standard_normal(80))
+    assert p_value([steady], steady.gain_um2, 0) == pytest.approx(0.001)
+
+
+def test_the_best_of_many_guesses_is_less_surprising() -> None:
+    random = np.random.default_rng(5)
+    looks = [look_of(random.standard_normal(80)) for _ in range(30)]
+    gain = max(look.gain_um2 for look in looks)
+    alone = p_value([max(looks, key=lambda look: look.gain_um2)], gain, 0)
+    assert alone < 0.1 < p_value(looks, gain, 0)
+    assert p_value([], gain, 0) == 1.0

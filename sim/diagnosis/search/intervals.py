@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from adaptive.types import FloatArray
+from adaptive.types import BoolArray, FloatArray
 from baselines.prandtl_ishlinskii.operators import play_run
-from sim.diagnosis.search.search import Search
+from sim.diagnosis.search.held_out import Split
 from sim.fitting.stage_model import ModelFit
 from sim.readings.readings import Readings
 
@@ -37,29 +37,29 @@ class ParameterErrors:
     freer: FloatArray
 
 
-def parameter_errors(fit: ModelFit, search: Search) -> ParameterErrors:
+def parameter_errors(fit: ModelFit, mask: BoolArray, parts: Split, readings: Readings | None) -> ParameterErrors:
     """The errors of a fit, each from one linear step at its optimum."""
     parameters = fit.model.parameters
     free = np.array([i for i in fit.free if parameters[i].low < fit.p[i] < parameters[i].high], dtype=np.int64)
     scale = np.array([parameters[i].step for i in free])
-    rows = fit.model.jacobian(fit.p, fit.signals, [int(i) for i in free]) * scale[:, None] * search.mask
+    rows = fit.model.jacobian(fit.p, fit.signals, [int(i) for i in free]) * scale[:, None] * mask
     bread = np.linalg.pinv(rows @ rows.T, rcond=1e-12)
-    scores = search.parts.blocks(rows * fit.residual_um)
+    scores = parts.blocks(rows * fit.residual_um)
     cover = bread @ (scores @ scores.T) @ bread * scale[:, None] * scale[None, :]
     # Directions that one fold alone determines keep the value from the whole record, as in `held_out`.
     size = np.sqrt(np.maximum(np.diag(rows @ rows.T), 1e-300))
     unit = rows / size[:, None]
     moves = []
-    for k in range(search.parts.n_folds):
-        inside = search.parts.samples(k)
+    for k in range(parts.n_folds):
+        inside = parts.samples(k)
         kept = unit[:, ~inside] @ unit[:, ~inside].T + 1e-4 * np.eye(free.size)
         moves.append(np.linalg.solve(kept, unit[:, ~inside] @ fit.residual_um[~inside]) / size * scale)
     freer = np.zeros(free.size)
-    if search.readings is not None:
-        columns = np.concatenate([unit, _freer_loop(search.readings) * search.mask])
+    if readings is not None:
+        columns = np.concatenate([unit, _freer_loop(readings) * mask])
         columns /= np.maximum(np.linalg.norm(columns, axis=1), 1e-300)[:, None]
         gram = columns @ columns.T + 1e-9 * np.eye(columns.shape[0])
-        solved = np.linalg.solve(gram, columns @ (fit.residual_um * search.mask))
+        solved = np.linalg.solve(gram, columns @ (fit.residual_um * mask))
         freer = solved[: free.size] / size * scale
     return ParameterErrors(fit, free, cover, np.array(moves), freer)
 
@@ -97,3 +97,9 @@ def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict
         values[name] = value
         spans[name] = (min(value, other) - half, max(value, other) + half)
     return values, spans
+
+
+def across_zero(errors: ParameterErrors, index: int) -> bool:
+    """Whether the 95 % intervals of all reported numbers of ``causes[index]`` hold zero."""
+    _, spans = numbers(errors, index)
+    return bool(spans) and all(low <= 0.0 <= high for low, high in spans.values())
