@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
-from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
 from sim.diagnosis.search.held_out import Split
+from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.readings import Readings
