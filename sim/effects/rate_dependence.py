@@ -72,12 +72,15 @@ class RateDependence(CauseModel):
 
     ``variant`` "width": the loop's width follows the rate at once, and its driving term does; the loop may widen about
     another line than its own middle, so that the gain changes with the rate as well. "thresholds" and "added": plays
-    whose thresholds grow by a share, or by as many volts, less the same plays at rest.
+    whose thresholds grow by a share, or by as many volts, less the same plays at rest. ``with_slope``: the driving term
+    of the nominal loop follows the rate, too. Where a loop of another shape has taken the place of the nominal one,
+    nothing shows its number.
     """
 
     test_answers_to_others: bool = True
     model_error: float = 0.3
     variant: str = "width"
+    with_slope: bool = True
     #: Time constant of the lag that filters the rate, s; with ``free_rate_lag`` the start value of its fit.
     rate_lag_s: float = 0.004
     free_rate_lag: bool = False
@@ -96,9 +99,10 @@ class RateDependence(CauseModel):
                 ModelParameter(f"weight{j}_um_per_V", "µm/V", 0.0, -g, g, 0.1 * g, ActsOn.STATIC) for j in (1, 2, 3)
             )
             return (*w, pace)
+        most = 1.0 if self.with_slope else 0.0
         own = (
             ModelParameter("width_per_decade", "1", 0.0, -1.0, 1.0, 0.02, ActsOn.STATIC),
-            ModelParameter("slope_per_decade", "1", 0.0, -1.0, 1.0, 0.02, ActsOn.STATIC),
+            ModelParameter("slope_per_decade", "1", 0.0, -most, most, 0.02, ActsOn.STATIC),
             ModelParameter("gain_per_decade", "1", 0.0, -0.05, 0.05, 1e-3, ActsOn.STATIC),
             pace,
         )
@@ -125,7 +129,7 @@ class RateDependence(CauseModel):
         out = []
         for f in (0.2, 2.0, 20.0, 200.0):
             rows = []
-            for i in range(len(parameters) - 1):
+            for i in (i for i, one in enumerate(parameters[:-1]) if one.high > one.low):
                 row = np.zeros(len(parameters))
                 row[-1] = np.log(f * data.swing_V)
                 row[i] = parameters[i].step
@@ -249,6 +253,7 @@ RATE_DEPENDENCE = Kind(
         forms=(
             RateDependence(),
             RateDependence(rate_lag_s=0.04),
+            RateDependence(with_slope=False),
             RateDependence(variant="thresholds"),
             RateDependence(variant="added"),
             RateDependence(variant="added", rate_lag_s=0.04),

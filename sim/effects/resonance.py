@@ -53,7 +53,9 @@ class Resonance(CauseModel):
         return _or_a_payload(data)
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
-        return bool(np.exp(p[1]) < 0.4)
+        # At the top of what the sampling shows it stands for what is faster still.
+        top = self.parameters(data)[0]
+        return bool(np.exp(p[1]) < 0.4 and p[0] < top.high - 0.5 * top.step)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         top = 0.47 / data.dt_s

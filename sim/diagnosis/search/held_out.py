@@ -93,6 +93,11 @@ def unit_columns(fit: ModelFit, mask: BoolArray, past: bool = True) -> FloatArra
     return np.asarray(rows[good] / norms[good, None])
 
 
+#: A parameter of whose effect a fold holds more than this share keeps its value when the fold is left out: the rest of
+#: the recording says nothing about it.
+_OWN_SHARE = 0.99
+
+
 def held_out(fit: ModelFit, mask: BoolArray, parts: Split) -> HeldOut:
     """Leave-one-fold-out error of the model linearised at its calibration; exact for a linear model."""
     rows = unit_columns(fit, mask, past=False)
@@ -114,10 +119,11 @@ def held_out(fit: ModelFit, mask: BoolArray, parts: Split) -> HeldOut:
     out = np.zeros_like(per_block)
     for f in range(parts.n_folds):
         pull = slopes[f] - grams[f] @ short
-        move = np.linalg.lstsq(whole - grams[f] + ridge, -pull, rcond=1e-12)[0]
+        free = np.flatnonzero(np.diag(grams[f]) <= _OWN_SHARE)
+        move = np.linalg.lstsq((whole - grams[f] + ridge)[np.ix_(free, free)], -pull[free], rcond=1e-12)[0]
         inside = parts.samples(f)
         left = np.zeros_like(residual)
-        left[inside] = residual[inside] - move @ rows[:, inside]
+        left[inside] = residual[inside] - move @ rows[np.ix_(free, inside)]
         out += parts.blocks(np.square(left))
     return HeldOut(out, float(out.sum()))
 

@@ -18,10 +18,11 @@ from sim.diagnosis.search.held_out import split
 from sim.diagnosis.search.screening import ScreenedCause, p_value
 from sim.effects import effect, simulate
 from sim.effects.hysteresis_shape import HysteresisShape
-from sim.effects.rate_dependence import RateDependence
+from sim.effects.rate_dependence import RATE_DEPENDENCE, RateDependence
+from sim.effects.resonance import Resonance
 from sim.effects.stick_slip import friction
 from sim.effects.timing import resample
-from sim.fitting.calibration import DampingRule, calibrate, damped_step
+from sim.fitting.calibration import DampingRule, calibrate, damped_step, free_indices
 from sim.fitting.dynamics import Dynamics, respond
 from sim.fitting.fit_data import ActsOn, FitData
 from sim.fitting.hysteresis_loops import bouc_wen_loop, bouc_wen_paced, path_lag
@@ -122,6 +123,24 @@ def test_a_rate_dependence_widens_the_loops_of_the_causes_beside_it() -> None:
     moving = np.abs(wider) > 1e-6
     assert float(np.ptp(wider)) > 0.1
     assert np.all(wider[moving] * loop[moving] < 0.0)
+
+
+def test_the_driving_term_of_a_loop_that_is_not_there_is_not_fitted() -> None:
+    """Beside plays that took the loop over, nothing shows its number: it ran to its bound and hid the growth."""
+    u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 5.0 * np.arange(400) * DT)
+    form = RateDependence(with_slope=False)
+    model = StageModel(FitData(DT, u, 10.0 * u), BoucWenStage("zero"), (form,))
+    moves = {model.parameters[i].name for i in free_indices(model)} & {s.name for s in form.parameters(model.data)}
+    assert moves == {"width_per_decade", "gain_per_decade", "log_v0"}
+    assert all(not row[1] for rows in form.guesses(model.data, u) for row in rows)
+    assert form in RATE_DEPENDENCE.cause.forms
+
+
+@pytest.mark.parametrize(("f_hz", "plausible"), [(900.0, True), (939.0, False), (940.0, False)])
+def test_a_mode_at_the_top_of_what_the_sampling_shows_is_none(f_hz: float, plausible: bool) -> None:
+    """0.47 of 2 kHz are 940 Hz: there it stands for what is faster."""
+    u = np.sin(np.arange(400) / 50.0)
+    assert Resonance().plausible(np.log([f_hz, 0.1]), FitData(DT, u, u)) is plausible
 
 
 def test_a_simulation_from_a_later_block_gives_what_a_whole_one_gives() -> None:
