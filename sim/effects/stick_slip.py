@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, InLibrary, Kind, Parameter, Place, block
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
+from sim.fitting.hysteresis_loops import plays_nested
 from sim.fitting.stage_model import CauseModel, Guess
 
 # Its step in the simulation.
@@ -65,31 +66,54 @@ def friction(x: FloatArray, width: float, share: float) -> FloatArray:
     return out
 
 
+#: Distances at which eighths of the contact break free where they do so gradually, relative to their mean: the middles
+#: of eighths of an exponential distribution.
+_BREAKS = -np.log1p(-(np.arange(8) + 0.5) / 8.0)
+_BREAKS = _BREAKS / _BREAKS.mean()
+
+
 @dataclass(frozen=True)
 class StickSlip(CauseModel):
-    """Friction, see `friction`: the stage sticks after each reversal, then slides behind by a share of the width."""
+    """Friction, see `friction`: the stage sticks after each reversal, then slides behind by a share of the width.
+
+    ``variant`` "gradual": the contact breaks free in parts, so the stage begins to slide before it has moved by the
+    width (presliding): plays of the motion side by side, ``gradual_share`` of whose radii differs.
+    """
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         return 1e-5 * data.range_um < float(p[0]) < 0.0099 * data.range_um
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         r = data.range_um
+        second = "gradual_share" if self.variant else "sliding_share"
         return (
             ModelParameter("width_um", "µm", 0.0, 0.0, 0.01 * r, 1e-4 * r, ActsOn.MOTION),
-            ModelParameter("sliding_share", "1", 1.0, 0.0, 1.0, 0.1, ActsOn.MOTION),
+            ModelParameter(second, "1", 1.0, 0.0, 1.0, 0.1, ActsOn.MOTION),
         )
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         r = data.range_um
         return [[np.array([w * r, share])] for w in (1e-4, 2.5e-4, 5e-4, 1e-3, 3e-3) for share in (1.0, 0.6, 0.2)]
 
+    def refined(self, p: FloatArray, left_floors: float, data: FitData) -> tuple[CauseModel, list[FloatArray]] | None:
+        if left_floors <= 1.1 or self.variant:
+            return None
+        return replace(self, variant="gradual"), [np.array([p[0] * p[1], share]) for share in (0.3, 1.0)]
+
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
-        return x_um if p[0] <= 0.0 else np.asarray(friction(x_um, float(p[0]), float(p[1])))
+        if p[0] <= 0.0:
+            return x_um
+        if not self.variant:
+            return np.asarray(friction(x_um, float(p[0]), float(p[1])))
+        radii_um = float(p[0]) * (1.0 + float(p[1]) * (_BREAKS - 1.0))
+        equal = np.full(radii_um.size, 1.0 / radii_um.size)
+        return np.asarray(x_um[0] + plays_nested(x_um - x_um[0], radii_um, equal))
 
 
 def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | None:
     v = {name: value for name, (value, _) in form.reported(p, data).items()}
-    return InLibrary((STICK_SLIP.clipped(width_um=v["width_um"], sliding_share=v["sliding_share"]),))
+    effect = STICK_SLIP.clipped(width_um=v["width_um"], sliding_share=v.get("sliding_share", 1.0))
+    return InLibrary((effect,), refit=bool(form.variant))
 
 
 STICK_SLIP = Kind(

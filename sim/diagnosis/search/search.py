@@ -476,7 +476,10 @@ class Search:
             return accepted
         start = fit.p.copy()
         start[[i for i, _ in mine]] = [s.neutral for _, s in mine]
-        other = calibrate(fit.model, start, self.mask, 20, 1e-4)
+        # The hold between samples, too, may be what fitted best beside such numbers.
+        held = replace(fit.model, nominal=fit.model.nominal.with_other_hold())
+        fits = [calibrate(model, start, self.mask, 20, 1e-4) for model in (fit.model, held)]
+        other = min(fits, key=lambda f: f.sse_um2)
         if other.sse_um2 > fit.sse_um2 * 0.99:
             return accepted
         return self._unless_it_holds_out_worse(accepted, other, base)

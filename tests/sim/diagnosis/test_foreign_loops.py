@@ -115,6 +115,10 @@ JUST_REACHED = single(851)
 RINGS_BESIDE_A_LAG = pair(852)
 #: Two lags: on a loop of the stage's own class, and on relays.
 TWO_LAGS_NO_DELAY = (pair(851), single(860))
+#: A lag of the amplifier beside creep, with held voltages: calibrated alone, lag, latch and hold all imitate it.
+LAG_AND_CREEP = pair(934)
+#: A bow whose outermost knot one fold alone shows, beside friction.
+ONE_FOLD = pair(894)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
 
@@ -321,6 +325,20 @@ def test_a_lag_is_found_below_what_rang_until_the_payload_was_found() -> None:
     low, high = named["amplifier_lag"].intervals["tau_s"]
     assert low < RINGS_BESIDE_A_LAG.effects["amplifier_lag"]["tau_s"] < high
     assert said.noise_floor_um < 4.0 * RINGS_BESIDE_A_LAG.rig.sigma_um
+
+
+def test_the_hold_that_a_missing_lag_called_for_is_tried_anew() -> None:
+    """Beside the wrong hold the latch stood at its bound, and a delay of a sample was named."""
+    said = diagnosed(LAG_AND_CREEP)
+    assert {c.name for c in said.causes} == {"amplifier_lag", "creep"}
+    lag = next(c for c in said.causes if c.name == "amplifier_lag").parameters["tau_s"]
+    assert lag == pytest.approx(LAG_AND_CREEP.effects["amplifier_lag"]["tau_s"], rel=0.003)
+
+
+def test_what_one_fold_alone_shows_does_not_keep_a_cause_from_being_found() -> None:
+    said = diagnosed(ONE_FOLD)
+    assert {c.name for c in said.causes} <= {"hysteresis_shape", "asymmetry", "sensor_nonlinearity", "stick_slip"}
+    assert "stick_slip" in {c.name for c in said.causes}
 
 
 def test_a_faint_drift_of_the_rests_counts_as_seen_where_the_fit_has_its_size() -> None:

@@ -20,7 +20,7 @@ from sim.effects import effect, simulate
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.rate_dependence import RATE_DEPENDENCE, RateDependence
 from sim.effects.resonance import Resonance
-from sim.effects.stick_slip import friction
+from sim.effects.stick_slip import StickSlip, friction, in_library
 from sim.effects.timing import resample
 from sim.fitting.calibration import DampingRule, calibrate, damped_step, free_indices
 from sim.fitting.dynamics import Dynamics, respond
@@ -190,6 +190,34 @@ def test_friction_with_full_share_is_a_play() -> None:
     play = plays(u - u[0], np.array([0.4]))[0] + u[0]
     assert np.max(np.abs(friction(u, 0.4, 1.0) - play)) <= 0.4 + 1e-12
     assert np.all(np.abs(friction(u, 0.4, 0.3) - u) <= 0.4 + 1e-12)
+
+
+def test_contact_that_breaks_free_in_parts_slides_as_friction_with_presliding_does() -> None:
+    """After a reversal at full friction z = F (1 - 2 exp(-s / 2F)): Dahl's equation, over the way s, solved."""
+    reach = 0.03
+    way = np.linspace(0.0, 1.0, 4001)
+    x = np.concatenate([way, 1.0 - way[1:]])
+    data = FitData(DT, x, 10.0 * x)
+    form = StickSlip(variant="gradual")
+    held = x - form.motion(x, np.array([reach, 1.0]), data)
+    expected = reach * (1.0 - 2.0 * np.exp(-way / (2.0 * reach)))
+    np.testing.assert_allclose(-held[way.size - 1 :], expected, atol=0.12 * reach)
+    assert np.std(-held[way.size - 1 :] - expected) < 0.03 * reach
+    np.testing.assert_allclose(form.motion(x, np.array([0.02, 0.0]), data), plays(x, np.array([0.02]))[0], atol=1e-12)
+
+
+def test_friction_is_fitted_in_parts_only_where_something_is_left() -> None:
+    data = FitData(DT, np.sin(np.arange(400) / 50.0), np.sin(np.arange(400) / 50.0))
+    p = np.array([0.01, 0.8])
+    assert StickSlip().refined(p, 1.1, data) is None
+    found = StickSlip().refined(p, 1.2, data)
+    assert found is not None
+    finer, starts = found
+    assert all(start[0] == 0.008 for start in starts)
+    assert finer.refined(starts[0], 9.0, data) is None
+    effect = in_library(finer, starts[0], data)
+    assert effect is not None
+    assert effect.refit
 
 
 def test_resampling_is_exact_for_a_parabola() -> None:
