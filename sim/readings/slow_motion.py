@@ -33,6 +33,9 @@ class Change:
     #: When that part begins and ends, s.
     begin_s: float = 0.0
     end_s: float = 0.0
+    #: The largest standard error over the whole record and its halves: what happens in one half excludes nothing in the
+    #: other.
+    widest: float = 0.0
 
     def agrees(self, value: float) -> bool:
         """Whether ``value`` is this change, within one error. From 2.5 errors on: a smaller change agrees with many."""
@@ -43,7 +46,8 @@ class Change:
         ``usual`` value."""
         if value > _SIGMAS * self.error and value > least:
             return True
-        return False if value < max(2.5 * self.error, least) and 2.0 * self.error < usual else None
+        known = 2.0 * max(self.error, self.widest) < usual
+        return False if value < max(2.5 * self.error, least) and known else None
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ def rests_over_time(readings: Readings) -> RestsOverTime:
         if parts:
             best = max(parts, key=lambda k: abs(values[k]) / max(errors[k], 1e-300))
             part = best[len(name) + 1 :]
-            drifts[name] = Change(values[best], errors[best], _WHEN[part], *rests.parts_s[part])
+            widest = max(errors[k] for k in parts)
+            drifts[name] = Change(values[best], errors[best], _WHEN[part], *rests.parts_s[part], widest)
     stepped = any(
         float(np.ptp(data.u_V[max(0, r.first - round(1.0 / data.dt_s)) : r.first + 1])) > 0.1 * data.swing_V
         for r in long_enough

@@ -35,6 +35,8 @@ class Thresholds:
     level: float = 0.01
     #: Least share of the held-out squared error that a cause must remove.
     least_gain: float = 0.02
+    #: Least gain in the fit, as a share of that in held-out stretches.
+    least_fitted: float = 0.5
     #: Least gain as a share of the squared noise floor.
     least_of_floor: float = 0.08
     #: Least share of the squared error above the noise floor that the first cause, and a further one, must remove.
@@ -48,6 +50,10 @@ class Thresholds:
     little: float = 1.1
     #: Cost of one parameter, as a share of the squared error: of two equal causes the simpler one is preferred.
     cost_per_number: float = 0.002
+    #: Where no cause is acceptable alone and this many noise floors are left, two are tried at once ...
+    much_left: float = 2.0
+    #: ... the first of which removes this share of what is above the noise.
+    least_of_two: float = 0.3
     #: Number of linearised guesses that are fitted in full.
     refits: int = 6
     most_causes: int = 5
@@ -324,6 +330,10 @@ class Search:
         seen = self.seen(best.cause)
         if gain <= 0.0 or (p > thresholds.level and not seen):
             return False
+        # What hardly changes the error of the fit does not explain it: it only steadies the numbers of earlier causes
+        # where a fold is left out.
+        if base.sse_um2 - best.fit.sse_um2 < thresholds.least_fitted * gain:
+            return False
         parameters = best.cause.parameters(best.fit.model.data)
         q = best.fit.model.parameters_of(best.fit.p, len(best.fit.model.causes) - 1)
         if best.cause.line_hz(q) is not None:
@@ -369,14 +379,13 @@ class Search:
     def extended(self, current: ModelFit, held: HeldOut) -> tuple[ModelFit, HeldOut, list[AcceptedCause]]:
         """Add causes to a fit, but none that the review dropped."""
         steps: list[AcceptedCause] = []
-        dropped = {cause.name for cause in self.unsteady}
         for round_ in range(len(current.model.causes), self.thresholds.most_causes):
             self.progress(f"looking for cause {round_ + 1}", 0.1 + 0.8 * round_ / self.thresholds.most_causes)
             names = {f.name for f in current.model.causes}
             left_um2 = np.zeros_like(held.per_block_um2)
             for name in names & self.left_um2.keys():
                 left_um2 += self.left_um2[name]
-            looks, _ = self.looks(current, self.catalogue.same_set(names) | dropped)
+            looks, _ = self._looks_beside(current)
             self.first_looks = self.first_looks or looks
             ranked = self.refit(
                 current, looks, self.thresholds.refits, 0.3 * self.thresholds.least_gain * current.sse_um2
@@ -391,7 +400,12 @@ class Search:
                     accepted = best
                     break
             if accepted is None:
-                break
+                two = self._two_at_once(ranked, current, held, left_um2, self.seed + round_)
+                if two is None or len(two[0].model.causes) > self.thresholds.most_causes:
+                    break
+                current, held, more = two
+                steps += more
+                continue
             self._with_agreement(accepted)
             # A freer form imitates what it stands beside: it does not take over a signature that the readings show.
             sight = self.sights.get(accepted.cause.name)
@@ -425,6 +439,58 @@ class Search:
         coarse = list(first_of.values())[:3]
         finer = [self._with_refined_model(candidate, base) for candidate in coarse]
         yield from sorted((f for f, c in zip(finer, coarse, strict=True) if f is not c), key=self._with_witness)
+
+    def _two_at_once(
+        self, refused: list[CauseCandidate], base: ModelFit, held: HeldOut, left_um2: FloatArray, seed: int
+    ) -> tuple[ModelFit, HeldOut, list[AcceptedCause]] | None:
+        """Two causes, each acceptable beside the other where neither is alone; None if there are none.
+
+        As long as one is missing, the other may explain too little, or have no plausible size.
+        """
+        floor_um2 = float(self.mask.sum()) * self.sigma_um**2
+        enough = self.thresholds.least_of_two * (held.sse_um2 - floor_um2)
+        if held.sse_um2 < self.thresholds.much_left**2 * floor_um2:
+            return None
+        for first in [c for c in refused if held.sse_um2 - c.held.sse_um2 > enough and not self.vetoed(c.cause)][:2]:
+            one = self.polish(first, base)
+            looks, _ = self._looks_beside(one.fit)
+            beside = self.refit(one.fit, looks, 4, 0.3 * self.thresholds.least_gain * one.fit.sse_um2)
+            for other in sorted((c for c in beside if self.plausible(c)), key=self._with_witness)[:2]:
+                second = self._with_refined_model(self.polish(other, one.fit), one.fit)
+                p_second = p_value(looks, one.held.sse_um2 - second.held.sse_um2, seed)
+                if not self.acceptable(second, one.held, left_um2, p_second, one.fit):
+                    continue
+                gone = np.maximum(one.held.per_block_um2 - second.held.per_block_um2, 0.0)
+                left = second.cause.model_error**2 * gone
+                # The first one must be acceptable beside the second, too.
+                both, less = self._last(second, len(base.model.causes))
+                alone = self.held(less)
+                p_first = p_value(self._looks_beside(less)[0], alone.sse_um2 - both.held.sse_um2, seed)
+                if self.acceptable(both, alone, left_um2 + left, p_first, less):
+                    gone = np.maximum(alone.per_block_um2 - both.held.per_block_um2, 0.0)
+                    self.left_um2[second.cause.name] = left
+                    self.left_um2[both.cause.name] = both.cause.model_error**2 * gone
+                    shares = [1.0 - both.held.sse_um2 / without.sse_um2 for without in (alone, one.held)]
+                    steps = [
+                        AcceptedCause(both.cause.name, p_first, shares[0]),
+                        AcceptedCause(second.cause.name, p_second, shares[1]),
+                    ]
+                    return both.fit, both.held, steps
+        return None
+
+    def _looks_beside(self, fit: ModelFit) -> tuple[list[ScreenedCause], list[CauseModel]]:
+        """The guesses beside the causes of ``fit``, without those that the review dropped."""
+        names = {cause.name for cause in fit.model.causes}
+        return self.looks(fit, self.catalogue.same_set(names) | {cause.name for cause in self.unsteady})
+
+    def _last(self, candidate: CauseCandidate, index: int) -> tuple[CauseCandidate, ModelFit]:
+        """An earlier cause of a candidate's model as the candidate, and the model without it."""
+        fit, where = candidate.fit, candidate.fit.model.slice_of(index)
+        less = self.without(fit, index)
+        cause = fit.model.causes[index]
+        p = np.concatenate([fit.p[: where.start], fit.p[where.stop :], fit.p[where]])
+        moved = calibrate(less.model.with_cause(cause), p, self.mask, cause.iterations, 1e-5)
+        return self._converged(replace(candidate, cause=cause), moved, less), less
 
     def _with_freer_form(self, fit: ModelFit) -> CauseCandidate | None:
         """The model with the first of its causes that has a freer form in that form; None if none has."""

@@ -278,6 +278,14 @@ def test_a_change_agrees_from_two_and_a_half_errors_on() -> None:
     assert not clear.agrees(0.26)
 
 
+@pytest.mark.parametrize(("widest", "seen"), [(0.0, False), (0.04, False), (0.06, None)])
+def test_a_change_is_excluded_only_where_each_part_of_the_record_would_show_it(
+    widest: float, seen: bool | None
+) -> None:
+    assert Change(0.01, 0.02, widest=widest).seen(0.01, 0.005, 0.1) is seen
+    assert Change(0.2, 0.02, widest=widest).seen(0.2, 0.005, 0.1) is True
+
+
 def test_noise_floor_sees_noise_and_not_creep() -> None:
     rng = np.random.default_rng(1)
     u = np.repeat([0.0, 5.0, 0.0, 3.0], 4000).astype(np.float64)
