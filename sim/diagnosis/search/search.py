@@ -36,7 +36,7 @@ class Thresholds:
     #: Least share of the held-out squared error that a cause must remove.
     least_gain: float = 0.02
     #: Least gain in the fit, as a share of that in held-out stretches.
-    least_fitted: float = 0.5
+    least_fitted: float = 0.1
     #: Least gain as a share of the squared noise floor.
     least_of_floor: float = 0.08
     #: Least share of the squared error above the noise floor that the first cause, and a further one, must remove.
