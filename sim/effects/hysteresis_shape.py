@@ -72,6 +72,7 @@ class HysteresisShape(CauseModel):
 
     test_answers_to_others: bool = True
     approximates: bool = True
+    shared: tuple[str, ...] = ("weight_um_per_V",)
     #: Voltage (V) that the stage had been driven to and back before the recording; 0 where it was relaxed.
     before_V: float = 0.0
 

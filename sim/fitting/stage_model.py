@@ -92,6 +92,8 @@ class CauseModel:
     imitates_others: bool = False
     #: It approximates a class of stages, each stretch with another error: its size may differ between stretches.
     approximates: bool = False
+    #: Reported numbers of which the nominal stage may take any part over: not zero where the cause is not there.
+    shared: tuple[str, ...] = ()
     #: Another drive can show it: False for what somebody has to do to the stage.
     shown_by_a_drive: bool = True
     #: It is shown by driving another axis, recorded or not.

@@ -100,6 +100,8 @@ def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict
 
 
 def across_zero(errors: ParameterErrors, index: int) -> bool:
-    """Whether the 95 % intervals of all reported numbers of ``causes[index]`` hold zero."""
+    """Whether the 95 % intervals of the reported numbers of ``causes[index]`` hold zero, but for those that the nominal
+    stage may give to it or take from it."""
     _, spans = numbers(errors, index)
-    return bool(spans) and all(low <= 0.0 <= high for low, high in spans.values())
+    own = [span for name, span in spans.items() if name not in errors.fit.model.causes[index].shared]
+    return bool(own) and all(low <= 0.0 <= high for low, high in own)

@@ -98,6 +98,20 @@ def test_a_number_may_be_zero_where_its_interval_holds_zero(freer: float, held: 
     assert across_zero(errors_of(Gain(), freer), 0) is held
 
 
+@pytest.mark.parametrize(("width", "held"), [(0.1, True), (0.5, False)])
+def test_what_the_nominal_stage_may_give_away_is_not_asked_to_be_zero(width: float, held: bool) -> None:
+    """A weight of 2 ± 0.2, which the nominal stage lacks, beside a width of ``width`` ± 0.4."""
+
+    @dataclass(frozen=True)
+    class Loop(Gain):
+        shared: tuple[str, ...] = ("weight",)
+
+        def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
+            return {"width": (width, np.array([2.0])), "weight": (2.0, np.array([1.0]))}
+
+    assert across_zero(errors_of(Loop(), 0.0), 0) is held
+
+
 @dataclass(frozen=True)
 class Silent(Gain):
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
