@@ -94,6 +94,8 @@ class CauseModel:
     approximates: bool = False
     #: Reported numbers of which the nominal stage may take any part over: not zero where the cause is not there.
     shared: tuple[str, ...] = ()
+    #: The reported number that is positive wherever it is there; it is dropped where the interval of this holds zero.
+    positive: str = ""
     #: Another drive can show it: False for what somebody has to do to the stage.
     shown_by_a_drive: bool = True
     #: It is shown by driving another axis, recorded or not.

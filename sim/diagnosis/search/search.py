@@ -15,7 +15,7 @@ import numpy as np
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
-from sim.diagnosis.search.intervals import across_zero, parameter_errors
+from sim.diagnosis.search.intervals import across_zero, parameter_errors, sign_is_open
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
 from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_free_memory, with_new_columns
@@ -639,9 +639,12 @@ class Search:
         most = self.thresholds.most_spread_seen if self.seen(cause) else self.thresholds.most_spread
         return few or cause.approximates or stretches.spread <= most
 
-    def may_be_zero(self, fit: ModelFit, index: int) -> bool:
-        """Whether the intervals of all numbers of a cause hold zero."""
-        return across_zero(parameter_errors(fit, self.mask, self.parts, self.readings), index)
+    def may_be_zero(self, fit: ModelFit, index: int, small: bool) -> bool:
+        """Whether the intervals of all numbers of a cause that removes little hold zero, or that of one that cannot."""
+        if not small and not fit.model.causes[index].positive:
+            return False
+        errors = parameter_errors(fit, self.mask, self.parts, self.readings)
+        return sign_is_open(errors, index) or (small and across_zero(errors, index))
 
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""
@@ -703,7 +706,7 @@ def review(
         is_line = cause.line_hz(fit.model.parameters_of(fit.p, index)) is not None
         small = not is_line and gain <= thresholds.least_about_zero * held_less.sse_um2
         idle = gain <= (0.0 if is_line else keep * held_less.sse_um2)
-        if idle or (small and search.may_be_zero(fit, index)):
+        if idle or search.may_be_zero(fit, index, small):
             fit, held = less, held_less
             found, index = [], 0
             continue

@@ -11,7 +11,7 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
+from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors, sign_is_open
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.readings import Readings
@@ -96,6 +96,12 @@ def test_what_a_loop_of_another_form_took_from_a_number_is_given_back() -> None:
 def test_a_number_may_be_zero_where_its_interval_holds_zero(freer: float, held: bool) -> None:
     """1 ± 0.196, and as far as the number beside a freer loop."""
     assert across_zero(errors_of(Gain(), freer), 0) is held
+
+
+@pytest.mark.parametrize(("freer", "is_open"), [(0.0, False), (-0.7, False), (-0.9, True)])
+def test_a_growth_that_may_be_none_is_told_from_one_that_is_not(freer: float, is_open: bool) -> None:
+    assert sign_is_open(errors_of(replace(Gain(), positive="twice"), freer), 0) is is_open
+    assert not sign_is_open(errors_of(Gain(), freer), 0)
 
 
 @pytest.mark.parametrize(("width", "held"), [(0.1, True), (0.5, False)])
