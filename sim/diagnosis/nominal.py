@@ -11,7 +11,7 @@ from adaptive.errors import InputError
 from adaptive.types import BoolArray, FloatArray
 from sim.effects import Chain, Effect, effect, simulate
 from sim.effects.base import Place
-from sim.fitting.calibration import calibrate, with_free_memory
+from sim.fitting.calibration import calibrate, with_dynamics_anew, with_free_memory
 from sim.fitting.dynamics import LIGHT, Dynamics, first_ringing, respond
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.hysteresis_loops import bouc_wen_loop, loop_numbers
@@ -418,7 +418,12 @@ def calibrate_nominal(kind: str | StageConfig, data: FitData, mask: BoolArray) -
             if best is None or fit.sse_um2 < best.sse_um2 * (0.95 if dearer else 1.0 - 1e-3):
                 best = fit
     assert best is not None
-    return with_free_memory(calibrate(best.model, best.p, mask, 12, 1e-5), mask)
+    best = calibrate(best.model, best.p, mask, 12, 1e-5)
+    anew = with_dynamics_anew(best, mask)
+    dearer = anew.model.nominal.substeps > best.model.nominal.substeps
+    if anew.sse_um2 < best.sse_um2 * (0.95 if dearer else 1.0 - 1e-3):
+        best = calibrate(anew.model, anew.p, mask, 12, 1e-5)
+    return with_free_memory(best, mask)
 
 
 def with_other_axis(fit: ModelFit, mask: BoolArray, *, refit: bool = True) -> ModelFit:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.types import BoolArray, FloatArray
+from sim.fitting.fit_data import ActsOn, ModelParameter
 from sim.fitting.stage_model import JacobianColumns, ModelFit, StageModel
 
 IntArray = NDArray[np.int64]
@@ -186,6 +187,24 @@ def calibrate(
         return replace(now, free=free)
     chosen = list(kept.parameters)
     return replace(now, free=free, rows=rows[chosen], row_indices=tuple(free[i] for i in chosen))
+
+
+def own_dynamics(fit: ModelFit) -> list[tuple[int, ModelParameter]]:
+    """The free numbers of the nominal mechanics, with their indices."""
+    own = enumerate(fit.model.parameters[: fit.model.n_nominal])
+    return [(i, s) for i, s in own if i in fit.free and s.acts_on == ActsOn.DYNAMICS]
+
+
+def with_dynamics_anew(fit: ModelFit, mask: BoolArray) -> ModelFit:
+    """The better of the fits with either hold in which the nominal mechanics begin at their neutral values.
+
+    Lag, latch and hold imitate each other within a few samples, and a fit does not leave the wrong ones.
+    """
+    start = fit.p.copy()
+    for i, s in own_dynamics(fit):
+        start[i] = s.neutral
+    models = (fit.model, replace(fit.model, nominal=fit.model.nominal.with_other_hold()))
+    return min((calibrate(model, start, mask, 20, 1e-4) for model in models), key=lambda f: f.sse_um2)
 
 
 def with_free_memory(fit: ModelFit, mask: BoolArray) -> ModelFit:

@@ -18,8 +18,15 @@ from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misf
 from sim.diagnosis.search.intervals import across_zero, parameter_errors, sign_is_open
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
-from sim.fitting.calibration import calibrate, clipped_to_bounds, evaluate, with_free_memory, with_new_columns
-from sim.fitting.fit_data import ActsOn, ModelParameter
+from sim.fitting.calibration import (
+    calibrate,
+    clipped_to_bounds,
+    evaluate,
+    own_dynamics,
+    with_dynamics_anew,
+    with_free_memory,
+    with_new_columns,
+)
 from sim.fitting.parallel import side_by_side
 from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
 from sim.readings.noise import has_spectral_line
@@ -521,7 +528,7 @@ class Search:
     def _other_hold(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the other hold between samples, if that fits better: a large cause can hide it."""
         fit = accepted.fit
-        model = self._with_other_hold(fit)
+        model = replace(fit.model, nominal=fit.model.nominal.with_other_hold())
         dearer = model.nominal.substeps > fit.model.nominal.substeps
         other = calibrate(model, fit.p, self.mask, 4, 2e-3, known=fit.columns())
         if other.sse_um2 > fit.sse_um2 * (0.95 if dearer else 0.99):
@@ -533,30 +540,12 @@ class Search:
         fits better: a large cause drove it there (a lag of nothing and a reading a sample late, for a lag)."""
         fit = accepted.fit
         # A step of a fit ends close to a bound, not on it.
-        if all(s.low + 0.02 * s.step < fit.p[i] < s.high - 0.02 * s.step for i, s in self._own_dynamics(fit)):
+        if all(s.low + 0.02 * s.step < fit.p[i] < s.high - 0.02 * s.step for i, s in own_dynamics(fit)):
             return accepted
-        other = self._with_dynamics_anew(fit)
+        other = with_dynamics_anew(fit, self.mask)
         if other.sse_um2 > fit.sse_um2 * 0.99:
             return accepted
         return self._unless_it_holds_out_worse(accepted, other, base)
-
-    @staticmethod
-    def _with_other_hold(fit: ModelFit) -> StageModel:
-        return replace(fit.model, nominal=fit.model.nominal.with_other_hold())
-
-    @staticmethod
-    def _own_dynamics(fit: ModelFit) -> list[tuple[int, ModelParameter]]:
-        """The free numbers of the nominal mechanics, with their indices."""
-        own = enumerate(fit.model.parameters[: fit.model.n_nominal])
-        return [(i, s) for i, s in own if i in fit.free and s.acts_on == ActsOn.DYNAMICS]
-
-    def _with_dynamics_anew(self, fit: ModelFit) -> ModelFit:
-        """The better of the fits with either hold in which the nominal mechanics begin at their neutral values."""
-        start = fit.p.copy()
-        for i, s in self._own_dynamics(fit):
-            start[i] = s.neutral
-        models = (fit.model, self._with_other_hold(fit))
-        return min((calibrate(model, start, self.mask, 20, 1e-4) for model in models), key=lambda f: f.sse_um2)
 
     def _unless_it_holds_out_worse(self, accepted: CauseCandidate, fit: ModelFit, base: ModelFit) -> CauseCandidate:
         """The candidate with ``fit``, which explains more, unless it does clearly worse in held-out stretches."""
@@ -664,7 +653,7 @@ class Search:
             less = calibrate(less.model, start, self.mask, 12, 1e-4)
         if fit.model.causes[index].fast:
             # It may have stood for the stage's own lag, or for half a sample of the hold.
-            less = min(less, self._with_dynamics_anew(less), key=lambda f: f.sse_um2)
+            less = min(less, with_dynamics_anew(less, self.mask), key=lambda f: f.sse_um2)
         return less
 
 

@@ -25,7 +25,7 @@ from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
 from sim.readings.ringing import Ringing, ringing
 from sim.readings.slow_motion import rests_over_time
-from tests.hidden.foreign.cases import pair, single
+from tests.hidden.foreign.cases import healthy, pair, single
 from tests.hidden.foreign.record import Case, Rig
 from tests.hidden.foreign.score import nominal_of, recording_of
 
@@ -123,6 +123,8 @@ DRIFT_AND_BEND = single(958)
 EARLY_HEAT, STEADIED = single(973), single(954)
 #: Held voltages: calibrated alone, a voltage that runs linearly fits better, and the lag is driven away.
 HELD = pair(988)
+#: Nothing hidden, under a multisine with held voltages at 500 Hz: a voltage that runs linearly fits at first.
+HELD_AT_FIRST = healthy(716)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
 
@@ -345,6 +347,14 @@ def test_two_causes_are_found_at_once_where_neither_explains_enough_alone() -> N
     assert drift == pytest.approx(DRIFT_AND_BEND.effects["gain_drift"]["total"], rel=0.05)
     assert {c.name for c in said.causes} <= {"gain_drift", "sensor_nonlinearity", "asymmetry", "hysteresis_shape"}
     assert said.extended_heldout_um < 0.06 * said.nominal_heldout_um
+
+
+def test_the_hold_is_the_one_that_fits_best_with_its_own_lag() -> None:
+    prepared = prepare(recording_of(HELD_AT_FIRST))
+    fit = calibrate_nominal("bouc_wen", with_nominal_kind("bouc_wen", prepared.data), prepared.mask)
+    numbers = dict(zip((s.name for s in fit.model.parameters), fit.p, strict=True))
+    assert (fit.model.nominal.hold, round(numbers["latch_samples"], 2)) == ("zero", 0.0)
+    assert numbers["tau_s"] == pytest.approx(HELD_AT_FIRST.rig.lag_s, rel=0.01)
 
 
 def test_the_stages_own_lag_is_not_named_as_a_second_one() -> None:
