@@ -150,7 +150,8 @@ def _beside_floor(error_um: float, d: Diagnosis) -> str:
     near = error_um <= AT_THE_FLOOR * floor
     if near and d.floor_source == DIFFERENCES:
         # Without rests or periods the estimate contains fast motion.
-        return f"below the only bound on the noise that this recording gives ({length(floor)}, from differences)"
+        where = "below" if error_um <= floor else "near"
+        return f"{where} the only bound on the noise that this recording gives ({length(floor)}, from differences)"
     if error_um < 0.5 * floor:
         return f"below its own noise floor ({length(floor)}): the test recording is quieter"
     rest = "at the noise floor" if near else f"{error_um / floor:.2g} times the noise floor"
@@ -241,6 +242,11 @@ def _section(place: int, cause: NamedCause, kind: Kind) -> list[str]:
         numbers.append(f"{name} = {with_unit(name, value)} ({low:.4g} to {high:.4g})")
     more = len(cause.parameters) - len(numbers)
     lines.append(f"{'; '.join(numbers)}{f'; and {more} more in report.json' if more > 0 else ''}.")
+    if cause.intervals and all(low <= 0.0 <= high for low, high in cause.intervals.values()):
+        lines.append(
+            "**The intervals of all its numbers hold zero**: the error falls with it on data that was not fitted, but "
+            "how large it is, this recording does not say."
+        )
     if cause.witness is not None:
         told = {
             True: f"Seen in the readings without a fit: {cause.witness.words}.",

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adaptive.types import FloatArray
 from sim import pictures
 from sim.effects.base import Cause, Context, InLibrary, Kind, Parameter, Place, block
 from sim.effects.holds import first_order
-from sim.effects.sampled_lags import apart, is_of_the_recorder, second_lag
+from sim.effects.sampled_lags import agrees, apart, is_of_the_recorder, second_lag
 from sim.fitting.fit_data import ActsOn, FitData, ModelParameter
 from sim.fitting.lags import lag_ends
 from sim.fitting.stage_model import CauseModel, Guess, single_guesses
+
+if TYPE_CHECKING:
+    from sim.readings.readings import Readings
 
 # Its step in the simulation.
 
@@ -55,6 +58,9 @@ class AmplifierLag(CauseModel):
 
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         return not is_of_the_recorder(float(p[0]), data)
+
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        return agrees(float(p[0]), readings)
 
     def joint_starts(self, nominal: FloatArray, names: tuple[str, ...], data: FitData) -> list[FloatArray]:
         return apart(nominal, names)

@@ -79,7 +79,7 @@ class RateDependence(CauseModel):
 
     test_answers_to_others: bool = True
     model_error: float = 0.3
-    positive: str = "growth_per_decade"
+    never_zero: bool = True
     variant: str = "width"
     with_slope: bool = True
     #: Time constant of the lag that filters the rate, s; with ``free_rate_lag`` the start value of its fit.

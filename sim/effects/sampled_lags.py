@@ -29,7 +29,8 @@ ComplexArray = NDArray[np.complex128]
 class LagsOfResponse:
     """What the response shows. ``missing``: what it lacks to show anything; then nothing else is given.
 
-    ``late``: a straight part of the phase; ``lagged``: a lag beside the stage's own. Each with its words.
+    ``late``: a straight part of the phase; ``lagged``: a lag beside the stage's own. Each with its words. ``lags_s``:
+    the time constants, the stage's own among them; ``lag_error_s``: standard error of the shortest.
     """
 
     missing: str
@@ -37,6 +38,8 @@ class LagsOfResponse:
     late_words: str = ""
     lagged: bool | None = None
     lag_words: str = ""
+    lags_s: tuple[float, ...] = ()
+    lag_error_s: float = 0.0
 
 
 def lags_of_response(readings: Readings) -> LagsOfResponse:
@@ -90,7 +93,8 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     )
     # A little more than the recorder's latch is not decided.
     late = None if either else True if delayed else None if late_s > 1.2 * data.dt_s else False
-    return LagsOfResponse("", late, words, lagged, lag_words)
+    lags_s = tuple(float(lag) for lag in more.p[4:])
+    return LagsOfResponse("", late, words, lagged, lag_words, lags_s, lag_error_s)
 
 
 def apart(nominal: FloatArray, names: tuple[str, ...]) -> list[FloatArray]:
@@ -115,6 +119,17 @@ def second_lag(readings: Readings) -> Sight:
     """The direct test of a lag beside the stage's own: its phase and its loss of gain."""
     found = readings.once(lags_of_response)
     return Sight(None, found.missing) if found.missing else Sight(found.lagged, found.lag_words)
+
+
+def agrees(tau_s: float, readings: Readings) -> str:
+    """How a fitted lag agrees with a lag of the response within 15 % or two standard errors; empty if with none."""
+    found = readings.once(lags_of_response)
+    if not found.lagged:
+        return ""
+    nearest_s = min(found.lags_s, key=lambda lag_s: abs(lag_s - tau_s))
+    if abs(nearest_s - tau_s) > max(0.15 * nearest_s, 2.0 * found.lag_error_s):
+        return ""
+    return f"the fit has {1e3 * tau_s:.3g} ms"
 
 
 def _below_modes(response: Response, known_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray, FloatArray]:

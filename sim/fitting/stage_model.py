@@ -94,8 +94,8 @@ class CauseModel:
     approximates: bool = False
     #: Reported numbers of which the nominal stage may take any part over: not zero where the cause is not there.
     shared: tuple[str, ...] = ()
-    #: The reported number that is positive wherever it is there; it is dropped where the interval of this holds zero.
-    positive: str = ""
+    #: It is dropped where the intervals of all its numbers hold zero, however much it removes.
+    never_zero: bool = False
     #: Another drive can show it: False for what somebody has to do to the stage.
     shown_by_a_drive: bool = True
     #: It is shown by driving another axis, recorded or not.
@@ -132,7 +132,8 @@ class CauseModel:
         return True
 
     def agreement(self, p: FloatArray, readings: Readings) -> str:
-        """How a number of a direct test, too faint to count alone, agrees with the fit ``p``; empty if it does not."""
+        """How a number of a direct test, that is too faint or answers to others as well, agrees with the fit ``p``;
+        empty if it does not."""
         return ""
 
     def line_hz(self, p: FloatArray) -> float | None:

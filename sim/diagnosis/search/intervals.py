@@ -105,10 +105,3 @@ def across_zero(errors: ParameterErrors, index: int) -> bool:
     _, spans = numbers(errors, index)
     own = [span for name, span in spans.items() if name not in errors.fit.model.causes[index].shared]
     return bool(own) and all(low <= 0.0 <= high for low, high in own)
-
-
-def sign_is_open(errors: ParameterErrors, index: int) -> bool:
-    """Whether the 95 % interval of the number that is positive wherever ``causes[index]`` is there holds zero."""
-    _, spans = numbers(errors, index)
-    span = spans.get(errors.fit.model.causes[index].positive)
-    return span is not None and span[0] <= 0.0

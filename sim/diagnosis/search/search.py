@@ -15,7 +15,7 @@ import numpy as np
 from adaptive.types import BoolArray, FloatArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.search.held_out import HeldOut, Split, held_out, monitor_misfit, worse_by
-from sim.diagnosis.search.intervals import across_zero, parameter_errors, sign_is_open
+from sim.diagnosis.search.intervals import across_zero, parameter_errors
 from sim.diagnosis.search.screening import ResidualScreen, ScreenedCause, p_value
 from sim.diagnosis.search.stretches import StretchSizes, sizes_by_stretch
 from sim.fitting.calibration import (
@@ -223,14 +223,17 @@ class Search:
     left_um2: dict[str, FloatArray] = field(default_factory=dict)
     #: Causes that the review dropped because their size changes from stretch to stretch.
     unsteady: list[UnsteadyCause] = field(default_factory=list)
+    #: Accepted causes whose direct test answers to others as well, but gives a number that agrees with the fit.
+    agreed: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         self.causes = self.causes or self.catalogue.forms
 
     def seen(self, cause: CauseModel) -> bool:
-        """Whether a direct test that answers to this cause alone sees it."""
+        """Whether a direct test sees this cause that answers to it alone, or gives the number that the fit has."""
         sight = self.sights.get(cause.name)
-        return sight is not None and sight.seen is True and not cause.test_answers_to_others
+        alone = not cause.test_answers_to_others or cause.name in self.agreed
+        return sight is not None and sight.seen is True and alone
 
     def vetoed(self, cause: CauseModel) -> bool:
         """Whether the readings excite the direct test of this cause, and it sees nothing."""
@@ -317,7 +320,7 @@ class Search:
         return cause.plausible(model.parameters_of(candidate.fit.p, len(model.causes) - 1), model.data)
 
     def agreement(self, candidate: CauseCandidate) -> str:
-        """How a number of the direct test, too faint to count alone, agrees with the fit."""
+        """How a number of the direct test, that is too faint or answers to others as well, agrees with the fit."""
         if self.readings is None:
             return ""
         model = candidate.fit.model
@@ -325,16 +328,24 @@ class Search:
         return candidate.cause.agreement(own, self.readings)
 
     def _with_agreement(self, candidate: CauseCandidate) -> None:
-        """A faint number of the direct test that agrees with the accepted fit is seen."""
-        sight, agreement = self.sights.get(candidate.cause.name), self.agreement(candidate)
-        if sight is not None and sight.seen is None and agreement:
-            self.sights[candidate.cause.name] = Sight(True, f"{sight.words}; {agreement}")
+        """A number of the direct test that agrees with the accepted fit is seen."""
+        name = candidate.cause.name
+        sight, agreement = self.sights.get(name), self.agreement(candidate)
+        if sight is None or sight.seen is False or not agreement:
+            return
+        if sight.seen is None or (candidate.cause.test_answers_to_others and name not in self.agreed):
+            self.sights[name] = Sight(True, f"{sight.words}; {agreement}")
+        if candidate.cause.test_answers_to_others:
+            self.agreed.add(name)
 
     def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
         """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
         thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
+        sight = self.sights.get(best.cause.name)
         seen = self.seen(best.cause)
+        if sight is not None and sight.seen is True and best.cause.test_answers_to_others:
+            seen = seen or bool(self.agreement(best))
         if gain <= 0.0 or (p > thresholds.level and not seen):
             return False
         # What hardly changes the error of the fit does not explain it: it only steadies the numbers of earlier causes
@@ -355,7 +366,6 @@ class Search:
         # Blocks whose error is mostly the model error of earlier causes are not evidence for a further one.
         clean = now > 2.0 * left_um2
         whole = gain / max(float((now - floor).sum()), 1e-3 * float(floor.sum()))
-        sight = self.sights.get(best.cause.name)
         faint = sight is not None and sight.seen is None and best.cause.imitates_others
         if faint and whole < thresholds.nearly_all and not self.agreement(best):
             return False
@@ -364,11 +374,12 @@ class Search:
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
         need = thresholds.least_excess_first if first else thresholds.least_excess_next
-        need /= thresholds.seen_eases if seen else 1.0
+        eases = thresholds.seen_eases if seen else 1.0
+        need /= eases
         # With a coarse grid, rounding errors repeat wherever the stage rests and could look like a cause.
         least = max(
-            thresholds.least_gain / (thresholds.seen_eases if seen else 1.0) * float(now.sum()),
-            (0.5 if self.coarse else thresholds.least_of_floor) * float(floor.sum()),
+            thresholds.least_gain / eases * float(now.sum()),
+            0.5 * float(floor.sum()) if self.coarse else thresholds.least_of_floor / eases * float(floor.sum()),
         )
         # A model error of earlier causes is never explained almost completely by another cause.
         left = float(now.sum()) / float(floor.sum())
@@ -629,11 +640,10 @@ class Search:
         return few or cause.approximates or stretches.spread <= most
 
     def may_be_zero(self, fit: ModelFit, index: int, small: bool) -> bool:
-        """Whether the intervals of all numbers of a cause that removes little hold zero, or that of one that cannot."""
-        if not small and not fit.model.causes[index].positive:
+        """Whether the intervals of all its numbers hold zero, of a cause that removes little or that is never zero."""
+        if not small and not fit.model.causes[index].never_zero:
             return False
-        errors = parameter_errors(fit, self.mask, self.parts, self.readings)
-        return sign_is_open(errors, index) or (small and across_zero(errors, index))
+        return across_zero(parameter_errors(fit, self.mask, self.parts, self.readings), index)
 
     def filled(self, fit: ModelFit) -> tuple[ModelFit, HeldOut]:
         """The fit to convergence, with a freer form of one of its causes where that explains more."""

@@ -11,7 +11,8 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors, sign_is_open
+from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
+from sim.diagnosis.search.search import Search, Thresholds
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.readings import Readings
@@ -98,10 +99,18 @@ def test_a_number_may_be_zero_where_its_interval_holds_zero(freer: float, held: 
     assert across_zero(errors_of(Gain(), freer), 0) is held
 
 
-@pytest.mark.parametrize(("freer", "is_open"), [(0.0, False), (-0.7, False), (-0.9, True)])
-def test_a_growth_that_may_be_none_is_told_from_one_that_is_not(freer: float, is_open: bool) -> None:
-    assert sign_is_open(errors_of(replace(Gain(), positive="twice"), freer), 0) is is_open
-    assert not sign_is_open(errors_of(Gain(), freer), 0)
+@pytest.mark.parametrize(
+    ("small", "never_zero", "dropped"), [(False, False, False), (False, True, True), (True, False, True)]
+)
+def test_what_may_be_zero_is_dropped_if_it_removes_little_or_is_never_zero(
+    small: bool, never_zero: bool, dropped: bool
+) -> None:
+    """A gain of nothing, and one of 1 whose interval is far from zero."""
+    mask, noise = np.ones(N, dtype=np.bool_), np.random.default_rng(3).standard_normal(N)
+    search = Search(mask, PARTS, 1.0, Thresholds(), 0, lambda stage, share: None)
+    cause = replace(Gain(), never_zero=never_zero)
+    assert search.may_be_zero(fit_of(cause, 0.0, np.ones(N), noise), 0, small) is dropped
+    assert not search.may_be_zero(fit_of(cause, 1.0, np.ones(N), noise), 0, small)
 
 
 @pytest.mark.parametrize(("width", "held"), [(0.1, True), (0.5, False)])

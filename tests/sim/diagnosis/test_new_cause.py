@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adaptive.errors import InputError
-from service.reports.diagnosis_page import Source, page
+from service.reports.diagnosis_page import DIFFERENCES, Source, page
 from sim.diagnosis.catalogue import CATALOGUE
 from sim.diagnosis.diagnose import Options, diagnose
 from sim.diagnosis.export import export_stage
@@ -49,6 +50,23 @@ def test_it_is_drawn_and_reported(diagnosis: Diagnosis) -> None:
     text = page(diagnosis, export_stage(diagnosis), Source("test"), viewer=False)
     assert "**cyclic error**" in text
     assert CYCLIC_ERROR.signature in text
+    assert "hold zero" not in text
+
+
+def test_the_page_says_that_the_size_is_open_where_all_intervals_hold_zero(diagnosis: Diagnosis) -> None:
+    wide = {name: (-1.0, 99.0) for name in diagnosis.causes[0].parameters}
+    unsure = replace(diagnosis, causes=(replace(diagnosis.causes[0], intervals=wide),))
+    assert "intervals of all its numbers hold zero" in page(unsure, export_stage(unsure), Source("test"), viewer=False)
+
+
+def test_the_page_does_not_say_below_the_bound_of_an_error_above_it(diagnosis: Diagnosis) -> None:
+    def told(floors: float) -> str:
+        floor = diagnosis.extended_heldout_um / floors
+        bound = replace(diagnosis, noise_floor_um=floor, floor_source=DIFFERENCES)
+        return page(bound, export_stage(bound), Source("test"), viewer=False)
+
+    assert "below the only bound" in told(0.9)
+    assert "near the only bound" in told(1.2)
 
 
 def test_its_stage_moves_like_the_real_one(diagnosis: Diagnosis, data: FitData) -> None:
