@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 ComplexArray = NDArray[np.complex128]
 
 
+#: Relative misfit up to which lags describe a response.
+_DESCRIBED = 0.08
+
+
 @dataclass(frozen=True)
 class LagsOfResponse:
     """What the response shows. ``missing``: what it lacks to show anything; then nothing else is given.
@@ -73,10 +77,11 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     lagged: bool | None = more.cost < 0.5 * fewer.cost and more.product > 5.0 * more.product_error
     if not lagged and (
         more.cost < 0.8 * fewer.cost
+        or more.off > _DESCRIBED
         or _fit(f, gain, sigma, data.dt_s, own + 1, latest_s, least_s=0.5 * data.dt_s).cost < 1.2 * fewer.cost
     ):
-        # A further lag improves the fit, but its size is not known, or lags of half a sample would not show: it is
-        # neither seen nor excluded.
+        # A further lag improves the fit, but its size is not known, or lags of half a sample would not show, or lags do
+        # not describe the response: it is neither seen nor excluded.
         lagged = None
     # Two lags bend the phase almost like one with a delay.
     either = delayed and lagged and _fit(f, gain, sigma, data.dt_s, own + 1, 1.5 * data.dt_s).cost < 1.25 * more.cost
@@ -149,11 +154,11 @@ def _below_modes(response: Response, known_hz: tuple[float, ...]) -> tuple[Float
 class _Fitted:
     """Parameters (log gain, latency, lags), their standard errors, and the squared misfit.
 
-    ``product``, ``product_error``: of the lags, s for one and s² for two.
+    ``product``, ``product_error``: of the lags, s for one and s² for two. ``off``: relative misfit, RMS.
     """
 
-    def __init__(self, p: FloatArray, cover: FloatArray, cost: float) -> None:
-        self.p, self.cost = p, cost
+    def __init__(self, p: FloatArray, cover: FloatArray, cost: float, off: float) -> None:
+        self.p, self.cost, self.off = p, cost, off
         self.errors = np.sqrt(np.maximum(np.diag(cover), 0.0))
         row = np.zeros(p.size)
         row[4:] = [np.prod(np.delete(p[4:], i)) for i in range(p.size - 4)]
@@ -220,7 +225,8 @@ def _fit_hold(
             best = solved
     assert best is not None
     cover = np.linalg.pinv(best.jac.T @ best.jac) * (2.0 * best.cost / max(1, 2 * f.size - best.x.size))
-    return _Fitted(np.asarray(best.x), np.asarray(cover), float(best.cost))
+    off = float(np.sqrt(best.cost / np.sum(np.square(weight))))
+    return _Fitted(np.asarray(best.x), np.asarray(cover), float(best.cost), off)
 
 
 def _sampled(turn: ComplexArray, ratios: FloatArray, late: float, straight: bool) -> ComplexArray:

@@ -48,7 +48,11 @@ class Saturation(CauseModel):
         slopes = []
         # Of a staircase, a single level may lie beyond the limit: the nearest one below it counts as well.
         near_V = 0.01 * data.swing_V
-        for side in (data.u_V > p[0] - near_V, data.u_V < p[1] + near_V):
+        cut_V = (data.u_high_V - float(p[0]), float(p[1]) - data.u_low_V)
+        for side, cut in zip((data.u_V > p[0] - near_V, data.u_V < p[1] + near_V), cut_V, strict=True):
+            # A limit that cuts next to nothing off only rounds an end of the range.
+            if cut < 0.2 * max(cut_V):
+                continue
             u, y = data.u_V[side], data.y_um[side]
             if u.size >= 20 and float(np.ptp(u)) > 0.005 * data.swing_V:
                 u = u - u.mean()

@@ -107,6 +107,12 @@ class Clock(CauseModel):
     def plausible(self, p: FloatArray, data: FitData) -> bool:
         return 3.0 <= abs(float(p[0])) <= 1500.0
 
+    def agreement(self, p: FloatArray, readings: Readings) -> str:
+        """A change of the lateness by three standard errors that is within a quarter of the fitted one."""
+        change = readings.once(change_of_lateness)
+        fits = abs(float(p[0]) + change.ppm) < 0.25 * abs(change.ppm)
+        return f"the fit by {-float(p[0]):.3g} ppm" if fits and abs(change.ppm) > 3.0 * change.sigma_ppm else ""
+
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:
         return (ModelParameter("clock_ppm", "ppm", 0.0, -2000.0, 2000.0, 5.0, ActsOn.READING),)
 
@@ -453,7 +459,20 @@ def in_library(form: CauseModel, p: FloatArray, data: FitData) -> InLibrary | No
 _PASSES = 6
 
 
-def seen(readings: Readings) -> Sight:
+@dataclass(frozen=True)
+class LatenessChange:
+    """By how much the lateness of the readings changes over the record, in ``count`` windows of fast motion.
+
+    ``steady``: in both halves of the record alike.
+    """
+
+    count: int
+    ppm: float = 0.0
+    sigma_ppm: float = 0.0
+    steady: bool = False
+
+
+def change_of_lateness(readings: Readings) -> LatenessChange:
     """The time by which the readings are late, in windows of fast motion: its change over the record.
 
     A clock error makes it grow in proportion to time; lost or doubled samples make it jump by whole samples.
@@ -463,7 +482,7 @@ def seen(readings: Readings) -> Sight:
     data = readings.data
     t, d, e = readings.lateness
     if t.size < 6:
-        return Sight(None, "too few stretches of fast motion to date the readings")
+        return LatenessChange(t.size)
     to_ppm = 1e6 * data.dt_s
     off, slope, sigma = 0.0, *_trend(t, d, e)
     now = readings
@@ -481,11 +500,22 @@ def seen(readings: Readings) -> Sight:
         t, d, e = now.lateness
         slope, sigma = _trend(t, d, e)
     ppm, sigma = to_ppm * (off + slope), to_ppm * sigma
-    words = f"the readings' lateness changes by {ppm:.3g} ± {1.96 * sigma:.2g} ppm over {t.size} stretches of motion"
     half = t < 0.5 * (t[0] + t[-1])
     parts = [to_ppm * (off + _trend(t[p], d[p], e[p])[0]) for p in (half, ~half) if int(p.sum()) >= 4]
-    steady = len(parts) == 2 and all(abs(part - ppm) < 0.5 * abs(ppm) for part in parts)
-    if off != 0.0 and abs(ppm) > 5.0 * sigma and abs(ppm) > 12.0 and steady:
+    steady = off != 0.0 and len(parts) == 2 and all(abs(part - ppm) < 0.5 * abs(ppm) for part in parts)
+    return LatenessChange(t.size, ppm, sigma, steady)
+
+
+def seen(readings: Readings) -> Sight:
+    """A clock error by the change of the lateness of the readings (`change_of_lateness`)."""
+    change = readings.once(change_of_lateness)
+    if change.count < 6:
+        return Sight(None, "too few stretches of fast motion to date the readings")
+    words = (
+        f"the readings' lateness changes by {change.ppm:.3g} ± {1.96 * change.sigma_ppm:.2g} ppm over {change.count} "
+        "stretches of motion"
+    )
+    if change.steady and abs(change.ppm) > 5.0 * change.sigma_ppm and abs(change.ppm) > 12.0:
         return Sight(True, words)
     # Slips have dates of their own and are judged by whole samples; without a trend nothing is decided here.
     return Sight(None, words)

@@ -86,7 +86,7 @@ class CauseModel:
     test_answers_to_others: bool = False
     #: It is not named where its direct test is excited and sees nothing.
     unseen_is_absent: bool = False
-    #: It is named only where its direct test sees it.
+    #: It is named only where its direct test sees it, or gives a number that agrees with the fit.
     must_be_seen: bool = False
     #: So smooth in time that it imitates the rest of many others: where its test is not excited, it must explain most.
     imitates_others: bool = False

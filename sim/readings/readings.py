@@ -273,7 +273,9 @@ class Readings:
             part = -np.sum(v * r, axis=1) / power
             return whole + part, np.sum(np.square(r + part[:, None] * v), axis=1), power
 
-        fast = np.max(np.abs(centred(speed, every)), axis=1, initial=0.0) >= 20.0 * self.sigma_um
+        # At a high rate the motion of one sample is small, but a window has more of them.
+        least_um = 20.0 * self.sigma_um * min(1.0, float(np.sqrt(1000.0 / window)))
+        fast = np.max(np.abs(centred(speed, every)), axis=1, initial=0.0) >= least_um
         if not fast.any():
             return np.empty(0), np.empty(0), np.empty(0)
         found = np.array(late_by(0, fast))

@@ -312,7 +312,9 @@ class Search:
         cause = candidate.cause
         if self.vetoed(cause):
             return False
-        if cause.must_be_seen and self.sights and self.sights[cause.name].seen is not True:
+        sight = self.sights.get(cause.name)
+        unseen = sight is not None and sight.seen is not True
+        if cause.must_be_seen and unseen and not self.agreement(candidate):
             return False
         if self.readings is not None and not cause.borne_out(self.readings):
             return False
@@ -338,8 +340,19 @@ class Search:
         if candidate.cause.test_answers_to_others:
             self.agreed.add(name)
 
-    def acceptable(self, best: CauseCandidate, held: HeldOut, left_um2: FloatArray, p: float, base: ModelFit) -> bool:
-        """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible."""
+    def acceptable(
+        self,
+        best: CauseCandidate,
+        held: HeldOut,
+        left_um2: FloatArray,
+        p: float,
+        base: ModelFit,
+        together_um2: float = 0.0,
+    ) -> bool:
+        """Whether the gain exceeds chance and the model errors of earlier causes, and the parameters are plausible.
+
+        ``together_um2``: the gain of this cause and of another one that is tried at once.
+        """
         thresholds = self.thresholds
         gain = held.sse_um2 - best.held.sse_um2
         sight = self.sights.get(best.cause.name)
@@ -369,7 +382,8 @@ class Search:
         faint = sight is not None and sight.seen is None and best.cause.imitates_others
         if faint and whole < thresholds.nearly_all and not self.agreement(best):
             return False
-        if not seen and gain < thresholds.least_of_nominal * self.nominal_um2 and whole < thresholds.least_whole:
+        most_um2 = max(gain, together_um2)
+        if not seen and most_um2 < thresholds.least_of_nominal * self.nominal_um2 and whole < thresholds.least_whole:
             return False
         gain = float((now - after)[clean].sum())
         excess = max(float((now - floor)[clean].sum()), 1e-3 * float(floor.sum()))
@@ -476,7 +490,8 @@ class Search:
             for other in sorted((c for c in beside if self.plausible(c)), key=self._with_witness)[:2]:
                 second = self._with_refined_model(self.polish(other, one.fit), one.fit)
                 p_second = p_value(looks, one.held.sse_um2 - second.held.sse_um2, seed)
-                if not self.acceptable(second, one.held, left_um2, p_second, one.fit):
+                together = held.sse_um2 - second.held.sse_um2
+                if not self.acceptable(second, one.held, left_um2, p_second, one.fit, together):
                     continue
                 gone = np.maximum(one.held.per_block_um2 - second.held.per_block_um2, 0.0)
                 left = second.cause.model_error**2 * gone
@@ -484,7 +499,7 @@ class Search:
                 both, less = self._last(second, len(base.model.causes))
                 alone = self.held(less)
                 p_first = p_value(self._looks_beside(less)[0], alone.sse_um2 - both.held.sse_um2, seed)
-                if self.acceptable(both, alone, left_um2 + left, p_first, less):
+                if self.acceptable(both, alone, left_um2 + left, p_first, less, together):
                     gone = np.maximum(alone.per_block_um2 - both.held.per_block_um2, 0.0)
                     self.left_um2[second.cause.name] = left
                     self.left_um2[both.cause.name] = both.cause.model_error**2 * gone

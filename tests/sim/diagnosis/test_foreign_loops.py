@@ -15,11 +15,15 @@ from sim.effects.gain_drift import in_rests
 from sim.effects.hysteresis_shape import HysteresisShape
 from sim.effects.payload_change import seen as payload_seen
 from sim.effects.sampled_lags import lags_of_response, second_lag
+from sim.effects.saturation import Saturation
 from sim.effects.saturation import seen as saturation_seen
+from sim.effects.sensor_lag import SensorLag
 from sim.effects.slew_limit import seen as slew_seen
 from sim.effects.thermal_drift import in_rests as drift_in_rests
+from sim.effects.timing import Clock
 from sim.effects.timing import seen as timing_seen
 from sim.fitting.calibration import with_new_columns
+from sim.fitting.fit_data import FitData
 from sim.readings.cycles import mirrored_branches
 from sim.readings.noise import noise_floor
 from sim.readings.readings import Readings
@@ -127,6 +131,17 @@ HELD = pair(988)
 HELD_AT_FIRST = healthy(716)
 #: No second lag: relays under a staircase whose steps are read in the middle of a sample.
 ONE_LAG = single(163)
+
+#: A limit of the voltage between the two highest levels of a staircase.
+CUT_OFF_ONE_LEVEL = single(1029)
+#: A second lag that the response gives to a few per cent of the fitted one.
+FAINT_LAG = pair(1033)
+#: A rate dependence whose growth is open but whose corner is known, behind a delay.
+KNOWN_CORNER = pair(1026)
+#: A loop that makes more of the response than its two lags.
+CROOKED = pair(1032)
+#: A clock error on a record of 10 kHz, on which a sample moves little.
+LATE_BY_LITTLE = pair(1030)
 
 
 def readings_of(case: Case) -> Readings:
@@ -406,3 +421,37 @@ def test_creep_on_a_loop_whose_steps_differ_is_not_seen_as_a_drift_of_the_gain(s
     found = rests_over_time(readings).creep
     assert found is not None
     assert found.value > 10.0 * found.error
+
+
+@pytest.mark.parametrize("case", [CUT_OFF_ONE_LEVEL, FAINT_LAG, KNOWN_CORNER], ids=lambda case: case.hidden[-1])
+def test_what_is_hidden_beside_a_foreign_loop_is_named(case: Case) -> None:
+    said = diagnosed(case)
+    named = {name for c in said.causes for name in (c.name, *c.alternatives)}
+    assert set(case.hidden) <= named
+    assert {c.name for c in said.causes} <= {*case.hidden, "hysteresis_shape"}
+
+
+def test_a_limit_that_cuts_next_to_nothing_off_does_not_speak_against_the_other_one() -> None:
+    """Levels up to 8 V, cut at 6.7 V; a fitted lower limit that only rounds the bottom is no evidence."""
+    u = np.repeat(np.tile([0.0, 0.05, 2.0, 4.0, 6.6, 8.0, 4.0], 4), 400)
+    data = FitData(1e-3, u, 10.0 * np.minimum(u, 6.7))
+    assert Saturation().plausible(np.array([6.7, 0.02]), data)
+    assert not Saturation().plausible(np.array([3.0, 0.02]), FitData(1e-3, u, 10.0 * u))
+
+
+def test_a_response_that_lags_do_not_describe_excludes_none() -> None:
+    assert second_lag(readings_of(CROOKED)).seen is None
+
+
+@pytest.mark.parametrize(("fitted_s", "agrees"), [(0.64e-3, True), (1.0e-3, True), (0.3e-3, False)])
+def test_a_fitted_lag_is_compared_with_that_of_the_response(fitted_s: float, agrees: bool) -> None:
+    """Behind the response of `FAINT_LAG` are lags of 0.65 and 1 ms; that of `ONE_LAG` has no second one."""
+    assert bool(SensorLag().agreement(np.array([fitted_s]), readings_of(FAINT_LAG))) is agrees
+    assert not SensorLag().agreement(np.array([fitted_s]), readings_of(ONE_LAG))
+
+
+@pytest.mark.parametrize(("fitted_ppm", "agrees"), [(45.4, True), (-45.4, False), (90.0, False)])
+def test_a_faint_change_of_the_lateness_is_compared_with_the_fitted_clock(fitted_ppm: float, agrees: bool) -> None:
+    readings = readings_of(LATE_BY_LITTLE)
+    assert timing_seen(readings).seen is None
+    assert bool(Clock().agreement(np.array([fitted_ppm]), readings)) is agrees
