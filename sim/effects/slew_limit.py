@@ -163,7 +163,10 @@ def _motions(readings: Readings) -> tuple[FloatArray, FloatArray]:
         return np.empty(0), np.empty(0)
     top = float(np.quantile(asked, 0.999))
     slow = asked < 0.3 * top
-    if int(slow.sum()) < 100 or float(np.corrcoef(asked[slow], got[slow])[0, 1]) < 0.97:
+    if int(slow.sum()) < 100 or min(float(np.ptp(asked[slow])), float(np.ptp(got[slow]))) == 0.0:
+        # Nothing moves between the steps.
+        return np.empty(0), np.empty(0)
+    if float(np.corrcoef(asked[slow], got[slow])[0, 1]) < 0.97:
         # Where slow motions do not follow either, a mode moves the stage.
         return np.empty(0), np.empty(0)
     if top < 10.0 * data.swing_V:

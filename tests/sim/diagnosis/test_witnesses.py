@@ -174,6 +174,14 @@ def test_what_is_slower_than_the_steps_says_nothing_about_a_limit_of_the_slew() 
         assert found["slew_limit"].seen is seen, found["slew_limit"].words
 
 
+def test_steps_between_which_nothing_moves_say_nothing_about_slow_motion() -> None:
+    """Steps too small to count as such are the only motion besides: no correlation of constants is asked for."""
+    u = np.repeat(np.tile([0.0, 2.0, 4.0, 2.0], 4), 2000) + np.repeat(np.tile([0.0, 0.05], 80), 200)
+    y = 10.0 * u + SIGMA_UM * np.random.default_rng(4).normal(size=u.size)
+    found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
+    assert found["slew_limit"].seen is not True
+
+
 def test_a_staircase_with_one_level_beyond_the_limit_shows_a_saturation() -> None:
     levels = [0.0, 2.0, 4.0, 6.6, 8.0, 6.6, 4.0, 2.0, 0.0]
     u = np.repeat(np.tile(levels, 2), 2000).astype(np.float64)
