@@ -199,6 +199,7 @@ def diagnose(
     missing = not_excited(search, floor)
     progress("simulating the next experiment", 0.95)
     is_named = verdict in ("effects", "partly")
+    untested = tuple(c.name for c in causes if is_named and c.witness is not None and c.witness.seen is None)
     open_ = [Rival(f.name, r.cause.name, extended, r.fit) for f in found for r in f.rivals if is_named]
     return Diagnosis(
         verdict=verdict,
@@ -210,7 +211,7 @@ def diagnose(
         floor_source=floor.source,
         causes=causes,
         not_excited=missing,
-        next_experiment=next_experiment(open_, missing, extended, floor.sigma_um, options.catalogue),
+        next_experiment=next_experiment(open_, missing, untested, extended, floor.sigma_um, options.catalogue),
         nominal=nominal,
         extended=extended,
         notes=notes,

@@ -8,8 +8,10 @@ import numpy as np
 
 from adaptive.types import FloatArray
 from sim.diagnosis.catalogue import Catalogue
+from sim.diagnosis.witnesses import witnesses
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit, StageModel
+from sim.readings.readings import Readings
 
 #: Resolution of a voltage monitor relative to the swing.
 MONITOR_NOISE = 2e-4
@@ -75,11 +77,17 @@ def _at(model: StageModel, p: FloatArray, experiment: Experiment) -> FloatArray:
 
 
 def next_experiment(
-    rivals: list[Rival], missing: tuple[str, ...], fit: ModelFit, sigma_um: float, catalogue: Catalogue
+    rivals: list[Rival],
+    missing: tuple[str, ...],
+    untested: tuple[str, ...],
+    fit: ModelFit,
+    sigma_um: float,
+    catalogue: Catalogue,
 ) -> str | None:
     """What to record next, as a sentence with the simulated difference; None if nothing is open.
 
-    ``missing``: names of the causes that the recording does not excite.
+    ``missing``: names of the causes that the recording does not excite; ``untested``: those of named causes whose
+    direct test it does not excite.
     """
     data = fit.model.data
     if rivals:
@@ -106,7 +114,8 @@ def next_experiment(
             f"{best}: simulated, {rival.name} and {rival.other} then differ by {size * 1e3:.3g} nm rms "
             f"({size / sigma_um:.2g} times the noise), against {here * 1e3:.2g} nm in this record"
         )
-    return _excite([f for f in catalogue.forms if f.name in missing], fit, sigma_um)
+    shown = _excite([f for f in catalogue.forms if f.name in missing], fit, sigma_um)
+    return shown or (_test(untested, fit, sigma_um, catalogue) if untested else None)
 
 
 def _apart(a: FloatArray, b: FloatArray) -> float:
@@ -138,3 +147,40 @@ def _excite(missing: list[CauseModel], fit: ModelFit, sigma_um: float) -> str | 
     if not best[1]:
         return None
     return f"{best[0]}: simulated, it would show {', '.join(best[1])}, which this record does not excite"
+
+
+def _test(untested: tuple[str, ...], fit: ModelFit, sigma_um: float, catalogue: Catalogue) -> str | None:
+    """The drive under which direct tests see most of the named causes that only the fit names, as a sentence.
+
+    A test counts that sees the cause in the simulation with it, and not in the one without it.
+    """
+    best: tuple[str, list[str]] = ("", [])
+    for experiment in experiments(fit.model.data):
+        names = [name for name in untested if name in _seen(fit.model, fit.p, experiment, sigma_um, catalogue)]
+        if len(names) <= len(best[1]):
+            continue
+        for i, cause in enumerate(fit.model.causes):
+            if cause.name in names:
+                where = fit.model.slice_of(i)
+                p = np.concatenate([fit.p[: where.start], fit.p[where.stop :]])
+                if cause.name in _seen(fit.model.without_cause(i), p, experiment, sigma_um, catalogue):
+                    names.remove(cause.name)
+        if len(names) > len(best[1]):
+            best = (experiment.words, names)
+    if not best[1]:
+        return None
+    return (
+        f"{best[0]}: simulated, direct tests of the readings then see {', '.join(best[1])}, which in this record only "
+        "the fit names"
+    )
+
+
+def _seen(model: StageModel, p: FloatArray, experiment: Experiment, sigma_um: float, catalogue: Catalogue) -> set[str]:
+    """The causes that direct tests see in simulated readings with white noise."""
+    home = model.data
+    reading_um = _at(model, p, experiment) + sigma_um * np.random.default_rng(0).standard_normal(home.n)
+    if not np.all(np.isfinite(reading_um)):
+        return set()
+    data = FitData(home.dt_s, experiment.u_V, reading_um, known_modes_hz=home.known_modes_hz, has_lag=home.has_lag)
+    sights = witnesses(Readings(data, np.ones(data.n, dtype=np.bool_), sigma_um), catalogue)
+    return {name for name, sight in sights.items() if sight.seen}

@@ -28,6 +28,9 @@ def _branches(readings: Readings, cycle: Cycle) -> tuple[FloatArray, FloatArray]
     if not readings.mask[cycle.start : stop].all():
         return None
     whole = u[cycle.start + late : stop]
+    if whole.size < 20:
+        # It is shorter than the lag, or ends with the recording.
+        return None
     top = cycle.top + late if late else cycle.top
     top = cycle.start + int(np.argmax(u[cycle.start : stop])) if top >= stop else top
     low, high = float(np.min(whole)), float(np.max(whole))

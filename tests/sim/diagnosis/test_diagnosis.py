@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 from adaptive.types import FloatArray
+from sim.diagnosis.catalogue import CATALOGUE
 from sim.diagnosis.diagnose import Options, diagnose
 from sim.diagnosis.export import export_stage
+from sim.diagnosis.next_experiment import next_experiment
+from sim.diagnosis.nominal import calibrate_nominal, with_nominal_kind
 from sim.diagnosis.result import Diagnosis
+from sim.diagnosis.witnesses import witnesses
 from sim.effects import Chain, Effect, effect, simulate
+from sim.effects.sensor_lag import SensorLag
+from sim.fitting.calibration import evaluate
 from sim.fitting.fit_data import FitData
+from sim.readings.readings import Readings
 from sim.stage.file import from_dict, to_dict
 
 DT = 1e-3
@@ -132,6 +139,22 @@ def test_the_same_recording_gives_the_same_report() -> None:
         "schema", "verdict", "nominal", "extended", "noise_floor_um", "effects", "not_excited", "next_experiment",
         "explainable", "defects", "left", "tried_not_named",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("tau_s", "said"), [(0.004, True), (0.0, False)])
+def test_the_next_experiment_lets_a_direct_test_see_what_only_the_fit_names(tau_s: float, said: bool) -> None:
+    """One sine excites no test of a lag; full steps do, if there is one beside the stage's own."""
+    u = 2.5 - 2.5 * np.cos(2.0 * np.pi * 1.0 * DT * np.arange(15_000))
+    chain = Chain(
+        (effect("bouc_wen", d_um_per_V=11.0, alpha=0.45), effect("mechanics"), effect("sensor_noise", rms_um=0.005))
+    )
+    data = with_nominal_kind("bouc_wen", FitData(DT, u, simulate(chain, u, DT)))
+    mask = np.ones(data.n, dtype=np.bool_)
+    assert witnesses(Readings(data, mask, 0.005))["sensor_lag"].seen is None
+    nominal = calibrate_nominal("bouc_wen", data, mask)
+    fit = evaluate(nominal.model.with_cause(SensorLag("sensor_lag")), np.append(nominal.p, tau_s), mask)
+    sentence = next_experiment([], (), ("sensor_lag",), fit, 0.005, CATALOGUE)
+    assert ("see sensor_lag" in str(sentence)) is said
 
 
 def test_the_other_axis_is_the_next_experiment_only_on_a_rig_that_has_one() -> None:

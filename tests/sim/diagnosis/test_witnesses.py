@@ -13,6 +13,7 @@ from sim.diagnosis.witnesses import witnesses
 from sim.effects import CAUSES
 from sim.effects.timing import slips_are_borne_out
 from sim.fitting.fit_data import EARLY_S, FitData
+from sim.readings.cycles import mirrored_branches
 from sim.readings.readings import Readings
 from sim.readings.sight import Sight
 from tests.hidden.excitation import FS_HZ, excitation
@@ -172,6 +173,19 @@ def test_what_is_slower_than_the_steps_says_nothing_about_a_limit_of_the_slew() 
         y = 10.0 * u + SIGMA_UM * np.random.default_rng(0).normal(size=u.size)
         found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))
         assert found["slew_limit"].seen is seen, found["slew_limit"].words
+
+
+def test_a_cycle_that_is_shorter_than_the_lag_has_no_branches() -> None:
+    """The last cycle of the record is over before the stage has followed it."""
+    u = np.concatenate([np.repeat(np.tile([0.0, 4.0, 2.0], 8), 1000), [0.0] * 1000, np.linspace(0.0, 4.0, 14), [0.0]])
+    s, y = 0.0, np.empty(u.size)
+    for k in range(u.size):
+        s += (u[k] - s) * DT / 0.2
+        y[k] = 10.0 * s
+    readings = Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM)
+    last = readings.cycles[-1]
+    assert readings.lag_s > (last.stop - last.start) * DT
+    assert mirrored_branches(readings).seen is None
 
 
 def test_steps_between_which_nothing_moves_say_nothing_about_slow_motion() -> None:
