@@ -259,7 +259,10 @@ def _section(place: int, cause: NamedCause, kind: Kind) -> list[str]:
         others = ", ".join(spaced(n) for n in kind.mistaken_for)
         lines.append(f"Easily mistaken for {others}; {kind.tells_apart}.")
     if cause.alternatives:
-        lines.append(f"**This recording cannot tell it from {', '.join(spaced(a) for a in cause.alternatives)}.**")
+        others = ", ".join(spaced(a) for a in cause.alternatives)
+        instead = [f"{spaced(a)} removes {min(100.0 * s, 100.0):.0f} %" for a, s in cause.instead.items()]
+        because = f": of what it removes, {', '.join(instead)} in its place" if instead else ""
+        lines.append(f"**This recording cannot tell it from {others}**{because}.")
     return [*lines, ""]
 
 

@@ -12,7 +12,6 @@ from adaptive.types import BoolArray
 from sim.diagnosis.catalogue import CATALOGUE, Catalogue
 from sim.diagnosis.next_experiment import Rival, next_experiment
 from sim.diagnosis.nominal import (
-    begins_at_rest,
     calibrate_nominal,
     fit_on_other_recording,
     with_nominal_kind,
@@ -74,7 +73,7 @@ def usable(data: FitData, mask: BoolArray, nominal: str | StageConfig = "bouc_we
     Raises InputError if fewer than 200 samples remain.
     """
     out = mask.copy()
-    if not begins_at_rest(data) and nominal == "bouc_wen":
+    if not data.begins_at_rest and nominal == "bouc_wen":
         out[:1] = False  # The start is fitted here, and it determines the lags.
         return out
     out[: max(4, min(round(0.02 / data.dt_s), data.n // 20))] = False
@@ -88,7 +87,7 @@ def settled(mask: BoolArray, fit: ModelFit, data: FitData) -> BoolArray:
 
     It only applies where the recording does not begin at rest: then the initial state of the mode is unknown.
     """
-    if fit.model.nominal.name != "linear" or begins_at_rest(data):
+    if fit.model.nominal.name != "linear" or data.begins_at_rest:
         return mask
     slowest = min(
         (2.0 * np.pi * f * (z if z < 1.0 else 0.5 / z) for f, z in fit.model.dynamics(fit.p).modes_hz), default=np.inf
@@ -246,8 +245,12 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
     for i, one in enumerate(found):
         values, spans = numbers(errors, i)
         also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data))
+        sight = search.sights.get(one.name)
+        also = tuple(dict.fromkeys((*also, *(sight.also if sight is not None else ()))))
         # One voltage and one sensor show the sum of these: the other one of a set is always possible.
         also = (*also, *sorted(search.catalogue.same_set({one.name}) - {one.name, *also}))
+        removed_um2 = one.held_without.sse_um2 - held.sse_um2
+        instead = {r.cause.name: (one.held_without.sse_um2 - r.held.sse_um2) / removed_um2 for r in one.rivals}
         own = 1.0 - held.sse_um2 / one.held_without.sse_um2
         # A single cause's share is measured best by removing it from the final model.
         share = own if len(found) == 1 else one.step.gain
@@ -263,7 +266,8 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
                 one.without.residual_um,
                 extended.residual_um,
                 i,
-                search.sights.get(one.name),
+                sight,
+                instead,
             )
         )
     return tuple(causes)

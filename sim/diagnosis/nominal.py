@@ -70,7 +70,7 @@ class BoucWenStage:
             return own
         r = data.range_um
         most = 2.0 * r
-        if begins_at_rest(data):
+        if data.begins_at_rest:
             # The first 20 ms are not judged then: a start would be free to grow until the end of its tail fits. It is
             # no larger than what moves there.
             first = data.y_um[: max(4, round(0.02 / data.dt_s))]
@@ -372,12 +372,6 @@ def file_stage(config: StageConfig) -> FileStage:
 NAMED = ("bouc_wen", "linear")
 
 
-def begins_at_rest(data: FitData) -> bool:
-    """True if the drive stays within 1 % of its swing about zero volts for the first 20 ms."""
-    first = data.u_V[: max(3, round(0.02 / data.dt_s))]
-    return bool(np.max(np.abs(first)) < 0.01 * data.swing_V)
-
-
 def nominal_candidates(kind: str | StageConfig, data: FitData) -> list[NominalStage]:
     """The nominal stage with each hold between two samples: recorders differ in how they sample the drive."""
     if isinstance(kind, StageConfig):
@@ -385,7 +379,7 @@ def nominal_candidates(kind: str | StageConfig, data: FitData) -> list[NominalSt
         return [stage, stage.with_other_hold()]
     if kind == "linear":
         return [LinearStage("zero"), LinearStage("first")]
-    free = not begins_at_rest(data)
+    free = not data.begins_at_rest
     return [BoucWenStage("zero", free_memory=free), BoucWenStage("first", free_memory=free)]
 
 
@@ -479,7 +473,7 @@ def fit_on_other_recording(fit: ModelFit, data: FitData, mask: BoolArray) -> Mod
         scales_from=home.data.scales,
     )
     nominal = home.nominal
-    if isinstance(nominal, BoucWenStage) and not begins_at_rest(data):
+    if isinstance(nominal, BoucWenStage) and not data.begins_at_rest:
         nominal = nominal.with_free_memory()
     model = StageModel(there, nominal, home.causes)
     known = {parameter.name: fit.p[i] for i, parameter in enumerate(home.parameters[: home.n_nominal])}

@@ -32,6 +32,7 @@ class NamedCause:
     before_um, after_um : residual without it (all else refitted) and with it, (n,), for its picture.
     index : index of its model in ``extended.model.causes``; -1 if it has none (quantisation).
     witness : what the direct test of its signature says; None if there is no such test.
+    instead : share of what it removes that an alternative removes in its place, by name, where both were fitted.
     """
 
     name: str
@@ -44,6 +45,7 @@ class NamedCause:
     after_um: FloatArray = field(repr=False)
     index: int = -1
     witness: Sight | None = None
+    instead: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ class Diagnosis:
         for effect, cause in zip(out["effects"], self.causes, strict=True):
             w = cause.witness
             effect["witness"] = None if w is None else {"seen": w.seen, "words": w.words}
+            effect["instead"] = cause.instead
         out["explainable"] = {
             "black_box_rmse_um": self.ceiling_um,
             "explained_share": self.explained,

@@ -84,21 +84,25 @@ class Creep(CauseModel):
             ModelParameter(f"weight{j + 1}", "1", 0.0, 0.0, 0.1, 0.005, ActsOn.MOTION, True)
             for j in range(self.taus_s(data).size)
         ]
-        # Creep goes on from a step before the recording.
-        return (*weights, ModelParameter("start_um", "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION))
+        # Creep goes on from a step just before the recording, and from motion long before it.
+        starts = [ModelParameter(name, "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION) for name in ("start_um", "before_um")]
+        return (*weights, *starts)
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
-        return [trial[:-1] for trial in super().guesses(data, residual_um)]
+        return [trial[: self.taus_s(data).size] for trial in super().guesses(data, residual_um)]
 
     def motion(self, x_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
-        if not np.any(p[:-1]):
-            return x_um
         taus = self.taus_s(data)
+        weights, starts = p[: taus.size], p[taus.size :]
+        if not np.any(weights):
+            return x_um
         rates = data.dt_s / taus
         poles = _POLES.get(x_um, rates.tobytes(), lambda: np.asarray(slow_poles(x_um, rates)))
-        out = x_um + p[:-1] @ poles
-        if p[-1] != 0.0:
-            out += p[-1] * (p[:-1] @ _steps(data, taus))
+        out = x_um + weights @ poles
+        if np.any(starts):
+            # A step a third of the record's length before it has left only its slow part.
+            ages_s = np.array([0.0, data.duration_s / 3.0])
+            out += (weights * (starts @ np.exp(-ages_s[:, None] / taus))) @ _steps(data, taus)
         return np.asarray(out)
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
@@ -108,7 +112,7 @@ class Creep(CauseModel):
         rise = 1.0 - np.exp(-t[None, :] / taus[:, None])
         x = np.log10(t) - np.log10(t).mean()
         row = rise @ x / float(x @ x)
-        row = np.append(row, 0.0)
+        row = np.append(row, np.zeros(p.size - taus.size))
         return {"gain_per_decade": (float(row @ p), row)}
 
 

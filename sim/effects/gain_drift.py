@@ -102,7 +102,10 @@ def in_rests(readings: Readings) -> Sight:
 def in_cycles(readings: Readings) -> Sight:
     """The height of equal cycles goes with time."""
     found = readings.once(cycles_over_time)
-    return Sight(None, found.missing) if found.missing else Sight(found.grew, found.height_words)
+    if found.missing:
+        return Sight(None, found.missing)
+    # Creep settles with the logarithm of time, which is as good as straight long after its beginning.
+    return Sight(found.grew, found.height_words, found.also if found.grew else ())
 
 
 GAIN_DRIFT = Kind(

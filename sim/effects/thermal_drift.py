@@ -101,7 +101,8 @@ def in_cycles(readings: Readings) -> Sight:
     found = readings.once(cycles_over_time)
     if found.missing:
         return Sight(None, found.missing)
-    return Sight(True if found.goes_on else None if found.moved else False, found.mean_words)
+    seen = True if found.goes_on else None if found.moved else False
+    return Sight(seen, found.mean_words, found.also if seen else ())
 
 
 THERMAL_DRIFT = Kind(

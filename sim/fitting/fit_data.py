@@ -215,6 +215,12 @@ class FitData:
         return np.asarray(still & settled & (samples_until(~still) > EARLY_S / self.dt_s))
 
     @property
+    def begins_at_rest(self) -> bool:
+        """Whether the drive stays within 1 % of its swing about zero volts for the first 20 ms."""
+        first = self.u_V[: max(3, round(0.02 / self.dt_s))]
+        return bool(np.max(np.abs(first)) < 0.01 * self.swing_V)
+
+    @property
     def warmth_K(self) -> FloatArray | None:
         """(n,) temperature above that at the start; None if it was not recorded or did not change."""
         return self._derived.get("warmth", self._temperature_rise)

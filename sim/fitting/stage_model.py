@@ -52,7 +52,7 @@ class NominalStage(Protocol):
 
 
 #: Parameters of the initial state: only the first samples determine them, so they cannot be held out.
-INITIAL_STATE = ("start_um", "h0", "before_share", "path_start_um")
+INITIAL_STATE = ("start_um", "before_um", "h0", "before_share", "path_start_um")
 
 #: Vectors whose simulated differences from the neutral span one linearised guess, and whether they may be scaled.
 Guess = list[FloatArray]

@@ -188,7 +188,7 @@ class CyclesOverTime:
     """What equal cycles show. ``missing``: what they lack to show anything; then nothing else is given.
 
     ``grew``: their height changes in time (None: it settles). ``moved``: their mean does, ``creeps`` clearly with the
-    logarithm of time, ``goes_on`` clearly with time.
+    logarithm of time, ``goes_on`` clearly with time. ``also``: what a change in time may be as well.
     """
 
     missing: str
@@ -198,12 +198,14 @@ class CyclesOverTime:
     moved: bool = False
     creeps: bool = False
     goes_on: bool = False
+    also: tuple[str, ...] = ()
 
 
 def cycles_over_time(readings: Readings) -> CyclesOverTime:
     """Creep and both drifts from height and mean of cycles of one kind: do they go with time or with its logarithm?
 
-    A drift goes on; creep after the beginning of the motion falls off with the logarithm of time.
+    A drift goes on; creep after the beginning of the motion falls off with the logarithm of time. Where that beginning
+    lies before the recording, the logarithm may be as good as straight.
     """
     data = readings.data
     kinds: dict[tuple[int, int], list[Cycle]] = {}
@@ -248,7 +250,12 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
     if settles:
         height_words += ", and settles with the logarithm of time"
     settled = creeps and abs(per_decade) > 5.0 * per_decade_error
-    return CyclesOverTime("", height_words, None if settles else gained, mean_words, moved, settled, goes_on)
+    also: tuple[str, ...] = ()
+    if not data.begins_at_rest:
+        also = ("creep",)
+        height_words += ", as it may with creep from before the recording"
+        mean_words += ", as it may with creep from before the recording" if goes_on else ""
+    return CyclesOverTime("", height_words, None if settles else gained, mean_words, moved, settled, goes_on, also)
 
 
 def _misfit(t: FloatArray, v: FloatArray) -> float:

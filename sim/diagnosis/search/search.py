@@ -75,6 +75,10 @@ class Thresholds:
     close_sigmas: float = 2.5
     #: ... where its error is at most this many times the accepted one.
     close_error: float = 2.0
+    #: The same for what it is easily mistaken for, where no direct test sees it: no form is exact on a measured stage.
+    close_unseen: float = 0.5
+    #: Most names in a set of a cause and what it is mistaken for.
+    widest: int = 3
     #: Largest spread of a cause's size between the stretches that excite it, where at least so many excite it.
     most_spread: float = 0.28
     #: The same where its signature is seen: no form is exact on a measured stage, but one that vanishes in some
@@ -223,6 +227,8 @@ class Search:
     left_um2: dict[str, FloatArray] = field(default_factory=dict)
     #: Causes that the review dropped because their size changes from stretch to stretch.
     unsteady: list[UnsteadyCause] = field(default_factory=list)
+    #: Causes that the review dropped because their numbers may all be zero.
+    uncertain: set[str] = field(default_factory=set)
     #: Accepted causes whose direct test answers to others as well, but gives a number that agrees with the fit.
     agreed: set[str] = field(default_factory=set)
 
@@ -249,6 +255,10 @@ class Search:
     def held(self, fit: ModelFit) -> HeldOut:
         return held_out(fit, self.mask, self.parts)
 
+    def mistaken_for(self, cause: CauseModel) -> tuple[str, ...]:
+        """What a cause is easily mistaken for, where no direct test says that it is this cause."""
+        return () if self.seen(cause) else self.catalogue.kind(cause.name).mistaken_for
+
     def looks(self, fit: ModelFit, skip: set[str]) -> tuple[list[ScreenedCause], list[CauseModel]]:
         """The best linearised guess of every applicable cause, largest gain first."""
         screen = ResidualScreen(fit, self.mask, self.parts)
@@ -262,8 +272,10 @@ class Search:
         """Find what is to be found anew (places of slips, frequencies of modes) in the residual of ``fit``."""
         self.causes = tuple(cause.found_again(fit, self.mask) for cause in self.causes)
 
-    def refit(self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float) -> list[CauseCandidate]:
-        """The most promising guesses fitted jointly, the lowest cost first."""
+    def refit(
+        self, base: ModelFit, looks: list[ScreenedCause], count: int, least_um2: float, also: tuple[str, ...] = ()
+    ) -> list[CauseCandidate]:
+        """The most promising guesses, and the best of each cause of ``also``, fitted jointly, the lowest cost first."""
         if not looks:
             return []
         chosen = [s for s in looks[:count] if s.gain_um2 > max(least_um2, 0.05 * looks[0].gain_um2)]
@@ -277,7 +289,7 @@ class Search:
             # looks like another form of its effect at first; and what a direct test sees.
             own = self.is_line(cause, look.start, base) or cause.takes_over
             own = own or (cause.beside_its_kind and cause.name == first)
-            if self.seen(cause) or cause.name in beside:
+            if self.seen(cause) or cause.name in beside or cause.name in also:
                 own = own or all(self.causes[c.index].name != cause.name for c in chosen)
             if own and all(look is not c for c in chosen):
                 chosen.append(look)
@@ -336,7 +348,7 @@ class Search:
         if sight is None or sight.seen is False or not agreement:
             return
         if sight.seen is None or (candidate.cause.test_answers_to_others and name not in self.agreed):
-            self.sights[name] = Sight(True, f"{sight.words}; {agreement}")
+            self.sights[name] = replace(sight, seen=True, words=f"{sight.words}; {agreement}")
         if candidate.cause.test_answers_to_others:
             self.agreed.add(name)
 
@@ -447,7 +459,7 @@ class Search:
                     # What is there already explains it better: no further cause.
                     current, held = freer.fit, freer.held
                     continue
-            accepted = self._other_hold(self._with_refined_model(accepted, current), current)
+            accepted = self._other_hold(self.finer(accepted, current), current)
             accepted = self._with_free_memory(self._off_bounds(accepted, current), current)
             share = 1.0 - accepted.held.sse_um2 / held.sse_um2
             gone = np.maximum(held.per_block_um2 - accepted.held.per_block_um2, 0.0)
@@ -469,7 +481,7 @@ class Search:
         for candidate in [*fitted, *candidates[3:]]:
             first_of.setdefault(candidate.cause.name, candidate)
         coarse = list(first_of.values())[:3]
-        finer = [self._with_refined_model(candidate, base) for candidate in coarse]
+        finer = [self.finer(candidate, base) for candidate in coarse]
         yield from sorted((f for f, c in zip(finer, coarse, strict=True) if f is not c), key=self._with_witness)
 
     def _two_at_once(
@@ -488,7 +500,7 @@ class Search:
             looks, _ = self._looks_beside(one.fit)
             beside = self.refit(one.fit, looks, 4, 0.3 * self.thresholds.least_gain * one.fit.sse_um2)
             for other in sorted((c for c in beside if self.plausible(c)), key=self._with_witness)[:2]:
-                second = self._with_refined_model(self.polish(other, one.fit), one.fit)
+                second = self.finer(self.polish(other, one.fit), one.fit)
                 p_second = p_value(looks, one.held.sse_um2 - second.held.sse_um2, seed)
                 together = held.sse_um2 - second.held.sse_um2
                 if not self.acceptable(second, one.held, left_um2, p_second, one.fit, together):
@@ -514,7 +526,8 @@ class Search:
     def _looks_beside(self, fit: ModelFit) -> tuple[list[ScreenedCause], list[CauseModel]]:
         """The guesses beside the causes of ``fit``, without those that the review dropped."""
         names = {cause.name for cause in fit.model.causes}
-        return self.looks(fit, self.catalogue.same_set(names) | {cause.name for cause in self.unsteady})
+        dropped = {cause.name for cause in self.unsteady} | self.uncertain
+        return self.looks(fit, self.catalogue.same_set(names) | dropped)
 
     def _last(self, candidate: CauseCandidate, index: int) -> tuple[CauseCandidate, ModelFit]:
         """An earlier cause of a candidate's model as the candidate, and the model without it."""
@@ -589,7 +602,7 @@ class Search:
             self.nominal = replace(self.nominal, p=np.append(self.nominal.p, [s.neutral for s in more]))
         return other
 
-    def _with_refined_model(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
+    def finer(self, accepted: CauseCandidate, base: ModelFit) -> CauseCandidate:
         """The candidate with the finer model of the same cause that costs least, if one costs less."""
         best, finer = accepted, self._refined(accepted, base)
         while finer is not None:
@@ -720,13 +733,17 @@ def review(
         is_line = cause.line_hz(fit.model.parameters_of(fit.p, index)) is not None
         small = not is_line and gain <= thresholds.least_about_zero * held_less.sse_um2
         idle = gain <= (0.0 if is_line else keep * held_less.sse_um2)
-        if idle or search.may_be_zero(fit, index, small):
+        if idle:
             fit, held = less, held_less
             found, index = [], 0
             continue
+        zero = search.may_be_zero(fit, index, small)
         stretches = search.stretches(fit, less)
-        if not search.steady(cause, stretches):
-            search.unsteady.append(UnsteadyCause(cause.name, gain / held_less.sse_um2, stretches))
+        if zero or not search.steady(cause, stretches):
+            if zero:
+                search.uncertain.add(cause.name)
+            else:
+                search.unsteady.append(UnsteadyCause(cause.name, gain / held_less.sse_um2, stretches))
             # It may have stood in the place of another cause.
             fit, held, more = search.extended(*search.filled(less))
             steps |= {step.name: step for step in more}
@@ -735,7 +752,7 @@ def review(
         # Beside one of a set that shows only its sum, the other one is no rival of a third cause.
         beside = search.catalogue.same_set({f.name for f in less.model.causes})
         looks, _ = search.looks(less, beside | {cause.name})
-        rivals = search.refit(less, looks, 4, 0.5 * gain)
+        rivals = search.refit(less, looks, 4, 0.5 * gain, search.mistaken_for(cause))
         cost = search.cost(fit, held, less)
         swap = None
         # Another cause may explain more in the place of one that is seen, but does not account for its signature.
@@ -751,26 +768,37 @@ def review(
             continue
         # With a voltage monitor, a rival must agree with the monitor as well.
         rivals = [r for r in rivals if r.cost - r.held.sse_um2 <= 1.2 * (cost - held.sse_um2) + 0.05 * gain]
-        names = _rivals(search, rivals, held, gain, held_less)
+        names = _rivals(search, cause, rivals, held, gain, less)
         found.append(ReviewedCause(steps[cause.name], less.without_signals(), held_less, names))
         index += 1
     return fit, held, found
 
 
 def _rivals(
-    search: Search, rivals: list[CauseCandidate], held: HeldOut, gain: float, held_less: HeldOut
+    search: Search, cause: CauseModel, rivals: list[CauseCandidate], held: HeldOut, gain: float, less: ModelFit
 ) -> tuple[CauseCandidate, ...]:
-    """The rivals that the recording cannot tell from the accepted cause, one of each name."""
+    """The rivals that the recording cannot tell from the accepted cause, one of each name.
+
+    ``gain``: what the cause removes of the held-out squared error of ``less``.
+    """
     out: list[CauseCandidate] = []
     thresholds = search.thresholds
+    mates = search.mistaken_for(cause)
+    sight = search.sights.get(cause.name)
+    there = search.catalogue.same_set({cause.name, *(sight.also if sight else ())})
     for rival in rivals:
+        own = rival.fit.model.parameters_of(rival.fit.p, len(rival.fit.model.causes) - 1)
+        # A permanent narrow line cannot be confused with another cause.
+        if rival.cause.line_hz(own) is not None or any(rival.cause.name == other.cause.name for other in out):
+            continue
         lost, sigmas = worse_by(rival.held, held)
         close = lost < thresholds.close_share * gain or (sigmas < thresholds.close_sigmas and lost < 0.25 * gain)
         close = close and rival.held.sse_um2 < thresholds.close_error**2 * held.sse_um2
-        own = rival.fit.model.parameters_of(rival.fit.p, len(rival.fit.model.causes) - 1)
-        # A permanent narrow line cannot be confused with another cause.
-        if rival.cause.line_hz(own) is not None:
-            continue
-        if close and search.plausible(rival) and all(rival.cause.name != other.cause.name for other in out):
+        more = {other.cause.name for other in out} | {rival.cause.name}
+        if not close and rival.cause.name in mates and len(there | more) <= thresholds.widest:
+            if thresholds.close_unseen * gain <= lost < thresholds.nearly_all * gain:
+                rival = search.finer(rival, less)
+            close = rival.held.sse_um2 - held.sse_um2 < thresholds.close_unseen * gain
+        if close and search.plausible(rival):
             out.append(rival)
     return tuple(out)

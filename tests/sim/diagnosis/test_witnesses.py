@@ -70,6 +70,20 @@ def test_on_a_healthy_stage_nothing_but_the_loop_is_seen() -> None:
     assert all(sight.words for sight in found.values())
 
 
+@pytest.mark.parametrize(("rest_s", "also"), [(0.0, ("creep",)), (1.0, ())])
+def test_cycles_that_began_before_the_record_do_not_tell_a_drift_from_creep(
+    rest_s: float, also: tuple[str, ...]
+) -> None:
+    """The logarithm of the time since a beginning that is long ago is as good as straight."""
+    t = np.arange(30_000) * DT
+    u = np.where(t < rest_s, 0.0, 4.0 + 4.0 * np.sin(2.0 * np.pi * 2.0 * (t - rest_s) - 0.5 * np.pi))
+    y = 10.0 * u + 0.02 * t + SIGMA_UM * np.random.default_rng(0).normal(size=u.size)
+    u, y = (u, y) if rest_s else (u[2000:], y[2000:])
+    found = witnesses(Readings(FitData(DT, u, y), np.ones(u.size, dtype=np.bool_), SIGMA_UM))["thermal_drift"]
+    assert found.seen is True, found.words
+    assert found.also == also
+
+
 def test_a_record_that_excites_nothing_decides_nothing() -> None:
     t = np.arange(8000) * DT
     u = 4.0 - 4.0 * np.cos(2.0 * np.pi * 0.5 * t)
