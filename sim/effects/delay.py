@@ -67,6 +67,10 @@ class Delay(CauseModel):
         dt = data.dt_s
         return (ModelParameter("tau_s", "s", dt, dt, max(0.01, 6.0 * dt), 0.1 * dt, ActsOn.DYNAMICS),)
 
+    def unresolved(self, data: FitData) -> dict[str, float]:
+        # A voltage that runs straight to the next sample in place of being held moves it by so much.
+        return {"tau_s": 0.5 * data.dt_s}
+
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return single_guesses([f * data.dt_s for f in (1.3, 1.8, 2.5, 3.2, 4.0, 5.0)])
 

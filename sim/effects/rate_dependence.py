@@ -7,7 +7,7 @@ low rate. ``growth_per_decade`` is relative to the loop of height ``width_um``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -164,8 +164,10 @@ class RateDependence(CauseModel):
             out -= bouc_wen_paced(u_V, slope, beta, gamma, float(h_um[0]), pace, float(p[1])) - h_um
         return np.asarray(out)
 
-    def on_loop(self, u_V: FloatArray, loop_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray | None:
-        return None if self.variant != "width" or p[0] == 0.0 else -p[0] * loop_um * self._pace(u_V, p, data)
+    def on_loop(
+        self, u_V: FloatArray, loop_um: Callable[[], FloatArray], p: FloatArray, data: FitData
+    ) -> FloatArray | None:
+        return None if self.variant != "width" or p[0] == 0.0 else -p[0] * loop_um() * self._pace(u_V, p, data)
 
     def _pace(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         """(n,) decades of the rate above the corner."""

@@ -27,6 +27,8 @@ ComplexArray = NDArray[np.complex128]
 
 #: Relative misfit up to which lags describe a response.
 _DESCRIBED = 0.08
+#: Latest reading, in samples, that the recorder's latch alone may account for.
+_LATCH = 1.2
 
 
 @dataclass(frozen=True)
@@ -78,10 +80,12 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
     if not lagged and (
         more.cost < 0.8 * fewer.cost
         or more.off > _DESCRIBED
+        or (not delayed and float(fewer.p[1]) > _LATCH * data.dt_s)
         or _fit(f, gain, sigma, data.dt_s, own + 1, latest_s, least_s=0.5 * data.dt_s).cost < 1.2 * fewer.cost
     ):
         # A further lag improves the fit, but its size is not known, or lags of half a sample would not show, or lags do
-        # not describe the response: it is neither seen nor excluded.
+        # not describe the response, or without it the readings are later than a recorder's latch makes them: it is
+        # neither seen nor excluded.
         lagged = None
     # Two lags bend the phase almost like one with a delay.
     either = delayed and lagged and _fit(f, gain, sigma, data.dt_s, own + 1, 1.5 * data.dt_s).cost < 1.25 * more.cost
@@ -97,7 +101,7 @@ def lags_of_response(readings: Readings) -> LagsOfResponse:
         f"{100 * more.cost / max(fewer.cost, 1e-300):.0f} %"
     )
     # A little more than the recorder's latch is not decided.
-    late = None if either else True if delayed else None if late_s > 1.2 * data.dt_s else False
+    late = None if either else True if delayed else None if late_s > _LATCH * data.dt_s else False
     lags_s = tuple(float(lag) for lag in more.p[4:])
     return LagsOfResponse("", late, words, lagged, lag_words, lags_s, lag_error_s)
 

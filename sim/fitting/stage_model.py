@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -181,6 +182,10 @@ class CauseModel:
         """Names of further causes that this one may be, whatever the recording says."""
         return ()
 
+    def unresolved(self, data: FitData) -> dict[str, float]:
+        """How far a reported number may be off, by its name, whatever the recording says: it widens the interval."""
+        return {}
+
     def drive(self, u_V: FloatArray, p: FloatArray, data: FitData) -> FloatArray:
         return u_V
 
@@ -194,9 +199,11 @@ class CauseModel:
         """(n,) the loop in ``added_um``, what `static` returned: what it lags by, like h of (2.2); None for no loop."""
         return None
 
-    def on_loop(self, u_V: FloatArray, loop_um: FloatArray, p: FloatArray, data: FitData) -> FloatArray | None:
-        """(n,) µm added to the static displacement by what acts on the loops of the nominal stage and of all causes
-        together, or None."""
+    def on_loop(
+        self, u_V: FloatArray, loop_um: Callable[[], FloatArray], p: FloatArray, data: FitData
+    ) -> FloatArray | None:
+        """(n,) µm added to the static displacement by what acts on ``loop_um()``, the loops of the nominal stage and of
+        all causes together, or None."""
         return None
 
     def dynamics(self, system: Dynamics, p: FloatArray) -> Dynamics:
@@ -250,6 +257,17 @@ class Signals:
     moved_um: FloatArray
     motion_um: FloatArray
     reading_um: FloatArray
+    #: What each cause adds to the static displacement.
+    added: tuple[Added, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Added:
+    """What a cause with the parameters ``p``, as bytes, adds to the static displacement (None: nothing)."""
+
+    cause: CauseModel
+    p: bytes
+    um: FloatArray | None
 
 
 @dataclass(frozen=True)
@@ -319,15 +337,17 @@ class StageModel:
         else:
             drive = kept.drive_V
         if start <= ActsOn.STATIC or kept is None:
-            own = mine.tobytes()
+            own, before = mine.tobytes(), tuple[Added, ...]()
             if kept is not None and start == ActsOn.STATIC and kept.nominal_p == own:
                 # Only a cause has changed: the nominal hysteresis, which costs most time, is the same.
-                h, w = kept.h_um, kept.w_um
+                h, w, before = kept.h_um, kept.w_um, kept.added
             else:
                 h, w = self.nominal.static(drive, mine, inner)
-            static = w + sum(extra) if (extra := self._added(drive, h, w, p, inner)) else w
+            added = self._added(drive, h, w, p, inner, before)
+            extra = [one.um for one in added if one.um is not None] + self._on_loop(drive, h, p, inner, added)
+            static = w + sum(extra) if extra else w
         else:
-            h, w, own, static = kept.h_um, kept.w_um, kept.nominal_p, kept.static_um
+            h, w, own, static, added = kept.h_um, kept.w_um, kept.nominal_p, kept.static_um, kept.added
         if start <= ActsOn.DYNAMICS or kept is None:
             # The kept static displacement is that without a start: a later simulation adds it again.
             began = self.nominal.start_um(mine)
@@ -362,25 +382,44 @@ class StageModel:
         for cause, q in pairs:
             reading = cause.reading(reading, q, s)
         reading = reading + self.nominal.offset_um(mine)
-        return Signals(drive, h, w, own, static, moved, motion, reading)
+        return Signals(drive, h, w, own, static, moved, motion, reading, added)
 
     def _added(
-        self, drive_V: FloatArray, h_um: FloatArray, w_um: FloatArray, p: FloatArray, inner: FitData
-    ) -> list[FloatArray]:
-        """What the causes add to the static displacement."""
-        added, loop_um = [], h_um
+        self,
+        drive_V: FloatArray,
+        h_um: FloatArray,
+        w_um: FloatArray,
+        p: FloatArray,
+        inner: FitData,
+        before: tuple[Added, ...],
+    ) -> tuple[Added, ...]:
+        """What each cause adds to the static displacement. ``before``: the same, of other parameters, if any."""
+        added: list[Added] = []
         for i, cause in enumerate(self.causes):
             q = self.parameters_of(p, i)
-            one = cause.static(drive_V, h_um, w_um, q, self.parameters_of(p, -1), inner)
-            if one is not None:
-                added.append(one)
-                more = cause.loop_um(drive_V, one, q, inner)
-                loop_um = loop_um if more is None else loop_um + more
-        for i, cause in enumerate(self.causes):
-            one = cause.on_loop(drive_V, loop_um, self.parameters_of(p, i), inner)
-            if one is not None:
-                added.append(one)
-        return added
+            own = q.tobytes()
+            if i < len(before) and before[i].cause is cause and before[i].p == own:
+                added.append(before[i])
+            else:
+                one = cause.static(drive_V, h_um, w_um, q, self.parameters_of(p, -1), inner)
+                added.append(Added(cause, own, one))
+        return tuple(added)
+
+    def _on_loop(
+        self, drive_V: FloatArray, h_um: FloatArray, p: FloatArray, inner: FitData, added: tuple[Added, ...]
+    ) -> list[FloatArray]:
+        """What the causes add that act on the loops of the stage and of all causes."""
+
+        def loop_um() -> FloatArray:
+            out = h_um
+            for i, cause in enumerate(self.causes):
+                um = added[i].um
+                more = None if um is None else cause.loop_um(drive_V, um, self.parameters_of(p, i), inner)
+                out = out if more is None else out + more
+            return out
+
+        each = (cause.on_loop(drive_V, loop_um, self.parameters_of(p, i), inner) for i, cause in enumerate(self.causes))
+        return [um for um in each if um is not None]
 
     def dynamics(self, p: FloatArray) -> Dynamics:
         """The mechanics: those of the nominal stage and what the causes add."""
@@ -446,7 +485,7 @@ class ModelFit:
     def without_signals(self) -> ModelFit:
         """The fit without what needs memory: of the simulated signals only drive and reading stay."""
         none = np.empty(0)
-        signals = replace(self.signals, h_um=none, w_um=none, static_um=none, moved_um=none, motion_um=none)
+        signals = replace(self.signals, h_um=none, w_um=none, static_um=none, moved_um=none, motion_um=none, added=())
         return replace(self, signals=signals, rows=None, row_indices=())
 
     def drive_at_samples(self) -> FloatArray:

@@ -92,6 +92,7 @@ def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict
         half = 1.96 * float(np.sqrt(max(float(g @ errors.cover @ g), 0.0)))
         jackknife = float(np.sqrt((folds - 1) / folds * np.sum(np.square(spread @ g))))
         half = max(half, float(stats.t.ppf(0.975, folds - 1)) * jackknife)
+        half += fit.model.causes[index].unresolved(fit.model.data).get(name, 0.0)
         # A loop shape is itself what the free form would take over.
         other = value if fit.model.causes[index].approximates else value + float(g @ errors.freer)
         values[name] = value
