@@ -20,6 +20,9 @@ from sim.readings.readings import Readings
 
 #: Thresholds of the plays of a freer loop, in swings of the voltage.
 _RADII = np.geomspace(0.004, 0.7, 14)
+#: By how much intervals are widened: on foreign stages the errors of all forms together move the numbers by more than
+#: the three errors above.
+WIDER = 1.5
 
 
 @dataclass(frozen=True)
@@ -70,11 +73,14 @@ def _freer_loop(readings: Readings) -> FloatArray:
     return play_run(u, _RADII * swing, np.full(_RADII.size, u[0])).T
 
 
-def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def numbers(
+    errors: ParameterErrors, index: int, wider: float = WIDER
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """The reported numbers of ``causes[index]`` with 95 % intervals.
 
-    The wider of the interval by the covariance over blocks and that by the fits that leave one fold out in turn (an
-    error of the model that differs from motion to motion); about the number, and about that beside a loop of free form.
+    ``wider`` times the wider of the interval by the covariance over blocks and that by the fits that leave one fold out
+    in turn (an error of the model that differs from motion to motion); about the number, and about that beside a loop
+    of free form.
     """
     fit, folds = errors.fit, errors.moves.shape[0]
     spread = errors.moves - np.mean(errors.moves, axis=0)
@@ -92,7 +98,7 @@ def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict
         half = 1.96 * float(np.sqrt(max(float(g @ errors.cover @ g), 0.0)))
         jackknife = float(np.sqrt((folds - 1) / folds * np.sum(np.square(spread @ g))))
         half = max(half, float(stats.t.ppf(0.975, folds - 1)) * jackknife)
-        half += fit.model.causes[index].unresolved(fit.model.data).get(name, 0.0)
+        half = wider * half + fit.model.causes[index].unresolved(fit.model.data).get(name, 0.0)
         # A loop shape is itself what the free form would take over.
         other = value if fit.model.causes[index].approximates else value + float(g @ errors.freer)
         values[name] = value
@@ -101,8 +107,10 @@ def numbers(errors: ParameterErrors, index: int) -> tuple[dict[str, float], dict
 
 
 def across_zero(errors: ParameterErrors, index: int) -> bool:
-    """Whether the 95 % intervals of the reported numbers of ``causes[index]`` hold zero, but for those that the nominal
-    stage may give to it or take from it."""
-    _, spans = numbers(errors, index)
+    """Whether the intervals of the reported numbers of ``causes[index]``, not widened, hold zero.
+
+    Numbers that the nominal stage may give to it or take from it do not count.
+    """
+    _, spans = numbers(errors, index, 1.0)
     own = [span for name, span in spans.items() if name not in errors.fit.model.causes[index].shared]
     return bool(own) and all(low <= 0.0 <= high for low, high in own)

@@ -11,8 +11,9 @@ import pytest
 
 from adaptive.types import FloatArray
 from sim.diagnosis.search.held_out import Split
-from sim.diagnosis.search.intervals import ParameterErrors, across_zero, numbers, parameter_errors
+from sim.diagnosis.search.intervals import WIDER, ParameterErrors, across_zero, numbers, parameter_errors
 from sim.diagnosis.search.search import Search, Thresholds
+from sim.effects.delay import Delay
 from sim.fitting.fit_data import FitData
 from sim.fitting.stage_model import CauseModel, ModelFit
 from sim.readings.readings import Readings
@@ -29,6 +30,13 @@ class Gain(CauseModel):
 
     def reported(self, p: FloatArray, data: FitData) -> dict[str, tuple[float, FloatArray]]:
         return {"twice": (2.0 * float(p[0]), np.array([2.0]))}
+
+
+class Blurred(Gain):
+    """A number that no recording gives to better than 0.25."""
+
+    def unresolved(self, data: FitData) -> dict[str, float]:
+        return {"twice": 0.25}
 
 
 def fit_of(cause: CauseModel, p: float, row: FloatArray, residual_um: FloatArray) -> ModelFit:
@@ -54,21 +62,29 @@ def errors_of(cause: CauseModel, freer: float) -> ParameterErrors:
 @pytest.mark.parametrize(("freer", "low", "high"), [(0.0, 0.0, 0.0), (0.7, 0.0, 1.4), (-0.3, -0.6, 0.0)])
 def test_an_interval_reaches_to_the_number_beside_a_loop_of_free_form(freer: float, low: float, high: float) -> None:
     values, spans = numbers(errors_of(Gain(), freer), 0)
-    half = 1.96 * 2.0 * 0.1
+    half = WIDER * 1.96 * 2.0 * 0.1
     assert values["twice"] == 2.0
     assert spans["twice"] == pytest.approx((2.0 + low - half, 2.0 + high + half))
 
 
 def test_a_loop_shape_is_not_compared_with_itself() -> None:
     _, spans = numbers(errors_of(replace(Gain(), approximates=True), 0.7), 0)
-    assert spans["twice"] == pytest.approx((2.0 - 0.392, 2.0 + 0.392))
+    assert spans["twice"] == pytest.approx((2.0 - WIDER * 0.392, 2.0 + WIDER * 0.392))
+
+
+def test_the_interval_of_a_delay_is_wider_by_half_a_sample_of_the_recorders_hold() -> None:
+    data = FitData(2e-3, np.linspace(0.0, 1.0, N), np.linspace(0.0, 1.0, N))
+    assert Delay().unresolved(data) == {"tau_s": 1e-3}
+    errors = errors_of(Blurred(), 0.0)
+    low, high = numbers(errors, 0)[1]["twice"]
+    assert high - low == pytest.approx(2.0 * (WIDER * 0.392 + 0.25))
 
 
 def test_folds_that_differ_count_by_their_spread() -> None:
     """The jackknife in closed form: moves of ±d give a standard error of d sqrt(3) over four folds."""
     moves = np.array([[0.1], [-0.1], [0.1], [-0.1]])
     _, spans = numbers(replace(errors_of(Gain(), 0.0), moves=moves), 0)
-    half = 3.182446 * 2.0 * np.sqrt(0.75 * 0.04)
+    half = WIDER * 3.182446 * 2.0 * np.sqrt(0.75 * 0.04)
     assert spans["twice"] == pytest.approx((2.0 - half, 2.0 + half))
 
 
