@@ -85,8 +85,12 @@ class Creep(CauseModel):
             for j in range(self.taus_s(data).size)
         ]
         # Creep goes on from a step just before the recording, and from motion long before it.
-        starts = [ModelParameter(name, "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION) for name in ("start_um", "before_um")]
-        return (*weights, *starts)
+        long_um = 0.0 if data.begins_at_rest else r
+        return (
+            *weights,
+            ModelParameter("start_um", "µm", 0.0, -r, r, 0.05 * r, ActsOn.MOTION),
+            ModelParameter("before_um", "µm", 0.0, -long_um, long_um, 0.05 * r, ActsOn.MOTION),
+        )
 
     def guesses(self, data: FitData, residual_um: FloatArray) -> list[Guess]:
         return [trial[: self.taus_s(data).size] for trial in super().guesses(data, residual_um)]

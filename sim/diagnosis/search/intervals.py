@@ -63,7 +63,9 @@ def parameter_errors(fit: ModelFit, mask: BoolArray, parts: Split, readings: Rea
         columns /= np.maximum(np.linalg.norm(columns, axis=1), 1e-300)[:, None]
         gram = columns @ columns.T + 1e-9 * np.eye(columns.shape[0])
         solved = np.linalg.solve(gram, columns @ (fit.residual_um * mask))
-        freer = solved[: free.size] / size * scale
+        # A linear step ends at the bounds of a number.
+        low, high = np.array([(parameters[i].low, parameters[i].high) for i in free]).reshape(-1, 2).T
+        freer = np.clip(fit.p[free] + solved[: free.size] / size * scale, low, high) - fit.p[free]
     return ParameterErrors(fit, free, cover, np.array(moves), freer)
 
 
