@@ -87,7 +87,7 @@ def test_the_command_names_the_cause_and_shows_progress(report: tuple[Path, dict
     assert (data["schema"], data["verdict"]) == (2, "effects")
     assert data["effects"][0]["name"] == "mains_hum"
     assert set(data["effects"][0]) == {
-        "name", "alternatives", "parameters", "intervals", "heldout_gain", "p_value", "witness",
+        "name", "alternatives", "parameters", "intervals", "heldout_gain", "p_value", "witness", "instead",
     }  # fmt: skip
     assert data["effects"][0]["parameters"]["amplitude_um"] == pytest.approx(0.05, rel=0.1)
     assert data["extended"]["heldout_rmse_um"] < 0.8 * data["nominal"]["heldout_rmse_um"]

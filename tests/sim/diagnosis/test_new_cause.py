@@ -127,3 +127,9 @@ def test_every_cause_says_what_the_page_says_of_its_direct_test() -> None:
     assert rows == {name: cause.sign for name, cause in CATALOGUE.causes.items() if cause.sign}
     for name, cause in CATALOGUE.causes.items():
         assert bool(cause.sign) == bool(cause.tests or cause.in_readings), name
+
+
+def test_the_page_says_how_much_an_alternative_removes(diagnosis: Diagnosis) -> None:
+    either = replace(diagnosis.causes[0], alternatives=("sensor_nonlinearity",), instead={"sensor_nonlinearity": 0.83})
+    text = page(replace(diagnosis, causes=(either,)), export_stage(diagnosis), Source("test"), viewer=False)
+    assert "cannot tell it from sensor nonlinearity**: of what it removes, sensor nonlinearity removes 83 %" in text
