@@ -244,11 +244,9 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
     errors = parameter_errors(extended, search.mask, search.parts, search.readings)
     for i, one in enumerate(found):
         values, spans = numbers(errors, i)
-        also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data))
-        sight = search.sights.get(one.name)
-        also = tuple(dict.fromkeys((*also, *(sight.also if sight is not None else ()))))
+        also = (*one.alternatives, *extended.model.causes[i].also(extended.model.data), *search.shown_as_well(one.name))
         # One voltage and one sensor show the sum of these: the other one of a set is always possible.
-        also = (*also, *sorted(search.catalogue.same_set({one.name}) - {one.name, *also}))
+        also = tuple(dict.fromkeys((*also, *sorted(search.catalogue.same_set({one.name}) - {one.name}))))
         removed_um2 = one.held_without.sse_um2 - held.sse_um2
         instead = {r.cause.name: (one.held_without.sse_um2 - r.held.sse_um2) / removed_um2 for r in one.rivals}
         own = 1.0 - held.sse_um2 / one.held_without.sse_um2
@@ -266,7 +264,7 @@ def named(search: Search, extended: ModelFit, held: HeldOut, found: list[Reviewe
                 one.without.residual_um,
                 extended.residual_um,
                 i,
-                sight,
+                search.sights.get(one.name),
                 instead,
             )
         )

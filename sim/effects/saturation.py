@@ -51,16 +51,14 @@ class Saturation(CauseModel):
         cut_V = (data.u_high_V - float(p[0]), float(p[1]) - data.u_low_V)
         moved_V = np.diff(data.u_V, prepend=data.u_V[0])
         ends = ((data.u_V > p[0] - near_V, moved_V < 0.0), (data.u_V < p[1] + near_V, moved_V > 0.0))
-        for (side, back), cut in zip(ends, cut_V, strict=True):
-            # A limit that cuts next to nothing off only rounds an end of the range.
-            if cut < 0.2 * max(cut_V):
-                continue
-            # On the way towards an end the readings still catch up with a lag.
-            for rows in (side, side & back):
-                u, y = data.u_V[rows], data.y_um[rows]
-                if u.size >= 20 and float(np.ptp(u)) > 0.005 * data.swing_V:
-                    u = u - u.mean()
-                    slopes.append(abs(float(u @ y) / float(u @ u)))
+        # A limit that cuts next to nothing off only rounds an end of the range.
+        cutting = [end for end, cut in zip(ends, cut_V, strict=True) if cut >= 0.2 * max(cut_V)]
+        # On the way towards an end the readings still catch up, so the way back counts alone, too.
+        for rows in (rows for side, back in cutting for rows in (side, side & back)):
+            u, y = data.u_V[rows], data.y_um[rows]
+            if u.size >= 20 and float(np.ptp(u)) > 0.005 * data.swing_V:
+                u = u - u.mean()
+                slopes.append(abs(float(u @ y) / float(u @ u)))
         return not slopes or min(slopes) < 0.35 * abs(data.gain_um_per_V)
 
     def parameters(self, data: FitData) -> tuple[ModelParameter, ...]:

@@ -244,6 +244,15 @@ def single_guesses(values: list[float]) -> list[Guess]:
     return [[np.array([v])] for v in values]
 
 
+@dataclass(frozen=True, slots=True)
+class Added:
+    """What a cause with the parameters ``p``, as bytes, adds to the static displacement (None: nothing)."""
+
+    cause: CauseModel
+    p: bytes
+    um: FloatArray | None
+
+
 @dataclass
 class Signals:
     """Signals between the blocks of one simulation, kept so that a later one may start at any block."""
@@ -259,15 +268,6 @@ class Signals:
     reading_um: FloatArray
     #: What each cause adds to the static displacement.
     added: tuple[Added, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Added:
-    """What a cause with the parameters ``p``, as bytes, adds to the static displacement (None: nothing)."""
-
-    cause: CauseModel
-    p: bytes
-    um: FloatArray | None
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,8 @@ class StageModel:
         else:
             drive = kept.drive_V
         if start <= ActsOn.STATIC or kept is None:
-            own, before = mine.tobytes(), tuple[Added, ...]()
+            own = mine.tobytes()
+            before: tuple[Added, ...] = ()
             if kept is not None and start == ActsOn.STATIC and kept.nominal_p == own:
                 # Only a cause has changed: the nominal hysteresis, which costs most time, is the same.
                 h, w, before = kept.h_um, kept.w_um, kept.added
@@ -393,7 +394,10 @@ class StageModel:
         inner: FitData,
         before: tuple[Added, ...],
     ) -> tuple[Added, ...]:
-        """What each cause adds to the static displacement. ``before``: the same, of other parameters, if any."""
+        """What each cause adds to the static displacement.
+
+        ``before``: what each added to the same h and w; it is taken over where the cause has the same parameters.
+        """
         added: list[Added] = []
         for i, cause in enumerate(self.causes):
             q = self.parameters_of(p, i)

@@ -247,14 +247,15 @@ def cycles_over_time(readings: Readings) -> CyclesOverTime:
         f"the height of {n} equal cycles changes by {100 * change * span:.2g} ± {196 * error * span:.1g} % in "
         f"{span:.3g} s"
     )
+    also = () if data.begins_at_rest else ("creep",)
+    as_creep = "; creep that began before the recording may do the same" if also else ""
     if settles:
         height_words += ", and settles with the logarithm of time"
+    elif gained:
+        height_words += as_creep
+    if goes_on:
+        mean_words += as_creep
     settled = creeps and abs(per_decade) > 5.0 * per_decade_error
-    also: tuple[str, ...] = ()
-    if not data.begins_at_rest:
-        also = ("creep",)
-        height_words += ", as it may with creep from before the recording"
-        mean_words += ", as it may with creep from before the recording" if goes_on else ""
     return CyclesOverTime("", height_words, None if settles else gained, mean_words, moved, settled, goes_on, also)
 
 

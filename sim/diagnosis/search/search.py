@@ -75,7 +75,8 @@ class Thresholds:
     close_sigmas: float = 2.5
     #: ... where its error is at most this many times the accepted one.
     close_error: float = 2.0
-    #: The same for what it is easily mistaken for, where no direct test sees it: no form is exact on a measured stage.
+    #: Where no direct test sees a cause, one that it is easily mistaken for is an alternative if it lacks less than
+    #: this share of the gain: no form is exact on a measured stage.
     close_unseen: float = 0.5
     #: Most names in a set of a cause and what it is mistaken for.
     widest: int = 3
@@ -258,6 +259,11 @@ class Search:
     def mistaken_for(self, cause: CauseModel) -> tuple[str, ...]:
         """What a cause is easily mistaken for, where no direct test says that it is this cause."""
         return () if self.seen(cause) else self.catalogue.kind(cause.name).mistaken_for
+
+    def shown_as_well(self, name: str) -> tuple[str, ...]:
+        """Other causes that show the same as this one in its direct test."""
+        sight = self.sights.get(name)
+        return () if sight is None else sight.also
 
     def looks(self, fit: ModelFit, skip: set[str]) -> tuple[list[ScreenedCause], list[CauseModel]]:
         """The best linearised guess of every applicable cause, largest gain first."""
@@ -784,8 +790,7 @@ def _rivals(
     out: list[CauseCandidate] = []
     thresholds = search.thresholds
     mates = search.mistaken_for(cause)
-    sight = search.sights.get(cause.name)
-    there = search.catalogue.same_set({cause.name, *(sight.also if sight else ())})
+    there = search.catalogue.same_set({cause.name, *search.shown_as_well(cause.name)})
     for rival in rivals:
         own = rival.fit.model.parameters_of(rival.fit.p, len(rival.fit.model.causes) - 1)
         # A permanent narrow line cannot be confused with another cause.
@@ -796,6 +801,7 @@ def _rivals(
         close = close and rival.held.sse_um2 < thresholds.close_error**2 * held.sse_um2
         more = {other.cause.name for other in out} | {rival.cause.name}
         if not close and rival.cause.name in mates and len(there | more) <= thresholds.widest:
+            # What falls a little short may do so because its form is coarse.
             if thresholds.close_unseen * gain <= lost < thresholds.nearly_all * gain:
                 rival = search.finer(rival, less)
             close = rival.held.sse_um2 - held.sse_um2 < thresholds.close_unseen * gain

@@ -440,13 +440,13 @@ def test_a_limit_that_cuts_next_to_nothing_off_does_not_speak_against_the_other_
     assert not Saturation().plausible(np.array([3.0, 0.02]), FitData(1e-3, u, 10.0 * u))
 
 
-def test_a_limit_shows_on_the_way_back_where_the_way_there_is_a_lag_s() -> None:
+def test_a_limit_shows_on_the_way_back_where_readings_lag_on_the_way_there() -> None:
     """Voltages that rise faster than the stage: its readings still rise beyond the limit."""
     u = np.tile(np.concatenate([np.linspace(0.0, 10.0, 400), np.full(200, 10.0), np.linspace(10.0, 0.0, 100)]), 6)
     y = 10.0 * lfilter([0.05], [1.0, -0.95], np.minimum(u, 9.3))
     data = FitData(1e-3, u, y)
-    top, row = data.u_V > 9.2, np.diff(data.u_V, prepend=0.0) < 0.0
-    ways = [float(np.polyfit(u[rows], y[rows], 1)[0]) for rows in (top, top & row)]
+    top, back = data.u_V > 9.2, np.diff(data.u_V, prepend=0.0) < 0.0
+    ways = [float(np.polyfit(u[rows], y[rows], 1)[0]) for rows in (top, top & back)]
     assert abs(ways[0]) > 0.35 * data.gain_um_per_V > abs(ways[1])
     assert Saturation().plausible(np.array([9.3, 0.0]), data)
     assert not Saturation().plausible(np.array([9.3, 0.0]), FitData(1e-3, u, 10.0 * u))

@@ -45,6 +45,7 @@ def fit_of(cause: CauseModel, p: float, row: FloatArray, residual_um: FloatArray
     model = SimpleNamespace(
         parameters=(bounds,),
         causes=(cause,),
+        n_nominal=0,
         data=None,
         jacobian=lambda p, signals, free: row[None, :],
         slice_of=lambda index: slice(0, 1),

@@ -180,13 +180,13 @@ def test_the_mirrors_modes_and_cross_talk_are_found_unaided() -> None:
 
 
 def test_a_part_of_the_stacks_record_contradicts_the_whole_nowhere() -> None:
-    """In motion from the first sample on: creep is as good as a drift there, and a rate dependence that changes from
-    stretch to stretch had stood in the place of the lag."""
+    """The part begins in motion, where creep is as good as a drift; and a rate dependence had taken the lag's place."""
     folder = DATA / "picma_stack"
     if not folder.exists():
         pytest.skip("measured data missing: picma_stack; set DEHYST_DATA to the folder that holds it")
     whole = read(folder / "model_sine_1hz.csv")
     part = diagnose_prepared(prepare(whole.part(len(whole) // 4, len(whole))))
+    # What the whole record shows, and the loop's shape, which has been named there, too.
     of_whole = (
         ("asymmetry", "sensor_nonlinearity"),
         ("sensor_lag", "amplifier_lag"),
