@@ -1,0 +1,148 @@
+"""The benchmark of measured records: its yardstick and its scores exactly, and the whole way over a made-up record."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines import fit_linear
+from benchmarks import measured
+from benchmarks.measured import (
+    SCORES,
+    Cut,
+    Record,
+    Source,
+    columns_of,
+    data_folder,
+    least_squares,
+    main,
+    plays,
+    ratio,
+    recursive,
+    replayed,
+    rmse_pct,
+    worst_ratio,
+)
+from service.config.settings import COMPETE
+from service.identification.identifying import Stretch
+
+
+def test_the_recursion_is_weighted_least_squares_of_the_samples_before_the_age() -> None:
+    rng = np.random.default_rng(1)
+    n, m, p, forget, age = 60, 40, 4, 0.97, 3
+    Z, u = rng.normal(size=(n + m, p)), rng.normal(size=n + m)
+    c, P = least_squares(Z[:n], u[:n])
+    got = recursive(Z[n:], u[n:], c, P, forget, age)
+    prior = 1e-6 * n * np.eye(p)
+    for k in range(m):
+        seen = max(0, k - age)  # samples of the test that the coefficients have seen
+        rows = slice(0, n + seen)
+        # Each sample of the test makes all that came before count less, and the prior too.
+        weight = forget ** np.r_[np.full(n, seen), np.arange(seen - 1, -1, -1)]
+        information = (Z[rows].T * weight) @ Z[rows] + forget**seen * prior
+        expected = Z[n + k] @ np.linalg.solve(information, (Z[rows].T * weight) @ u[rows])
+        assert got[k] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_a_recursion_that_winds_up_begins_anew_with_its_covariance() -> None:
+    Z, u = np.zeros((400, 2)), np.zeros(400)
+    Z[-2:], u[-2:] = np.eye(2), 1.0
+    got = recursive(Z, u, np.zeros(2), np.eye(2), 0.9, 1)
+    assert np.all(np.isfinite(got))
+    assert got[-1] == 0.0
+
+
+def test_plays_follow_at_the_distance_of_their_radius() -> None:
+    got = plays(np.array([0.0, 3.0, 1.0, -4.0]), np.array([0.0, 1.0, 10.0]))
+    assert got.tolist() == [[0, 0, 0], [3, 2, 0], [1, 2, 0], [-4, -3, 0]]
+
+
+def test_scores() -> None:
+    assert rmse_pct(np.array([1.0, 2.0]), np.array([4.0, -2.0]), 50.0) == pytest.approx(2.0 * np.sqrt(12.5))
+    scores = {"frozen": 2.0, "linear": 8.0, "mpi": 0.5, "yardstick": 1.0, "learner": 1.5, "least squares": 0.1}
+    assert ratio(scores, "learner") == 3.0
+    assert ratio(scores | {"mpi": 3.0}, "learner") == 1.5
+
+
+def test_the_worst_window_counts_frozen_at_least_as_its_floor() -> None:
+    one, other = np.array([1.0, 1.0, 4.0, 4.0, 0.2, 0.2]), np.array([1.0, 1.0, 8.0, 8.0, 0.01, 0.01])
+    assert worst_ratio(one, other, 2) == pytest.approx(2.0)  # 0.2 % over the floor of 0.1 %
+    assert worst_ratio(one[:4], other[:4], 2) == pytest.approx(1.0)
+    assert worst_ratio(one[:4], other[:4], 99) == pytest.approx(np.sqrt(34.0 / 130.0))
+
+
+def test_late_readings_are_put_beside_their_voltages(tmp_path: Path) -> None:
+    t_s, u_V = np.arange(100) * 0.01, np.arange(100.0)
+    rows = np.column_stack([t_s, u_V, np.r_[np.zeros(2), u_V[:-2]]])
+    np.savetxt(tmp_path / "late.csv", rows, delimiter=",", header="t_s,u_V,y_um", comments="")
+    cut = Cut.of(Record("late", Source("late.csv", um=3.0), (0.1, 0.5), (0.5, 0.9)), tmp_path, late=2)
+    assert (cut.split, cut.u_V.size, cut.left, cut.jump) == (40, 80, 8, False)
+    assert np.array_equal(cut.y_um, 3.0 * cut.u_V)
+
+
+def test_columns_of_two_runs_do_not_see_the_jump_between_them() -> None:
+    y_um = np.r_[np.sin(np.arange(500) * 0.02), 5.0 + np.sin(np.arange(300) * 0.02)]
+    cut = Cut(0.001, np.zeros(800), y_um, 500, jump=True)
+    Z, at = columns_of(cut)
+    assert at.tolist() == list(range(800))
+    assert Z[500:780, -2:] == pytest.approx(Z[:280, -2:])  # velocity and acceleration: the same motion elsewhere
+    fast, every = columns_of(Cut(0.0004, np.zeros(800), y_um, 500, jump=True))
+    assert every[:3].tolist() == [0, 3, 6]
+    assert 500 in every
+    assert fast.shape == (every.size, Z.shape[1])
+
+
+def test_a_record_that_is_missing_is_skipped_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DEHYST_DATA", str(tmp_path))
+    assert data_folder() == tmp_path
+    assert main(["--only", "raster"]) == 1
+    assert capsys.readouterr().out.count("missing; set DEHYST_DATA") == 3
+
+
+def test_the_learner_beats_the_frozen_model_on_a_stage_that_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t_s = np.arange(6000) * 0.002
+    u_V = 4.0 + 4.0 * np.sin(2.0 * np.pi * (0.4 * t_s + 0.1 * np.sin(0.7 * t_s)))
+    y_um = 10.0 * u_V - 2.0 * plays(u_V, np.array([0.4, 1.2])).sum(axis=1)
+    y_um[3000:] *= 1.03  # where the test begins
+    y_um += np.random.default_rng(2).normal(0.0, 0.003, y_um.size)
+    rows = np.column_stack([t_s, u_V, y_um])
+    np.savetxt(tmp_path / "made.csv", rows, delimiter=",", header="t_s,u_V,y_um", comments="")
+    monkeypatch.setenv("DEHYST_DATA", str(tmp_path))
+    monkeypatch.setattr(measured, "RECORDS", (Record("made up", Source("made.csv"), (0.0, 6.0), (6.0, 12.0)),))
+    assert main(["--json", str(tmp_path / "out.json")]) == 0
+    (result,) = json.loads((tmp_path / "out.json").read_text())
+    scores = result["scores"]
+    assert set(scores) == {*SCORES, "yardstick"}
+    assert set(COMPETE) <= set(scores)
+    assert scores["frozen"] > 1.0
+    assert scores["learner"] < 0.3 * scores["frozen"]
+    assert scores["served"] == pytest.approx(scores["learner"], rel=0.05)
+    assert result["worst"] < 0.5
+    assert result["troubles"] == []
+    assert sum(result["verdicts"].values()) == pytest.approx(1.0)
+    assert "| made up | 6 / 6 | " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("dt_s", "least", "most"), [(0.001, 61.0, 64.0), (0.005, 13.0, 13.0)])
+def test_no_prediction_knows_the_samples_of_the_last_60_ms(dt_s: float, least: float, most: float) -> None:
+    n = 400
+    u_V = np.arange(float(n))
+    test = Stretch(u_V, np.zeros(n), np.zeros((n, 3)), np.ones(n, dtype=np.bool_))
+    model = fit_linear(u_V, np.sin(u_V) + u_V, dt_s)[0]
+    taught = [-1]
+    got = replayed(
+        test, dt_s,
+        lambda part: taught.append(part.stop - 1),
+        lambda: (taught[-1], model, model.rest_memory(0.0)),
+        lambda seen, _model, _memory, points: np.full(points[0].size, float(seen)),
+    )  # fmt: skip
+    ages = u_V - got  # each answer is the last sample that it knows
+    assert np.isnan(got[: int(least)]).all()
+    assert (np.nanmin(ages), np.nanmax(ages)) == (least, most)
