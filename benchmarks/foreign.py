@@ -9,11 +9,15 @@ the commanded range.
 ``--healthy HOURS --json out/healthy.jsonl`` runs stages on which nothing happens, with the learning loop alone, until
 the file holds that many hours of simulated time, and prints each trouble that was reported. Further calls go on where
 the file ends.
+
+``--motions raster:10,tone:50 --runs 40 --json out/motions.jsonl`` runs motions that users make (``foreign_motions.py``)
+on stages on which nothing happens, and adds to the file.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import multiprocessing
@@ -30,8 +34,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import foreign_motions
 from lab.rehearsal.disturbance import BURSTS_HZ, CLASSES, SENSOR, SPIKES_HZ, draw
 from service.reports.tables import markdown
+from tests.foreign.motions import MOTIONS, motion
 
 PRESETS = ("random", "issue", "as_drawn")
 #: The event comes so long after the start of the closed loop, s, by preset, and up to so much later.
@@ -58,6 +64,8 @@ HEALTHY, HEALTHY_SAMPLES, HEALTHY_S = "healthy", 300_000, (120.0, 300.0)
 MOST_FAILED = 10
 
 Record = dict[str, Any]
+#: What makes a record, and the record without results if its process dies.
+Run = tuple[Callable[[], Record], Record]
 
 
 def run_one(name: str, seed: int, preset: str = "random", after_s: float = AFTER_S) -> Record:
@@ -107,24 +115,28 @@ def run_healthy_stage(seed: int, block: int) -> Record:
     return record | {"cpu_s": time.process_time() - begin_cpu, "wall_s": time.perf_counter() - begin}
 
 
-def run_all(
-    plan: Sequence[tuple[str, int]], jobs: int, preset: str = "random", after_s: float = AFTER_S
-) -> Iterator[Record]:
-    """The runs of ``plan``, (class, seed) each, in the order in which they end. If a process dies, its run
-    has failed."""
+def run_all(plan: Sequence[Run], jobs: int) -> Iterator[Record]:
+    """The runs of ``plan`` in the order in which they end. If a process dies, its run has failed."""
     _one_blas_thread()
     if jobs == 1:
-        for name, seed in plan:
-            yield run_one(name, seed, preset, after_s)
+        for run, _ in plan:
+            yield run()
         return
     with _pool(jobs) as pool:
-        waiting = {pool.submit(run_one, name, seed, preset, after_s): (name, seed) for name, seed in plan}
+        waiting = {pool.submit(run): lost for run, lost in plan}
         for done in as_completed(waiting):
             try:
                 yield done.result()
             except BrokenProcessPool:
-                name, seed = waiting[done]
-                yield {"seed": seed, "preset": preset, "class": name, "failed": "the process ended"}
+                yield waiting[done] | {"failed": "the process ended"}
+
+
+def event_runs(plan: Iterable[tuple[str, int]], preset: str = "random", after_s: float = AFTER_S) -> list[Run]:
+    """The runs of (class, seed)."""
+    return [
+        (functools.partial(run_one, name, seed, preset, after_s), {"seed": seed, "preset": preset, "class": name})
+        for name, seed in plan
+    ]
 
 
 def run_healthy_hours(
@@ -460,7 +472,7 @@ def run_line(jobs: int) -> list[Record]:
         flush=True,
     )
     records = []
-    for record in run_all(LINE, jobs):
+    for record in run_all(event_runs(LINE), jobs):
         records.append(record)
         if sys.stderr.isatty():
             print(f"\r{len(records)} of {len(LINE)}", end="", file=sys.stderr, flush=True)
@@ -487,7 +499,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="which stages (random); as_drawn: also such as move against their voltage after a turn, as no piezo does",
     )  # fmt: skip
     parser.add_argument(
-        "--after", type=float, default=AFTER_S, metavar="S", help=f"closed loop after the event, s ({AFTER_S:g})"
+        "--after", type=float, metavar="S",
+        help=f"closed loop after the event, s ({AFTER_S:g}), or from {foreign_motions.FROM_S:g} s of a motion on "
+        f"({foreign_motions.AFTER_S:g})",
+    )  # fmt: skip
+    parser.add_argument("--poor", action="store_true", help="--motions: identify from 2 s of half the stroke")
+    parser.add_argument(
+        "--true-length", action="store_true", help="--motions: hold for an hour, stand for a night; takes hours"
     )
     parser.add_argument(
         "--block", type=int, default=5, metavar="N",
@@ -498,6 +516,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--healthy", type=float, metavar="HOURS",
         help="run stages on which nothing happens until --json holds so many hours of simulated time; it is continued",
     )  # fmt: skip
+    only.add_argument(
+        "--motions", metavar="NAME[,NAME]",
+        help=f"run motions on stages on which nothing happens: {', '.join(MOTIONS)}; raster:10 is one of 10 Hz",
+    )  # fmt: skip
     only.add_argument("--line", action="store_true", help=f"run {len(LINE)} fixed stages and print one line")
     only.add_argument("--table", nargs="+", type=Path, metavar="F", help="print the tables of these files; run nothing")
     given = parser.parse_args(arguments)
@@ -506,6 +528,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jobs = given.jobs if given.jobs is not None else 2 if given.line else 1
     if given.runs < 1 or jobs < 1 or given.first_seed < 0:
         parser.error("--runs, --jobs: expected at least 1; --first-seed: expected 0 or more")
+    names = given.motions.split(",") if given.motions is not None else []
+    for name in names:
+        try:
+            motion(name)
+        except (KeyError, ValueError):
+            parser.error(f"--motions: got {name!r}, expected some of {', '.join(MOTIONS)}, or such as raster:10")
+    if given.after is None:
+        given.after = foreign_motions.AFTER_S if names else AFTER_S
     if given.after < 4.0:
         parser.error(f"--after: got {given.after:g} s, expected 4 s or more")
     if given.healthy is not None:
@@ -515,18 +545,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"--block: got {given.block}, expected 1 to 512")
         records = _run_healthy(given, jobs)
         print(healthy_table(records))
+    elif names:
+        records = _run_motions(given, names, jobs)
+        print(foreign_motions.table(records))
     elif given.line:
         records = run_line(jobs)
         print(line(records))
     elif given.table:
         records = read(given.table)
+        motions = [record for record in records if "motion" in record]
         healthy = [record for record in records if record.get("class") == HEALTHY]
-        others = [record for record in records if record.get("class") != HEALTHY]
-        print(
-            "\n\n".join(
-                [*([table(others)] if others or not healthy else []), *([healthy_table(healthy)] if healthy else [])]
-            )
-        )
+        others = [record for record in records if "motion" not in record and record.get("class") != HEALTHY]
+        tables = ((table, others), (healthy_table, healthy), (foreign_motions.table, motions))
+        print("\n\n".join(made(part) for made, part in tables if part) or table([]))
     else:
         records = _run(given, jobs)
         print(table(records))
@@ -536,36 +567,62 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(given: argparse.Namespace, jobs: int) -> list[Record]:
     classes = given.only or list(CLASSES)
     seeds = range(given.first_seed, given.first_seed + given.runs)
-    plan = [(classes[seed % len(classes)], seed) for seed in seeds]
-    records = []
     if given.json:
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text("")
-    for record in run_all(plan, jobs, given.preset, given.after):
+    plan = event_runs([(classes[seed % len(classes)], seed) for seed in seeds], given.preset, given.after)
+    return _run_plan(plan, jobs, given.json, told)
+
+
+def _run_motions(given: argparse.Namespace, names: Sequence[str], jobs: int) -> list[Record]:
+    """The runs of the file so far, and the new ones."""
+    records = _continued(given.json, lambda record: "motion" in record)
+    recording = foreign_motions.RECORDINGS[given.poor]
+    plan = [
+        (
+            functools.partial(foreign_motions.run_motion, name, seed, recording, given.after, given.true_length),
+            {"seed": seed, "recording": recording, "motion": name},
+        )
+        for name, seed in foreign_motions.planned(names, given.first_seed, given.runs)
+    ]
+    return [*records, *_run_plan(plan, jobs, given.json, foreign_motions.told)]
+
+
+def _run_plan(plan: Sequence[Run], jobs: int, path: Path | None, told: Callable[[Record], str]) -> list[Record]:
+    records = []
+    for record in run_all(plan, jobs):
         records.append(record)
-        print(f"[{len(records)}/{given.runs}] {told(record)}", file=sys.stderr, flush=True)
-        if given.json:
-            with given.json.open("a") as file:
-                file.write(json.dumps(record) + "\n")
+        print(f"[{len(records)}/{len(plan)}] {told(record)}", file=sys.stderr, flush=True)
+        _add(path, record)
     return records
 
 
+def _add(path: Path | None, record: Record) -> None:
+    if path:
+        with path.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+
+
+def _continued(path: Path | None, holds: Callable[[Record], bool]) -> list[Record]:
+    """Those runs of a file for which ``holds``; the file is ready for more."""
+    if not path:
+        return []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        return []
+    if (text := path.read_text()) and not text.endswith("\n"):
+        path.write_text(f"{text}\n")  # after a line that was cut off
+    return [record for record in read([path]) if holds(record)]
+
+
 def _run_healthy(given: argparse.Namespace, jobs: int) -> list[Record]:
-    records: list[Record] = []
-    if given.json and given.json.exists():
-        records = [record for record in read([given.json]) if record.get("class") == HEALTHY]
-        if (text := given.json.read_text()) and not text.endswith("\n"):
-            given.json.write_text(f"{text}\n")  # after a line that was cut off
-        if records:
-            print(f"{given.json}: {len(records)} runs, {_hours(records):.2f} h", file=sys.stderr)
-    elif given.json:
-        given.json.parent.mkdir(parents=True, exist_ok=True)
+    records = _continued(given.json, lambda record: record.get("class") == HEALTHY)
+    if records:
+        print(f"{given.json}: {len(records)} runs, {_hours(records):.2f} h", file=sys.stderr)
     for record in run_healthy_hours(given.healthy, given.first_seed, jobs, given.block, records):
         records.append(record)
         print(f"[{_hours(records):.2f} of {given.healthy:g} h] {told_healthy(record)}", file=sys.stderr, flush=True)
-        if given.json:
-            with given.json.open("a") as file:
-                file.write(json.dumps(record) + "\n")
+        _add(given.json, record)
     return records
 
 

@@ -133,7 +133,7 @@ class RandomReference:
             cosine @ (self._amplitude_um * self._omega),
             -sine @ (self._amplitude_um * self._omega**2),
         )
-        added = _product(fade, tones)
+        added = product(fade, tones)
         return Motion(y + added.y_um, v + added.v_um_per_s, a + added.a_um_per_s2)
 
 
@@ -166,7 +166,8 @@ class SmoothStep:
         )
 
 
-def _product(f: Motion, g: Motion) -> Motion:
+def product(f: Motion, g: Motion) -> Motion:
+    """The product of two functions of time, with its derivatives."""
     return Motion(
         f.y_um * g.y_um,
         f.v_um_per_s * g.y_um + f.y_um * g.v_um_per_s,
@@ -190,5 +191,5 @@ class Excursion:
         back = SmoothStep(self.to_s - self.way_s, self.to_s)(t_s)
         weight = Motion(*(one - other for one, other in zip(there, back, strict=True)))
         y, v, a = self.base(t_s)
-        away = _product(weight, Motion(self.level_um - y, -v, -a))
+        away = product(weight, Motion(self.level_um - y, -v, -a))
         return Motion(y + away.y_um, v + away.v_um_per_s, a + away.a_um_per_s2)
