@@ -22,6 +22,7 @@ from __future__ import annotations
 import types
 from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache
 from math import inf, isfinite
@@ -71,16 +72,31 @@ class Entry:
 class Refused(ModelFileError):
     """An entry of a state is not as declared."""
 
-    def __init__(self, name: str, got: str, expected: str) -> None:
+    def __init__(self, name: str, got: str, expected: str = "") -> None:
         self.entry, self.got, self.expected = name, got, expected
         super().__init__(
-            f"state entry {name}: got {got}, expected {expected}; the state is damaged, of another axis or of another "
-            "version: start from the model file"
+            f"state entry {name}: {f'got {got}, expected {expected}' if expected else got}; the state is damaged, of "
+            "another axis or of another version: start from the model file"
         )
 
     def under(self, prefix: str) -> Refused:
         """The same of a state that is part of another."""
         return Refused(prefix + self.entry, self.got, self.expected)
+
+    @classmethod
+    def by_check(cls, error: ValueError) -> Refused:
+        """Of a check of what must fit together; it says "NAME: got ..., expected ..."."""
+        name, _, what = str(error).partition(": ")
+        return cls(name, what)
+
+
+@contextmanager
+def within(prefix: str) -> Iterator[None]:
+    """Refusals from inside are of entries under ``prefix``."""
+    try:
+        yield
+    except Refused as error:
+        raise error.under(prefix) from error
 
 
 # --- The declarations of a class.
@@ -157,7 +173,8 @@ def _save(record: Any, prefix: str, state: StateDict) -> None:
         if kind == "number":
             state[name] = slot.of(value)
         elif kind == "array":
-            state[name] = value.copy()
+            if value is not None:
+                state[name] = value.copy()
         elif kind == "values" or kind == "arrays":
             state[name] = np.array(() if value is None else value, dtype=slot.of)
         elif kind == "counts":
@@ -177,9 +194,11 @@ def copied(record: T) -> T:
     changes: dict[str, Any] = {}
     for slot in _slots(_type(record)):
         value = getattr(record, slot.field)
+        if value is None:
+            continue
         if slot.kind in ("array", "counts"):
             changes[slot.field] = value.copy()
-        elif slot.kind in ("values", "records", "arrays") and value is not None:
+        elif slot.kind in ("values", "records", "arrays"):
             changes[slot.field] = slot.make(copied(x) if slot.kind == "records" else x for x in value)
         elif slot.kind == "record":
             changes[slot.field] = copied(value)
@@ -202,7 +221,21 @@ def load(cls: type[T], state: Mapping[str, Any], sizes: Sizes | None = None, giv
 
 def restore(part: Any, state: Mapping[str, Any], sizes: Sizes | None = None, given: Given | None = None) -> None:
     """Set the declared fields of ``part`` from its ``save``. Raises as ``load``; then nothing is changed."""
-    _put(part, _values_of_all(type(part), state, sizes or {}, given or {}))
+    values = _values_of_all(type(part), state, sizes or {}, given or {})
+    _check(part, values)
+    _put(part, values)
+
+
+def _check(part: Any, values: dict[str, Any]) -> None:
+    """Let a part that has ``check_state`` compare its new values with what it was made with."""
+    if hasattr(part, "check_state"):
+        try:
+            part.check_state(values)
+        except ValueError as error:
+            raise Refused.by_check(error) from error
+    for slot in _slots(_type(part)):
+        if slot.kind == "part":
+            _check(getattr(part, slot.field), values[slot.field])
 
 
 def _put(part: Any, values: dict[str, Any]) -> None:
@@ -222,7 +255,7 @@ def _build(cls: type[T], values: dict[str, Any], given: Given) -> T:
         if check is not None:
             check()
     except ValueError as error:
-        raise Refused("", str(error), "values that fit together") from error
+        raise Refused.by_check(error) from error
     return made
 
 
@@ -245,6 +278,8 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
         name, of, below = slot.name, slot.of, given.get(slot.field, {})
         if slot.kind == "number":
             values[slot.field] = _number(of, _leaf(parts, name), slot.entry, name)
+        elif slot.kind == "array" and slot.optional and name not in parts:
+            values[slot.field] = None
         elif slot.kind in ("array", "arrays", "values"):
             values[slot.field] = _sequence(slot, _leaf(parts, name), sizes, bound)
         elif slot.kind == "counts":
@@ -267,11 +302,9 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
 
 
 def _nested(slot: _Slot, name: str, parts: dict[str, StateDict], sizes: Sizes, given: Given) -> Any:
-    try:
+    with within(f"{name}."):
         values = _values_of_all(slot.of, parts.pop(name, {}), sizes, given)
         return values if slot.kind == "part" else _build(slot.of, values, given)
-    except Refused as error:
-        raise error.under(f"{name}.") from error
 
 
 def _leaf(parts: dict[str, StateDict], name: str) -> Any:

@@ -26,6 +26,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
 from adaptive.online.learner import Learner
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
+from adaptive.state import load, save
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -191,7 +192,7 @@ class _SmoothedMotion:
             "anchor_um": self._anchor_um,
         }
         if self._state is not None:
-            state |= prefixed("smoother.", self._smoother.state_dict(self._state))
+            state |= prefixed("smoother.", save(self._state))
         return state
 
     def restore(self, state: StateDict) -> None:
@@ -201,7 +202,7 @@ class _SmoothedMotion:
         self._glitches, self._since_start = int(state["glitches"]), int(state["since_start"])
         self._since_left, self._anchor_um = int(state["since_left"]), float(state["anchor_um"])
         smoother = under("smoother.", state)
-        self._state = self._smoother.from_state(smoother) if smoother else None
+        self._state = load(SmootherState, smoother, self._smoother.sizes) if smoother else None
 
 
 @dataclass(slots=True)

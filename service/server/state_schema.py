@@ -85,7 +85,7 @@ RULES: Final = (
     Rule(r"voltage_std_V", "", finite=False),
     # --- the learner
     Rule(r"front\.(past\d|proven_past)\.(motion)", "3"),
-    Rule(r"front\.(past\d|proven_past)\.u_before_V", "one", finite=False),
+    Rule(r"front\.(past\d|proven_past)\.u_before_V", "", finite=False),
     Rule(r"front\.(past\d|proven_past)\.(lag_V|lag_um|u_V)", "*", finite=False),
     Rule(r"front\.(past\d|proven_past)\.memory", "m"),
     Rule(r"front\.heard", "*,2"),
