@@ -14,7 +14,8 @@ stranger. `restore` does the same for an object that is no dataclass, in place. 
 A class whose ``KIND`` is a text says so in an entry of that name, so that none is taken for another.
 
 What a field may be: a number, a truth value, a text; an array; a list or tuple of numbers, stored as an array; a list,
-tuple or deque of arrays of one shape; a dictionary of counts; another record, or None; a list or tuple of records.
+tuple or deque of arrays or of rows of numbers; a dictionary of numbers or arrays by name; another record, or None; a
+list or tuple of records.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ _NUMBERS: Final = {float: "a finite number", int: "an integer", bool: "a truth v
 
 
 class _Slot(NamedTuple):
-    """A declared field. kind : "number", "array", "values" (numbers stored as an array), "arrays", "counts", "record",
+    """A declared field. kind : "number", "array", "values" (numbers stored as an array), "arrays", "named", "record",
     "part" (an object that is filled in place), or "records". of : the type of its elements. make : of the container."""
 
     field: str
@@ -142,9 +143,11 @@ def _slot(field: str, hint: Any, entry: Entry) -> _Slot:
     elif make is np.ndarray:
         kind, made = "array", np.dtype(get_args(of[1])[0])
     elif make is dict:
-        kind, made = "counts", int
+        kind, made = "named", of[1] if of[1] in _NUMBERS else np.dtype(get_args(get_args(of[1])[1])[0])
     elif make in (list, tuple, deque):
         kind, made = ("values", of[0]) if of[0] in _NUMBERS else ("records", of[0])
+        if get_origin(of[0]) is tuple:
+            kind, made = "values", get_args(of[0])[0]
         if get_origin(of[0]) is np.ndarray:
             kind, made = "arrays", np.dtype(get_args(get_args(of[0])[1])[0])
     else:
@@ -176,9 +179,13 @@ def _save(record: Any, prefix: str, state: StateDict) -> None:
             if value is not None:
                 state[name] = value.copy()
         elif kind == "values" or kind == "arrays":
-            state[name] = np.array(() if value is None else value, dtype=slot.of)
-        elif kind == "counts":
-            state.update((f"{name}.{key}", int(count)) for key, count in value.items())
+            made, row = np.array(() if value is None else value, dtype=slot.of), slot.shapes[0]
+            # Without a row, the array has the length of one all the same.
+            state[name] = made.reshape(-1, row[1]) if len(row) == 2 and isinstance(row[1], int) else made
+        elif kind == "named":
+            below = f"{name}." if slot.name else prefix
+            of = slot.of if slot.of in _NUMBERS else np.array
+            state.update((below + key, of(one)) for key, one in value.items())
         elif kind == "records":
             for i, one in enumerate(value):
                 _save(one, f"{name}{i}.", state)
@@ -196,7 +203,7 @@ def copied(record: T) -> T:
         value = getattr(record, slot.field)
         if value is None:
             continue
-        if slot.kind in ("array", "counts"):
+        if slot.kind in ("array", "named"):
             changes[slot.field] = value.copy()
         elif slot.kind in ("values", "records", "arrays"):
             changes[slot.field] = slot.make(copied(x) if slot.kind == "records" else x for x in value)
@@ -263,10 +270,14 @@ def _values_of_all(cls: Any, state: Mapping[str, Any], sizes: Sizes, given: Give
     """Field to value, with no entry left over."""
     parts = parted(state)
     values = _values(cls, parts, sizes, given, {})
+    _no_more(parts)
+    return values
+
+
+def _no_more(parts: Mapping[str, StateDict]) -> None:
     for part, entries in parts.items():
         rest = next(iter(entries), "")
         raise Refused(f"{part}.{rest}" if rest else part, _words(entries.get(rest)), "no entry of this name")
-    return values
 
 
 def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, bound: dict[str, int]) -> dict[str, Any]:
@@ -282,8 +293,12 @@ def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, b
             values[slot.field] = None
         elif slot.kind in ("array", "arrays", "values"):
             values[slot.field] = _sequence(slot, _leaf(parts, name), sizes, bound)
-        elif slot.kind == "counts":
-            values[slot.field] = _counts(slot.entry, name, parts.pop(name, {}))
+        elif slot.kind == "named":
+            given_names = slot.entry.among or tuple(parts.get(name, ()))
+            below_parts = parts if not name else {key: {"": value} for key, value in parts.pop(name, {}).items()}
+            with within(f"{name}." if name else ""):
+                values[slot.field] = {key: _one(slot, _leaf(below_parts, key), key) for key in given_names}
+                _no_more({} if not name else below_parts)
         elif slot.kind == "records":
             found: list[Any] = []
             while f"{name}{len(found)}" in parts and len(found) < slot.entry.most:
@@ -314,11 +329,11 @@ def _leaf(parts: dict[str, StateDict], name: str) -> Any:
     return entries[""]
 
 
-def _counts(entry: Entry, name: str, counts: StateDict) -> dict[str, int]:
-    different = set(counts) ^ set(entry.among) if entry.among else ()
-    for key in different:
-        raise Refused(f"{name}.{key}", "an entry" if key in counts else "nothing", f"the names {sorted(entry.among)}")
-    return {key: _number(int, value, entry, f"{name}.{key}") for key, value in counts.items()}
+def _one(slot: _Slot, value: Any, name: str) -> Any:
+    """A number or array of a dictionary."""
+    if slot.of in _NUMBERS:
+        return _number(slot.of, value, slot.entry, name)
+    return _sequence(slot._replace(kind="array", name=name), value, {}, {})
 
 
 def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
@@ -363,7 +378,9 @@ def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> A
         return np.array(value, order="C")
     if slot.kind == "arrays":
         return slot.make(np.array(row) for row in value)
-    return None if slot.optional and not value.size else slot.make(value.tolist())
+    if slot.optional and not value.size:
+        return None
+    return slot.make(value.tolist() if value.ndim == 1 else map(tuple, value.tolist()))
 
 
 def _fits(slot: _Slot, got: tuple[int, ...], sizes: Sizes, bound: dict[str, int]) -> bool:
@@ -416,13 +433,16 @@ def rows(cls: Any, prefix: str = "") -> Iterator[Row]:
             yield from rows(slot.of, inner)
             continue
         limits = [_range(entry), "" if entry.finite else "may be NaN or infinite"]
-        if slot.kind == "counts":
-            name += ".NAME"
+        if slot.kind == "named":
+            names = entry.among if entry.among and not slot.name else ("NAME",)
+            name = f"{name}.NAME" if slot.name else prefix + ", ".join(names)
         elif slot.of is bool or slot.of == np.dtype(bool):
             limits = ["a truth value"]
         elif slot.of is str:
             limits = [", ".join(f"`{word}`" for word in entry.among if word) or "a text"]
         shape = (
-            "" if slot.kind in ("number", "counts") else " or ".join(str(",".join(map(str, s))) for s in slot.shapes)
+            ""
+            if slot.of in _NUMBERS and slot.kind in ("number", "named")
+            else " or ".join(str(",".join(map(str, s))) for s in slot.shapes)
         )
         yield Row(name, shape, entry.unit, ", ".join(filter(None, limits)), entry.meaning)

@@ -173,7 +173,7 @@ WHOLE = Whole(
         ({"hold.fault": "drunk"}, "hold.fault: got 'drunk', expected .*stuck"),
         ({"hold.y_um": np.zeros(2)}, r"hold.y_um: got float64 \(2,\), expected .* a shape of \(1,\)"),
         ({"hold.u_V": np.zeros(51), "hold.y_um": np.zeros(51)}, "hold.u_V"),
-        ({"counts.lost": 1}, "counts.lost: got an entry, expected the names"),
+        ({"counts.lost": 1}, "counts.lost: got 1, expected no entry of this name"),
         ({"mark1.beta": np.full(3, np.nan)}, "mark1.beta: got elements from nan to nan, expected finite numbers"),
         ({"past0.beta": np.zeros(3)}, "past0.at: got nothing, expected one entry"),
         ({"why": "x" * 41}, "why: got 41 characters, expected at most 40"),
