@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import types
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache
@@ -54,7 +54,7 @@ class Entry:
     meaning, unit : for people; unit "" : none.
     shape : of an array, ``"p,p|0"``: alternatives of dimensions, each a number or a name. A name that the caller of
         `load` gives no size for stands for one length within a record. "" : one dimension of any length.
-    low, high : range of every element. finite : whether NaN and infinities are refused.
+    low, high : range of every element. finite : whether NaN and infinities are refused, and numbers beyond MOST_FLOAT.
     name : in the file, where it is not that of the field; "" puts the fields of a record among those of its owner.
     most : longest dimension, longest text, or most records. among : the texts that are allowed, or the names of counts.
     """
@@ -98,6 +98,13 @@ def within(prefix: str) -> Iterator[None]:
         yield
     except Refused as error:
         raise error.under(prefix) from error
+
+
+@contextmanager
+def part_of(state: StateDict, prefix: str) -> Iterator[StateDict]:
+    """The entries under ``prefix``, taken out of ``state``; refusals from inside are of entries under it."""
+    with within(prefix):
+        yield {name.removeprefix(prefix): state.pop(name) for name in list(state) if name.startswith(prefix)}
 
 
 # --- The declarations of a class.
@@ -354,7 +361,8 @@ def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
     if type(value) is int and abs(value) > MOST_INT:
         raise Refused(name, str(value)[:40], "an integer from -3 x 2^61 to 3 x 2^61")
     if isfinite(value):
-        if not (entry.low <= value <= entry.high and abs(value) <= (MOST_FLOAT if of is float else MOST_INT)):
+        small = of is int or not entry.finite or abs(value) <= MOST_FLOAT
+        if not (entry.low <= value <= entry.high and small):
             raise Refused(name, repr(value), f"a number {_range(entry) or f'of at most {MOST_FLOAT:g}'}")
     elif entry.finite:
         raise Refused(name, repr(value), _NUMBERS[of])
@@ -422,15 +430,16 @@ class Row(NamedTuple):
     meaning: str
 
 
-def rows(cls: Any, prefix: str = "") -> Iterator[Row]:
-    """The entries that ``save`` writes of a record of ``cls``, in its order."""
+def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Row]:
+    """The entries that ``save`` writes of a record of ``cls``, in its order; without those of records in ``apart``."""
     for slot in _slots(cls):
         entry, name, inner = slot.entry, prefix + slot.name, prefix
         if slot.kind in ("record", "part", "records"):
             if slot.name:
                 inner = f"{name}{'N' if slot.kind == 'records' else ''}."
                 yield Row(inner, "", "", "may be absent" if slot.optional else "", entry.meaning)
-            yield from rows(slot.of, inner)
+            if slot.of not in apart:
+                yield from rows(slot.of, inner, apart)
             continue
         limits = [_range(entry), "" if entry.finite else "may be NaN or infinite"]
         if slot.kind == "named":

@@ -26,7 +26,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
 from adaptive.online.learner import Learner
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
-from adaptive.state import Entry, Refused, load, restore, save, within
+from adaptive.state import Entry, Refused, load, part_of, restore, save
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -325,26 +325,25 @@ class Judge:
         self._past.clear()
         self._past.extend(past)
         for i, (name, model) in enumerate(zip(names, like, strict=True)):
-            with within(f"score.{name}."):
-                kept = taken(state, f"score.{name}.")
+            with part_of(state, f"score.{name}.") as kept:
                 self.scores[i] = load(_RunningError, kept, {"memory": model.memory_size})
 
 
-def taken(state: StateDict, prefix: str) -> StateDict:
-    """Take the entries under ``prefix`` out of ``state``; they come without it."""
-    return {name.removeprefix(prefix): state.pop(name) for name in list(state) if name.startswith(prefix)}
+def check_like(model: InverseModel, other: InverseModel, name: str) -> None:
+    """Raise ModelFileError where the stored model ``name`` cannot stand in the place of ``other``."""
+    same = type(model) is type(other) and model.memory_size == other.memory_size and model.dt_s == other.dt_s
+    if isinstance(model, LssvmInverse) and isinstance(other, LssvmInverse):
+        same = same and model.features.sizes == other.features.sizes
+    if not same:
+        raise Refused(name, f"a {type(model).__name__} of other sizes", "a model like the present one")
 
 
 def snapshots_of(state: StateDict, where: str, names: tuple[str, ...], like: Snapshots) -> Snapshots:
     """Take snapshots of the contestants ``names`` out of ``state``; of the same kinds and sizes as ``like``."""
-    with within(f"{where}."):
-        made = ChampionInverse.from_state(taken(state, f"{where}."))
+    with part_of(state, f"{where}.") as kept:
+        made = ChampionInverse.from_state(kept)
         for name, model, other in zip(made.names, made.models, like, strict=False):
-            same = type(model) is type(other) and model.memory_size == other.memory_size
-            if isinstance(model, LssvmInverse) and isinstance(other, LssvmInverse):
-                same = same and model.features.sizes == other.features.sizes
-            if not same or model.dt_s != other.dt_s:
-                raise Refused(name, f"a {type(model).__name__} of another size", "a model like the contestant's")
+            check_like(model, other, name)
         if made.names != names:
             raise Refused("names", repr(made.names)[:80], repr(names))
     return made.models
@@ -744,13 +743,14 @@ class Competition:
             raise Refused("kinds", repr(kinds)[:80], f"one of {', '.join(_ONLINE_KINDS)} for each of {names}"[:200])
         contestants: dict[str, OnlineModel] = {}
         for name, kind in zip(names, kinds, strict=True):
-            with within(f"model.{name}."):
-                contestants[name] = _ONLINE_KINDS[kind].from_state(taken(rest, f"model.{name}."))
+            with part_of(rest, f"model.{name}.") as kept:
+                contestants[name] = _ONLINE_KINDS[kind].from_state(kept)
         for name, model in contestants.items():
             if rest.pop(f"base.{name}", None) != fingerprint(model.base):
                 raise Refused(f"base.{name}", "another fingerprint", "that of the identified model")
         try:
-            config = CompetitionConfig(**taken(rest, "config."))
+            with part_of(rest, "config.") as settings:
+                config = CompetitionConfig(**settings)
             made = cls(contestants, float(rest["range_um"]), float(rest["span_V"]), config, restart)
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error

@@ -82,7 +82,7 @@ def wholes(draw: st.DrawFn) -> Whole:
         array(n).tolist(), [draw(doubles | st.just(math.nan)) for _ in range(n)], draw(st.sampled_from(["", "stuck"]))
     )
     return Whole(
-        draw(st.integers(-1, MOST_INT)), draw(st.floats(-MOST_FLOAT, MOST_FLOAT) | st.just(math.nan)),
+        draw(st.integers(-1, MOST_INT)), draw(st.floats()),
         draw(st.booleans()), draw(st.text(max_size=40)), draw(st.sampled_from([array(3, 3), np.empty((0, 0))])),
         np.array(draw(st.permutations(range(3)))), np.array(draw(st.lists(st.booleans(), min_size=3, max_size=3))),
         {"learnt": draw(st.integers(0, 9)), "refused": 0}, draw(st.none() | st.tuples(doubles, doubles, doubles)),
