@@ -167,14 +167,14 @@ def _slot(field: str, hint: Any, entry: Entry) -> _Slot:
 # --- Saving.
 
 
-def save(record: Any) -> StateDict:
-    """The declared fields of ``record`` under flat names; copies."""
+def save(record: Any, copies: bool = True) -> StateDict:
+    """The declared fields of ``record`` under flat names; ``copies=False``: with the arrays themselves."""
     state: StateDict = {}
-    _save(record, "", state)
+    _save(record, "", state, copies)
     return state
 
 
-def _save(record: Any, prefix: str, state: StateDict) -> None:
+def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
     kind_of = getattr(type(record), "KIND", None)
     if kind_of is not None:
         state[f"{prefix}kind"] = kind_of
@@ -184,7 +184,7 @@ def _save(record: Any, prefix: str, state: StateDict) -> None:
             state[name] = slot.of(value)
         elif kind == "array":
             if value is not None:
-                state[name] = value.copy()
+                state[name] = value.copy() if copies else value
         elif kind == "values" or kind == "arrays":
             made, row = np.array(() if value is None else value, dtype=slot.of), slot.shapes[0]
             # Without a row, the array has the length of one all the same.
@@ -195,9 +195,9 @@ def _save(record: Any, prefix: str, state: StateDict) -> None:
             state.update((below + key, of(one)) for key, one in value.items())
         elif kind == "records":
             for i, one in enumerate(value):
-                _save(one, f"{name}{i}.", state)
+                _save(one, f"{name}{i}.", state, copies)
         elif value is not None:
-            _save(value, f"{name}." if slot.name else prefix, state)
+            _save(value, f"{name}." if slot.name else prefix, state, copies)
 
 
 def copied(record: T) -> T:
@@ -345,6 +345,8 @@ def _one(slot: _Slot, value: Any, name: str) -> Any:
 
 def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
     """``value`` as a number, truth value or text of the type ``of``."""
+    if of is type(value) is float and -MOST_FLOAT <= value <= MOST_FLOAT and entry.low <= value <= entry.high:
+        return value  # most are
     # JSON has no NaN: a file stores it as an array of shape ().
     if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.shape == () and value.dtype == float):
         value = value.item()
@@ -395,8 +397,11 @@ def _fits(slot: _Slot, got: tuple[int, ...], sizes: Sizes, bound: dict[str, int]
     for shape in slot.shapes:
         if len(shape) != len(got):
             continue
-        wanted = [x if isinstance(x, int) else sizes.get(x, bound.get(x)) for x in shape]
-        if all(n == size or (size is None and n <= slot.entry.most) for n, size in zip(got, wanted, strict=True)):
+        for x, n in zip(shape, got, strict=True):
+            size = x if isinstance(x, int) else sizes.get(x, bound.get(x))
+            if n != size and (size is not None or n > slot.entry.most):
+                break
+        else:
             bound.update((x, n) for x, n in zip(shape, got, strict=True) if isinstance(x, str) and x != "*")
             return True
     return False

@@ -343,8 +343,8 @@ class ResidualWindow:
     def state_dict(self, arrays: bool = True) -> StateDict:
         """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
         c, healing = self._config, self._healing.state()
-        kept = (self._born, self._own, self._turn, self.kernel_variance, c.gamma, c.widths, healing)
-        return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept))
+        kept = (self._born.copy(), self._own.copy(), self._turn, self.kernel_variance, c.gamma, c.widths, healing)
+        return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
 
     def read(self, values: StateDict, arrays: bool = True) -> KernelState:
         """A ``state_dict`` for `take`. Raises ModelFileError where it does not fit.
