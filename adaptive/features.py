@@ -24,13 +24,14 @@ from __future__ import annotations
 
 from dataclasses import InitVar, dataclass, field, replace
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
-from adaptive.types import FloatArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 
 # --- The compiled loops: the memory after a point, and the inputs of a model at that point.
 
@@ -149,36 +150,24 @@ def _run_features(
 class FeatureMap:
     """Frozen map from motion to model inputs.
 
-    Parameters
-    ----------
-    dt_s : sample time, s.
-    y_min_um, y_max_um : the range that (2.42) maps to [-1, 1], µm.
-    v_scale_um_per_s, a_scale_um_per_s2 : velocity and acceleration that count as 1.
-    thresholds_um : play thresholds, µm, ascending, positive; empty for no memory.
-    arc_lengths_um : of the arc states, µm, ascending, positive; empty for none.
-    time_constants_s : of the slow states, s, ascending, positive; empty for none.
-    kernel_plays : indices into ``thresholds_um`` of the plays that the kernel sees.
-    y_rest_um : where the plays rest, in the frame.
-    gain, offset_um : the frame: a reading y stands for the displacement (y - offset_um)/gain of the identified stage.
-    dead_um : dead band of the path that the arc states relax over, some deviations of the motion's noise, µm.
-    linear : whether the basis holds more than the constant. asymmetric : whether it holds the plays times y.
+    The frame: a reading y stands for the displacement (y - offset_um)/gain of the identified stage.
     """
 
-    dt_s: float
-    y_min_um: float
-    y_max_um: float
-    v_scale_um_per_s: float
-    a_scale_um_per_s2: float
-    thresholds_um: tuple[float, ...] = ()
-    arc_lengths_um: tuple[float, ...] = ()
-    time_constants_s: tuple[float, ...] = ()
-    kernel_plays: tuple[int, ...] = ()
-    linear: bool = True
-    asymmetric: bool = False
-    y_rest_um: float = 0.0
-    gain: float = 1.0
-    offset_um: float = 0.0
-    dead_um: float = 0.0
+    dt_s: Annotated[float, Entry("sample time", "s")]
+    y_min_um: Annotated[float, Entry("lower end of the range, which (2.42) maps to -1", "µm")]
+    y_max_um: Annotated[float, Entry("upper end, mapped to 1", "µm")]
+    v_scale_um_per_s: Annotated[float, Entry("velocity that counts as 1", "µm/s")]
+    a_scale_um_per_s2: Annotated[float, Entry("acceleration that counts as 1", "µm/s²")]
+    thresholds_um: Annotated[tuple[float, ...], Entry("play thresholds, ascending", "µm", "plays")] = ()
+    arc_lengths_um: Annotated[tuple[float, ...], Entry("of the arc states, ascending", "µm", "arcs")] = ()
+    time_constants_s: Annotated[tuple[float, ...], Entry("of the slow states, ascending", "s", "slow")] = ()
+    kernel_plays: Annotated[tuple[int, ...], Entry("plays that the kernel sees, by index", "", "kernel_plays")] = ()
+    linear: Annotated[bool, Entry("whether the basis holds more than the constant")] = True
+    asymmetric: Annotated[bool, Entry("whether it holds the plays times y")] = False
+    y_rest_um: Annotated[float, Entry("where the plays rest, in the frame", "µm")] = 0.0
+    gain: Annotated[float, Entry("gain of the frame")] = 1.0
+    offset_um: Annotated[float, Entry("offset of the frame", "µm")] = 0.0
+    dead_um: Annotated[float, Entry("dead band of the arcs' path, some deviations of the motion's noise", "µm")] = 0.0
 
     #: A map from which only the frame differs: all else is taken from it unchecked.
     like: InitVar[FeatureMap | None] = None
@@ -302,41 +291,15 @@ class FeatureMap:
         _run_features(y_um, v_um_per_s, a_um_per_s2, after, self._arrays, basis, kernel)
         return basis, kernel, after
 
-    def state_dict(self) -> StateDict:
-        return {
-            "dt_s": self.dt_s,
-            "y_min_um": self.y_min_um,
-            "y_max_um": self.y_max_um,
-            "v_scale_um_per_s": self.v_scale_um_per_s,
-            "a_scale_um_per_s2": self.a_scale_um_per_s2,
-            "thresholds_um": np.array(self.thresholds_um, dtype=np.float64),
-            "arc_lengths_um": np.array(self.arc_lengths_um, dtype=np.float64),
-            "time_constants_s": np.array(self.time_constants_s, dtype=np.float64),
-            "kernel_plays": np.array(self.kernel_plays, dtype=np.int64),
-            "linear": self.linear,
-            "asymmetric": self.asymmetric,
-            "y_rest_um": self.y_rest_um,
-            "gain": self.gain,
-            "offset_um": self.offset_um,
-            "dead_um": self.dead_um,
-        }
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the dimensions of what belongs to this map; see `adaptive.state`."""
+        plays, arcs, slow = self.thresholds_um, self.arc_lengths_um, self.time_constants_s
+        named = {"plays": plays, "arcs": arcs, "slow": slow, "kernel_plays": self.kernel_plays}
+        sizes = {name: len(values) for name, values in named.items()}
+        return sizes | {"p": self.basis_size, "d": self.kernel_size, "m": self.memory_size}
 
-    @classmethod
-    def from_state(cls, values: StateDict) -> FeatureMap:
-        return cls(
-            dt_s=float(values["dt_s"]),
-            y_min_um=float(values["y_min_um"]),
-            y_max_um=float(values["y_max_um"]),
-            v_scale_um_per_s=float(values["v_scale_um_per_s"]),
-            a_scale_um_per_s2=float(values["a_scale_um_per_s2"]),
-            thresholds_um=tuple(float(x) for x in values["thresholds_um"]),
-            arc_lengths_um=tuple(float(x) for x in values["arc_lengths_um"]),
-            time_constants_s=tuple(float(x) for x in values["time_constants_s"]),
-            kernel_plays=tuple(int(x) for x in values["kernel_plays"]),
-            linear=bool(values["linear"]),
-            asymmetric=bool(values["asymmetric"]),
-            y_rest_um=float(values["y_rest_um"]),
-            gain=float(values["gain"]),
-            offset_um=float(values["offset_um"]),
-            dead_um=float(values["dead_um"]),
-        )
+    def check_like(self, base: FeatureMap) -> None:
+        """Raise ValueError where arrays that belong to ``base`` would not fit this map."""
+        if self.sizes != base.sizes:
+            raise ValueError(f"features: sizes {self.sizes}, the model has {base.sizes}")

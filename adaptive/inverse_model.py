@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import InitVar, dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
 from adaptive.compiled import all_finite, compiled, compiled_reassociating, dot, in_numpy
-from adaptive.errors import InputError, ModelFileError
+from adaptive.errors import InputError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
-from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict, prefixed, under
+from adaptive.state import Entry, load, save
+from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 
 # --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
 
@@ -229,39 +231,31 @@ def _with_margins(domain: FloatArray) -> FloatArray:
 class LssvmInverse:
     """Immutable inverse LSSVM; implements ``adaptive.types.InverseModel``.
 
-    Parameters
-    ----------
-    name : by which it is served.
-    features : the map from motion to inputs; its ``dt_s`` is the model's.
-    beta : (p,) linear part, V per normalised input.
-    support : (N, d) kernel inputs of the samples, dimensionless. alpha : (N,) their weights, V.
-    widths : (d,) kernel widths, dimensionless. gamma : regularisation.
-    domain : (6,) learnt range of y (µm), v (µm/s), a (µm/s²), as [y0, y1, v0, v1, a0, a1].
-    noise_variance : of one prediction at a sample, V². kernel_variance : of the kernel part away from samples, V².
-    beta_covariance : (p, p) of the linear part, V², or (0, 0) where unknown.
-    span_V : voltage range of the recording it was identified from, V.
-    seq : sequence number of the last sample that it has seen, -1 for none.
-    valid : whether the learner declares it valid.
-    anchor, allowed_V : (p,) linear part of the identified model, or (0,), and the largest difference of the voltage
-    from it, V: whatever was learnt, no answer is further from the identified model.
+    ``anchor`` and ``allowed_V``: whatever was learnt, no answer is further from the identified model.
     """
 
-    name: str
-    features: FeatureMap
-    beta: FloatArray
-    support: FloatArray
-    alpha: FloatArray
-    widths: FloatArray
-    gamma: float
-    domain: FloatArray
-    noise_variance: float = 0.0
-    kernel_variance: float = 0.0
-    beta_covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    span_V: float = 1.0
-    seq: int = -1
-    valid: bool = True
-    anchor: FloatArray = field(default_factory=lambda: np.empty(0))
-    allowed_V: float = 0.0
+    KIND = "lssvm"
+
+    name: Annotated[str, Entry("by which it is served", most=1000)]
+    features: Annotated[FeatureMap, Entry("map from motion to inputs; its sample time is the model's")]
+    beta: Annotated[FloatArray, Entry("linear part, per normalised input", "V", "p")]
+    support: Annotated[FloatArray, Entry("kernel inputs of the samples", "", "samples,d")]
+    alpha: Annotated[FloatArray, Entry("their weights", "V", "samples")]
+    widths: Annotated[FloatArray, Entry("kernel widths", "", "d")]
+    gamma: Annotated[float, Entry("regularisation")]
+    domain: Annotated[FloatArray, Entry("learnt range [y0, y1, v0, v1, a0, a1]", "µm, µm/s, µm/s²", "6")]
+    noise_variance: Annotated[float, Entry("of one prediction at a sample", "V²")] = 0.0
+    kernel_variance: Annotated[float, Entry("of the kernel part away from samples", "V²")] = 0.0
+    beta_covariance: Annotated[FloatArray, Entry("of the linear part, empty where unknown", "V²", "p,p|0,0")] = field(
+        default_factory=lambda: np.empty((0, 0))
+    )
+    span_V: Annotated[float, Entry("voltage range of the recording it was identified from", "V")] = 1.0
+    seq: Annotated[int, Entry("number of the last sample that it has seen, -1 for none", low=-1)] = -1
+    valid: Annotated[bool, Entry("whether the learner declares it valid")] = True
+    anchor: Annotated[FloatArray, Entry("linear part of the identified model, or empty", "V", "p|0")] = field(
+        default_factory=lambda: np.empty(0)
+    )
+    allowed_V: Annotated[float, Entry("largest difference from the identified linear part, 0 for any", "V")] = 0.0
     #: A model from which only frame, linear part, domain and noise differ: the rest is shared with it unchecked.
     like: InitVar[LssvmInverse | None] = None
     _scaled: FloatArray = field(init=False, repr=False, compare=False)
@@ -433,36 +427,9 @@ class LssvmInverse:
 
     def state_dict(self) -> StateDict:
         """Flat names to arrays and JSON scalars; ``from_state`` builds an equal model."""
-        state: StateDict = {"kind": "lssvm", "name": self.name, "gamma": self.gamma}
-        state |= prefixed("features.", self.features.state_dict())
-        for name in ("beta", "support", "alpha", "widths", "domain", "beta_covariance", "anchor"):
-            state[name] = getattr(self, name).copy()
-        for name in ("noise_variance", "kernel_variance", "span_V", "seq", "valid", "allowed_V"):
-            state[name] = getattr(self, name)
-        return state
+        return save(self)
 
     @classmethod
     def from_state(cls, state: StateDict) -> LssvmInverse:
         """Inverse of ``state_dict``. Raises ModelFileError on missing or misshapen entries."""
-        try:
-            return cls(
-                name=str(state["name"]),
-                features=FeatureMap.from_state(under("features.", state)),
-                gamma=float(state["gamma"]),
-                noise_variance=float(state["noise_variance"]),
-                kernel_variance=float(state["kernel_variance"]),
-                span_V=float(state["span_V"]),
-                seq=int(state["seq"]),
-                valid=bool(state["valid"]),
-                # Files from before there was a bound have none.
-                anchor=np.asarray(state.get("anchor", ()), dtype=np.float64),
-                allowed_V=float(state.get("allowed_V", 0.0)),
-                beta=np.asarray(state["beta"], dtype=np.float64),
-                support=np.asarray(state["support"], dtype=np.float64),
-                alpha=np.asarray(state["alpha"], dtype=np.float64),
-                widths=np.asarray(state["widths"], dtype=np.float64),
-                domain=np.asarray(state["domain"], dtype=np.float64),
-                beta_covariance=np.asarray(state["beta_covariance"], dtype=np.float64),
-            )  # fmt: skip
-        except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(f"lssvm model: entry missing or damaged: {error}; identify the stage again") from error
+        return load(cls, state)

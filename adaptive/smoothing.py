@@ -14,13 +14,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cache
 from math import factorial, pi
+from typing import Annotated
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
-from adaptive.types import FloatArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 
 #: Outputs of the smoother: displacement, velocity, acceleration.
 OUTPUTS = 3
@@ -58,11 +60,11 @@ class SmootherConfig:
 
 @dataclass(slots=True)
 class SmootherState:
-    """x: (order,) predicted state in sample units. ring: (lag + 1, 1 + 3) innovation and prediction of each step."""
+    """State of a `FixedLagSmoother`."""
 
-    x: FloatArray
-    ring: FloatArray
-    count: int = 0
+    x: Annotated[FloatArray, Entry("predicted state, in sample units", "µm", "order")]
+    ring: Annotated[FloatArray, Entry("innovation and prediction of each step", "µm", "taps,4")]
+    count: Annotated[int, Entry("steps so far", low=0)] = 0
 
     def copy(self) -> SmootherState:
         """An independent copy."""
@@ -155,6 +157,11 @@ class FixedLagSmoother:
             value.flags.writeable = False
             object.__setattr__(self, name, value)
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the dimensions of a `SmootherState`, and of rings of ``lag`` + 2 ``slots``."""
+        return {"order": self.config.order, "taps": self.config.lag + 1, "slots": self.config.lag + 2}
+
     def initial_state(self, y_um: float) -> SmootherState:
         """State at rest at ``y_um`` (µm)."""
         x = np.zeros(self.config.order)
@@ -184,14 +191,6 @@ class FixedLagSmoother:
         out = _run(y, state.x, state.ring, self.transition, self.gain, self.lag_gains) * self.scale
         out[: self.config.lag] = np.nan
         return out
-
-    def state_dict(self, state: SmootherState) -> StateDict:
-        return {"x": state.x.copy(), "ring": state.ring.copy(), "count": state.count}
-
-    def from_state(self, values: StateDict) -> SmootherState:
-        return SmootherState(
-            np.array(values["x"], dtype=np.float64), np.array(values["ring"], dtype=np.float64), int(values["count"])
-        )
 
 
 @cache

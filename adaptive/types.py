@@ -262,11 +262,6 @@ def under(prefix: str, state: Mapping[str, Any]) -> StateDict:
     return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
 
 
-def numbers_of(values: Any) -> StateDict:
-    """The fields of a dataclass of numbers by name: `dataclasses.asdict` without its deep copies."""
-    return {name: getattr(values, name) for name in values.__dataclass_fields__}
-
-
 def parted(state: Mapping[str, Any]) -> dict[str, StateDict]:
     """All entries by the part of their names before the first dot; {} for one that there is not. Inverse of ``joined``.
 

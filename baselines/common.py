@@ -1,15 +1,17 @@
-"""What all baselines share: the report of a fit, argument checks, and the entries that every stored baseline has."""
+"""What all baselines share: the report of a fit, argument checks."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adaptive.compiled import all_finite
 from adaptive.errors import InputError
-from adaptive.types import FloatArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 
 # --- How well an identified baseline fits its recording, and the motion that the recording covers.
 
@@ -18,9 +20,9 @@ from adaptive.types import FloatArray, StateDict
 class Domain:
     """Range of the motion in an identification: displacement µm, largest speed µm/s."""
 
-    y_min_um: float
-    y_max_um: float
-    v_max_um_per_s: float
+    y_min_um: Annotated[float, Entry("lowest displacement", "µm")]
+    y_max_um: Annotated[float, Entry("highest displacement", "µm")]
+    v_max_um_per_s: Annotated[float, Entry("largest speed", "µm/s")]
 
     @staticmethod
     def of(y_um: FloatArray, dt_s: float) -> Domain:
@@ -175,17 +177,3 @@ def checked_memory(memory: FloatArray, size: int) -> FloatArray:
     if size and not all_finite(copy):
         raise InputError(f"memory: got {copy.tolist()}, expected finite values; start from rest_memory")
     return copy
-
-
-def common_state(dt_s: float, std_V: float, domain: Domain) -> StateDict:
-    """The entries that every stored baseline has."""
-    return {"dt_s": dt_s, "voltage_std_V": std_V, **asdict(domain)}
-
-
-def common_fields(name: str, state: StateDict) -> tuple[float, float, Domain]:
-    """``dt_s``, ``voltage_std_V`` and the domain of the stored model ``name``; InputError where one is missing."""
-    try:
-        domain = Domain(float(state["y_min_um"]), float(state["y_max_um"]), float(state["v_max_um_per_s"]))
-        return float(state["dt_s"]), float(state["voltage_std_V"]), domain
-    except KeyError as missing:
-        raise InputError(f"{missing.args[0]}: missing in the state of a {name} model; write the model again") from None

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adaptive.errors import InputError
-from adaptive.types import Feedforward, FloatArray, StateDict, prefixed, under
+from adaptive.state import Entry, load, save
+from adaptive.types import Feedforward, FloatArray, StateDict
 from baselines.bounded_least_squares import SLOPE_FLOOR
 from baselines.common import (
     Domain,
@@ -17,21 +19,19 @@ from baselines.common import (
     checked_memory,
     checked_motion,
     checked_recording,
-    common_fields,
-    common_state,
     positive,
     std_of_voltage,
     std_or_nan,
 )
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
 
 
 @dataclass(frozen=True)
 class LinearParameters:
     """``y = gain u + offset``. Raises InputError unless both are finite and the gain is not zero."""
 
-    gain_um_per_V: float
-    offset_um: float = 0.0
+    gain_um_per_V: Annotated[float, Entry("gain", "µm/V")]
+    offset_um: Annotated[float, Entry("displacement at 0 V", "µm")] = 0.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.gain_um_per_V) and self.gain_um_per_V != 0.0):
@@ -63,11 +63,11 @@ class LinearInverse:
     ``voltage_std_V`` is one standard deviation of the voltage, from the residual of the identification; NaN: unknown.
     """
 
-    parameters: LinearParameters
-    dt_s: float
-    domain: Domain
-    voltage_std_V: float = math.nan
-    name: str = "linear"
+    parameters: Annotated[LinearParameters, Entry("the identified stage", name="")]
+    dt_s: Annotated[float, Entry("sample time", "s")]
+    domain: Annotated[Domain, Entry("motion of the identification", name="")]
+    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
+    name: Annotated[str, Entry("by which it is served", most=1000)] = "linear"
 
     def __post_init__(self) -> None:
         positive("dt_s", self.dt_s, "s")
@@ -107,20 +107,13 @@ class LinearInverse:
         return checked_memory(memory, 0)
 
     def state_dict(self) -> StateDict:
-        """Flat numbers by name."""
-        p = self.parameters
-        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
-        return {**state, "name": self.name, "gain_um_per_V": p.gain_um_per_V, "offset_um": p.offset_um}
+        """Flat numbers and vectors by name."""
+        return save(self)
 
     @staticmethod
     def from_state(state: StateDict) -> LinearInverse:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
-        dt_s, std_V, domain = common_fields("linear", state)
-        try:
-            parameters = LinearParameters(float(state["gain_um_per_V"]), float(state["offset_um"]))
-        except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of a linear model; write it again") from None
-        return LinearInverse(parameters, dt_s, domain, std_V, str(state.get("name", "linear")))
+        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
+        return load(LinearInverse, state)
 
 
 def fit_linear(
@@ -141,6 +134,12 @@ class LinearOnline(LeastSquaresOnline):
     By default a sample is remembered for 100 samples that teach.
     """
 
+    BASE = LinearInverse
+
+    base: LinearInverse
+    _gain: Annotated[float, Entry("gain", "µm/V", name="gain_now")]
+    _offset: Annotated[float, Entry("offset", "µm", name="offset_now")]
+
     def __init__(self, model: LinearInverse, config: LeastSquaresConfig | None = None) -> None:
         p, domain = model.parameters, model.domain
         y = np.linspace(domain.y_min_um, domain.y_max_um, 50)
@@ -154,6 +153,10 @@ class LinearOnline(LeastSquaresOnline):
         self.base = model
         self._gain, self._offset, self._sign = p.gain_um_per_V, p.offset_um, np.sign(p.gain_um_per_V)
         self._square = (model.voltage_std_V * p.gain_um_per_V) ** 2 if np.isfinite(model.voltage_std_V) else 0.0
+
+    @property
+    def pending_size(self) -> int:
+        return 2
 
     def _regressors_now(self) -> FloatArray:
         return np.array([self._recent[-1][0], 1.0])
@@ -179,17 +182,3 @@ class LinearOnline(LeastSquaresOnline):
         """The present line; its standard deviation is that of the recent residuals."""
         std = float(np.sqrt(self._square)) / abs(self._gain)
         return replace(self.base, parameters=LinearParameters(self._gain, self._offset), voltage_std_V=std)
-
-    def state_dict(self) -> StateDict:
-        """The whole state; ``from_state`` continues to the same last bit."""
-        now = {"gain_now": self._gain, "offset_now": self._offset}
-        return {**self._learning_state(), **now, **prefixed("base_", self.base.state_dict())}
-
-    @classmethod
-    def from_state(cls, state: StateDict) -> LinearOnline:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
-        made = cls(LinearInverse.from_state(under("base_", state)), config_from(state))
-        made._restore_learning(state)
-        made._gain = float(field_of(state, "gain_now", "linear"))
-        made._offset = float(field_of(state, "offset_now", "linear"))
-        return made

@@ -9,12 +9,12 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
 from adaptive.compiled import compiled
-from adaptive.errors import InputError
+from adaptive.errors import InputError, ModelFileError
 from adaptive.online.gates import (
     DUPLICATE,
     GAP,
@@ -28,6 +28,7 @@ from adaptive.online.gates import (
     TIMING,
     UNEXCITED,
 )
+from adaptive.state import Entry, restore, save, within
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -60,6 +61,20 @@ class OnlineBaseline(ABC):
     dt_s : sample time, s.
     settle : samples after a start or a gap that do not teach.
     """
+
+    #: Classes of the identified model, whose state and settings the constructor takes, and of the settings.
+    BASE: ClassVar[Any]
+    CONFIG: ClassVar[Any]
+
+    base: InverseModel
+    config: Any
+    _seq: Annotated[int, Entry("number of the last sample handled, -1 before any", low=-1)]
+    _t_s: Annotated[float, Entry("its time", "s")]
+    _since_start: Annotated[int, Entry("samples since the start or a gap", low=0)]
+    _square: Annotated[float, Entry("mean square residual", "µm²", low=0.0, name="square_um2")]
+    _counters: Annotated[
+        dict[str, int], Entry("samples by outcome", low=0, name="count", among=(LEARNT, PASSED, *REASONS))
+    ]
 
     def __init__(self, dt_s: float, settle: int) -> None:
         self._dt = dt_s
@@ -169,6 +184,10 @@ class OnlineBaseline(ABC):
         return TIMING if abs(sample.t_s - self._t_s - expected) > _TIMING_TOLERANCE * expected else ""
 
     @abstractmethod
+    def snapshot(self) -> InverseModel:
+        """The present model, immutable."""
+
+    @abstractmethod
     def _restart(self, u_V: float, y_um: float, first: bool) -> None:
         """Begin at the first sample or after a gap, where the time since the sample before is not one step."""
 
@@ -176,37 +195,52 @@ class OnlineBaseline(ABC):
     def _advance(self, u_V: float, y_um: float, settled: bool) -> str:
         """Take a good sample one step after the last. Returns the outcome. ``settled``: it may teach."""
 
+    # ---- keeping
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the dimensions of the state."""
+        return {}
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What the records of a stored state do not hold themselves; see `adaptive.state.load`."""
+        return {}
+
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where new values of the state do not fit what this baseline was made with."""
+
+    def state_dict(self) -> StateDict:
+        """The whole state, the identified model and the settings; ``from_state`` continues to the same last bit."""
+        settings = {
+            name: np.array(value) if isinstance(value, tuple) else value for name, value in asdict(self.config).items()
+        }
+        return save(self) | prefixed("config.", settings) | prefixed("base.", self.base.state_dict())
+
     @classmethod
-    @abstractmethod
-    def from_state(cls, state: StateDict) -> OnlineModel:
-        """Inverse of ``state_dict`` of the same class."""
+    def from_state(cls, state: StateDict) -> Self:
+        """Inverse of ``state_dict`` of the same class. Raises ModelFileError where it does not fit."""
+        with within("base."):
+            base = cls.BASE.from_state(under("base.", state))
+        settings = {
+            name: tuple(value.tolist()) if isinstance(value, np.ndarray) else value
+            for name, value in under("config.", state).items()
+        }
+        try:
+            made = cls(base, cls.CONFIG(**settings))
+        except (TypeError, ValueError) as error:
+            raise ModelFileError(f"state: settings damaged: {error}; start from the model file") from error
+        own = {name: value for name, value in state.items() if not name.startswith(("base.", "config."))}
+        restore(made, own, made.sizes, made.given)
+        made._restored()
+        return made
 
     def restored(self, state: StateDict) -> OnlineModel:
-        """A baseline of this class with ``state``. Raises InputError where a field is missing."""
+        """A baseline of this class with ``state``. Raises ModelFileError where it does not fit."""
         return self.from_state(state)
 
-    def _common_state(self) -> StateDict:
-        counted = prefixed("count_", self._counters)
-        return {
-            "seq": self._seq,
-            "t_s": self._t_s,
-            "since_start": self._since_start,
-            "square_um2": self._square,
-            **counted,
-        }
-
-    def _restore_common(self, state: StateDict) -> None:
-        self._seq, self._t_s = int(state["seq"]), float(state["t_s"])
-        self._since_start, self._square = int(state["since_start"]), float(state["square_um2"])
-        for name in self._counters:
-            self._counters[name] = int(state[f"count_{name}"])
-
-
-def field_of(state: StateDict, name: str, kind: str) -> Any:
-    """The entry ``name`` of the stored state of a ``kind`` model. Raises InputError where it is missing."""
-    if name not in state:
-        raise InputError(f"{name}: missing in the state of a {kind} model; start from a model file instead")
-    return state[name]
+    def _restored(self) -> None:
+        """Make anew what follows from the state."""
 
 
 # --- Online least squares with forgetting and lower bounds on the weights, for models that are linear in them.
@@ -273,13 +307,36 @@ class LeastSquaresOnline(OnlineBaseline):
     rows : (n, p) rows of the identified model, from which learning starts.
     """
 
+    CONFIG = LeastSquaresConfig
+
+    _normal: Annotated[FloatArray, Entry("normal matrix of the remembered samples", "", "rows,rows")]
+    _recent: Annotated[deque[tuple[float, float]], Entry("last voltages and readings", "V, µm", "*,2")]
+    _taught_u: Annotated[
+        float,
+        Entry("voltage of the last sample that taught, at first infinite", "V", finite=False, name="taught_u_V"),
+    ]
+    _pending: Annotated[FloatArray, Entry("part of a row that depends on the voltage", "", "pending|0")]
+
+    @property
+    def pending_size(self) -> int:
+        """Number of regressors that depend on the voltage."""
+        raise NotImplementedError
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"rows": len(self._normal), "pending": self.pending_size}
+
+    def check_state(self, values: dict[str, Any]) -> None:
+        if not values["_pending"].size and values["_since_start"] >= self.config.learn_every:
+            raise ValueError(f"pending: got nothing, expected {self.pending_size} numbers")
+
     def __init__(self, dt_s: float, u_range_V: float, config: LeastSquaresConfig, rows: FloatArray) -> None:
         super().__init__(dt_s, config.settle)
         self.config = config
         self._step_V = config.excitation * u_range_V
         self._keep = 1.0 - 1.0 / config.remember
         self._normal = (rows.T @ rows) * (config.trust / rows.shape[0])
-        self._recent: deque[tuple[float, float]] = deque(maxlen=2 * _HALF + 1)
+        self._recent = deque(maxlen=2 * _HALF + 1)
         self._taught_u = np.inf
         self._pending = np.empty(0)
 
@@ -338,31 +395,3 @@ class LeastSquaresOnline(OnlineBaseline):
         """
         matrix = normal[:-1, :-1] + 1e-12 * np.diag(normal).max() * np.eye(lower.size)
         return bounded_minimum(matrix, normal[:-1, -1], lower)
-
-    def _learning_state(self) -> StateDict:
-        return {
-            **self._common_state(),
-            **prefixed("config_", asdict(self.config)),
-            "normal": self._normal.copy(),
-            "recent": np.array(list(self._recent), dtype=np.float64).reshape(-1, 2),
-            "taught_u_V": float(self._taught_u) if np.isfinite(self._taught_u) else None,
-            "pending": self._pending.copy(),
-        }
-
-    def _restore_learning(self, state: StateDict) -> None:
-        self._restore_common(state)
-        self._normal = np.array(state["normal"], dtype=np.float64)
-        self._recent.extend((float(u), float(y)) for u, y in np.asarray(state["recent"]).reshape(-1, 2))
-        taught = state["taught_u_V"]
-        self._taught_u = np.inf if taught is None else float(taught)
-        self._pending = np.array(state["pending"], dtype=np.float64)
-
-
-def config_from(state: StateDict) -> LeastSquaresConfig:
-    """The configuration in a stored state. Raises InputError where a field is missing."""
-    values = under("config_", state)
-    whole = {name: int(field_of(values, name, "online")) for name in ("learn_every", "solve_every", "settle")}
-    real = {name: float(field_of(values, name, "online")) for name in ("remember", "trust", "excitation")}
-    return LeastSquaresConfig(
-        learn_every=whole["learn_every"], solve_every=whole["solve_every"], settle=whole["settle"], **real
-    )

@@ -21,13 +21,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.features import FeatureMap, advance
 from adaptive.inverse_model import LssvmInverse, unpacked, voltage_of
-from adaptive.types import FloatArray, IntArray, StateDict, prefixed, under
+from adaptive.state import Entry
+from adaptive.types import FloatArray, IntArray
 
 #: Newton's steps a sample, and the displacement over which the slope is taken, as a share of the range.
 STEPS, SLOPE_SHARE = 2, 1e-5
@@ -55,17 +57,19 @@ _Y, _V, _A, _U, _LOW, _HIGH, _WAY, _CUT, _OFF, _SLOPE, _LINE = range(11)
 class Reckoning:
     """A reckoned place, and the fixed model that reckons it.
 
-    Parameters
-    ----------
-    model : an immutable snapshot. memory : (m,) hysteresis memory after the last sample.
     numbers : place (µm, µm/s, µm/s²) and voltage (V) of the last sample; the band (µm); way gone and what the band cut
     off since the doubt began (µm); what a reading shows more than the place (µm); mean slope (V/µm), and the voltage
     at which the line through the start is at 0 µm (V).
     """
 
-    model: LssvmInverse
-    memory: FloatArray
-    numbers: FloatArray
+    model: Annotated[LssvmInverse, Entry("an immutable snapshot, which reckons the place")]
+    memory: Annotated[FloatArray, Entry("hysteresis memory after the last sample", "µm", "m")]
+    numbers: Annotated[FloatArray, Entry("place, voltage, band and uncertainty, in the order of `Reckoning`", "", "11")]
+
+    def check_state(self) -> None:
+        """Raise ValueError where the memory is not of the model."""
+        if self.memory.shape != (self.model.memory_size,):
+            raise ValueError(f"memory: {self.memory.shape}, the model has one of {self.model.memory_size}")
 
     @classmethod
     def begin(
@@ -172,20 +176,6 @@ class Reckoning:
         constants, counts = self.model.packed
         _step(u_V, f.dt_s, self.range_um, anew, self.memory, self.numbers, constants, counts)
         return self.y_um
-
-    def state_dict(self) -> StateDict:
-        """All of it under flat names."""
-        own = {"memory": self.memory.copy(), "numbers": self.numbers.copy()}
-        return {**own, **prefixed("model.", self.model.state_dict())}
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> Reckoning:
-        """Inverse of ``state_dict``."""
-        model = LssvmInverse.from_state(under("model.", values))
-        memory, numbers = (np.array(values[name], dtype=np.float64) for name in ("memory", "numbers"))
-        if numbers.shape != (11,) or memory.shape != (model.memory_size,):
-            raise ValueError(f"reckoning: got shapes {memory.shape}, {numbers.shape}, expected {model.memory_size}, 11")
-        return cls(model, memory, numbers)
 
 
 def drive_V(model: LssvmInverse) -> float:

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan, nan
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from adaptive.compiled import compiled, shared
-from adaptive.errors import InputError, ModelFileError
+from adaptive.errors import InputError
 from adaptive.features import ACCELERATION, MOTION_COLUMNS, VELOCITY
-from adaptive.types import FloatArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 
 # --- The drift filter's algebra, compiled: one scalar measurement of a random walk, in O(p²).
 #
@@ -179,17 +181,21 @@ class DriftConfig:
 
 @dataclass(slots=True)
 class DriftState:
-    """Counters of the filter. fast_V2, slow_V2 : short-term and long-term mean square innovation, V².
+    """Counters of the filter, and the innovations by which it detects changes."""
 
-    rejected : refused measurements in a row. quiet : updates since the last burst. bursts, updates : totals.
-    """
+    fast_V2: Annotated[float, Entry("short-term mean square innovation", "V²", low=0.0)] = 0.0
+    slow_V2: Annotated[float, Entry("long-term mean square innovation", "V²", low=0.0)] = 0.0
+    rejected: Annotated[int, Entry("refused measurements in a row", low=0)] = 0
+    quiet: Annotated[int, Entry("updates since the last burst", low=0)] = 0
+    bursts: Annotated[int, Entry("detected changes", low=0)] = 0
+    updates: Annotated[int, Entry("updates so far", low=0)] = 0
 
-    fast_V2: float = 0.0
-    slow_V2: float = 0.0
-    rejected: int = 0
-    quiet: int = 0
-    bursts: int = 0
-    updates: int = 0
+
+class Mark(NamedTuple):
+    """An estimate of the filter to return to."""
+
+    beta: Annotated[FloatArray, Entry("linear part", "V", "p")]
+    covariance: Annotated[FloatArray, Entry("its covariance", "V²", "p,p")]
 
 
 #: Time constants of the short-term and long-term mean square innovation, s.
@@ -256,6 +262,10 @@ class DriftFilter:
     beta : (p,) initial estimate, and covariance : (p, p) its covariance, V².
     step_s : time between two updates, s. span_V : the model's voltage span, V.
     """
+
+    _x: Annotated[FloatArray, Entry("linear part", "V", "p", name="beta")]
+    _P: Annotated[FloatArray, Entry("its covariance", "V²", "p,p", name="covariance")]
+    state: Annotated[DriftState, Entry("counters of the filter", name="")]
 
     def __init__(
         self, config: DriftConfig, beta: FloatArray, covariance: FloatArray, step_s: float, span_V: float
@@ -326,9 +336,9 @@ class DriftFilter:
         """Add variance in the directions of a sudden change of the stage: gain, offset, velocity, acceleration."""
         _expect_change(self.config, self.state, self._x, self._P, self._burst)
 
-    def mark(self) -> tuple[FloatArray, FloatArray]:
-        """(beta, covariance) as copies, for `restore` and `go_back`."""
-        return self.beta, self.covariance
+    def mark(self) -> Mark:
+        """The estimate as copies, for `restore` and `go_back`."""
+        return Mark(self.beta, self.covariance)
 
     def restore(self, mark: tuple[FloatArray, FloatArray]) -> None:
         """Return to a marked estimate."""
@@ -343,38 +353,6 @@ class DriftFilter:
     def shift_constant(self, by_V: float) -> None:
         """Add ``by_V`` to the constant, V; another part of the model has lost as much."""
         self._x[0] += by_V
-
-    def state_dict(self) -> StateDict:
-        s = self.state
-        return {
-            "beta": self.beta,
-            "covariance": self.covariance,
-            "fast_V2": s.fast_V2,
-            "slow_V2": s.slow_V2,
-            "rejected": s.rejected,
-            "quiet": s.quiet,
-            "bursts": s.bursts,
-            "updates": s.updates,
-        }
-
-    @classmethod
-    def from_state(cls, config: DriftConfig, step_s: float, span_V: float, values: StateDict) -> DriftFilter:
-        made = cls(
-            config,
-            np.asarray(values["beta"], dtype=np.float64),
-            np.asarray(values["covariance"], dtype=np.float64),
-            step_s,
-            span_V,
-        )
-        made.state = DriftState(
-            fast_V2=float(values["fast_V2"]),
-            slow_V2=float(values["slow_V2"]),
-            rejected=int(values["rejected"]),
-            quiet=int(values["quiet"]),
-            bursts=int(values["bursts"]),
-            updates=int(values["updates"]),
-        )
-        return made
 
 
 # --- Creep at rest.
@@ -396,14 +374,13 @@ class RestCreep:
     hysteresis. If the constant of the linear part absorbed the change, the modelled hysteresis would not reverse, and
     the model would be wrong as soon as the stage moves. Creep is a displacement without a change of voltage. Therefore
     it becomes an offset of the feature map's frame (``adaptive.features``), and the modelled hysteresis reverses too.
-
-    constant_V : constant of the linear part when the rest began, NaN while the stage moves.
-    steps : updates of the filter since then. u_V : voltage at the last possible move of the frame.
     """
 
-    constant_V: float = nan
-    steps: int = 0
-    u_V: float = nan
+    constant_V: Annotated[
+        float, Entry("constant of the linear part when the rest began, NaN in motion", "V", finite=False)
+    ] = nan
+    steps: Annotated[int, Entry("updates of the filter since then", low=0)] = 0
+    u_V: Annotated[float, Entry("voltage at the last possible move of the frame", "V", finite=False)] = nan
 
     @shared
     def leave(self) -> None:
@@ -432,16 +409,3 @@ class RestCreep:
         gained_um = (constant_V - self.constant_V) * range_um / span_V
         most_um = FASTEST_PER_S * range_um * FRAME_EVERY * step_s
         return -min(max(gained_um * min(1.0, FRAME_EVERY * step_s / creep_s), -most_um), most_um)
-
-    def state_dict(self) -> StateDict:
-        return {"constant_V": self.constant_V, "steps": self.steps, "u_V": self.u_V}
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> RestCreep:
-        """Inverse of ``state_dict``; older states have no entries and give a moving stage."""
-        if not values:
-            return cls()
-        try:
-            return cls(float(values["constant_V"]), int(values["steps"]), float(values["u_V"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(f"rest: entry missing or damaged: {error}") from error

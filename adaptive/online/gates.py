@@ -12,13 +12,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import isfinite
+from typing import Annotated
 
 import numpy as np
 
 from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap
-from adaptive.types import Sample, StateDict, numbers_of
+from adaptive.state import Entry
+from adaptive.types import Sample
 
 # --- Gates.
 
@@ -121,32 +123,24 @@ class AdmissionConfig:
 
 @dataclass(slots=True)
 class AdmissionState:
-    """seq, t_s : of the last sample taken.
+    """What the gates remember of the samples so far."""
 
-    since_start, since_jump : samples since the smoother started, since it was moved to a place that had jumped,
-    since_step, since_glitch : since the voltage stepped, since the sensor was last found to have been wrong.
-    moved, anchor_um : the smoother's count when the stage last left a place, and where it then was.
-    u_V, u_before_V : the last two voltages. kink_V : the largest kink of the voltage of late, fading.
-    innovation2 : mean square error of the smoother's predictions, in ranges².
-    y_um, same : the last reading, and how many in a row are equal to it; low_V, high_V : the voltages meanwhile.
-    """
-
-    seq: int = -1
-    t_s: float = 0.0
-    since_start: int = 0
-    since_jump: int = 0
-    since_step: int = 0
-    since_glitch: int = 1_000_000_000
-    moved: int = 0
-    anchor_um: float = 0.0
-    u_V: float = 0.0
-    u_before_V: float = 0.0
-    kink_V: float = 0.0
-    innovation2: float = 0.0
-    y_um: float = 0.0
-    same: int = 0
-    low_V: float = 0.0
-    high_V: float = 0.0
+    seq: Annotated[int, Entry("number of the last sample taken, -1 before any", low=-1)] = -1
+    t_s: Annotated[float, Entry("its time", "s")] = 0.0
+    since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
+    since_jump: Annotated[int, Entry("samples since the smoother was moved to a place that had jumped", low=0)] = 0
+    since_step: Annotated[int, Entry("samples since the voltage stepped", low=0)] = 0
+    since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
+    moved: Annotated[int, Entry("the smoother's count when the stage last left a place", low=0)] = 0
+    anchor_um: Annotated[float, Entry("where the stage then was", "µm")] = 0.0
+    u_V: Annotated[float, Entry("the last voltage", "V")] = 0.0
+    u_before_V: Annotated[float, Entry("the voltage before", "V")] = 0.0
+    kink_V: Annotated[float, Entry("largest kink of the voltage of late, fading", "V", low=0.0)] = 0.0
+    innovation2: Annotated[float, Entry("mean square error of the smoother's predictions", "ranges²", low=0.0)] = 0.0
+    y_um: Annotated[float, Entry("the last reading", "µm")] = 0.0
+    same: Annotated[int, Entry("how many readings in a row are equal to it", low=0)] = 0
+    low_V: Annotated[float, Entry("lowest voltage meanwhile", "V")] = 0.0
+    high_V: Annotated[float, Entry("highest voltage meanwhile", "V")] = 0.0
 
     @shared
     def take(self, sample: Sample, steps: int) -> None:
@@ -171,14 +165,6 @@ class AdmissionState:
     def note_jump(self) -> None:
         """The smoother is moved to another place."""
         self.since_jump = 0
-
-    def state_dict(self) -> StateDict:
-        return numbers_of(self)
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> AdmissionState:
-        kinds = {name: type(value) for name, value in numbers_of(cls()).items()}
-        return cls(**{name: kind(values[name]) for name, kind in kinds.items()})
 
 
 @shared

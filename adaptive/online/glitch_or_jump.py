@@ -13,10 +13,9 @@ From the first such reading on, samples are held and not learnt. Dead reckoning 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -25,7 +24,8 @@ from adaptive.features import FeatureMap
 from adaptive.online.dead_reckoning import SLOPES, Reckoning
 from adaptive.online.gates import REPEATED, AdmissionConfig, EnvelopeConfig
 from adaptive.online.track import Step
-from adaptive.types import BoolArray, FloatArray, StateDict, prefixed, under
+from adaptive.state import Entry
+from adaptive.types import BoolArray, FloatArray
 
 # --- The level at which readings settle. The distances r(k) of the readings from the dead-reckoned position are fitted:
 #
@@ -243,38 +243,32 @@ class Circumstances(NamedTuple):
 
 @dataclass(slots=True)
 class Hold:
-    """Held samples, and the quantities that `judge` uses.
+    """Held samples, and the quantities that `judge` uses."""
 
-    reckoning : dead reckoning since the last trusted reading ``last_um``.
-    u_V, y_um, old_um : for each sample: voltage, reading (NaN if there is none), and expected reading without a jump.
-    slope, shift_um : the jumps accepted so far; the expected reading is slope old + shift.
-    jumped : number of samples at the last of these jumps, 0 if there is none.
-    silent : number of samples at the last one without a reading, or with a stuck one.
-    level, away_um : the level that `judge` has found: index of its first reading, and its distance.
-    seen_um : largest distance from the expected reading. good : readings in a row at the expected level.
-    rang : number of samples at the last detection of ringing about the expected level, 0 if never.
-    same_um, same : last reading, and how many readings in a row are equal to it.
-    low_um, high_um : lowest and highest dead-reckoned position during those.
-    """
-
-    reckoning: Reckoning
-    last_um: float
-    u_V: list[float] = field(default_factory=list)
-    y_um: list[float] = field(default_factory=list)
-    old_um: list[float] = field(default_factory=list)
-    slope: float = 1.0
-    shift_um: float = 0.0
-    jumped: int = 0
-    silent: int = 0
-    level: int = 0
-    away_um: float = 0.0
-    seen_um: float = 0.0
-    good: int = 0
-    rang: int = 0
-    same_um: float = math.nan
-    same: int = 0
-    low_um: float = 0.0
-    high_um: float = 0.0
+    reckoning: Annotated[Reckoning, Entry("dead reckoning since the last trusted reading")]
+    last_um: Annotated[float, Entry("that reading", "µm", finite=False)]
+    u_V: Annotated[list[float], Entry("voltage of each sample", "V", "held", finite=False, most=20_000)] = field(
+        default_factory=list
+    )
+    y_um: Annotated[list[float], Entry("its reading, NaN without one", "µm", "held", finite=False, most=20_000)] = (
+        field(default_factory=list)
+    )
+    old_um: Annotated[
+        list[float], Entry("its expected reading without a jump", "µm", "held", finite=False, most=20_000)
+    ] = field(default_factory=list)
+    slope: Annotated[float, Entry("jumps accepted so far: the expected reading is slope old + shift")] = 1.0
+    shift_um: Annotated[float, Entry("the shift of them", "µm", finite=False)] = 0.0
+    jumped: Annotated[int, Entry("number of samples at the last of these jumps, 0 for none", low=0)] = 0
+    silent: Annotated[int, Entry("number of samples at the last one without a reading, or stuck", low=0)] = 0
+    level: Annotated[int, Entry("index of the first reading of the level that `judge` has found", low=0)] = 0
+    away_um: Annotated[float, Entry("distance of that level", "µm", finite=False)] = 0.0
+    seen_um: Annotated[float, Entry("largest distance from the expected reading", "µm", finite=False)] = 0.0
+    good: Annotated[int, Entry("readings in a row at the expected level", low=0)] = 0
+    rang: Annotated[int, Entry("number of samples at the last ringing about that level, 0 for never", low=0)] = 0
+    same_um: Annotated[float, Entry("the last reading, NaN before any", "µm", finite=False)] = math.nan
+    same: Annotated[int, Entry("how many readings in a row are equal to it", low=0)] = 0
+    low_um: Annotated[float, Entry("lowest dead-reckoned position during those", "µm", finite=False)] = 0.0
+    high_um: Annotated[float, Entry("highest dead-reckoned position during those", "µm", finite=False)] = 0.0
 
     @classmethod
     def after_equal(cls, reckoning: Reckoning, last_um: float, same_um: float, same: int) -> Hold:
@@ -313,26 +307,6 @@ class Hold:
     def shift(self, by_um: float) -> None:
         """Move the expected readings by ``by_um``."""
         self.shift_um += by_um
-
-    def state_dict(self) -> StateDict:
-        """The whole state under flat names."""
-        state: StateDict = prefixed("reckoning.", self.reckoning.state_dict())
-        for name in ("u_V", "y_um", "old_um"):
-            state[name] = np.array(getattr(self, name), dtype=np.float64)
-        return state | {name: getattr(self, name) for name in _NUMBERS}
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> Hold:
-        """Inverse of ``state_dict``. Raises KeyError, TypeError or ValueError where it does not fit."""
-        kept: dict[str, Any] = {name: [float(x) for x in values[name]] for name in ("u_V", "y_um", "old_um")}
-        kept |= {name: kind(values[name]) for name, kind in _NUMBERS.items()}
-        return cls(Reckoning.from_state(under("reckoning.", values)), **kept)
-
-
-_NUMBERS: dict[str, Callable[[Any], Any]] = {
-    "last_um": float, "slope": float, "shift_um": float, "jumped": int, "silent": int, "level": int, "away_um": float,
-    "seen_um": float, "good": int, "rang": int, "same_um": float, "same": int, "low_um": float, "high_um": float,
-}  # fmt: skip
 
 
 def _is_stuck(hold: Hold, stuck_um: float) -> bool:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import nan
+from typing import Annotated, Any
 
 from adaptive.compiled import shared
 from adaptive.features import FeatureMap
@@ -29,46 +30,9 @@ from adaptive.online.glitch_or_jump import MOST_BRIDGED, Circumstances, Hold, Ve
 from adaptive.online.missing_motion import PROBE_EVERY, UNKNOWN_S, MissingMotion
 from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, STILL_STEPS, Following, Outcome, Trial
 from adaptive.online.track import Pair, Past, Step, Taken, Track
-from adaptive.smoothing import FixedLagSmoother, smoother_of
-from adaptive.types import FloatArray, Sample, StateDict, joined, parted, prefixed
-
-# --- What an intake holds beside its numbers, as flat entries and back.
-
-
-def _parts_to_state(
-    gates: AdmissionState,
-    track: Track | None,
-    hold: Hold | None,
-    trial: Trial | None,
-    before: FeatureMap | None,
-    following: Following,
-) -> StateDict:
-    """All parts that exist; copies."""
-    parts = {"gates": gates.state_dict(), "following": following.state_dict()}
-    for name, part in (("track", track), ("hold", hold), ("trial", trial), ("before", before)):
-        if part is not None:
-            parts[name] = part.state_dict()
-    return joined(parts)
-
-
-def _parts_of(
-    smoother: FixedLagSmoother, model: LssvmInverse, parts: dict[str, StateDict]
-) -> tuple[AdmissionState, Track | None, Hold | None, Trial | None, FeatureMap | None, Following]:
-    """Inverse of ``_parts_to_state``; ``model`` is the identified one.
-
-    Raises KeyError, TypeError, ValueError or InputError where it does not fit.
-    """
-    gates = AdmissionState.from_state(parts["gates"])
-    track, hold, trial, before = (parts[name] for name in ("track", "hold", "trial", "before"))
-    return (
-        gates,
-        Track.from_state(smoother, model.features, track) if track else None,
-        Hold.from_state(hold) if hold else None,
-        Trial.from_state(trial, model) if trial else None,
-        FeatureMap.from_state(before) if before else None,
-        Following.from_state(parts["following"]),
-    )
-
+from adaptive.smoothing import smoother_of
+from adaptive.state import Entry, restore, save
+from adaptive.types import FloatArray, Sample
 
 #: A jump back differs from the jump by less than this share of it.
 BACK_SHARE = 0.1
@@ -104,11 +68,31 @@ def lags(gates: AdmissionState, x_um: float, dy_um: float, range_um: float) -> b
 class Intake:
     """The intake of a learner; ``base`` is the identified model.
 
-    Attributes
-    ----------
-    track : of the stage, None before the first reading. gates : state of the gates.
-    following : check that the readings follow the drive; confirmed : whether it has just confirmed that they do.
+    ``confirmed`` : whether the last check has confirmed that the readings follow the drive.
     """
+
+    gates: Annotated[AdmissionState, Entry("state of the gates")]
+    following: Annotated[Following, Entry("check that the readings follow the drive")]
+    track: Annotated[Track | None, Entry("of the stage, before the first reading none")]
+    _hold: Annotated[Hold | None, Entry("readings that are held back")]
+    _trial: Annotated[Trial | None, Entry("trial of the sensor")]
+    _control: Annotated[Trial | None, Entry("control trial: it judges readings that are trusted")]
+    missing: Annotated[MissingMotion | None, Entry("a gap of which the motion is not known yet")]
+    _before: Annotated[FeatureMap | None, Entry("the frame before the last jump")]
+    _proven: Annotated[FeatureMap | None, Entry("the frame before the first jump that is not confirmed")]
+    _proven_past: Annotated[Past | None, Entry("a place from then")]
+    _pasts: Annotated[list[Past], Entry("places in which the readings followed, older first", name="past", most=2)]
+    _lost: Annotated[bool, Entry("whether the smoother has to start again")]
+    _jump_um: Annotated[float, Entry("by how much the last jump moved readings", "µm")]
+    _calm: Annotated[int, Entry("samples since readings were last held back", low=0)]
+    _credit: Annotated[int, Entry("passed control trials; without any the model judges no sensor", high=CREDIT)]
+    _until_control: Annotated[int, Entry("samples until the next control trial")]
+    _look_from: Annotated[int, Entry("samples since the start from which on it is looked again for lags", low=0)]
+    _reckoned_seq: Annotated[int, Entry("the last sample that has advanced the place", low=-1)]
+    restarts: Annotated[int, Entry("restarts of the smoother", low=0)]
+    jumps: Annotated[int, Entry("jumps taken", low=0)]
+    undone: Annotated[int, Entry("jumps taken back", low=0)]
+    trials: Annotated[int, Entry("trials of the sensor", low=0)]
 
     def __init__(self, base: LssvmInverse, config: LearnerConfig) -> None:
         self.base = base
@@ -116,38 +100,38 @@ class Intake:
         self.range_um = base.features.y_max_um - base.features.y_min_um
         self.smoother = smoother_of(config.smoother(self.dt_s))
         self.gates = admission.AdmissionState()
-        self.track: Track | None = None
+        self.track = None
         # Standard deviation of the model's predictions as of the last sample, V; that of the most recent ones.
         self._doubt_V = self._recent_V = 0.0
         self.restarts = self.jumps = self.undone = self.trials = 0
         self.following = Following()
         self.confirmed = False
-        self.missing: MissingMotion | None = None
+        self.missing = None
         self._look_every = max(1, round(LOOK_S / self.dt_s))
         self._least_um = LAGS_SHARE * self.range_um
         self._middle_um = 0.5 * (base.features.y_max_um + base.features.y_min_um)
         self._admission = config.admission.at(self.dt_s)
         self._envelope = config.envelope
-        self._hold: Hold | None = None
-        self._trial: Trial | None = None
+        self._hold = None
+        self._trial = None
         self._lost = True  # The smoother has to start again.
-        self._before: FeatureMap | None = None  # The frame before the last jump, and by how much it moved readings, µm.
+        self._before = None  # The frame before the last jump, and by how much it moved readings, µm.
         self._jump_um = 0.0
         # The frame before the first jump since the readings were last found to follow the drive, and a place from then.
-        self._proven: FeatureMap | None = None
-        self._proven_past: Past | None = None
+        self._proven = None
+        self._proven_past = None
         self._calm = 1_000_000  # Samples since readings were last held back.
         # A model that does not depend on the displacement cannot check a sensor.
         self._tells = answers(base)
         self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
         # A control trial judges readings that are trusted. A fault that it finds is the model's, and costs the model
         # credit: without credit the model may not judge the sensor. Samples until the next control trial.
-        self._control: Trial | None = None
+        self._control = None
         self._credit, self._until_control = FIRST_CREDIT, 0
         self._reckoned_seq = -1  # The last sample that has advanced the place, with a reading or without.
         self._look_from = 0  # Samples since the start from which on it is looked again whether the readings lag.
         # Places from before the last steps in which the readings followed the drive, the older one first.
-        self._pasts: list[Past] = []
+        self._pasts = []
 
     @property
     def served(self) -> FeatureMap:
@@ -739,52 +723,26 @@ class Intake:
 
     # ---- keeping
 
-    def state_dict(self) -> StateDict:
-        """The whole state under flat names."""
-        state = _parts_to_state(self.gates, self.track, self._hold, self._trial, self._before, self.following)
-        for i, past in enumerate(self._pasts):
-            state |= prefixed(f"past{i}.", past.state_dict())
-        if self._proven is not None:
-            state |= prefixed("proven.", self._proven.state_dict())
-        if self._proven_past is not None:
-            state |= prefixed("proven_past.", self._proven_past.state_dict())
-        state |= {
-            "lost": self._lost,
-            "jump_um": self._jump_um,
-            "calm": self._calm,
-            "trials": self.trials,
-            "credit": self._credit,
-            "until_control": self._until_control,
-            "look_from": self._look_from,
-            "reckoned_seq": self._reckoned_seq,
-        }
-        if self.missing is not None:
-            state |= prefixed("missing.", self.missing.state_dict())
-        if self._control is not None:
-            state |= prefixed("control.", self._control.state_dict())
-        return state | {"restarts": self.restarts, "jumps": self.jumps, "undone": self.undone}
+    @property
+    def given(self) -> dict[str, Any]:
+        """What the records of a stored state do not hold themselves; see `adaptive.state.load`."""
+        track = {"smoother": self.smoother, "base": self.base.features}
+        return {"track": track, "_trial": {"base": self.base}, "_control": {"base": self.base}}
 
-    def restore(self, state: StateDict) -> None:
-        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        parts = parted(state)
-        made = _parts_of(self.smoother, self.base, parts)
-        self.gates, self.track, self._hold, self._trial, self._before, self.following = made
-        self._pasts = [Past.from_state(values) for values in (parts["past0"], parts["past1"]) if values]
-        missing = parts["missing"]
-        self.missing = MissingMotion.from_state(missing) if missing else None
-        control = parts["control"]
-        self._control = Trial.from_state(control, self.base) if control else None
-        self._credit = int(state.get("credit", FIRST_CREDIT))
-        self._until_control = int(state.get("until_control", 0))
-        self._look_from = int(state.get("look_from", 0))
-        self._reckoned_seq = int(state.get("reckoned_seq", self.gates.seq))
-        proven = parts["proven"]
-        self._proven = FeatureMap.from_state(proven) if proven else None
-        past = parts["proven_past"]
-        self._proven_past = Past.from_state(past) if past else None
-        self._lost, self._jump_um = bool(state["lost"]), float(state["jump_um"])
-        self.restarts, self.jumps, self.undone = (int(state[name]) for name in ("restarts", "jumps", "undone"))
-        self.trials, self._calm = int(state.get("trials", 0)), int(state.get("calm", 1_000_000))
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the dimensions of the state."""
+        return self.base.features.sizes | self.smoother.sizes
+
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where a frame has other sizes than the model."""
+        for name in ("_before", "_proven"):
+            if values[name] is not None:
+                values[name].check_like(self.base.features)
+
+    def go_on_as(self, other: Intake) -> None:
+        """Continue from the state of another intake of the same model."""
+        restore(self, save(other), self.sizes, self.given)
 
 
 def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:

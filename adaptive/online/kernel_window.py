@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -12,12 +12,13 @@ from adaptive.compiled import shared
 from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
-from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData, numbers_of, prefixed, under
+from adaptive.state import Entry, load, rows, save
+from adaptive.types import FloatArray, Hyperparameters, IntArray, StateDict, WindowData
 from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import Status, WindowArrays
-from adaptive.window.healing import Healing
-from adaptive.window.window import SolverConfig, Window, WindowConfig
+from adaptive.window.healing import Healing, HealingState
+from adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
 
 #: Least share of its own weight that an old sample keeps.
 LEAST_FADED = 1e-3
@@ -77,12 +78,40 @@ NOWHERE = -1
 
 @dataclass(slots=True)
 class Turn:
-    """clock : steps so far. Samples up to step ``changed`` are from before the last change; slots from ``next`` on may
-    hold some."""
+    """Where the window is on its way through its slots."""
 
-    clock: int = 0
-    changed: int = 0
-    next: int = NOWHERE
+    clock: Annotated[int, Entry("steps so far", low=0)] = 0
+    changed: Annotated[int, Entry("samples up to this step are from before the last change", low=0)] = 0
+    next: Annotated[int, Entry("slots from this on may hold some, -1 for none", low=NOWHERE)] = NOWHERE
+
+
+@dataclass(slots=True)
+class KernelState:
+    """What a `ResidualWindow` holds beside the arrays of its solver."""
+
+    born: Annotated[IntArray, Entry("step that each sample came with", "", "N")]
+    own_weights: Annotated[FloatArray, Entry("weight that each sample came with", "", "N")]
+    turn: Annotated[Turn, Entry("place in the window", name="")]
+    kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)]
+    gamma: Annotated[float, Entry("regularisation", low=0.0)]
+    widths: Annotated[tuple[float, ...], Entry("kernel widths", "", "d", low=1e-100)]
+    healing: Annotated[HealingState | None, Entry("a new factorisation on its way")]
+
+    def check_state(self) -> None:
+        """Raise ValueError where the next slot is none."""
+        if self.turn.next > self.born.size:
+            raise ValueError(f"next: got {self.turn.next}, expected at most {self.born.size}")
+
+
+@dataclass(slots=True)
+class KernelSolverState(KernelState):
+    """The same with the arrays of the solver."""
+
+    solver: Annotated[SolverState, Entry("arrays of the solver", name="")]
+
+
+#: Entries of the solver in a state.
+_SOLVER = frozenset(row.name for row in rows(SolverState))
 
 
 @shared
@@ -313,28 +342,26 @@ class ResidualWindow:
 
     def state_dict(self, arrays: bool = True) -> StateDict:
         """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
-        own = {
-            "born": self._born.copy(),
-            "own_weights": self._own.copy(),
-            **numbers_of(self._turn),
-            "kernel_variance": self.kernel_variance,
-        }
-        hyper = {"gamma": self._config.gamma, "widths": np.array(self._config.widths)}
-        healing = prefixed("healing.", self._healing.state_dict())
-        return {**(self._window.state_dict() if arrays else {}), **own, **hyper, **healing}
+        c, healing = self._config, self._healing.state()
+        kept = (self._born.copy(), self._own.copy(), self._turn, self.kernel_variance, c.gamma, c.widths, healing)
+        return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
 
-    def restore(self, values: StateDict, arrays: bool = True) -> None:
-        """Continue from a ``state_dict``. Raises InputError where its capacity or number of inputs differs.
+    def read(self, values: StateDict, arrays: bool = True) -> KernelState:
+        """A ``state_dict`` for `take`. Raises ModelFileError where it does not fit.
 
-        ``arrays=False`` : the solver's arrays stay.
+        ``arrays=False`` : the entries of the solver are left aside.
         """
-        c = self._config
-        widths = tuple(float(w) for w in values["widths"])
-        self._config = WindowConfig(c.capacity, widths, float(values["gamma"]), c.form, c.accuracy)
-        kept = self._window.arrays
-        self._window = Window.from_state(self._config, values) if arrays else Window(self._config, kept)
-        self._healing = Healing.from_state(self._window, under("healing.", values))
-        self._born = np.array(values["born"], dtype=np.int64)
-        self._own = np.array(values["own_weights"], dtype=np.float64)
-        self._turn = Turn(int(values["clock"]), int(values["changed"]), int(values["next"]))
-        self.kernel_variance = float(values["kernel_variance"])
+        sizes = {"N": self._config.capacity, "d": self._config.dimension}
+        if arrays:
+            return load(KernelSolverState, values, sizes)
+        return load(KernelState, {name: value for name, value in values.items() if name not in _SOLVER}, sizes)
+
+    def take(self, state: KernelState) -> None:
+        """Continue from ``state``; the solver's arrays stay where it holds none."""
+        c, kept = self._config, self._window.arrays
+        self._config = WindowConfig(c.capacity, state.widths, state.gamma, c.form, c.accuracy)
+        solver = state.solver if isinstance(state, KernelSolverState) else None
+        self._window = Window(self._config, kept) if solver is None else Window.of(self._config, solver)
+        self._healing = Healing.of(self._window, state.healing)
+        self._born, self._own, self._turn = state.born, state.own_weights, state.turn
+        self.kernel_variance = state.kernel_variance

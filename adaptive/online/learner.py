@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, sqrt
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -23,13 +23,14 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import Reckoning, drive_V
-from adaptive.online.drift import DriftFilter, RestCreep
-from adaptive.online.gates import check_pair, new_counters
+from adaptive.online.drift import DriftFilter, Mark, RestCreep
+from adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from adaptive.online.glitch_or_jump import level_of
 from adaptive.online.intake import Intake
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.missing_motion import MissingMotion
 from adaptive.online.track import Pair
+from adaptive.state import Entry, Refused, restore, save, within
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -40,8 +41,6 @@ from adaptive.types import (
     StateDict,
     WindowData,
     joined,
-    numbers_of,
-    parted,
     prefixed,
     under,
 )
@@ -61,25 +60,19 @@ FALLBACK_RATIO = 1.3
 
 @dataclass(slots=True)
 class Judgement:
-    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model.
+    """Mean square prediction errors, V², over long and short time, of the learner and of the frozen model."""
 
-    error_V : the learner's last error. judged : number of errors. valid : whether the learnt model is valid.
-    inside : number of errors within one stated standard deviation.
-    fallback : whether the frozen model is served because it predicts better; fallen_s : for how long, s.
-    doubt_V2 : extra variance after a jump whose cause is open; it decays as errors are seen.
-    """
-
-    long_V2: float
-    short_V2: float
-    frozen_V2: float
-    frozen_short_V2: float
-    error_V: float = 0.0
-    judged: int = 0
-    inside: int = 0
-    valid: bool = True
-    fallback: bool = False
-    fallen_s: float = 0.0
-    doubt_V2: float = 0.0
+    long_V2: Annotated[float, Entry("mean square error of the learner over long time", "V²", low=0.0)]
+    short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
+    frozen_V2: Annotated[float, Entry("mean square error of the identified model over long time", "V²", low=0.0)]
+    frozen_short_V2: Annotated[float, Entry("the same over short time", "V²", low=0.0)]
+    error_V: Annotated[float, Entry("the learner's last error", "V")] = 0.0
+    judged: Annotated[int, Entry("number of errors", low=0)] = 0
+    inside: Annotated[int, Entry("number of errors within one stated standard deviation", low=0)] = 0
+    valid: Annotated[bool, Entry("whether the learnt model is valid")] = True
+    fallback: Annotated[bool, Entry("whether the identified model is served because it predicts better")] = False
+    fallen_s: Annotated[float, Entry("for how long", "s", low=0.0)] = 0.0
+    doubt_V2: Annotated[float, Entry("extra variance after a jump of open cause; it decays", "V²", low=0.0)] = 0.0
 
     @shared
     def take(self, error_V: float, frozen_error_V: float, step_s: float) -> None:
@@ -141,32 +134,15 @@ class Judgement:
         """Variance behind the stated uncertainty: the larger of long and short term, plus ``doubt_V2``."""
         return max(self.long_V2, self.short_V2) + self.doubt_V2
 
-    def state_dict(self) -> StateDict:
-        return numbers_of(self)
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> Judgement:
-        return cls(
-            long_V2=float(values["long_V2"]),
-            short_V2=float(values["short_V2"]),
-            frozen_V2=float(values["frozen_V2"]),
-            frozen_short_V2=float(values["frozen_short_V2"]),
-            error_V=float(values["error_V"]),
-            judged=int(values["judged"]),
-            inside=int(values["inside"]),
-            valid=bool(values["valid"]),
-            fallback=bool(values["fallback"]),
-            fallen_s=float(values["fallen_s"]),
-            doubt_V2=float(values["doubt_V2"]),
-        )
-
 
 class Delay:
     """The last ``steps`` + 1 coefficient vectors: errors are those of the model as it was ``steps`` ago."""
 
+    _past: Annotated[deque[FloatArray], Entry("linear parts of late, oldest first", "V", "*,p|0", name="delay")]
+
     def __init__(self, steps: int) -> None:
         self.steps = steps
-        self._past: deque[FloatArray] = deque(maxlen=steps + 1)
+        self._past = deque(maxlen=steps + 1)
 
     def push(self, vector: FloatArray) -> FloatArray:
         """Take the newest, return the oldest kept."""
@@ -178,18 +154,8 @@ class Delay:
         for vector in self._past:
             vector[0] += by
 
-    def array(self) -> FloatArray:
-        """All vectors, oldest first, for a state file."""
-        return np.array(self._past, dtype=np.float64)
-
-    def restore(self, vectors: FloatArray) -> None:
-        self._past.extend(np.array(v, dtype=np.float64) for v in vectors)
-
 
 # --- The learner.
-
-#: Estimate and covariance of the drift filter.
-Mark = tuple[FloatArray, FloatArray]
 
 #: Names of the events that are counted beside the samples.
 EVENTS = ("fallbacks", "rollbacks", "distrusts", "begun_again", "adoptions", "adoptions_refused")
@@ -220,17 +186,6 @@ NEWEST = 100
 MOST_MOVED = 2.0
 #: Troubles of the model. The identified one is served then.
 RAIL, MODEL_LEFT_ENVELOPE = "rail", "model_left_envelope"
-
-
-def _ages(values: object) -> tuple[int, int]:
-    """Two counts; older states have none."""
-    first, second = (0, 0) if values is None else np.asarray(values).tolist()
-    return int(first), int(second)
-
-
-def _mark(values: StateDict) -> Mark:
-    """A mark of the drift filter from its entries."""
-    return np.array(values["beta"], dtype=np.float64), np.array(values["covariance"], dtype=np.float64)
 
 
 @shared
@@ -282,25 +237,36 @@ def time_at_rail(rail_s: float, saturated: bool, step_s: float) -> float:
 class Parts:
     """The changing state of a learner, and the operations on several of its parts.
 
-    Attributes
-    ----------
-    intake : gates, smoother, frame and hysteresis memory. filter : of the linear part. window : the kernel part.
-    rest : creep at rest. judgement, delay : errors at the age of serving.
-    domain : (6,) learnt range, as of the snapshot.
-    point : (d,) kernel inputs of the last instant that was due for learning, NaN before any.
     first : the filter's estimate of the identified model.
+    window : the kernel part, whose state is among the entries ``window``.
     check_every, check_s : samples between two checks of envelope, rails and sensor, and the time between them, s.
     allowed_V : largest difference of the model from the identified linear part, V; 0 for no bound.
-    left_s, left : see ``watch_shape``; time outside, or inside where negative, s.
-    alone : whether the identified model is served because readings are on trial.
-    moved_V, moved_s : how far the estimate had moved before that trial, V rms over the range, and within what time, s.
-    rail_s, railed : see ``watch_rail``; time at a limit, or off it where negative, s.
-    confirmed : the filter's estimates from before readings that followed the drive, the older one first. mark_ages,
-    confirmed_ages : number of errors judged when the marks were made.
-    mark, next_mark : good estimates of the filter; ``mark`` is the one before the last, because the last may already
-    contain a beginning fault. jump_mark, proven_mark : those before the last, and before the first open jump.
-    counters : samples by outcome. events : by name.
     """
+
+    intake: Annotated[Intake, Entry("gates, smoother, frame and hysteresis memory", name="front")]
+    filter: Annotated[DriftFilter, Entry("filter of the linear part")]
+    rest: Annotated[RestCreep, Entry("creep at rest")]
+    judgement: Annotated[Judgement, Entry("errors at the age of serving")]
+    delay: Annotated[Delay, Entry("estimates of late", name="")]
+    domain: Annotated[FloatArray, Entry("learnt range, as of the snapshot", "µm, µm/s, µm/s²", "6")]
+    point: Annotated[FloatArray, Entry("kernel inputs of the last instant due for learning", "", "d", finite=False)]
+    counters: Annotated[dict[str, int], Entry("samples by outcome", low=0, among=(LEARNT, PASSED, *REASONS))]
+    events: Annotated[dict[str, int], Entry("events by name", low=0, among=EVENTS)]
+    # ``mark`` is the good estimate before the last, because the last may already contain a beginning fault.
+    mark: Annotated[Mark, Entry("a good estimate of the filter")]
+    next_mark: Annotated[Mark, Entry("a newer one")]
+    jump_mark: Annotated[Mark, Entry("the estimate before the last jump")]
+    proven_mark: Annotated[Mark, Entry("the estimate before the first open jump")]
+    confirmed: Annotated[tuple[Mark, Mark], Entry("estimates before readings that followed, older first")]
+    mark_ages: Annotated[tuple[int, int], Entry("errors judged when the two good estimates were made", "", "2")]
+    confirmed_ages: Annotated[tuple[int, int], Entry("errors judged when the confirmed ones were made", "", "2")]
+    rail_s: Annotated[float, Entry("time at a limit, off it where negative; see ``watch_rail``", "s")]
+    railed: Annotated[bool, Entry("whether the model was given up for that")]
+    left_s: Annotated[float, Entry("time outside the envelope, inside where negative; see ``watch_shape``", "s")]
+    left: Annotated[bool, Entry("whether the model was given up for that")]
+    alone: Annotated[bool, Entry("whether the identified model is served because readings are on trial")]
+    moved_V: Annotated[float, Entry("how far the estimate had moved before that trial, rms", "V", low=0.0)]
+    moved_s: Annotated[float, Entry("within what time", "s", low=1e-9)]
 
     def __init__(
         self,
@@ -317,11 +283,11 @@ class Parts:
         self.filter = DriftFilter(config.drift, base.beta, covariance, step_s, base.span_V)
         self.first = self.filter.mark()
         self.window = window or ResidualWindow.from_model(base, config.window, config.eviction, config.solver)
-        self.mark: Mark = self.filter.mark()
-        self.next_mark: Mark = self.mark
-        self.jump_mark: Mark = self.mark
-        self.proven_mark: Mark = self.mark
-        self.confirmed: tuple[Mark, Mark] = (self.mark, self.mark)
+        self.mark = self.filter.mark()
+        self.next_mark = self.mark
+        self.jump_mark = self.mark
+        self.proven_mark = self.mark
+        self.confirmed = (self.mark, self.mark)
         self.mark_ages = self.confirmed_ages = (0, 0)
         self.domain = base.domain.copy()
         self.point = np.full(base.features.kernel_size, np.nan)
@@ -592,62 +558,15 @@ class Parts:
 
     def state_dict(self, arrays: bool = True) -> StateDict:
         """The whole changing state under flat names; ``arrays=False``: without the arrays of the window's solver."""
-        groups = {
-            "front": self.intake.state_dict(),
-            "filter": self.filter.state_dict(),
-            "window": self.window.state_dict(arrays),
-            "rest": self.rest.state_dict(),
-            "judgement": self.judgement.state_dict(),
-            "counters": dict(self.counters),
-            "events": dict(self.events),
-            "mark": {"beta": self.mark[0].copy(), "covariance": self.mark[1].copy()},
-            "next_mark": {"beta": self.next_mark[0].copy(), "covariance": self.next_mark[1].copy()},
-            "jump_mark": {"beta": self.jump_mark[0].copy(), "covariance": self.jump_mark[1].copy()},
-            "proven_mark": {"beta": self.proven_mark[0].copy(), "covariance": self.proven_mark[1].copy()},
-            "confirmed0": {"beta": self.confirmed[0][0].copy(), "covariance": self.confirmed[0][1].copy()},
-            "confirmed1": {"beta": self.confirmed[1][0].copy(), "covariance": self.confirmed[1][1].copy()},
-        }
-        return joined(groups) | {
-            "domain": self.domain.copy(),
-            "point": self.point.copy(),
-            "delay": self.delay.array(),
-            "rail_s": self.rail_s,
-            "railed": self.railed,
-            "left_s": self.left_s,
-            "left": self.left,
-            "alone": self.alone,
-            "moved_V": self.moved_V,
-            "moved_s": self.moved_s,
-            "mark_ages": np.array(self.mark_ages),
-            "confirmed_ages": np.array(self.confirmed_ages),
-        }
+        return save(self) | prefixed("window.", self.window.state_dict(arrays))
 
     def restore(self, state: StateDict, arrays: bool = True) -> None:
-        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        parts = parted(state)
-        self.intake.restore(parts["front"])
-        f = self.filter
-        self.filter = DriftFilter.from_state(self.config.drift, f.step_s, f.span_V, parts["filter"])
-        self.window.restore(parts["window"], arrays)
-        self.rest = RestCreep.from_state(parts["rest"])
-        self.judgement = Judgement.from_state(parts["judgement"])
-        self.counters |= {key: int(value) for key, value in parts["counters"].items()}
-        self.events |= {key: int(value) for key, value in parts["events"].items()}
-        self.domain = np.array(state["domain"], dtype=np.float64)
-        self.point = np.array(state["point"], dtype=np.float64)
-        self.rail_s, self.railed = float(state.get("rail_s", 0.0)), bool(state.get("railed", False))
-        self.left_s, self.left = float(state.get("left_s", 0.0)), bool(state.get("left", False))
-        self.alone = bool(state.get("alone", False))
-        self.moved_V, self.moved_s = float(state.get("moved_V", 0.0)), float(state.get("moved_s", MARK_S))
-        self.mark_ages, self.confirmed_ages = (_ages(state.get(f"{name}_ages")) for name in ("mark", "confirmed"))
-        self.delay = Delay(self.delay.steps)
-        self.delay.restore(np.asarray(state["delay"], dtype=np.float64))
-        names = ("mark", "next_mark", "jump_mark")
-        self.mark, self.next_mark, self.jump_mark = (_mark(parts[name]) for name in names)
-        proven = parts["proven_mark"]
-        self.proven_mark = _mark(proven) if proven else self.jump_mark
-        kept = [parts["confirmed0"], parts["confirmed1"]]
-        self.confirmed = (_mark(kept[0]), _mark(kept[1])) if all(kept) else (self.mark, self.next_mark)
+        """Inverse of ``state_dict``. Raises ModelFileError where it does not fit; then nothing is changed."""
+        own = {name: value for name, value in state.items() if not name.startswith("window.")}
+        with within("window."):
+            window = self.window.read(under("window.", state), arrays)
+        restore(self, own, self.intake.sizes, {"intake": self.intake.given})
+        self.window.take(window)
 
 
 def _warm(base: LssvmInverse, config: LearnerConfig) -> None:
@@ -745,7 +664,7 @@ class Learner:
         if its.track is None:
             self.resync()
             return
-        mine.restore(its.state_dict())
+        mine.go_on_as(its)
 
     def _handle(self, sample: Sample) -> str:
         parts, intake = self.parts, self.parts.intake
@@ -1044,8 +963,11 @@ class Learner:
 
     def resume(self, state: StateDict, arrays: bool = True) -> None:
         """Continue from the changing part of a state; ``arrays=False``: the solver's arrays hold theirs already."""
-        self.parts.restore(state, arrays)
-        self._frozen = bool(state["frozen"])
+        changing = {n: value for n, value in state.items() if not n.startswith(("base.", "config.", "frozen"))}
+        if type(state.get("frozen")) is not bool:
+            raise Refused("frozen", repr(state.get("frozen"))[:80], "a truth value")
+        self.parts.restore(changing, arrays)
+        self._frozen = state["frozen"]
         self._cache = None
 
     def restored(self, state: StateDict) -> Learner:
@@ -1056,13 +978,11 @@ class Learner:
     def from_state(cls, state: StateDict) -> Learner:
         """Inverse of ``state_dict``. Raises ModelFileError where entries are missing or do not fit together."""
         made = cls.__new__(cls)
-        try:
+        with within("base."):
             base = LssvmInverse.from_state(under("base.", state))
+        try:
             made._begin(base, LearnerConfig.from_state(under("config.", state)))
-            made.parts.restore(state)
-            made._frozen = bool(state["frozen"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(
-                f"learner state: entry missing or damaged: {error}; start from the model instead"
-            ) from error
+            raise ModelFileError(f"learner state: setting missing or damaged: {error}; start from the model") from error
+        made.resume(state)
         return made

@@ -16,14 +16,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.features import advance, fill
 from adaptive.inverse_model import LssvmInverse, mean_of, track_memory, unpacked
-from adaptive.types import FloatArray, IntArray, StateDict, prefixed, under
+from adaptive.state import Entry
+from adaptive.types import FloatArray, IntArray
 
 #: Turning points, as shares of the way from the two known places to the farthest one that can be reached.
 TURNS: Final = (0.0, 0.1, 0.4, 1.0)
@@ -50,22 +51,20 @@ CLOSED_SHARE, PATIENCE_S, LONGEST_S = 3e-4, 0.25, 1.0
 
 @dataclass(slots=True)
 class MissingMotion:
-    """An open gap.
+    """An open gap."""
 
-    Parameters
-    ----------
-    model : of the moment before the gap, in the frame that is served; none is learnt in motion while the gap is open.
-    members : (c, m) memories. noise_V : deviation of the model's error, V. std_V : spread of the members' voltages, V.
-    since : smoothed instants since the gap. moved_s : time of motion since, s. rests : whether the stage is at rest.
-    """
+    model: Annotated[LssvmInverse, Entry("as before the gap, in the frame that is served; learnt only at rest")]
+    members: Annotated[FloatArray, Entry("possible memories", "µm", "*,m", most=4096)]
+    noise_V: Annotated[float, Entry("deviation of the model's error", "V", low=0.0)]
+    std_V: Annotated[float, Entry("spread of the members' voltages", "V", low=0.0)] = 0.0
+    since: Annotated[int, Entry("smoothed instants since the gap", low=0)] = 0
+    moved_s: Annotated[float, Entry("time of motion since", "s", low=0.0)] = 0.0
+    rests: Annotated[bool, Entry("whether the stage is at rest")] = False
 
-    model: LssvmInverse
-    members: FloatArray
-    noise_V: float
-    std_V: float = 0.0
-    since: int = 0
-    moved_s: float = 0.0
-    rests: bool = False
+    def check_state(self) -> None:
+        """Raise ValueError where there are no members, or they are not of the model."""
+        if not len(self.members) or self.members.shape[1] != self.model.memory_size:
+            raise ValueError(f"members: {self.members.shape}, expected some of {self.model.memory_size} entries")
 
     @classmethod
     def begin(
@@ -144,22 +143,6 @@ class MissingMotion:
         y, v, a = motion
         places = np.array([y - away_um, y, y + away_um])
         self.std_V = float(_largest_distance(places, v, a, self.members, *self.model.packed))
-
-    def state_dict(self) -> StateDict:
-        """All of it under flat names."""
-        names = ("noise_V", "std_V", "since", "moved_s", "rests")
-        own = {"members": self.members.copy()} | {name: getattr(self, name) for name in names}
-        return {**own, **prefixed("model.", self.model.state_dict())}
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> MissingMotion:
-        """Inverse of ``state_dict``. Raises KeyError, TypeError, ValueError or InputError where it does not fit."""
-        model = LssvmInverse.from_state(under("model.", values))
-        members = np.array(values["members"], dtype=np.float64)
-        if members.ndim != 2 or not members.shape[0] or members.shape[1] != model.memory_size:
-            raise ValueError(f"members: got shape {members.shape}, expected (n, {model.memory_size})")
-        floats = {name: float(values[name]) for name in ("noise_V", "std_V", "moved_s")}
-        return cls(model, members, since=int(values["since"]), rests=bool(values["rests"]), **floats)
 
 
 def _path(*corners_um: float) -> FloatArray:

@@ -30,7 +30,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -38,7 +38,8 @@ from adaptive.compiled import shared
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning, drive_V
 from adaptive.online.glitch_or_jump import Circumstances, Slope, correlated, slope_of, tolerance_um
-from adaptive.types import FloatArray, StateDict, numbers_of, prefixed, under
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 
 # --- The check that always runs.
 
@@ -78,31 +79,23 @@ class Following:
 
     Each step is a vector (u, p), scaled so that its larger component is 1 or -1.
 
-    u_V, p_V : applied voltage, and voltage of the model for the reading, at the end of the last step.
-    steps : number of pairs since then.
-    count, driven : number of steps, and of steps in which the voltage moved; with forgetting.
-    uu, pp, up : sums of the products over the steps; with forgetting.
-    good, still : number of steps in a row in which the readings followed, and stood still.
-    last_V, noise2 : last p - u, V, and its mean square change between two pairs, V².
-    way_V : length of the way of p - u since the end of the last step, V.
-    drift_V_per_s, drift2 : mean rate of p - u over the last steps, V/s, and its mean square; with forgetting.
     """
 
-    u_V: float = math.nan
-    p_V: float = math.nan
-    steps: int = 0
-    count: float = 0.0
-    driven: float = 0.0
-    uu: float = 0.0
-    pp: float = 0.0
-    up: float = 0.0
-    good: int = 0
-    still: int = 0
-    last_V: float = math.nan
-    noise2: float = 0.0
-    way_V: float = 0.0
-    drift_V_per_s: float = 0.0
-    drift2: float = 0.0
+    u_V: Annotated[float, Entry("applied voltage at the end of the last step", "V", finite=False)] = math.nan
+    p_V: Annotated[float, Entry("the model's voltage for the reading there", "V", finite=False)] = math.nan
+    steps: Annotated[int, Entry("number of pairs since then", low=0)] = 0
+    count: Annotated[float, Entry("number of steps, with forgetting", low=0.0)] = 0.0
+    driven: Annotated[float, Entry("number of steps in which the voltage moved, with forgetting", low=0.0)] = 0.0
+    uu: Annotated[float, Entry("sum of u² over the steps, with forgetting", low=0.0)] = 0.0
+    pp: Annotated[float, Entry("sum of p² over the steps, with forgetting", low=0.0)] = 0.0
+    up: Annotated[float, Entry("sum of u p over the steps, with forgetting")] = 0.0
+    good: Annotated[int, Entry("steps in a row in which the readings followed", low=0)] = 0
+    still: Annotated[int, Entry("steps in a row in which the readings stood still", low=0)] = 0
+    last_V: Annotated[float, Entry("last p - u", "V", finite=False)] = math.nan
+    noise2: Annotated[float, Entry("mean square change of p - u between two pairs", "V²", low=0.0)] = 0.0
+    way_V: Annotated[float, Entry("length of the way of p - u since the end of the last step", "V", low=0.0)] = 0.0
+    drift_V_per_s: Annotated[float, Entry("mean rate of p - u, with forgetting", "V/s")] = 0.0
+    drift2: Annotated[float, Entry("mean square rate of p - u, with forgetting", "V²/s²", low=0.0)] = 0.0
 
     def forget(self) -> None:
         """Discard all steps so far."""
@@ -166,18 +159,6 @@ class Following:
         fault = _shows_fault(self, abs(p - u) <= STEADY, drift_V_per_s)
         self.good = 0 if fault else self.good + 1
         return fault or self.still >= STILL_STEPS
-
-    def state_dict(self) -> StateDict:
-        return numbers_of(self)
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> Following:
-        """Inverse of ``state_dict``; older states have no entries and give an empty check."""
-        if not values:
-            return cls()
-        # Older states have no entries for what was added since.
-        values = {"drift_V_per_s": 0.0, "drift2": 0.0, "way_V": 0.0} | values
-        return cls(**{name: type(value)(values[name]) for name, value in numbers_of(cls()).items()})
 
 
 @shared
@@ -278,55 +259,43 @@ OPEN = Decision(Outcome.OPEN)
 
 @dataclass(slots=True)
 class Trial:
-    """State of a trial.
+    """State of a trial. ``base`` : the identified model."""
 
-    reckoning : dead-reckoned position of the stage.
-    base, memory : the identified model, and its memory (m,) if the readings are assumed to be true.
-    window : (4, VALUES) ring buffer: voltage u, reading y, dead-reckoned position x, and the model's voltage p for the
-    reading. The next column is ``count`` modulo VALUES.
-    fault, why : name of the fault and the reason as text; "" while no fault is reported.
-    since, looked : number of samples since the trial began: now, and at the last evaluation.
-    suspected, times : the fault that the last evaluation found, and how often in a row.
-    rested : evaluations in a row at rest with steady readings at a new level.
-    obeyed : evaluations in a row in which p followed the applied voltage.
-    followed : evaluations in a row in which the readings followed the dead-reckoned position.
-    agreed : evaluations in a row, of those, with the same ``slope`` and ``shift_um``.
-    returned : evaluations in a row, after a reported fault, that found the readings right. One window is not enough:
-    readings of another stage move like this one's now and then.
-    open_slope, open_shift_um : jumps that were reverted when the trial began; 0 for none.
-    bent : 1 if readings that seemed shifted have bent otherwise than the position: they may be of another stage.
-    by_voltages : 1 if the dead-reckoned position is not to be believed: only the voltages are compared.
-    mean_u_V, mean_p_V, uu, pp, up : means of u and p over ``LONG_S``, V, and of the products of their deviations, V²;
-    with forgetting.
-    """
-
-    reckoning: Reckoning
+    reckoning: Annotated[Reckoning, Entry("dead-reckoned position of the stage")]
     base: LssvmInverse
-    memory: FloatArray
-    window: FloatArray
-    fault: str = ""
-    why: str = ""
-    count: int = 0
-    since: int = 0
-    looked: int = 0
-    suspected: str = ""
-    times: int = 0
-    rested: int = 0
-    obeyed: int = 0
-    followed: int = 0
-    agreed: int = 0
-    returned: int = 0
-    slope: float = 1.0
-    shift_um: float = 0.0
-    open_slope: float = 0.0
-    open_shift_um: float = 0.0
-    bent: int = 0
-    by_voltages: int = 0
-    mean_u_V: float = 0.0
-    mean_p_V: float = 0.0
-    uu: float = 0.0
-    pp: float = 0.0
-    up: float = 0.0
+    memory: Annotated[FloatArray, Entry("memory of the identified model if the readings are true", "µm", "m")]
+    window: Annotated[
+        FloatArray,
+        Entry(
+            "ring of voltage u, reading y, dead-reckoned position x, and the model's voltage p for the reading",
+            "V, µm, µm, V", f"4,{VALUES}", finite=False,
+        ),
+    ]  # fmt: skip
+    fault: Annotated[str, Entry("name of the fault that is reported", among=("", *sorted(SENSOR_FAULTS)))] = ""
+    why: Annotated[str, Entry("its reason", most=2000)] = ""
+    count: Annotated[int, Entry("columns written to the ring", low=0)] = 0
+    since: Annotated[int, Entry("samples since the trial began", low=0)] = 0
+    looked: Annotated[int, Entry("the same at the last evaluation", low=0)] = 0
+    suspected: Annotated[str, Entry("the fault of the last evaluation", among=("", *sorted(SENSOR_FAULTS)))] = ""
+    times: Annotated[int, Entry("how often in a row it was found", low=0)] = 0
+    rested: Annotated[int, Entry("evaluations in a row at rest with steady readings at a new level", low=0)] = 0
+    obeyed: Annotated[int, Entry("evaluations in a row in which p followed the applied voltage")] = 0
+    followed: Annotated[int, Entry("evaluations in a row in which the readings followed the position", low=0)] = 0
+    agreed: Annotated[int, Entry("those in a row with the same slope and shift", low=0)] = 0
+    # One window is not enough: readings of another stage move like this one's now and then.
+    returned: Annotated[int, Entry("evaluations in a row, after a fault, that found the readings right", low=0)] = 0
+    slope: Annotated[float, Entry("slope of the readings over the position")] = 1.0
+    shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
+    open_slope: Annotated[float, Entry("jumps reverted when the trial began, 0 for none")] = 0.0
+    open_shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
+    # They may be of another stage.
+    bent: Annotated[int, Entry("1 if readings that seemed shifted bend otherwise than the position", low=0)] = 0
+    by_voltages: Annotated[int, Entry("1 if the position is not believed and voltages are compared", low=0)] = 0
+    mean_u_V: Annotated[float, Entry("mean of u over LONG_S, with forgetting", "V")] = 0.0
+    mean_p_V: Annotated[float, Entry("mean of p", "V")] = 0.0
+    uu: Annotated[float, Entry("mean square deviation of u", "V²", low=0.0)] = 0.0
+    pp: Annotated[float, Entry("mean square deviation of p", "V²", low=0.0)] = 0.0
+    up: Annotated[float, Entry("mean product of the deviations", "V²")] = 0.0
 
     @classmethod
     def begin(
@@ -532,39 +501,6 @@ class Trial:
         self.suspected = fault
         if self.times >= (RENAMED if self.fault else NAMED):
             self.fault, self.why = fault, why
-
-    def state_dict(self) -> StateDict:
-        """The whole state under flat names."""
-        own = {name: getattr(self, name) for name in _NUMBERS}
-        return {
-            **own,
-            "memory": self.memory.copy(),
-            "window": self.window.copy(),
-            **prefixed("reckoning.", self.reckoning.state_dict()),
-        }
-
-    @classmethod
-    def from_state(cls, values: StateDict, base: LssvmInverse) -> Trial:
-        """Inverse of ``state_dict``, but for ``base``.
-
-        Raises KeyError, TypeError or ValueError where it does not fit.
-        """
-        window = np.array(values["window"], dtype=np.float64)
-        if window.shape != (4, VALUES):
-            raise ValueError(f"trial.window: got shape {window.shape}, expected (4, {VALUES})")
-        # Older states have no entries for what was added since.
-        values = dict.fromkeys(_NUMBERS, 0) | {"fault": "", "why": "", "suspected": ""} | values
-        numbers: dict[str, Any] = {name: kind(values[name]) for name, kind in _NUMBERS.items()}
-        memory = np.array(values["memory"], dtype=np.float64)
-        return cls(Reckoning.from_state(under("reckoning.", values)), base, memory, window, **numbers)
-
-
-_NUMBERS = {
-    "fault": str, "why": str, "count": int, "since": int, "looked": int, "suspected": str, "times": int, "rested": int,
-    "obeyed": int, "followed": int, "agreed": int, "returned": int, "slope": float, "shift_um": float,
-    "open_slope": float, "open_shift_um": float, "bent": int, "by_voltages": int,
-    "mean_u_V": float, "mean_p_V": float, "uu": float, "pp": float, "up": float,
-}  # fmt: skip
 
 
 def beside_drift(x: FloatArray, y: FloatArray, noise: float) -> tuple[float, float]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from adaptive.errors import InputError
 from adaptive.features import FeatureMap, advance_both
 from adaptive.inverse_model import track_memory
 from adaptive.online.dead_reckoning import Reckoning
 from adaptive.smoothing import FixedLagSmoother, SmootherState
-from adaptive.types import BoolArray, FloatArray, StateDict, joined, under
+from adaptive.state import Entry
+from adaptive.types import BoolArray, FloatArray
 
 Motion = tuple[float, float, float]
 
@@ -66,16 +66,20 @@ class Taken(NamedTuple):
 class Past:
     """A known place of the stage, and the voltages since: dead reckoning can start from it.
 
-    motion, u_before_V, lag_V, lag_um : as ``Track.since_motion`` gives them. memory : (m,) of that instant.
-    u_V : voltages since.
+    The first four are as ``Track.since_motion`` gives them.
     """
 
-    motion: Motion
-    u_before_V: float
-    lag_V: FloatArray
-    lag_um: FloatArray
-    memory: FloatArray
-    u_V: list[float]
+    motion: Annotated[Motion, Entry("motion there", "µm, µm/s, µm/s²", "3")]
+    u_before_V: Annotated[float, Entry("voltage there", "V", finite=False)]
+    lag_V: Annotated[FloatArray, Entry("voltages over the lag since", "V", finite=False, most=20_000)]
+    lag_um: Annotated[FloatArray, Entry("first readings over the lag since", "µm", finite=False, most=20_000)]
+    memory: Annotated[FloatArray, Entry("hysteresis memory there", "µm", "m")]
+    u_V: Annotated[list[float], Entry("voltages since", "V", finite=False, most=5000)]
+
+    def check_state(self) -> None:
+        """Raise ValueError where there are more readings than voltages."""
+        if len(self.lag_um) > len(self.lag_V):
+            raise ValueError(f"lag_um: {len(self.lag_um)} readings, but {len(self.lag_V)} voltages")
 
     @classmethod
     def of(cls, track: Track) -> Past:
@@ -88,44 +92,35 @@ class Past:
         motion = (reckoning.y_um, reckoning.v_um_per_s, 0.0)
         return cls(motion, reckoning.u_V, u_V, place_um, reckoning.memory.copy(), [])
 
-    def state_dict(self) -> StateDict:
-        values = {"motion": self.motion, "u_before_V": self.u_before_V, "lag_V": self.lag_V, "lag_um": self.lag_um,
-                  "memory": self.memory, "u_V": self.u_V}  # fmt: skip
-        return {name: np.array(value, dtype=np.float64) for name, value in values.items()}
-
-    @classmethod
-    def from_state(cls, values: StateDict) -> Past:
-        """Inverse of ``state_dict``."""
-        y, v, a = (float(x) for x in values["motion"])
-        lag_V, lag_um, memory = (np.array(values[name], dtype=np.float64) for name in ("lag_V", "lag_um", "memory"))
-        return cls((y, v, a), float(values["u_before_V"]), lag_V, lag_um, memory, [float(u) for u in values["u_V"]])
-
 
 @dataclass(slots=True)
 class Track:
     """A track with its state; ``base`` is the feature map of the model that the learner started from.
 
-    Attributes
-    ----------
-    state : of the smoother. u_V, y_um, good : rings of (lag + 2,) by the smoother's count.
-    features, served : the feature map of the instant that is being learnt, and the one to serve with; they differ for
-    a lag after a jump, until the smoother's count ``switch``.
-    memory, frozen_memory : (m,) hysteresis memory in the learner's frame and in that of ``base``, which knows of no
-    jump. motion : last smoothed motion (µm, µm/s, µm/s²), ``lag`` samples old; None before there is one.
+    ``features`` and ``served`` differ for a lag after a jump. ``frozen_memory`` knows of no jump.
     """
 
     smoother: FixedLagSmoother
     base: FeatureMap
-    state: SmootherState
-    u_V: FloatArray
-    y_um: FloatArray
-    good: BoolArray
-    features: FeatureMap
-    served: FeatureMap
-    memory: FloatArray
-    frozen_memory: FloatArray
-    motion: Motion | None = None
-    switch: int = 0
+    state: Annotated[SmootherState, Entry("state of the smoother", name="smoother")]
+    u_V: Annotated[FloatArray, Entry("ring of voltages by the smoother's count", "V", "slots", finite=False)]
+    y_um: Annotated[FloatArray, Entry("ring of readings by the smoother's count", "µm", "slots", finite=False)]
+    good: Annotated[BoolArray, Entry("ring of which readings are good", "", "slots")]
+    features: Annotated[FeatureMap, Entry("feature map of the instant that is being learnt")]
+    served: Annotated[FeatureMap, Entry("feature map to serve with")]
+    memory: Annotated[FloatArray, Entry("hysteresis memory in the learner's frame", "µm", "m")]
+    frozen_memory: Annotated[FloatArray, Entry("hysteresis memory in the identified frame", "µm", "m")]
+    motion: Annotated[
+        Motion | None, Entry("last smoothed motion, ``lag`` samples old, if any", "µm, µm/s, µm/s²", "3|0")
+    ] = None
+    switch: Annotated[int, Entry("the smoother's count until which the two maps differ", low=0)] = 0
+
+    def check_state(self) -> None:
+        """Raise ValueError where a map has other sizes than that of the model. Equal maps become one object."""
+        for name in ("features", "served"):
+            getattr(self, name).check_like(self.base)
+        if self.features == self.served:
+            self.features = self.served
 
     @classmethod
     def begin(cls, smoother: FixedLagSmoother, base: FeatureMap, served: FeatureMap, y_um: float) -> Track:
@@ -271,36 +266,3 @@ class Track:
         track_memory(y_um[:jumped], after, self.features.arrays)
         track_memory(y_um[jumped:], after, self.served.arrays)
         return after
-
-    def state_dict(self) -> StateDict:
-        """All of it under flat names, but for what it was made with."""
-        parts = {
-            "smoother": self.smoother.state_dict(self.state),
-            "features": self.features.state_dict(),
-            "served": self.served.state_dict(),
-        }
-        state = joined(parts)
-        for name in ("u_V", "y_um", "good", "memory", "frozen_memory"):
-            state[name] = getattr(self, name).copy()
-        return state | {"motion": np.array(self.motion or (), dtype=np.float64), "switch": self.switch}
-
-    @classmethod
-    def from_state(cls, smoother: FixedLagSmoother, base: FeatureMap, values: StateDict) -> Track:
-        """Inverse of ``state_dict``. Raises InputError where it is of another lag."""
-        slots = smoother.config.lag + 2
-        floats = {name: np.array(values[name], dtype=np.float64) for name in ("u_V", "y_um", "memory", "frozen_memory")}
-        if floats["u_V"].shape != (slots,):
-            raise InputError(f"u_V: got {floats['u_V'].shape[0]} slots, expected {slots}; the smoother's lag differs")
-        features, served = (FeatureMap.from_state(under(f"{name}.", values)) for name in ("features", "served"))
-        motion = [float(x) for x in values["motion"]]
-        return cls(
-            smoother=smoother,
-            base=base,
-            state=smoother.from_state(under("smoother.", values)),
-            good=np.array(values["good"], dtype=np.bool_),
-            features=served if features == served else features,
-            served=served,
-            motion=(motion[0], motion[1], motion[2]) if motion else None,
-            switch=int(values["switch"]),
-            **floats,
-        )

@@ -7,12 +7,14 @@ A replay, a copy and a window restored from its state continue with the same num
 from __future__ import annotations
 
 import threading
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
 from adaptive.errors import NumericsError
-from adaptive.types import IntArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.window import Window
@@ -24,6 +26,26 @@ from adaptive.window.window import Window
 
 #: Arrays that a factorisation reads and does not write.
 _FIELDS = ("R", "X", "scaled")
+
+
+@dataclass(slots=True)
+class HealingState:
+    """A refresh in progress: what it factors."""
+
+    left: Annotated[int, Entry("steps until it is swapped in", low=-1, high=1000)]
+    R: Annotated[FloatArray, Entry("kernel matrix with the noise variances", "", "N,N")]
+    X: Annotated[FloatArray, Entry("features", "", "d,N")]
+    scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
+    y: Annotated[FloatArray, Entry("targets", "V", "N")]
+    w: Annotated[FloatArray, Entry("noise weights", "", "N")]
+    count: Annotated[int, Entry("samples at its beginning", low=1)]
+    form: Annotated[int, Entry("form of the window: 0 inverse, 1 Cholesky", low=0, high=1)]
+    new_form: Annotated[int, Entry("form of the new factorisation", low=0, high=1)]
+
+    def check_state(self) -> None:
+        """Raise ValueError where there are more samples than slots."""
+        if self.count > self.y.size:
+            raise ValueError(f"count: got {self.count}, expected at most the window's {self.y.size} samples")
 
 
 class Refresh:
@@ -80,23 +102,23 @@ class Refresh:
         self._source.take_arrays(copy.arrays)
         return True
 
-    def state_dict(self) -> StateDict:
+    def state(self, left: int) -> HealingState:
         """The input of the factorisation, as it was at the beginning. May be called while `factor` runs."""
         A = self._copy.arrays
         fields = {name: getattr(A, name).copy() for name in _FIELDS}
-        samples = {"y": A.V[ws.Y].copy(), "w": A.V[ws.W].copy()}
-        return {**fields, **samples, "count": self._count, "form": self._form, "new_form": int(A.C[ws.FORM])}
+        y, w = A.V[ws.Y].copy(), A.V[ws.W].copy()
+        return HealingState(left, **fields, y=y, w=w, count=self._count, form=self._form, new_form=int(A.C[ws.FORM]))
 
     @classmethod
-    def from_state(cls, window: Window, state: StateDict) -> Refresh:
-        """Inverse of ``state_dict``, for ``window``. The factor has to be made again; it comes out the same."""
-        made = cls(window, int(state["new_form"]))
+    def of(cls, window: Window, state: HealingState) -> Refresh:
+        """Inverse of ``state``, for ``window``. The factor has to be made again; it comes out the same."""
+        made = cls(window, state.new_form)
         A = made._copy.arrays
         for name in _FIELDS:
-            getattr(A, name)[...] = state[name]
-        A.V[ws.Y], A.V[ws.W] = state["y"], state["w"]
-        A.C[ws.COUNT] = made._count = int(state["count"])
-        made._form = int(state["form"])
+            getattr(A, name)[...] = getattr(state, name)
+        A.V[ws.Y], A.V[ws.W] = state.y, state.w
+        A.C[ws.COUNT] = made._count = state.count
+        made._form = state.form
         return made
 
 
@@ -161,16 +183,16 @@ class Healing:
         self._wait()
         return self.__dict__.copy()
 
-    def state_dict(self) -> StateDict:
-        """Flat; empty where no refresh is in progress. Does not wait for the thread."""
-        return {} if self._refresh is None else {"left": self._left, **self._refresh.state_dict()}
+    def state(self) -> HealingState | None:
+        """None where no refresh is in progress. Does not wait for the thread."""
+        return None if self._refresh is None else self._refresh.state(self._left)
 
     @classmethod
-    def from_state(cls, window: Window, state: StateDict) -> Healing:
-        """Inverse of ``state_dict``: continues with the same result to the last bit."""
+    def of(cls, window: Window, state: HealingState | None) -> Healing:
+        """Inverse of ``state``: continues with the same result to the last bit."""
         made = cls(window)
-        if state:
-            made._left, made._refresh = int(state["left"]), Refresh.from_state(window, state)
+        if state is not None:
+            made._left, made._refresh = state.left, Refresh.of(window, state)
             made._start()
         return made
 

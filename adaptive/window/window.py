@@ -9,13 +9,14 @@ the oracle that the tests compare with.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
 from adaptive import kernels, lapack, lssvm
 from adaptive.errors import InputError, NumericsError
-from adaptive.types import FloatArray, StateDict
+from adaptive.state import Entry
+from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
 from adaptive.window import cholesky_form, steps
 from adaptive.window.arrays import Status, WindowArrays
@@ -92,7 +93,44 @@ class WindowConfig:
 INVERSE_ERROR_SHARE = 3e-18
 
 #: Arrays whose entry in a state is the array itself.
-_SAVED = ("X", "scaled", "inverse_widths", "V", "U", "C", "order")
+_SAVED = ("X", "scaled", "inverse_widths", "S", "V", "U", "F", "C", "order")
+
+
+@dataclass(slots=True)
+class SolverState:
+    """The arrays of a window; see `adaptive.window.arrays`. It has PR in the inverse form, else P and R."""
+
+    X: Annotated[FloatArray, Entry("features", "", "d,N")]
+    scaled: Annotated[FloatArray, Entry("features over their widths", "", "d,N")]
+    inverse_widths: Annotated[FloatArray, Entry("one over the widths", "", "d", low=1e-100)]
+    S: Annotated[FloatArray, Entry("P 1, or L^-1 1 by position", "", "N")]
+    V: Annotated[FloatArray, Entry("targets, noise weights, dual weights and other vectors", "V", f"{ws.ROWS},N")]
+    U: Annotated[FloatArray, Entry("what a refused step restores", "", f"{ws.UNDO_ROWS},room")]
+    F: Annotated[FloatArray, Entry("regularisation, residuals, bias", "", f"{ws.FLOATS}")]
+    C: Annotated[IntArray, Entry("counters", "", f"{ws.COUNTERS}", low=-1)]
+    order: Annotated[IntArray, Entry("slot at each position of the factor", "", "N")]
+    PR: Annotated[FloatArray | None, Entry("lower triangle of P beside the upper one of R", "", "N,room_PR")] = None
+    P: Annotated[FloatArray | None, Entry("the Cholesky factor L' by position", "", "N,N")] = None
+    R: Annotated[FloatArray | None, Entry("kernel matrix with the noise variances", "", "N,N")] = None
+
+    def check_state(self) -> None:
+        """Raise ValueError where counters or places would lead out of the arrays."""
+        d, n = self.X.shape
+        C = self.C.tolist()
+        places = (ws.COUNT, ws.UNDO_SLOT, ws.CURSOR, ws.UNDO_PLACE, ws.CARRIED)
+        if max(C[place] for place in places) > n:
+            raise ValueError(f"C: got {C}, expected at most the window's {n} samples")
+        if C[ws.COUNT] < 0 or not 0 <= C[ws.FORM] <= 1 or C[ws.CURSOR] < 0:
+            raise ValueError(f"C: got {C}, expected a count, a form of 0 or 1 and a cursor")
+        if not np.array_equal(np.sort(self.order), np.arange(n)):
+            raise ValueError(f"order: no permutation, expected each of 0 to {n - 1} once")
+        if self.U.shape[1] != max(n, 1 + d):
+            raise ValueError(f"U: got {self.U.shape[1]} columns, expected {max(n, 1 + d)}")
+        whole, packed = (self.P is not None, self.R is not None), self.PR is not None
+        if whole != ((C[ws.FORM] == ws.CHOLESKY_FORM),) * 2 or packed == whole[0]:
+            raise ValueError(f"PR: got P and R: {whole[0]}, {whole[1]}; expected them in the Cholesky form, else PR")
+        if self.PR is not None and self.PR.shape[1] != n + 1:
+            raise ValueError(f"PR: got {self.PR.shape[1]} columns, expected {n + 1}")
 
 
 class Window:
@@ -335,74 +373,38 @@ class Window:
         """An independent window in the same state, to the last bit."""
         return Window(self.config, ws.duplicate(self._arrays))
 
-    def state_dict(self) -> StateDict:
-        """All arrays under flat names; `from_state` continues from them with the same result to the last bit."""
-        A, n = self._arrays, self.config.capacity
-        saved = {name: getattr(A, name).copy() for name in _SAVED}
+    def state(self) -> SolverState:
+        """All that changes; `of` continues from it with the same result to the last bit. Copies."""
+        A = self._arrays
+        saved: dict[str, Any] = {name: getattr(A, name).copy() for name in _SAVED}
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
             saved["C"][ws.LOGGED] = 0
-        # A window once had further linear coefficients beside the bias. Its file format, with a row for each of them
-        # and entries without content, stays readable both ways.
-        return {
-            **_matrices(A),
-            **saved,
-            "F": A.F[: ws.GRAM].copy(),
-            "S": A.S[None].copy(),
-            "beta": A.F[[ws.BETA]],
-            "G": A.F[[ws.GRAM]][None],
-            "H": np.ones((1, n)),
-            "linear": np.zeros(0, dtype=np.int64),
-            "small": np.zeros((3, self.config.dimension)),
-        }
+        return SolverState(**(saved | _matrices(A)))
 
     @classmethod
-    def from_state(cls, config: WindowConfig, state: StateDict) -> Window:
-        """Raises InputError where an entry is missing or its shape is not that of ``config``."""
+    def of(cls, config: WindowConfig, state: SolverState) -> Window:
+        """Inverse of ``state``, which is of the sizes of ``config``."""
         window = cls(config)
         A = window.arrays
-        expected, whole = window.state_dict(), "P" in state
-        if whole:
-            expected.pop("PR", None)  # a window whose form is given begins in it
-            expected |= {"P": A.P, "R": A.R}
-        for name, own in expected.items():
-            given = np.shape(state[name]) if name in state else ()
-            # States of older versions lack the last rows of V and C, which are zero where nothing is known yet.
-            older = name in ("V", "C") and len(given) == own.ndim and given[1:] == own.shape[1:]
-            if name not in state or not (given == own.shape or (older and given[0] < own.shape[0])):
-                got = given if name in state else "nothing"
-                raise InputError(f"{name}: got {got}, expected an array {own.shape}; the state is of another window")
-        if whole:
-            A.P[:], A.R[:] = state["P"], state["R"]
+        if state.PR is None:
+            A.P[:], A.R[:] = state.P, state.R
         else:
             below = np.tri(config.capacity, dtype=np.bool_)
-            A.P[:] = np.where(below, state["PR"][:, :-1], 0.0)
-            A.R[:] = np.where(below, state["PR"][:, 1:].T, state["PR"][:, 1:])
+            A.P[:] = np.where(below, state.PR[:, :-1], 0.0)
+            A.R[:] = np.where(below, state.PR[:, 1:].T, state.PR[:, 1:])
         for name in _SAVED:
-            getattr(A, name)[: len(state[name])] = state[name]
-        A.F[: ws.BETA] = state["F"][: ws.BETA]
-        A.S[:], A.F[ws.BETA], A.F[ws.GRAM] = state["S"][0], state["beta"][0], state["G"][0, 0]
+            getattr(A, name)[...] = getattr(state, name)
         A.C[ws.UNDO] = ws.UNDO_NOTHING
         if A.C[ws.FORM] == ws.CHOLESKY_FORM:
-            cholesky_form.take_upper(A, _upper_factor(A.P.copy(), A.C[ws.LOGGED] != 0))
+            cholesky_form.take_upper(A, A.P.copy())
         return window
 
 
-def _upper_factor(P: FloatArray, lower: bool) -> FloatArray:
-    """L' of a state. States of an older version may have it in the lower triangle: column j from row N - 1 - j on."""
-    if lower:
-        n = len(P)
-        old = P.copy()
-        for k in range(n - 1):
-            P[k, k + 1 :] = old[n - 1 - k, : n - 1 - k]
-    return P
-
-
-def _matrices(A: ws.WindowArrays) -> StateDict:
+def _matrices(A: ws.WindowArrays) -> dict[str, FloatArray]:
     """P and R of a state.
 
     In the inverse form the lower triangle of P holds all of it, and R is symmetric: ``PR`` (N, N + 1) is the lower
     triangle of P, and beside it the upper one of R. In the Cholesky form the upper triangle of ``P`` is L' by position.
-    States of older versions hold both matrices in either form.
     """
     if A.C[ws.FORM] == ws.CHOLESKY_FORM:
         upper = np.zeros_like(A.P)

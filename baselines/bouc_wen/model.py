@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
+from adaptive.state import Entry, load, save
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from baselines.bouc_wen.step import crossing, hysteresis_step, poles, run_stage, settled
 from baselines.common import (
     Domain,
     checked_memory,
     checked_motion,
-    common_fields,
-    common_state,
     of_length,
     positive,
     std_or_nan,
@@ -41,21 +41,19 @@ from baselines.common import (
 class BoucWenParameters:
     """The seven parameters of (2.1), (2.2), an offset, and the hold convention of the module.
 
-    Units: m kg, b N s/m, k N/m, d µm/V, alpha 1, beta and gamma 1/V, offset µm.
-
     Raises InputError unless m, b, k, d are positive and the drive u - g rises with u along every branch, which the
     inverse needs: alpha < 1, 2 alpha beta < beta + gamma, and beta + gamma > 0.
     """
 
-    m_kg: float
-    b_N_s_per_m: float
-    k_N_per_m: float
-    d_um_per_V: float
-    alpha: float
-    beta_per_V: float
-    gamma_per_V: float
-    offset_um: float = 0.0
-    hold: str = "linear"
+    m_kg: Annotated[float, Entry("m", "kg")]
+    b_N_s_per_m: Annotated[float, Entry("b", "N s/m")]
+    k_N_per_m: Annotated[float, Entry("k", "N/m")]
+    d_um_per_V: Annotated[float, Entry("d", "µm/V")]
+    alpha: Annotated[float, Entry("alpha")]
+    beta_per_V: Annotated[float, Entry("beta", "1/V")]
+    gamma_per_V: Annotated[float, Entry("gamma", "1/V")]
+    offset_um: Annotated[float, Entry("displacement at 0 V", "µm")] = 0.0
+    hold: Annotated[str, Entry("hold convention", among=("linear", "zero_order"))] = "linear"
     shape: FloatArray = field(init=False, repr=False, compare=False)
     modes: tuple[complex, complex] = field(init=False, repr=False, compare=False)
 
@@ -117,21 +115,6 @@ class BoucWenParameters:
     def with_gain(self, d_um_per_V: float, offset_um: float) -> BoucWenParameters:
         """The same hysteresis and dynamics with another gain and offset."""
         return replace(self, d_um_per_V=d_um_per_V, offset_um=offset_um)
-
-    def state_dict(self) -> StateDict:
-        """Values by field name."""
-        names = ("m_kg", "b_N_s_per_m", "k_N_per_m", "d_um_per_V", "alpha", "beta_per_V", "gamma_per_V")
-        return {**{name: getattr(self, name) for name in names}, "offset_um": self.offset_um, "hold": self.hold}
-
-    @staticmethod
-    def from_state(state: StateDict) -> BoucWenParameters:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
-        names = ("m_kg", "b_N_s_per_m", "k_N_per_m", "d_um_per_V", "alpha", "beta_per_V", "gamma_per_V", "offset_um")
-        try:
-            numbers = {name: float(state[name]) for name in names}
-            return BoucWenParameters(**numbers, hold=str(state["hold"]))
-        except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of a bouc_wen model; write it again") from None
 
 
 #: The chapter's identified stage, Table 2.1 (d: 1.1351e-5 m/V).
@@ -239,11 +222,11 @@ class BoucWenInverse:
     motion, because (2.2) responds to every reversal and sensor noise would wear the hysteresis off.
     """
 
-    parameters: BoucWenParameters
-    dt_s: float
-    domain: Domain
-    voltage_std_V: float = math.nan
-    name: str = "bouc_wen"
+    parameters: Annotated[BoucWenParameters, Entry("the identified stage", name="")]
+    dt_s: Annotated[float, Entry("sample time", "s")]
+    domain: Annotated[Domain, Entry("motion of the identification", name="")]
+    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
+    name: Annotated[str, Entry("by which it is served", most=1000)] = "bouc_wen"
     _constants: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -306,13 +289,10 @@ class BoucWenInverse:
         _track(u_V, self.parameters.shape, memory)
 
     def state_dict(self) -> StateDict:
-        """Flat numbers by name."""
-        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
-        return {**state, "name": self.name, **self.parameters.state_dict()}
+        """Flat numbers and vectors by name."""
+        return save(self)
 
     @staticmethod
     def from_state(state: StateDict) -> BoucWenInverse:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
-        dt_s, std_V, domain = common_fields("bouc_wen", state)
-        parameters = BoucWenParameters.from_state(state)
-        return BoucWenInverse(parameters, dt_s, domain, std_V, str(state.get("name", "bouc_wen")))
+        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
+        return load(BoucWenInverse, state)

@@ -10,7 +10,8 @@ rho = beta/lambda. They are random walks in the time that samples teach, within 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -18,10 +19,11 @@ from adaptive.compiled import all_finite, compiled
 from adaptive.errors import InputError
 from adaptive.online import drift as drift_step
 from adaptive.online.gates import LEARNT, NUMERICS, OUTLIER, PASSED, SETTLING, UNEXCITED
-from adaptive.types import FloatArray, StateDict, prefixed, under
+from adaptive.state import Entry
+from adaptive.types import FloatArray
 from baselines.bouc_wen.model import BoucWenInverse
 from baselines.bouc_wen.step import hysteresis_step, settled, stage_output, stage_step
-from baselines.online_baseline import OnlineBaseline, field_of
+from baselines.online_baseline import OnlineBaseline
 
 #: Relative increase of one shape parameter in each copy of the model.
 _NUDGE = 1e-3
@@ -93,6 +95,19 @@ def _copies_step(
 
 class BoucWenOnline(OnlineBaseline):
     """Bouc-Wen stage whose parameters follow the samples. Implements ``adaptive.types.OnlineModel``."""
+
+    BASE, CONFIG = BoucWenInverse, TrackingConfig
+
+    base: BoucWenInverse
+    config: TrackingConfig
+    _x: Annotated[FloatArray, Entry("gain, offset, alpha, lambda, rho, relative", "", "5")]
+    _P: Annotated[FloatArray, Entry("their covariance", "", "5,5")]
+    _states: Annotated[FloatArray, Entry("states of the model and of its three copies", "V", "4,6")]
+    _taught_u: Annotated[
+        float,
+        Entry("voltage of the last sample that taught, at first infinite", "V", finite=False, name="taught_u_V"),
+    ]
+    _refused: Annotated[int, Entry("refusals in a row", low=0)]
 
     def __init__(self, model: BoucWenInverse, config: TrackingConfig | None = None) -> None:
         self.config = config or TrackingConfig()
@@ -198,34 +213,5 @@ class BoucWenOnline(OnlineBaseline):
         )
         return replace(self.base, parameters=now, voltage_std_V=float(np.sqrt(self._square)) / now.d_um_per_V)
 
-    def state_dict(self) -> StateDict:
-        """The whole state; ``from_state`` continues to the same last bit."""
-        config = asdict(self.config)
-        config.update(first_std=np.array(self.config.first_std), walk_std=np.array(self.config.walk_std))
-        return {
-            **self._common_state(),
-            **prefixed("config_", config),
-            "x": self._x.copy(),
-            "P": self._P.copy(),
-            "states": self._states.copy(),
-            "taught_u_V": float(self._taught_u) if np.isfinite(self._taught_u) else None,
-            "refused": self._refused,
-            **prefixed("base_", self.base.state_dict()),
-        }
-
-    @classmethod
-    def from_state(cls, state: StateDict) -> BoucWenOnline:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
-        values = under("config_", state)
-        for name in ("first_std", "walk_std"):
-            values[name] = tuple(float(value) for value in field_of(values, name, "bouc_wen"))
-        made = cls(BoucWenInverse.from_state(under("base_", state)), TrackingConfig(**values))
-        made._restore_common(state)
-        made._x = np.array(field_of(state, "x", "bouc_wen"), dtype=np.float64)
-        made._P = np.array(field_of(state, "P", "bouc_wen"), dtype=np.float64)
-        made._states = np.array(field_of(state, "states", "bouc_wen"), dtype=np.float64)
-        taught = field_of(state, "taught_u_V", "bouc_wen")
-        made._taught_u = np.inf if taught is None else float(taught)
-        made._refused = int(field_of(state, "refused", "bouc_wen"))
-        made._set_shapes()
-        return made
+    def _restored(self) -> None:
+        self._set_shapes()

@@ -13,13 +13,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Annotated, Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from adaptive.compiled import DOUBLE, all_finite, all_finite_doubles
-from adaptive.errors import InputError, ModelFileError
+from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse, evaluate_point
+from adaptive.state import Entry, Refused, load, save, within
 from adaptive.types import Feedforward, FloatArray, IntArray, InverseModel, StateDict, prefixed, under
 from baselines.bouc_wen.model import BoucWenInverse
 from baselines.linear import LinearInverse
@@ -88,6 +89,17 @@ def _inverse_kind_of(model: InverseModel) -> str:
     raise InputError(
         f"model {model.name!r}: got a {type(model).__name__}, expected one of the kinds {', '.join(INVERSE_KINDS)}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ChampionEntries:
+    """What a stored `ChampionInverse` holds beside its models, which are under their names."""
+
+    name: Annotated[str, Entry("by which it is served", most=1000)]
+    names: Annotated[str, Entry("names of the contestants, separated by commas", most=10_000)]
+    kinds: Annotated[str, Entry("kinds of their models", most=10_000)]
+    champion: Annotated[int, Entry("index of the contestant that answers", low=0)]
+    blend_s: Annotated[float, Entry("duration of a change of champion in a caller's stream", "s", low=0.0)]
 
 
 @dataclass(frozen=True)
@@ -305,14 +317,8 @@ class ChampionInverse:
 
     def state_dict(self) -> StateDict:
         """Flat entries; contestants under ``NAME.``. Raises InputError for a class that cannot be stored."""
-        kinds = [_inverse_kind_of(model) for model in self.models]
-        state: StateDict = {
-            "name": self.name,
-            "names": ",".join(self.names),
-            "kinds": ",".join(kinds),
-            "champion": self.champion,
-            "blend_s": self.blend_s,
-        }
+        kinds = ",".join(_inverse_kind_of(model) for model in self.models)
+        state = save(ChampionEntries(self.name, ",".join(self.names), kinds, self.champion, self.blend_s))
         for name, model in zip(self.names, self.models, strict=True):
             state |= prefixed(f"{name}.", model.state_dict())
         return state
@@ -320,13 +326,19 @@ class ChampionInverse:
     @classmethod
     def from_state(cls, state: StateDict) -> ChampionInverse:
         """Inverse of ``state_dict``. Raises ModelFileError on missing or damaged entries."""
+        names = str(state.get("names")).split(",")
+        models = {name: under(f"{name}.", state) for name in names}
+        own = load(
+            ChampionEntries,
+            {n: value for n, value in state.items() if not n.startswith(tuple(f"{name}." for name in names))},
+        )
+        kinds, built = own.kinds.split(","), []
+        if len(set(names)) != len(names) or len(kinds) != len(names) or set(kinds) - set(INVERSE_KINDS):
+            raise Refused("kinds", repr(own.kinds)[:80], f"one of {', '.join(INVERSE_KINDS)} for each of {names}"[:200])
+        for name, kind in zip(names, kinds, strict=True):
+            with within(f"{name}."):
+                built.append(INVERSE_KINDS[kind].from_state(models[name]))
         try:
-            names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
-            models = []
-            for name, kind in zip(names, kinds, strict=True):
-                models.append(INVERSE_KINDS[kind].from_state(under(f"{name}.", state)))
-            return cls(tuple(names), tuple(models), int(state["champion"]), float(state["blend_s"]), str(state["name"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(
-                f"champion model: entry missing or damaged: {error}; identify the stage again"
-            ) from error
+            return cls(tuple(names), tuple(built), own.champion, own.blend_s, own.name)
+        except ValueError as error:
+            raise Refused.by_check(error) from error

@@ -17,7 +17,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates
 from adaptive.online.learner import Learner
 from adaptive.smoothing import FixedLagSmoother, SmootherConfig, SmootherState
+from adaptive.state import Entry, Refused, load, part_of, restore, save
 from adaptive.types import (
     FloatArray,
     Hyperparameters,
@@ -36,7 +37,6 @@ from adaptive.types import (
     StateDict,
     WindowData,
     prefixed,
-    under,
 )
 from baselines.bouc_wen.model import BoucWenInverse
 from baselines.bouc_wen.online import BoucWenOnline
@@ -116,6 +116,17 @@ _MAX_GLITCHES = 3
 class _SmoothedMotion:
     """Collects the smoothed motion with the voltage of the same instant, and marks the samples that are scored."""
 
+    _state: Annotated[SmootherState | None, Entry("state of the smoother", name="smoother")]
+    _u: Annotated[deque[float], Entry("voltages over the lag", "V", most=20_000)]
+    _rows: Annotated[
+        list[tuple[float, float, float, float, float]],
+        Entry("motion, voltage, and whether it is scored", "µm, µm/s, µm/s², V", "*,5"),
+    ]
+    _glitches: Annotated[int, Entry("readings in a row far from the prediction", low=0)]
+    _since_start: Annotated[int, Entry("samples since the smoother started", low=0)]
+    _since_left: Annotated[int, Entry("samples since the stage left a place", low=0)]
+    _anchor_um: Annotated[float, Entry("that place", "µm")]
+
     def __init__(self, config: CompetitionConfig, dt_s: float, range_um: float) -> None:
         self._config = config
         self._dt_s = dt_s
@@ -124,9 +135,9 @@ class _SmoothedMotion:
         self._glitch_um = config.glitch_share * range_um * max(1.0, dt_s / _GLITCH_DT_S)
         self._smoother = FixedLagSmoother(SmootherConfig.for_rate(dt_s, config.cutoff_hz))
         self.lag = self._smoother.config.lag
-        self._state: SmootherState | None = None
-        self._u: deque[float] = deque(maxlen=self.lag + 1)
-        self._rows: list[tuple[float, float, float, float, float]] = []
+        self._state = None
+        self._u = deque(maxlen=self.lag + 1)
+        self._rows = []
         self._glitches = 0
         self._since_start = 0
         self._since_left = 0
@@ -180,28 +191,15 @@ class _SmoothedMotion:
         self._rows.clear()
         return rows
 
-    def state_dict(self) -> StateDict:
-        """The whole state; copies."""
-        state: StateDict = {
-            "u": np.array(self._u, dtype=np.float64),
-            "rows": np.array(self._rows, dtype=np.float64).reshape(-1, 5),
-            "glitches": self._glitches,
-            "since_start": self._since_start,
-            "since_left": self._since_left,
-            "anchor_um": self._anchor_um,
-        }
-        if self._state is not None:
-            state |= prefixed("smoother.", self._smoother.state_dict(self._state))
-        return state
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the dimensions of the state."""
+        return self._smoother.sizes
 
-    def restore(self, state: StateDict) -> None:
-        """Continue from a ``state_dict``."""
-        self._u.extend(float(u) for u in state["u"])
-        self._rows = [tuple(float(x) for x in row) for row in np.asarray(state["rows"]).reshape(-1, 5)]  # type: ignore[misc]
-        self._glitches, self._since_start = int(state["glitches"]), int(state["since_start"])
-        self._since_left, self._anchor_um = int(state["since_left"]), float(state["anchor_um"])
-        smoother = under("smoother.", state)
-        self._state = self._smoother.from_state(smoother) if smoother else None
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where there is a smoother without a voltage."""
+        if values["_state"] is not None and not values["_u"]:
+            raise ValueError("u: got no voltage, expected those over the lag")
 
 
 @dataclass(slots=True)
@@ -211,9 +209,9 @@ class _RunningError:
     ``weight`` rises from 0 to 1 as scored motion fills the horizon.
     """
 
-    memory: FloatArray
-    square_V2: float = 0.0
-    weight: float = 0.0
+    memory: Annotated[FloatArray, Entry("hysteresis memory of the scored model, empty before a score", "", "memory|0")]
+    square_V2: Annotated[float, Entry("weighted mean square error", "V²", low=0.0)] = 0.0
+    weight: Annotated[float, Entry("weight of all scores", low=0.0)] = 0.0
 
     @property
     def mean_V2(self) -> float:
@@ -313,23 +311,42 @@ class Judge:
             # A stored champion model holds the snapshots; its champion has no meaning here.
             state |= prefixed(f"{where}.", ChampionInverse(names, snapshots, 0).state_dict())
         for name, score in zip(names, self.scores, strict=True):
-            state |= {
-                f"score.{name}.memory": score.memory.copy(),
-                f"score.{name}.square_V2": score.square_V2,
-                f"score.{name}.weight": score.weight,
-            }
+            state |= prefixed(f"score.{name}.", save(score))
         return state
 
     def restore(self, names: tuple[str, ...], state: StateDict) -> None:
-        """Continue from a ``state_dict``. Raises KeyError, ValueError or TypeError where it does not fit."""
-        self._start = ChampionInverse.from_state(under("start.", state)).models
+        """Continue from a ``state_dict``. Raises ModelFileError where it does not fit; entries are taken out."""
+        seqs = state.pop("past_seq", None)
+        if not isinstance(seqs, np.ndarray) or seqs.dtype != np.int64 or seqs.shape > (self._past.maxlen or 0,):
+            raise Refused("past_seq", repr(seqs)[:80], f"up to {self._past.maxlen} integers")
+        like = self._start
+        self._start = snapshots_of(state, "start", names, like)
+        past = [(seq, snapshots_of(state, f"past{k}", names, like)) for k, seq in enumerate(seqs.tolist())]
         self._past.clear()
-        for k, seq in enumerate(np.asarray(state["past_seq"]).tolist()):
-            self.remember(int(seq), ChampionInverse.from_state(under(f"past{k}.", state)).models)
-        for name, score in zip(names, self.scores, strict=True):
-            kept = under(f"score.{name}.", state)
-            score.memory = np.array(kept["memory"], dtype=np.float64)
-            score.square_V2, score.weight = float(kept["square_V2"]), float(kept["weight"])
+        self._past.extend(past)
+        for i, (name, model) in enumerate(zip(names, like, strict=True)):
+            with part_of(state, f"score.{name}.") as kept:
+                self.scores[i] = load(_RunningError, kept, {"memory": model.memory_size})
+
+
+def check_like(model: InverseModel, other: InverseModel, name: str) -> None:
+    """Raise ModelFileError where the stored model ``name`` cannot stand in the place of ``other``."""
+    same = type(model) is type(other) and model.memory_size == other.memory_size and model.dt_s == other.dt_s
+    if isinstance(model, LssvmInverse) and isinstance(other, LssvmInverse):
+        same = same and model.features.sizes == other.features.sizes
+    if not same:
+        raise Refused(name, f"a {type(model).__name__} of other sizes", "a model like the present one")
+
+
+def snapshots_of(state: StateDict, where: str, names: tuple[str, ...], like: Snapshots) -> Snapshots:
+    """Take snapshots of the contestants ``names`` out of ``state``; of the same kinds and sizes as ``like``."""
+    with part_of(state, f"{where}.") as kept:
+        made = ChampionInverse.from_state(kept)
+        for name, model, other in zip(made.names, made.models, like, strict=False):
+            check_like(model, other, name)
+        if made.names != names:
+            raise Refused("names", repr(made.names)[:80], repr(names))
+    return made.models
 
 
 # --- The rules by which a competition replaces its champion.
@@ -346,16 +363,13 @@ class ChampionChoice:
     ----------
     config : margin, floor and patience.
     span_V : voltage span that the floor refers to, V.
-    champion : index of the contestant that is served.
-    ahead_s : motion during which another contestant has been ahead without a break, s.
-    changes : number of changes of champion.
     """
 
     config: CompetitionConfig
     span_V: float
-    champion: int = 0
-    ahead_s: float = 0.0
-    changes: int = 0
+    champion: Annotated[int, Entry("index of the contestant that is served", low=0)] = 0
+    ahead_s: Annotated[float, Entry("motion during which another has been ahead without a break", "s", low=0.0)] = 0.0
+    changes: Annotated[int, Entry("changes of champion", low=0)] = 0
 
     def choose(self, errors_V: Sequence[float], scored_s: float) -> str:
         """Choose by the rms errors (k,), V, after ``scored_s`` more seconds of scored motion.
@@ -395,6 +409,15 @@ class Competition:
 
     Raises InputError where there is no contestant or a range is not positive.
     """
+
+    _range_um: Annotated[float, Entry("displacement range of the identification", "µm")]
+    _span_V: Annotated[float, Entry("its voltage range", "V")]
+    _seq: Annotated[int, Entry("number of the last sample, -1 before any", low=-1)]
+    _frozen: Annotated[bool, Entry("whether learning is stopped")]
+    _failed_seq: Annotated[int, Entry("sample at which the favourite failed or was restarted, -1 for none", low=-1)]
+    _choice: Annotated[ChampionChoice, Entry("the choice of a champion", name="")]
+    _out: Annotated[list[bool], Entry("which contestants have failed", "", "contestants")]
+    _motion: Annotated[_SmoothedMotion, Entry("smoothed motion on which the contestants are scored")]
 
     def __init__(
         self,
@@ -684,24 +707,8 @@ class Competition:
 
         Raises InputError where a contestant is of a class that cannot be stored.
         """
-        kinds: dict[type, str] = {known: kind for kind, known in _ONLINE_KINDS.items()}
-        if any(type(model) not in kinds for model in self._models):
-            raise InputError(f"contestants: expected models of the kinds {', '.join(_ONLINE_KINDS)} to be stored")
-        state: StateDict = {
-            "names": ",".join(self.names),
-            "kinds": ",".join(kinds[type(model)] for model in self._models),
-            "range_um": self._range_um,
-            "span_V": self._span_V,
-            "seq": self._seq,
-            "frozen": self._frozen,
-            "failed_seq": self._failed_seq,
-            "champion": self._choice.champion,
-            "ahead_s": self._choice.ahead_s,
-            "changes": self._choice.changes,
-            "out": np.array(self._out, dtype=np.bool_),
-        }
+        state: StateDict = {"names": ",".join(self.names), "kinds": self._kinds, **save(self)}
         state |= prefixed("config.", self.config.state_dict())
-        state |= prefixed("motion.", self._motion.state_dict())
         state |= prefixed("newest.", ChampionInverse(self.names, self._newest, 0).state_dict())
         state |= self.judge.state_dict(self.names)
         for name, model in zip(self.names, self._models, strict=True):
@@ -710,8 +717,18 @@ class Competition:
             state |= prefixed(f"model.{name}.", model.state_dict())
         return state
 
+    @property
+    def _kinds(self) -> str:
+        kinds: dict[type, str] = {known: kind for kind, known in _ONLINE_KINDS.items()}
+        if any(type(model) not in kinds for model in self._models):
+            raise InputError(f"contestants: expected models of the kinds {', '.join(_ONLINE_KINDS)} to be stored")
+        return ",".join(kinds[type(model)] for model in self._models)
+
     def restored(self, state: StateDict) -> Competition:
         """A competition with ``state`` that restarts its favourite as this one does. Raises ModelFileError."""
+        for name, own in (("names", ",".join(self.names)), ("kinds", self._kinds)):
+            if state.get(name) != own:
+                raise Refused(name, repr(state.get(name))[:80], repr(own))
         return self.from_state(state, self._restart)
 
     @classmethod
@@ -720,27 +737,37 @@ class Competition:
 
         Raises ModelFileError where an entry is missing or damaged.
         """
+        rest = dict(state)
+        names, kinds = str(rest.pop("names", "")).split(","), str(rest.pop("kinds", "")).split(",")
+        if len(set(names)) != len(kinds) or set(kinds) - set(_ONLINE_KINDS):
+            raise Refused("kinds", repr(kinds)[:80], f"one of {', '.join(_ONLINE_KINDS)} for each of {names}"[:200])
+        contestants: dict[str, OnlineModel] = {}
+        for name, kind in zip(names, kinds, strict=True):
+            with part_of(rest, f"model.{name}.") as kept:
+                contestants[name] = _ONLINE_KINDS[kind].from_state(kept)
+        for name, model in contestants.items():
+            if rest.pop(f"base.{name}", None) != fingerprint(model.base):
+                raise Refused(f"base.{name}", "another fingerprint", "that of the identified model")
         try:
-            names, kinds = str(state["names"]).split(","), str(state["kinds"]).split(",")
-            contestants = {
-                name: _ONLINE_KINDS[kind].from_state(under(f"model.{name}.", state))
-                for name, kind in zip(names, kinds, strict=True)
-            }
-            config = CompetitionConfig(**under("config.", state))
-            made = cls(contestants, float(state["range_um"]), float(state["span_V"]), config, restart)
-            made._restore(state)
+            with part_of(rest, "config.") as settings:
+                config = CompetitionConfig(**settings)
+            made = cls(contestants, float(rest["range_um"]), float(rest["span_V"]), config, restart)
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f"competition state: entry missing or damaged: {error}; start from models") from error
+        made._restore(rest)
         return made
 
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where the champion is none of the contestants."""
+        if values["_choice"].champion >= len(self.names):
+            champion = values["_choice"].champion
+            raise ValueError(f"champion: got {champion}, expected a number from 0 to {len(self.names) - 1}")
+
     def _restore(self, state: StateDict) -> None:
-        """Continue from ``state``, which holds the same contestants. Raises KeyError, ValueError or TypeError."""
-        self._motion.restore(under("motion.", state))
+        """Continue from ``state``, which holds the same contestants. Raises ModelFileError."""
         self.judge.restore(self.names, state)
-        self._newest = ChampionInverse.from_state(under("newest.", state)).models
-        self._choice.champion, self._choice.changes = int(state["champion"]), int(state["changes"])
-        self._choice.ahead_s = float(state["ahead_s"])
+        newest = snapshots_of(state, "newest", self.names, self._newest)
+        given = {"_choice": {"config": self.config, "span_V": self._span_V}}
+        restore(self, state, {"contestants": len(self.names), **self._motion.sizes}, given)
+        self._newest = newest
         self._serving = self._served()
-        self._out = [bool(out) for out in np.asarray(state["out"]).tolist()]
-        self._frozen, self._failed_seq = bool(state["frozen"]), int(state["failed_seq"])
-        self._seq = int(state["seq"])

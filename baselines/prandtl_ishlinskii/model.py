@@ -16,18 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from adaptive.compiled import compiled
 from adaptive.errors import InputError
+from adaptive.state import Entry, load, save
 from adaptive.types import BoolArray, Feedforward, FloatArray, StateDict
 from baselines.common import (
     Domain,
     checked_memory,
     checked_motion,
-    common_fields,
-    common_state,
     of_length,
     positive,
     std_or_nan,
@@ -110,13 +110,15 @@ class MpiParameters:
     Raises InputError on thresholds, weights or offsets that do not make an invertible model.
     """
 
-    r_V: tuple[float, ...]
-    w_h: tuple[float, ...]
-    d_um: tuple[float, ...] = (0.0,)
-    w_s: tuple[float, ...] = (1.0,)
-    c_um: float = 0.0
-    y_ref_um: float = 0.0
-    lag_s: float = 0.0
+    r_V: Annotated[tuple[float, ...], Entry("play thresholds, ascending from 0", "V", "plays", most=10_000)]
+    w_h: Annotated[tuple[float, ...], Entry("their weights", "µm/V", "plays", most=10_000)]
+    d_um: Annotated[tuple[float, ...], Entry("dead-zone thresholds, ascending from 0", "µm", "zones", most=10_000)] = (
+        0.0,
+    )
+    w_s: Annotated[tuple[float, ...], Entry("their weights", "", "zones", most=10_000)] = (1.0,)
+    c_um: Annotated[float, Entry("offset of x", "µm")] = 0.0
+    y_ref_um: Annotated[float, Entry("displacement where x is 0", "µm")] = 0.0
+    lag_s: Annotated[float, Entry("first-order lag of the stage", "s")] = 0.0
     r_: FloatArray = field(init=False, repr=False, compare=False)
     w_h_: FloatArray = field(init=False, repr=False, compare=False)
     d_: FloatArray = field(init=False, repr=False, compare=False)
@@ -156,32 +158,6 @@ class MpiParameters:
         y = np.empty(u.size)
         _run_forward(u, self.r_, self.w_h_, self.d_, self.w_s_, self.c_um, self.y_ref_um, state, y)
         return _lag(y, self.lag_s / dt_s) if self.lag_s > 0.0 else y
-
-    def state_dict(self) -> StateDict:
-        """The four vectors and three scalars by name."""
-        return {
-            "r_V": self.r_.copy(),
-            "w_h": self.w_h_.copy(),
-            "d_um": self.d_.copy(),
-            "w_s": self.w_s_.copy(),
-            "c_um": self.c_um,
-            "y_ref_um": self.y_ref_um,
-            "lag_s": self.lag_s,
-        }
-
-    @staticmethod
-    def from_state(state: StateDict) -> MpiParameters:
-        """Inverse of :meth:`state_dict`; raises InputError where a field is missing or wrong."""
-        try:
-            vectors = {key: _tuple(np.asarray(state[key], dtype=np.float64)) for key in ("r_V", "w_h", "d_um", "w_s")}
-            return MpiParameters(
-                **vectors,
-                c_um=float(state["c_um"]),
-                y_ref_um=float(state["y_ref_um"]),
-                lag_s=float(state["lag_s"]),
-            )
-        except KeyError as missing:
-            raise InputError(f"{missing.args[0]}: missing in the state of an mpi model; write it again") from None
 
 
 def from_inverse_saturation(
@@ -275,11 +251,11 @@ class MpiInverse:
     ``track`` and ``feedforward`` agree on the memory to round-off. ``voltage_std_V``: NaN where it is unknown.
     """
 
-    parameters: MpiParameters
-    dt_s: float
-    domain: Domain
-    voltage_std_V: float = math.nan
-    name: str = "mpi"
+    parameters: Annotated[MpiParameters, Entry("the identified stage", name="")]
+    dt_s: Annotated[float, Entry("sample time", "s")]
+    domain: Annotated[Domain, Entry("motion of the identification", name="")]
+    voltage_std_V: Annotated[float, Entry("standard deviation of the voltage", "V", finite=False)] = math.nan
+    name: Annotated[str, Entry("by which it is served", most=1000)] = "mpi"
     _plays: FloatArray = field(init=False, repr=False, compare=False)
     _saturation: FloatArray = field(init=False, repr=False, compare=False)
     _scalars: FloatArray = field(init=False, repr=False, compare=False)
@@ -340,11 +316,9 @@ class MpiInverse:
 
     def state_dict(self) -> StateDict:
         """Flat numbers and vectors by name."""
-        state = common_state(self.dt_s, self.voltage_std_V, self.domain)
-        return {**state, "name": self.name, **self.parameters.state_dict()}
+        return save(self)
 
     @staticmethod
     def from_state(state: StateDict) -> MpiInverse:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing or wrong."""
-        dt_s, std_V, domain = common_fields("mpi", state)
-        return MpiInverse(MpiParameters.from_state(state), dt_s, domain, std_V, str(state.get("name", "mpi")))
+        """Inverse of :meth:`state_dict`. Raises ModelFileError where a field is missing or wrong."""
+        return load(MpiInverse, state)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 
 from adaptive.errors import InputError
 from adaptive.online.drift import joseph, walk
-from adaptive.types import FloatArray, StateDict, prefixed, under
-from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline, config_from, field_of
+from adaptive.state import Entry
+from adaptive.types import FloatArray
+from baselines.online_baseline import LeastSquaresConfig, LeastSquaresOnline
 from baselines.prandtl_ishlinskii.identify import MpiGrid
-from baselines.prandtl_ishlinskii.model import MpiInverse, inverse_thresholds, inverse_weights
+from baselines.prandtl_ishlinskii.model import MpiInverse, MpiParameters, inverse_thresholds, inverse_weights
 from baselines.prandtl_ishlinskii.operators import dead_zone_sum, play_run, play_start, play_step, ramps
 
 #: Random walk of gain and offset per square root of a second of teaching: relative, and as a share of the stroke.
@@ -30,17 +32,13 @@ class GainFilter:
     A slower least-squares fit on (y - offset)/gain then sees samples from before and after a change of the gain or of
     the sensor's zero as samples of one stage.
 
-    Attributes
-    ----------
     walk : (2,) variances added per sample, of the gain and of the offset (µm²).
-    covariance : (2, 2) of the estimate.
-    gain, offset_um : the estimate.
     """
 
     walk: FloatArray
-    covariance: FloatArray
-    gain: float = 1.0
-    offset_um: float = 0.0
+    covariance: Annotated[FloatArray, Entry("of the estimate", "1, µm, µm²", "2,2")]
+    gain: Annotated[float, Entry("the estimated gain", low=_GAIN_MIN, high=_GAIN_MAX)] = 1.0
+    offset_um: Annotated[float, Entry("the estimated offset", "µm")] = 0.0
 
     @classmethod
     def start(cls, gain_walk: float, offset_walk_um: float, step_s: float) -> GainFilter:
@@ -62,15 +60,6 @@ class GainFilter:
         """The displacement without the filter's gain and offset, in the frame of the model, µm."""
         return (y_um - self.offset_um) / self.gain
 
-    def state_dict(self) -> StateDict:
-        """Estimate and covariance; copies."""
-        return {"gain": self.gain, "offset_um": self.offset_um, "covariance": self.covariance.copy()}
-
-    def restore(self, state: StateDict) -> None:
-        """Continue from a ``state_dict``."""
-        self.gain, self.offset_um = float(state["gain"]), float(state["offset_um"])
-        self.covariance = np.array(state["covariance"], dtype=np.float64)
-
 
 class MpiOnline(LeastSquaresOnline):
     """Play weights, offset and inverse-saturation slopes that follow the stage, fitted to (2.40) with a fixed scale.
@@ -79,6 +68,27 @@ class MpiOnline(LeastSquaresOnline):
     gain and offset, and the weights are fitted in its frame. Without it, least squares over samples from before and
     after a change of gain would explain the difference by the shape for as long as they are remembered.
     """
+
+    BASE = MpiInverse
+
+    base: MpiInverse
+    _unknowns: Annotated[FloatArray, Entry("weights, offset and inverse-saturation slopes", "", "unknowns")]
+    _states: Annotated[FloatArray, Entry("states of the plays", "V", "plays", name="states_V")]
+    _shape: Annotated[MpiParameters, Entry("the present model", name="now")]
+    _frame: Annotated[GainFilter, Entry("gain and offset")]
+
+    @property
+    def pending_size(self) -> int:
+        return self._states.size + 1
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        plays, zones = self._states.size, len(self._shape.d_um)
+        return super().sizes | {"unknowns": self._unknowns.size, "plays": plays, "zones": zones}
+
+    @property
+    def given(self) -> dict[str, Any]:
+        return {"_frame": {"walk": self._frame.walk}}
 
     def __init__(self, model: MpiInverse, config: LeastSquaresConfig | None = None) -> None:
         p, domain = model.parameters, model.domain
@@ -165,24 +175,3 @@ class MpiOnline(LeastSquaresOnline):
         now = replace(shape, w_s=w_s, y_ref_um=f.gain * shape.y_ref_um + f.offset_um)
         std_V = float(np.sqrt(self._square)) / float(np.sum(shape.w_h_) * shape.w_s_[0])
         return replace(self.base, parameters=now, voltage_std_V=std_V)
-
-    def state_dict(self) -> StateDict:
-        """The whole state; ``from_state`` continues to the same last bit."""
-        now = {
-            "unknowns": self._unknowns.copy(),
-            "states_V": self._states.copy(),
-            **prefixed("now_", self._shape.state_dict()),
-            **prefixed("frame_", self._frame.state_dict()),
-        }
-        return {**self._learning_state(), **now, **prefixed("base_", self.base.state_dict())}
-
-    @classmethod
-    def from_state(cls, state: StateDict) -> MpiOnline:
-        """Inverse of :meth:`state_dict`. Raises InputError where a field is missing."""
-        made = cls(MpiInverse.from_state(under("base_", state)), config_from(state))
-        made._restore_learning(state)
-        made._unknowns = np.array(field_of(state, "unknowns", "mpi"), dtype=np.float64)
-        made._states = np.array(field_of(state, "states_V", "mpi"), dtype=np.float64)
-        made._shape = made._shape.from_state(under("now_", state))
-        made._frame.restore(under("frame_", state))
-        return made

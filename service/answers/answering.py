@@ -8,12 +8,13 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adaptive.compiled import all_finite
+from adaptive.state import Entry
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.fallback import Rules, answer_safely
@@ -36,9 +37,17 @@ class MemoryTracker:
     from t_k on. What is not finite is left out.
     """
 
+    _rows: Annotated[
+        list[tuple[float, float, float, float]], Entry("motion and voltage that wait", "µm, µm/s, µm/s², V", "*,4")
+    ]
+    _begun: Annotated[bool, Entry("whether a sample has come")]
+    _seq: Annotated[int, Entry("number of the last sample, -1 for none", low=-1)]
+    _y: Annotated[float, Entry("its displacement", "µm", finite=False)]
+    _v: Annotated[float, Entry("its velocity", "µm/s", finite=False)]
+
     def __init__(self, dt_s: float) -> None:
         self._dt_s = dt_s
-        self._rows: list[tuple[float, float, float, float]] = []
+        self._rows = []
         self._begun = False
         self.forget()
 
@@ -48,17 +57,6 @@ class MemoryTracker:
         self._seq = -1
         self._y = math.nan
         self._v = math.nan
-
-    def state_dict(self) -> dict[str, float | FloatArray]:
-        """All of it: numbers, and (n, 4) rows that wait."""
-        rows = np.array(self._rows, dtype=np.float64).reshape(-1, 4)
-        return {"rows": rows, "begun": float(self._begun), "seq": self._seq, "y": self._y, "v": self._v}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from ``state_dict``. Raises KeyError or ValueError, before anything changes, where it is damaged."""
-        rows = [(y, v, a, u) for y, v, a, u in np.asarray(state["rows"], dtype=np.float64).reshape(-1, 4).tolist()]
-        begun, seq, y, v = bool(state["begun"]), int(state["seq"]), float(state["y"]), float(state["v"])
-        self._rows, self._begun, self._seq, self._y, self._v = rows, begun, seq, y, v
 
     def add(self, seq: int, u_V: float, y_um: float) -> None:
         """One sample in order: voltage in V, displacement in µm."""

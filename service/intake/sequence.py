@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-import numpy as np
+from adaptive.state import Entry
 
 IN_ORDER: Final = "in_order"
 LATE: Final = "late"
@@ -55,13 +55,22 @@ _MOST_FIRST: Final = 2**52
 class SequenceTracker:
     """Classifies the numbers of arriving samples and maps them to one count that never decreases.
 
-    Attributes
-    ----------
-    last : highest number taken in order in the stage's present count, -1 before any.
-    received, lost, late, restarts : number of samples received; numbers that never arrived; samples that were doubled,
-        out of order, or far ahead without confirmation; changes to another count.
-    refuted : the number far ahead that later samples have just contradicted, -1 for none.
+    ``refuted`` : the number far ahead that later samples have just contradicted, -1 for none.
     """
+
+    last: Annotated[int, Entry("highest number in order in the stage's present count, -1 before any", low=-1)]
+    received: Annotated[int, Entry("samples received", low=0)]
+    lost: Annotated[int, Entry("numbers that never arrived", low=0)]
+    late: Annotated[int, Entry("samples doubled, out of order, or far ahead without confirmation", low=0)]
+    restarts: Annotated[int, Entry("changes to another count", low=0)]
+    _offset: Annotated[int, Entry("what is added to a number of the present count")]
+    _since: Annotated[int, Entry("samples in order since the count began or since its last gap", low=0)]
+    _t_s: Annotated[float, Entry("time of the last one", "s", finite=False)]
+    _run: Annotated[int, Entry("samples that confirm the claim of another count", low=0)]
+    _run_first: Annotated[int, Entry("first number of the claim")]
+    _run_last: Annotated[int, Entry("its last number")]
+    _run_t_s: Annotated[float, Entry("time of its first", "s", finite=False)]
+    _gaps: Annotated[deque[tuple[int, int]], Entry("skipped numbers, first and last, newest last", "", "*,2")]
 
     def __init__(self, dt_s: float) -> None:
         self.last = -1
@@ -83,7 +92,7 @@ class SequenceTracker:
         self._run_first = self._run_last = -1
         self._run_t_s = math.nan
         # Skipped numbers, the newest last. A late sample that fills such a gap is no sign of a restart.
-        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS_KEPT)
+        self._gaps = deque(maxlen=_GAPS_KEPT)
 
     def take(self, seq: int, t_s: float) -> str:
         """The outcome for a sample with the number ``seq`` and the stage's time ``t_s``, s: one of the names above.
@@ -186,27 +195,6 @@ class SequenceTracker:
         if lost > MOST_CONFIRMATIONS:
             self._since = 0
 
-    def state_dict(self) -> dict[str, Any]:
-        """The whole state: plain numbers, and the gaps (n, 2)."""
-        kept = {"last": self.last, **self.counters(), "offset": self._offset, "since": self._since, "t_s": self._t_s}
-        kept |= {"run": self._run, "run_first": self._run_first, "run_last": self._run_last, "run_t_s": self._run_t_s}
-        return {**kept, "gaps": np.array(self._gaps, dtype=np.int64).reshape(-1, 2)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``. Raises KeyError or ValueError, before anything changes, if it is damaged.
-
-        States from before claims needed confirmation lack some entries; their count is treated as one just begun.
-        """
-        names = ("last", "received", "lost", "late", "restarts", "offset", "run", "run_last")
-        s = {name: int(state[name]) for name in names}
-        run_first, since = int(state.get("run_first", s["run_last"] - s["run"] + 1)), int(state.get("since", 0))
-        t_s, run_t_s = (float(state.get(name, math.nan)) for name in ("t_s", "run_t_s"))
-        gaps = np.asarray(state["gaps"], dtype=np.int64).reshape(-1, 2).tolist()
-        self._gaps = deque(((first, last) for first, last in gaps), maxlen=_GAPS_KEPT)
-        self.last, self.received, self.lost, self.late = s["last"], s["received"], s["lost"], s["late"]
-        self.restarts, self._offset, self._run, self._run_last = s["restarts"], s["offset"], s["run"], s["run_last"]
-        self._run_first, self._since, self._t_s, self._run_t_s = run_first, since, t_s, run_t_s
-
     def counters(self) -> dict[str, int]:
         """Counters for the status."""
         return {"received": self.received, "lost": self.lost, "late": self.late, "restarts": self.restarts}
@@ -244,14 +232,30 @@ class SampleClock:
     while are refused.
     """
 
+    _times: Annotated[
+        dict[str, float],
+        Entry(
+            "time of the last sample that continues, offset that was removed, time of the last that does not", "s",
+            low=-8.0 * MAX_TIME_S, high=8.0 * MAX_TIME_S, finite=False, name="",
+            among=("t_last_s", "t_offset_s", "t_other_s"),
+        ),
+    ]  # fmt: skip
+    _counts: Annotated[
+        dict[str, int],
+        Entry(
+            "their numbers, how many did not continue, whether a count begins, and refusals in a row", low=-1,
+            name="", among=("number_last", "number_other", "others", "anew", "unheard"),
+        ),
+    ]  # fmt: skip
+    sets: Annotated[int, Entry("how often the clock has been set", low=0)]
+
     def __init__(self, dt_s: float) -> None:
         self._dt_s = dt_s
-        #: How often the clock has been set.
         self.sets = 0
         #: Whether the time of the last sample does not continue those before.
         self.in_doubt = False
         # Time of the last sample that continues, offset that was removed, time of the last one that does not; s.
-        self._times: dict[str, float] = {"t_last_s": 0.0, "t_offset_s": 0.0, "t_other_s": math.nan}
+        self._times = {"t_last_s": 0.0, "t_offset_s": 0.0, "t_other_s": math.nan}
         # Their numbers, how many did not continue in a row, whether the stage's count begins anew with the next time,
         # and how many samples in a row the learner has refused.
         self._counts = {"number_last": -1, "number_other": -1, "others": 0, "anew": 0, "unheard": 0}
@@ -267,7 +271,7 @@ class SampleClock:
         if not abs(t_s) <= MAX_TIME_S:
             return math.nan
         passed = number - n["number_last"]
-        # Only states from older versions have numbers that are further apart than that.
+        # A state may have numbers that are further apart than that.
         expected_s = t["t_last_s"] + (passed * self._dt_s if passed * self._dt_s <= MAX_TIME_S else self._dt_s)
         begins, n["anew"] = n["anew"] and n["number_last"] >= 0, 0
         if begins:
@@ -303,20 +307,8 @@ class SampleClock:
         n["unheard"] = 0
         return True
 
-    def state_dict(self) -> dict[str, float]:
-        """The whole state, as numbers."""
-        return {**self._times, **self._counts, "sets": self.sets}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``. Raises KeyError or ValueError, before anything changes, if it is damaged.
-
-        A time beyond `MAX_TIME_S`, from an older state, is discarded.
-        """
-        times = {name: float(state[name]) for name in self._times}
-        counts = {name: int(state[name]) for name in ("number_last", "number_other", "others")}
-        counts |= {name: int(state.get(name, 0)) for name in ("anew", "unheard")}
-        sets = int(state["sets"])
-        if not max(abs(times["t_last_s"]), abs(times["t_offset_s"])) <= 8.0 * MAX_TIME_S:
-            fresh = SampleClock(self._dt_s)
-            times, counts = fresh._times, fresh._counts
-        self._times, self._counts, self.sets = times, counts, sets
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where the clock has no time."""
+        for name in ("t_last_s", "t_offset_s"):
+            if not math.isfinite(values["_times"][name]):
+                raise ValueError(f"{name}: got {values['_times'][name]}, expected a finite time")

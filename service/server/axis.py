@@ -13,15 +13,14 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, Final, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Final, NamedTuple, Protocol
 
-import numpy as np
-
-from adaptive.errors import InputError, ModelFileError
+from adaptive.errors import ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER, TIMING
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
+from adaptive.state import Entry, Refused, load, part_of, restore, save
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
 from service.answers.answering import MemoryTracker, Served, answer, blends, learns, most_ahead
 from service.answers.guard import Limits
 from service.answers.slices import Pace
@@ -30,7 +29,7 @@ from service.config.settings import LEARN, AxisConfig
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
-from service.protocol.model import Safety, build_model, stored_kind
+from service.protocol.model import Safety, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
@@ -41,11 +40,10 @@ from service.server.learner_supervisor import (
     ModelWatchConfig,
     Revive,
     champion_of,
-    check_same_learner,
     fingerprint,
+    stored_model,
 )
 from service.server.moves import Moves
-from service.server.state_schema import StateSchema
 
 # --- Events of an axis: kept for the wire, and written to the log of the process.
 
@@ -149,7 +147,7 @@ class Archive(Protocol):
         """The checkpoints, newest first."""
         ...
 
-    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
+    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
         """The learner of a checkpoint, whose state passes ``check``.
 
         Raises FieldError if there is none with this number, or it does not fit.
@@ -172,6 +170,33 @@ class SampleCounts(NamedTuple):
 _RECENT: Final = 1024
 
 
+@dataclass(slots=True)
+class ServedEntries:
+    """What is served, beside models and memories."""
+
+    seq: Annotated[int, Entry("the last sample handled before the snapshot, -1 before any", low=-1)]
+    t_s: Annotated[float, Entry("its time", "s")]
+    u_V: Annotated[float, Entry("its voltage", "V", finite=False)]
+    default: Annotated[str, Entry("name of the model that answers where a query names none", most=1000)]
+    trust: Annotated[float, Entry("weight of the learning model inside its domain", low=0.0, high=1.0)]
+    trouble: Annotated[str, Entry("what is wrong with the samples or the learner, empty for nothing", most=1000)]
+
+
+@dataclass(slots=True)
+class AxisEntries:
+    """What an axis holds beside the learner and its supervisor, numbers and clock of samples, and frozen models."""
+
+    seq: Annotated[int, Entry("number of the last sample handled, -1 before any", low=-1)]
+    served: Annotated[ServedEntries, Entry("what is served")]
+    gates: Annotated[dict[str, int], Entry("samples by outcome", low=0)]
+    memory: Annotated[dict[str, FloatArray], Entry("hysteresis memory of each served model")]
+    held: Annotated[FloatArray | None, Entry("memory of the stand-in when learning was stopped")]
+
+
+#: Beginnings of the entries of the supervisor.
+_OF_SUPERVISOR: Final = ("frozen_by", "dead", "adoptions", "watch.", "model.", "mark.", "learner.")
+
+
 class Axis:
     """The models of one axis.
 
@@ -183,7 +208,6 @@ class Axis:
     limits : those of ``config``, with a displacement range filled in.
     revive : starts another learner from a model, some time after a learner has failed; None: it stays failed.
     stage : name of the stage, for the log. archive : checkpoints to go back to, or None.
-    template : state of a learner like ``learner`` that has learnt some samples: what a state to restore must look like.
         By default that of ``learner`` itself.
     warnings : what the operator should know from the start on, by the name of its event.
 
@@ -200,7 +224,6 @@ class Axis:
         *,
         stage: str = "",
         archive: Archive | None = None,
-        template: StateDict | None = None,
         warnings: Mapping[str, str] | None = None,
     ) -> None:
         if config.served == AUTO and AUTO not in models:
@@ -239,10 +262,6 @@ class Axis:
         #: Queries whose samples under way began far ahead of the stage; and whether the last one did.
         self.far_ahead = 0
         self._far_ahead = False
-        if template is None:
-            template = {} if learner is None else learner.state_dict()
-        sizes = {name: memory.size for name, memory in self.newest.memories.items()}
-        self._schema = StateSchema(template, sizes)
         self.warnings = dict(warnings or {})
         for event, detail in self.warnings.items():
             self.note(event, detail)
@@ -527,7 +546,7 @@ class Axis:
         """
         if self._archive is None or self.learner is None:
             raise FieldError("checkpoint", checkpoint, "an axis that learns and keeps checkpoints", "see 'checkpoints'")
-        learner = self._archive.learner_of(checkpoint, self.learner, self._check_state)
+        learner = self._archive.learner_of(checkpoint, self.learner)
         self.supervisor.replace(learner)
         newest = self.newest
         changed = {self.config.learn: learner.snapshot(), **champion_of(learner)}
@@ -549,28 +568,17 @@ class Axis:
         of another identification can be refused.
         """
         served = self.newest
-        state: StateDict = {
-            "seq": self.handled_seq,
-            "served.seq": served.seq,
-            "served.t_s": served.t_s,
-            "served.u_V": served.u_V,
-            "served.default": served.default,
-            "served.trust": served.trust,
-            "served.trouble": served.trouble,
-        }
-        state |= prefixed("sequence.", self.sequence.state_dict())
-        state |= prefixed("clock.", self.clock.state_dict())
-        state |= prefixed("tracker.", self.tracker.state_dict())
-        state |= prefixed("gates.", self._gates)
-        state |= prefixed("memory.", served.memories)
+        answers = ServedEntries(served.seq, served.t_s, served.u_V, served.default, served.trust, served.trouble)
+        held = served.held if served.frozen else None
+        state = save(AxisEntries(self.handled_seq, answers, self._gates, served.memories, held))
+        for name, part in (("sequence", self.sequence), ("clock", self.clock), ("tracker", self.tracker)):
+            state |= prefixed(f"{name}.", save(part))
         if served.frozen:
             for name in (self.config.learn, AUTO):
                 if name in served.models and learns(name, self.config):
                     model = served.models[name]
                     role = f"frozen.{'auto' if name == AUTO else 'learn'}."
                     state |= {f"{role}kind": stored_kind(model), **prefixed(role, model.state_dict())}
-            if served.held is not None:
-                state["frozen.held"] = served.held.copy()
         state |= self.supervisor.state_dict(served.trouble in POISON)
         return state
 
@@ -581,65 +589,52 @@ class Axis:
                 "it holds a learner alone, as the file of an axis of a fleet does; serve it by a [fleet], or remove it "
                 "to begin with the model file"
             )
-        self._check_state(state)
+        rest = dict(state)
+        sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)
         try:
-            sequence, clock, tracker = SequenceTracker(self.dt_s), SampleClock(self.dt_s), MemoryTracker(self.dt_s)
-            sequence.restore(under("sequence.", state))
-            clock.restore(under("clock.", state))
-            tracker.restore(under("tracker.", state))
-            supervisor = self.supervisor.restored(state, sequence.received)
-            served = self._restored_snapshot(state, supervisor)
-            gates = {name: int(count) for name, count in under("gates.", state).items()}
-            seq = int(state["seq"])
-        except (
-            LookupError,
-            TypeError,
-            ValueError,
-            ArithmeticError,
-            AttributeError,
-            RecursionError,
-            InputError,
-        ) as error:
+            for name, part in (("sequence", sequence), ("clock", clock), ("tracker", tracker)):
+                with part_of(rest, f"{name}.") as kept:
+                    restore(part, kept)
+            theirs = [name for name in rest if name.startswith(_OF_SUPERVISOR)]
+            supervisor = self.supervisor.restored({name: rest.pop(name) for name in theirs}, sequence.received)
+            served, own = self._restored_snapshot(rest, supervisor)
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
             raise ModelFileError(f"state: entry missing or damaged: {error!r}") from error
         self.sequence, self.clock, self.tracker, self.supervisor = sequence, clock, tracker, supervisor
-        self._gates = gates
+        self._gates = own.gates
         self._snapshots = (served,)
-        self.handled_seq = seq
+        self.handled_seq = own.seq
         self._update_counts()
 
-    def _check_state(self, state: StateDict) -> None:
-        """Raise ModelFileError if ``state`` is of another learner, or an entry is not as it must be."""
-        if self.learner is not None:
-            check_same_learner(under("learner.", state), self.learner)
-        self._schema.check(state)
-
-    def _restored_snapshot(self, state: StateDict, supervisor: LearnerSupervisor) -> Served:
+    def _restored_snapshot(self, rest: StateDict, supervisor: LearnerSupervisor) -> tuple[Served, AxisEntries]:
+        """The snapshot and the axis' own entries of ``rest``, which holds nothing else. Raises ModelFileError."""
         now = self.newest
         models = dict(now.models)
         if supervisor.learner is not None:
             good = supervisor.watch.good
             models[self.config.learn] = supervisor.learner.snapshot() if good is None else good
             models |= champion_of(supervisor.learner)
-        for role, name in (("frozen.learn.", self.config.learn), ("frozen.auto.", AUTO)):
-            if supervisor.frozen and f"{role}kind" in state and name in models:
-                models[name] = build_model(str(state[f"{role}kind"]), under(role, state), f"the frozen model {name!r}")
+        for role, name in (("learn", self.config.learn), ("auto", AUTO)):
+            with part_of(rest, f"frozen.{role}.") as kept:
+                if kept and supervisor.frozen and name in models:
+                    models[name] = stored_model(kept, models[name], f"the frozen model {name!r}")
+        own = load(AxisEntries, rest)
         memories: dict[str, FloatArray] = {}
         for name, model in models.items():
-            memory = np.array(state.get(f"memory.{name}", model.rest_memory(0.0)), dtype=np.float64)
-            if memory.shape != (model.memory_size,) or not np.isfinite(memory).all():
-                raise FieldError(f"memory.{name}", memory.shape, f"({model.memory_size},) finite numbers")
-            memories[name] = memory
-        default = str(state["served.default"])
+            memories[name] = memory = own.memory.get(name, model.rest_memory(0.0))
+            if memory.shape != (model.memory_size,):
+                raise Refused(f"memory.{name}", f"float64 {memory.shape}", f"a shape of ({model.memory_size},)")
+        s = own.served
         served = replace(
-            now, seq=int(state["served.seq"]), t_s=float(state["served.t_s"]), u_V=float(state["served.u_V"]),
-            models=models, memories=memories, default=default if default in models else now.default,
-            trust=float(state["served.trust"]), trouble=str(state["served.trouble"]), frozen=False, held=None,
+            now, seq=s.seq, t_s=s.t_s, u_V=s.u_V, models=models, memories=memories,
+            default=s.default if s.default in models else now.default, trust=s.trust, trouble=s.trouble, frozen=False,
+            held=None,
         )  # fmt: skip
         if not supervisor.frozen:
-            return served
-        served, held = served.freeze(), state.get("frozen.held")
-        if held is None or served.held is None:  # a state of before there was one
-            return served
-        if np.shape(held) != served.held.shape:
-            raise FieldError("frozen.held", np.shape(held), f"{served.held.shape}")
-        return replace(served, held=np.array(held, dtype=np.float64))
+            return served, own
+        served = served.freeze()
+        if own.held is None or served.held is None:
+            return served, own
+        if own.held.shape != served.held.shape:
+            raise Refused("held", f"float64 {own.held.shape}", f"a shape of {served.held.shape}")
+        return replace(served, held=own.held), own

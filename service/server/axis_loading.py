@@ -73,7 +73,7 @@ def load_axis(
         made = Competition.from_models(config.learn, learner, model, others, config.competition, make)
         return made if len(made.names) > 1 else learner
 
-    learner = template = None
+    learner = None
     if config.learn:
         if config.learn not in models:
             raise FieldError(
@@ -88,7 +88,6 @@ def load_axis(
             raise ModelFileError(
                 f"{config.model}: model {config.learn!r} cannot learn: {error}; identify the stage again"
             ) from error
-        template = warmed.state_dict()
         models |= champion_of(learner)
     archive = None
     if config.checkpoints is not None:
@@ -96,9 +95,7 @@ def load_axis(
     warnings = _warnings(limits, bundle.meta)
     if config.learn and 1.0 / bundle.meta.dt_s > _CERTAIN_HZ:
         warnings |= _rate_warning(warmed, limits)
-    axis = Axis(
-        config, models, learner, limits, begin, stage=stage, archive=archive, template=template, warnings=warnings
-    )
+    axis = Axis(config, models, learner, limits, begin, stage=stage, archive=archive, warnings=warnings)
     _warm_models(axis)
     return axis
 

@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
 
@@ -20,9 +20,10 @@ from adaptive.errors import DehystError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed, under
+from adaptive.state import Entry, load, part_of, restore, save
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
 from baselines.competition.champion import ChampionInverse
-from baselines.competition.competition import Competition
+from baselines.competition.competition import Competition, check_like
 from service.answers.answering import Served
 from service.answers.fallback import log_model_error
 from service.answers.guard import Limits
@@ -99,12 +100,18 @@ class ModelWatchConfig:
 
 
 class ModelWatch:
-    """The watch over one axis. One thread calls it.
+    """The watch over one axis. One thread calls it."""
 
-    Attributes
-    ----------
-    trouble : name of the present trouble, "" for none. trust : weight of the served model, 0 to 1; 1 without trouble.
-    """
+    trouble: Annotated[str, Entry("name of the present trouble, empty for none", most=1000)]
+    trust: Annotated[float, Entry("weight of the served model, 1 without trouble", low=0.0, high=1.0)]
+    _n: Annotated[
+        dict[str, float],
+        Entry(
+            "counts of samples, the repeated reading and its voltages, and the share of bad readings", finite=False,
+            name="",
+            among=("count", "still", "y", "u_low", "u_high", "bad", "marked", "since", "clean", "seen", "failed"),
+        ),
+    ]  # fmt: skip
 
     def __init__(self, config: ModelWatchConfig, dt_s: float, limits: Limits) -> None:
         self.config = config
@@ -117,8 +124,7 @@ class ModelWatch:
         self._good: InverseModel | None = None
         self._mark: InverseModel | None = None
         self._next_mark: InverseModel | None = None
-        #: Numbers only, so that they can be stored.
-        self._n: dict[str, float] = {
+        self._n = {
             "count": 0, "still": 0, "y": math.nan, "u_low": math.inf, "u_high": -math.inf,
             "bad": 0.0, "marked": 0, "since": 0, "clean": 0, "seen": 0, "failed": 0,
         }  # fmt: skip
@@ -238,15 +244,16 @@ class ModelWatch:
         known = zip(ROLES, (self._good, self._mark, self._next_mark), strict=True)
         return {role: model for role, model in known if model is not None}
 
-    def state_dict(self) -> dict[str, Any]:
-        """Numbers and words, without the models."""
-        return {"trouble": self.trouble, "trust": self.trust, **self._n}
+    def check_state(self, values: dict[str, Any]) -> None:
+        """Raise ValueError where a count is no number."""
+        for name, value in values["_n"].items():
+            if name not in ("y", "u_low", "u_high") and not math.isfinite(value):
+                raise ValueError(f"{name}: got {value}, expected a finite number")
 
-    def restored(self, state: dict[str, Any], models: dict[str, InverseModel]) -> ModelWatch:
-        """A watch like this one that continues from ``state_dict`` and ``models``. Raises KeyError, ValueError."""
+    def restored(self, state: StateDict, models: dict[str, InverseModel]) -> ModelWatch:
+        """A watch like this one that continues from its saved state and ``models``. Raises ModelFileError."""
         made = ModelWatch(self.config, self._dt_s, self._limits)
-        made._n = {name: float(state[name]) for name in self._n}
-        made.trouble, made.trust = str(state["trouble"]), float(state["trust"])
+        restore(made, state)
         made._good, made._mark, made._next_mark = (models.get(role) for role in ROLES)
         return made
 
@@ -264,12 +271,10 @@ def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
 # --- Stored states of a learner: whether one fits the learner of an axis, and the fingerprint of a model.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
-STATE_SCHEMA: Final = 3
+STATE_SCHEMA: Final = 4
 #: Entries of a learner's state that learning does not change: its settings, and of the identified model what tuning
 #: does not change. They must equal those of the present learner.
 _FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")
-#: Settings that older states lack; learners of that time had no such bounds.
-_ADDED: Final = re.compile(r"(^|\.)config\.envelope\.")
 
 
 def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
@@ -278,12 +283,31 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
     return like.restored(state)
 
 
+def stored_model(state: StateDict, like: InverseModel, what: str) -> InverseModel:
+    """The model with ``state`` and its kind. Raises ModelFileError where it cannot stand in the place of ``like``."""
+    kind = str(state.get("kind"))
+    if not hasattr(type(like), "KIND"):  # else its own entry
+        state.pop("kind", None)
+    made = build_model(kind, state, what)
+    check_like(made, like, "kind")
+    return made
+
+
+@dataclass(slots=True)
+class SupervisorEntries:
+    """What a `LearnerSupervisor` holds beside the learner, the watch and the models."""
+
+    frozen_by: Annotated[str, Entry("who has stopped learning, empty for nobody", most=1000)]
+    dead: Annotated[bool, Entry("whether the learner has failed")]
+    adoptions: Annotated[str, Entry("hyper-parameters that wait for their sample, as JSON")]
+
+
 def check_same_learner(state: StateDict, like: OnlineModel) -> None:
     """Raise ModelFileError if ``state`` is of a learner with other settings or another identified model."""
     if not state:
         raise ModelFileError("it holds no learner, but this axis learns")
     for name, value in like.state_dict().items():
-        if not _FIXED.search(name) or (name not in state and _ADDED.search(name)):
+        if not _FIXED.search(name):
             continue
         if name not in state or not _equal(value, state[name]):
             what = "setting" if "config." in name else "identified model"
@@ -487,12 +511,9 @@ class LearnerSupervisor:
 
     def state_dict(self, poisoned: bool) -> StateDict:
         """All that samples and operators have changed; copies. ``poisoned`` : the state to go back to is needed."""
-        state: StateDict = {
-            "frozen_by": self._frozen_by,
-            "dead": self._failed,
-            "adoptions": json.dumps([retuned.to_json() for retuned in self.adoptions.pending]),
-        }
-        state |= prefixed("watch.", self.watch.state_dict())
+        adoptions = json.dumps([retuned.to_json() for retuned in self.adoptions.pending])
+        state = save(SupervisorEntries(self._frozen_by, self._failed, adoptions))
+        state |= prefixed("watch.", save(self.watch))
         for role, model in self.watch.models().items():
             state |= {f"model.{role}.kind": stored_kind(model), **prefixed(f"model.{role}.", model.state_dict())}
         if poisoned:
@@ -502,22 +523,27 @@ class LearnerSupervisor:
         return state
 
     def restored(self, state: StateDict, received: int) -> LearnerSupervisor:
-        """A supervisor like this one with ``state``; this one does not change.
+        """A supervisor like this one with ``state``, of which all entries must be its own; this one does not change.
 
-        Raises KeyError, TypeError, ValueError or InputError where entries are missing or damaged, ModelFileError where
-        the learner's state does not fit.
+        Raises ModelFileError, or ValueError of a damaged adoption.
         """
-        learner = None if self.learner is None else restored_learner(under("learner.", state), self.learner)
-        models = {
-            role: build_model(str(state[f"model.{role}.kind"]), under(f"model.{role}.", state), f"the {role} model")
-            for role in ROLES
-            if f"model.{role}.kind" in state
-        }
-        watch = self.watch.restored(under("watch.", state), models)
+        rest, learner, models = dict(state), self.learner, {}
+        with part_of(rest, "learner.") as kept:
+            learner = None if self.learner is None else restored_learner(kept, self.learner)
+        for role in ROLES:
+            with part_of(rest, f"model.{role}.") as kept:
+                if kept and learner is not None:
+                    models[role] = stored_model(kept, learner.snapshot(), f"the {role} model")
+        with part_of(rest, "watch.") as kept:
+            watch = self.watch.restored(kept, models)
+        with part_of(rest, "mark.") as mark:
+            if mark and self.learner is not None:
+                restored_learner(mark, self.learner)
+        own = load(SupervisorEntries, rest)
         made = LearnerSupervisor(self.name, learner, watch, self._dt_s, self._note, self._revive)
-        made._frozen_by, made._failed = str(state["frozen_by"]), bool(state["dead"])
-        made.adoptions.add(*(Retuned.from_json(entry, "adoptions") for entry in json.loads(str(state["adoptions"]))))
-        made._marks, made._marked = (under("mark.", state), {}), received
+        made._frozen_by, made._failed = own.frozen_by, own.dead
+        made.adoptions.add(*(Retuned.from_json(entry, "adoptions") for entry in json.loads(own.adoptions)))
+        made._marks, made._marked = (mark, {}), received
         made._set_teaching()
         return made
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
 from adaptive.errors import DehystError, ModelFileError
+from adaptive.state import MOST_FLOAT, MOST_INT
 from adaptive.types import OnlineModel, StateDict, under
 from service.intake.sample_queue import SampleQueue
 from service.protocol.container import MAX_HEADER_BYTES, UNITS, decode_body, decode_header, encode_body, split_state
@@ -26,7 +27,6 @@ from service.protocol.errors import FieldError
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.learner_supervisor import STATE_SCHEMA, restored_learner
-from service.server.state_schema import MOST_FLOAT, MOST_INT
 from service.storage.output import atomic_write
 from service.storage.segments import claim, is_still_at, rows_behind
 
@@ -202,8 +202,8 @@ class CheckpointFolder:
         """Numbers of all checkpoints, newest first."""
         return [number_of(path) for path in reversed(self._paths())]
 
-    def learner_of(self, number: int, like: OnlineModel, check: Callable[[StateDict], None]) -> OnlineModel:
-        """The learner of a checkpoint, whose state passes ``check``.
+    def learner_of(self, number: int, like: OnlineModel) -> OnlineModel:
+        """The learner of a checkpoint.
 
         Raises InputError if it does not exist or does not match ``like``.
         """
@@ -212,7 +212,6 @@ class CheckpointFolder:
             raise FieldError("checkpoint", number, f"one of those there are ({known} ...)", "see 'checkpoints'")
         try:
             state = self.read(number)[1]
-            check(state)
             return restored_learner(under("learner.", state), like)
         except ModelFileError as error:
             raise FieldError("checkpoint", number, "one that is whole and matches", str(error)) from error

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from adaptive.errors import InputError
 from adaptive.features import FeatureMap
+from adaptive.state import load, save
 
 MAP = FeatureMap(
     dt_s=1e-3,
@@ -143,7 +144,7 @@ def test_two_inputs_have_no_memory() -> None:
 
 def test_state_round_trip() -> None:
     framed = replace(MAP, gain=0.94, offset_um=1.5, dead_um=0.02)
-    assert FeatureMap.from_state(framed.state_dict()) == framed
+    assert load(FeatureMap, save(framed)) == framed
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError
+from adaptive.state import load, save
 from adaptive.types import FloatArray
 from baselines import fit_bouc_wen, fit_linear, fit_mpi
 from baselines.bouc_wen.identify import identify_bouc_wen
@@ -241,7 +242,7 @@ def test_saturation_helper_round_trip() -> None:
     model = from_inverse_saturation(
         np.array([0.0, 1.0]), np.array([5.0, 1.0]), np.array([0.0, 9.0]), np.array([1.0, 0.3]), 0.5, -2.0, 1e-3
     )
-    assert type(model).from_state(model.state_dict()) == model
+    assert load(type(model), save(model)) == model
 
 
 class TestSwarm:

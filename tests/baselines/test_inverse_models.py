@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adaptive.errors import InputError
+from adaptive.errors import InputError, ModelFileError
 from adaptive.types import InverseModel
 from baselines.bouc_wen.model import TABLE_2_1, BoucWenInverse
 from baselines.common import Domain
@@ -93,14 +93,14 @@ def test_storage_round_trip(model: LinearInverse | MpiInverse | BoucWenInverse) 
     np.testing.assert_array_equal(again.feedforward(Y, V, A, memory).u_V, model.feedforward(Y, V, A, memory).u_V)
     for name in state:
         if name != "name":
-            with pytest.raises(InputError, match=name):
+            with pytest.raises(ModelFileError, match=name):
                 type(model).from_state({key: value for key, value in state.items() if key != name})
 
 
 @every
 @pytest.mark.parametrize("std_V", [-0.01, np.inf])
 def test_a_deviation_that_is_none_is_refused(model: LinearInverse | MpiInverse | BoucWenInverse, std_V: float) -> None:
-    with pytest.raises(InputError, match=f"voltage_std_V: got {std_V}, expected"):
+    with pytest.raises(ModelFileError, match=f"voltage_std_V: got {std_V}, expected"):
         type(model).from_state(model.state_dict() | {"voltage_std_V": std_V})
     none = replace(model, voltage_std_V=np.nan)
     assert np.isnan(none.feedforward(Y, V, A, none.rest_memory(10.0)).std_V).all()

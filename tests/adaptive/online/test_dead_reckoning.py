@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import CREEP_PER_S, LOST_SHARE, OFF_LINE, SLOPES, Reckoning, answers, mean_slope
 from adaptive.online.learner import Learner
+from adaptive.state import load, save
 from adaptive.types import FloatArray, Sample
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
@@ -118,6 +119,6 @@ def test_uncertainty_grows_with_the_way_and_not_at_rest(model: LssvmInverse) -> 
 def test_state_goes_on_to_the_last_bit(model: LssvmInverse) -> None:
     one = Reckoning.begin(model, REST, 4.0, np.full(3, 4.0), np.full(2, 40.1), model.rest_memory(40.0))
     one.advance(4.1)
-    two = Reckoning.from_state(one.state_dict())
+    two = load(Reckoning, save(one))
     assert [one.advance(u) for u in (4.2, 4.4, 4.3)] == [two.advance(u) for u in (4.2, 4.4, 4.3)]
     np.testing.assert_array_equal(one.memory, two.memory)

@@ -18,6 +18,7 @@ from adaptive.online import drift as drift_step
 from adaptive.online.config import LearnerConfig
 from adaptive.online.drift import DriftConfig, DriftFilter, RestCreep
 from adaptive.online.learner import Learner
+from adaptive.state import load, restore, save
 from adaptive.types import Sample
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
@@ -103,7 +104,8 @@ def test_rest_opens_nothing_but_the_constant() -> None:
 def test_state_round_trip_goes_on_to_the_last_bit() -> None:
     one = made()
     feed(one, rows(100), 1.02 * TRUE)
-    two = DriftFilter.from_state(one.config, STEP, 8.0, one.state_dict())
+    two = made()
+    restore(two, save(one), {"p": TRUE.size})
     for f in (one, two):
         feed(f, rows(50, 5), 1.02 * TRUE)
     np.testing.assert_array_equal(one.beta, two.beta)
@@ -278,13 +280,12 @@ def test_a_new_rest_begins_from_the_constant_that_it_finds() -> None:
 def test_its_state_goes_on_and_damage_is_named() -> None:
     rest = RestCreep()
     after(rest, 13, 1e-3)
-    again = RestCreep.from_state(rest.state_dict())
+    again = load(RestCreep, save(rest))
     one, other = ([r.shift_um(1.002, 5.0, 8.0, 80.0, STEP_S, 0.1) for _ in range(20)] for r in (rest, again))
     assert one == other
     assert sum(one) < 0.0
-    assert isnan(RestCreep.from_state({}).constant_V), "a state from before there was any"
-    with pytest.raises(ModelFileError, match="rest"):
-        RestCreep.from_state({"constant_V": 1.0, "steps": 3})
+    with pytest.raises(ModelFileError, match="u_V: got nothing"):
+        load(RestCreep, {"constant_V": 1.0, "steps": 3})
 
 
 def rested(model: LssvmInverse, config: LearnerConfig, hold_s: float) -> tuple[float, Learner]:

@@ -19,6 +19,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL, Learner
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_GAIN
+from adaptive.state import load, save
 from adaptive.types import FloatArray, Sample, StateDict
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
@@ -130,7 +131,7 @@ def test_never_raises_on_data(seq: int, t: float, u: float, y: float) -> None:
 
 def test_state_round_trip_and_counters() -> None:
     s = state(since_glitch=2, u_V=1.25)
-    assert AdmissionState.from_state(s.state_dict()) == s
+    assert load(AdmissionState, save(s)) == s
     assert set(gates.new_counters()) == {gates.LEARNT, gates.PASSED, *gates.REASONS}
 
 
@@ -480,22 +481,6 @@ def test_configuration_and_envelope_go_there_and_back() -> None:
     # Settings from before there was an envelope have its defaults.
     old = {name: value for name, value in state.items() if not name.startswith("envelope.")}
     assert LearnerConfig.from_state(old) == replace(config, envelope=EnvelopeConfig())
-
-
-def test_a_state_from_before_there_was_an_envelope_goes_on(
-    model: LssvmInverse, all_strokes: Recording, warm: StateDict
-) -> None:
-    new = ("config.envelope.", "rail", "left", "confirmed", "front.trials", "front.following.", "front.past",
-           "base.anchor", "base.allowed_V")  # fmt: skip
-    old = {name: value for name, value in warm.items() if not name.startswith(new)}
-    assert len(warm) - len(old) > 15
-    learner, twin = Learner.from_state(old), Learner.from_state(warm)
-    assert learner.config.envelope == EnvelopeConfig()
-    said = feed(learner, all_strokes, AT, AT + 1500)
-    feed(twin, all_strokes, AT, AT + 1500)
-    assert learner.trouble == ""
-    assert said.count("learnt") > 700
-    np.testing.assert_array_equal(learner.parts.filter.beta, twin.parts.filter.beta)
 
 
 @pytest.mark.parametrize("trouble", [RAIL, MODEL_LEFT_ENVELOPE])

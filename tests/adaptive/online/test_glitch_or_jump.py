@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import NamedTuple
+from typing import NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
@@ -30,6 +30,7 @@ from adaptive.online.glitch_or_jump import (
     slope_of,
 )
 from adaptive.online.learner import Learner
+from adaptive.state import load, save
 from adaptive.types import FloatArray, Sample, StateDict
 from sim.stage.presets import preset
 from sim.stage.stage import Stage
@@ -507,11 +508,9 @@ def test_all_of_a_hold_is_in_its_state(model: LssvmInverse) -> None:
     for k in range(5):
         put(hold, PLACE_UM + 0.1 * k, math.nan if k == 2 else PLACE_UM - 0.2 * k)
     plain = [field for field in fields(Hold) if field.name not in ("reckoning", "u_V", "y_um", "old_um")]
-    values = {
-        field.name: {"int": 7 + i, "float": 0.5 + i, "bool": True}[str(field.type)] for i, field in enumerate(plain)
-    }
+    values = {one.name: {int: 7 + i, float: 0.5 + i}[get_type_hints(Hold)[one.name]] for i, one in enumerate(plain)}
     one = replace(hold, **values)
-    two = Hold.from_state(one.state_dict())
+    two = load(Hold, save(one))
     for field in fields(Hold):
         if field.name != "reckoning":
             np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)

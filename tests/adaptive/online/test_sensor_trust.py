@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from adaptive.errors import ModelFileError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.dead_reckoning import Reckoning
 from adaptive.online.gates import AdmissionConfig, AdmissionState, EnvelopeConfig, watch_reading
@@ -35,6 +36,7 @@ from adaptive.online.sensor_trust import (
     bends_otherwise,
     beside_drift,
 )
+from adaptive.state import load, save
 from adaptive.types import FloatArray, Sample, StateDict
 from sim.signals.voltages import training_input
 from sim.stage.presets import preset
@@ -320,28 +322,27 @@ def test_to_forget_is_to_begin_anew_but_for_the_noise() -> None:
     assert following.noise2 == noise2
     for one in fields(Following):
         if one.name != "noise2":
-            now, then = (each.state_dict()[one.name] for each in (following, fresh))
+            now, then = (getattr(each, one.name) for each in (following, fresh))
             assert now == then or (math.isnan(now) and math.isnan(then))
     # A stage in another frame: nothing of the step is across the two.
     assert not any(asked(following, u, u + 7.0))
 
 
-def test_state_goes_on_to_the_last_bit_and_an_old_one_is_that_of_a_beginning() -> None:
+def test_state_of_the_check_goes_on_to_the_last_bit() -> None:
     u = strokes(10.0)
     p = np.where(np.arange(u.size) < 1800, u, u[1800]) + 0.01 * np.random.default_rng(4).standard_normal(u.size)
     one = Following()
     cut = 1812
     asked(one, u[:cut], p[:cut])
     assert 0 < one.still < STILL_STEPS
-    two = Following.from_state(one.state_dict())
+    two = load(Following, save(one))
     assert two == one
     said = asked(one, u[cut:], p[cut:])
     assert True in said
     assert asked(two, u[cut:], p[cut:]) == said
-    assert one.state_dict() == two.state_dict()
-    assert math.isnan(Following.from_state({}).u_V)
-    with pytest.raises(KeyError):
-        Following.from_state({"u_V": 1.0})
+    assert one == two
+    with pytest.raises(ModelFileError, match="p_V: got nothing"):
+        load(Following, {"u_V": 1.0})
 
 
 # --- A sensor that is wrong has a name within half a second, teaches nothing, and earns its trust back; a good one has
@@ -798,7 +799,7 @@ def test_all_of_it_is_in_its_state(model: LssvmInverse, motions: dict[str, Recor
         "rested": 3, "obeyed": 4, "followed": 5, "agreed": 6, "slope": 1.25, "shift_um": -3.5,
     }  # fmt: skip
     one = replace(one, **changed)
-    two = Trial.from_state(one.state_dict(), model)
+    two = load(Trial, save(one), given={"base": model})
     for field in fields(Trial):
         mine, its = getattr(one, field.name), getattr(two, field.name)
         if field.name in ("memory", "window"):
@@ -809,9 +810,9 @@ def test_all_of_it_is_in_its_state(model: LssvmInverse, motions: dict[str, Recor
     for k in rest:
         assert one.put(float(u[k]), float(y[k]), now) == two.put(float(u[k]), float(y[k]), now)
     assert one.fault == two.fault
-    state = one.state_dict() | {"window": np.zeros((4, 3))}
-    with pytest.raises(ValueError, match="window"):
-        Trial.from_state(state, model)
+    state = save(one) | {"window": np.zeros((4, 3))}
+    with pytest.raises(ModelFileError, match="window"):
+        load(Trial, state, given={"base": model})
 
 
 # ---- what a trial takes back, what is served meanwhile, and when no trial is held

@@ -16,6 +16,7 @@ from adaptive.errors import InputError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.learner import FALLBACK_RATIO, LONG_S, SHORT_S, Delay, Judgement, Learner
+from adaptive.state import load, restore, save
 
 ENTER_V, LEAVE_V = 0.25, 1.0
 BETWEEN_V = 0.5
@@ -161,7 +162,7 @@ def test_inside_counts_by_what_was_stated_before_the_error_was_known() -> None:
 
 def test_a_state_comes_back_whole() -> None:
     j = Judgement(1.0, 2.0, 3.0, 4.0, 0.5, 7, 3, False, True, 0.25, 0.125)
-    assert Judgement.from_state(j.state_dict()) == j
+    assert load(Judgement, save(j)) == j
 
 
 # ---- the model as it was
@@ -172,7 +173,7 @@ def test_the_delay_gives_back_what_was_so_many_steps_ago() -> None:
     given = [np.array([float(k), 1.0]) for k in range(6)]
     assert [float(delay.push(vector)[0]) for vector in given] == [0.0, 0.0, 0.0, 1.0, 2.0, 3.0]
     again = Delay(2)
-    again.restore(delay.array())
+    restore(again, save(delay))
     delay.shift(10.0)
     assert float(delay.push(np.array([6.0, 1.0]))[0]) == 14.0
     assert float(again.push(np.array([6.0, 1.0]))[0]) == 4.0

@@ -96,7 +96,7 @@ def test_what_comes_of_it_is_the_same_to_the_last_bit(
     assert other._healing.open
     restored = ResidualWindow(CAPACITY, model, "fifo", SolverConfig(form))
     state = other.state_dict()
-    restored.restore(state)
+    restored.take(restored.read(state))
     assert restored._healing.open
     twins = [other, restored, copy.deepcopy(other), pickle.loads(pickle.dumps(other))]
     for window in twins:
@@ -184,7 +184,7 @@ def test_the_solver_is_the_users_choice(model: LssvmInverse, form: Form) -> None
     window = ResidualWindow.from_model(model, 100, "nearest", solver)
     made = window.with_hyperparameters(window.hyper)
     again = ResidualWindow(100, model, "nearest", solver)
-    again.restore(made.state_dict())
+    again.take(again.read(made.state_dict()))
     for held in (window, made, again):
         assert (held._window.config.form, held._window.config.accuracy) == (form, 1e-7)
         assert held._window.form == ("inverse" if form == "auto" else form)

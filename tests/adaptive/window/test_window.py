@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive import lssvm
-from adaptive.errors import InputError, NumericsError
+from adaptive.errors import InputError, ModelFileError, NumericsError
+from adaptive.state import load, save
 from adaptive.types import FloatArray
 from adaptive.window import arrays as ws
 from adaptive.window import steps
 from adaptive.window.arrays import Status, handle_of
 from adaptive.window.healing import begin
-from adaptive.window.window import Form, Window, WindowConfig
+from adaptive.window.window import Form, SolverState, Window, WindowConfig
 from tests.adaptive.window.windows import CAPACITY, GAMMA, STEPS, WIDTHS, assert_exact, empty, filled, forms, sample
 
 # --- The sliding window in both forms, against the direct solver and against itself.
@@ -145,7 +146,7 @@ def test_auto_takes_the_form_that_the_accuracy_needs() -> None:
 def test_state_goes_on_to_the_last_bit(form: Form) -> None:
     window, rng = filled(form), np.random.default_rng(6)
     window.replace(1, *sample(rng))
-    again = Window.from_state(window.config, window.state_dict())
+    again = Window.of(window.config, window.state())
     twin = window.copy()
     for _ in range(5):
         point = sample(rng)
@@ -159,9 +160,9 @@ def test_state_goes_on_to_the_last_bit(form: Form) -> None:
 def test_both_matrices_share_one_in_the_inverse_form() -> None:
     """Only what is used: the lower triangle of P, and one triangle of R, which is symmetric to the last bit."""
     window = filled("inverse")
-    state = window.state_dict()
+    state = save(window.state())
     assert sum(state[name].size for name in ("P", "R", "PR") if name in state) == CAPACITY * (CAPACITY + 1)
-    again = Window.from_state(window.config, state)
+    again = Window.of(window.config, load(SolverState, state))
     np.testing.assert_array_equal(again.arrays.R, window.arrays.R)
     np.testing.assert_array_equal(np.tril(again.arrays.P), np.tril(window.arrays.P))
 
@@ -174,12 +175,12 @@ def test_a_copy_is_independent() -> None:
 
 
 def test_foreign_state_is_refused() -> None:
-    state = filled("inverse").state_dict()
-    with pytest.raises(InputError, match="expected an array"):
-        Window.from_state(WindowConfig(CAPACITY + 1, WIDTHS, GAMMA), state)
+    state, sizes = save(filled("inverse").state()), {"N": CAPACITY, "d": len(WIDTHS)}
+    with pytest.raises(ModelFileError, match="expected an array"):
+        load(SolverState, state, sizes | {"N": CAPACITY + 1})
     del state["PR"]
-    with pytest.raises(InputError, match="PR: got nothing"):
-        Window.from_state(WindowConfig(CAPACITY, WIDTHS, GAMMA), state)
+    with pytest.raises(ModelFileError, match="PR: got P and R: False"):
+        load(SolverState, state, sizes)
 
 
 @pytest.mark.parametrize(("form", "gamma", "bound"), [("inverse", 1e3, 1e-8), ("cholesky", 1e6, 1e-7)])
@@ -245,29 +246,6 @@ def test_singular_samples_leave_the_window_as_it_was() -> None:
     window.arrays.R[0, 1] = window.arrays.R[1, 0] = R
     np.testing.assert_array_equal(window.alpha, alpha)
     assert_exact(window)
-
-
-@pytest.mark.parametrize(("form", "lower"), [("inverse", False), ("cholesky", False), ("cholesky", True)])
-def test_a_state_of_an_older_version_goes_on(form: Form, lower: bool) -> None:
-    """Without the diagonal and the last counters, both matrices whole, and the factor in either triangle of P."""
-    window, rng = filled(form), np.random.default_rng(6)
-    window.replace(1, *sample(rng))
-    state = window.state_dict()
-    state.pop("PR", None)
-    P = state["P"] if "P" in state else window.arrays.P.copy()
-    if lower:
-        upper, P = P, np.diag(np.diag(P))
-        for j in range(CAPACITY - 1):
-            P[CAPACITY - 1 - j, : CAPACITY - 1 - j] = upper[j, j + 1 :]
-        state["C"][ws.LOGGED] = 1
-    state |= {"P": P, "R": window.arrays.R.copy()}
-    state |= {"V": state["V"][: ws.DIAGONAL], "C": state["C"][: ws.UNDO_PLACE]}
-    again = Window.from_state(window.config, state)
-    point = sample(rng)
-    for w in (window, again):
-        assert w.replace(2, *point) is Status.ACCEPTED
-    np.testing.assert_array_equal(again.alpha, window.alpha)
-    assert_exact(again)
 
 
 # --- What all others foretell for each sample of a window, against fits without it.

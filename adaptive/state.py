@@ -1,0 +1,462 @@
+"""The changing state of an axis: each field is declared once, and all uses of the state follow from the declaration.
+
+A field is declared in its annotation. Fields without an `Entry` are no part of the state::
+
+    @dataclass(slots=True)
+    class Rest:
+        constant_V: Annotated[float, Entry("constant when the rest began, NaN in motion", "V", finite=False)] = nan
+        steps: Annotated[int, Entry("updates since", low=0)] = 0
+
+`save` writes a record as flat names to arrays and numbers, the form of checkpoints and of the wire. `load` checks every
+entry before anything is built: compiled code reads arrays without checks of bounds, and a state may come from a
+stranger. `restore` does the same for an object that is no dataclass, in place. `rows` lists the entries for people.
+
+A class whose ``KIND`` is a text says so in an entry of that name, so that none is taken for another.
+
+What a field may be: a number, a truth value, a text; an array; a list or tuple of numbers, stored as an array; a list,
+tuple or deque of arrays or of rows of numbers; a dictionary of numbers or arrays by name; another record, or None; a
+list or tuple of records.
+"""
+
+from __future__ import annotations
+
+import types
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cache
+from math import inf, isfinite
+from typing import Annotated, Any, Final, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from adaptive.errors import ModelFileError
+from adaptive.types import StateDict, parted
+
+T = TypeVar("T")
+
+#: Largest magnitude of a float: its cube is still finite. Largest magnitude of an integer: sample numbers of up to 2^62
+#: are legal, and what is counted on from one must fit 64 bits.
+MOST_FLOAT: Final = 1e100
+MOST_INT: Final = 3 * 2**61
+#: Longest dimension without a size of its own, and longest text.
+MOST_ROWS: Final = 2_000_000
+MOST_TEXT: Final = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Declaration of a field of the state.
+
+    Attributes
+    ----------
+    meaning, unit : for people; unit "" : none.
+    shape : of an array, ``"p,p|0"``: alternatives of dimensions, each a number or a name. A name that the caller of
+        `load` gives no size for stands for one length within a record. "" : one dimension of any length.
+    low, high : range of every element. finite : whether NaN and infinities are refused, and numbers beyond MOST_FLOAT.
+    name : in the file, where it is not that of the field; "" puts the fields of a record among those of its owner.
+    most : longest dimension, longest text, or most records. among : the texts that are allowed, or the names of counts.
+    """
+
+    meaning: str
+    unit: str = ""
+    shape: str = ""
+    low: float = -inf
+    high: float = inf
+    finite: bool = True
+    name: str | None = None
+    most: int = MOST_ROWS
+    among: tuple[str, ...] = ()
+
+
+class Refused(ModelFileError):
+    """An entry of a state is not as declared."""
+
+    def __init__(self, name: str, got: str, expected: str = "") -> None:
+        self.entry, self.got, self.expected = name, got, expected
+        super().__init__(
+            f"state entry {name}: {f'got {got}, expected {expected}' if expected else got}; the state is damaged, of "
+            "another axis or of another version: start from the model file"
+        )
+
+    def under(self, prefix: str) -> Refused:
+        """The same of a state that is part of another."""
+        return Refused(prefix + self.entry, self.got, self.expected)
+
+    @classmethod
+    def by_check(cls, error: ValueError) -> Refused:
+        """Of a check of what must fit together; it says "NAME: got ..., expected ..."."""
+        name, _, what = str(error).partition(": ")
+        return cls(name, what)
+
+
+@contextmanager
+def within(prefix: str) -> Iterator[None]:
+    """Refusals from inside are of entries under ``prefix``."""
+    try:
+        yield
+    except Refused as error:
+        raise error.under(prefix) from error
+
+
+@contextmanager
+def part_of(state: StateDict, prefix: str) -> Iterator[StateDict]:
+    """The entries under ``prefix``, taken out of ``state``; refusals from inside are of entries under it."""
+    with within(prefix):
+        yield {name.removeprefix(prefix): state.pop(name) for name in list(state) if name.startswith(prefix)}
+
+
+# --- The declarations of a class.
+
+_NUMBERS: Final = {float: "a finite number", int: "an integer", bool: "a truth value", str: "a text"}
+
+
+class _Slot(NamedTuple):
+    """A declared field. kind : "number", "array", "values" (numbers stored as an array), "arrays", "named", "record",
+    "part" (an object that is filled in place), or "records". of : the type of its elements. make : of the container."""
+
+    field: str
+    name: str
+    entry: Entry
+    kind: str
+    of: Any
+    optional: bool
+    make: Any
+    shapes: tuple[tuple[int | str, ...], ...]
+    least: int
+
+
+def _type(record: Any) -> Any:
+    return type(record)
+
+
+@cache
+def _slots(cls: Any) -> tuple[_Slot, ...]:
+    hints = get_type_hints(cls, include_extras=True).items()
+    declared = ((field, *get_args(hint)[:2]) for field, hint in hints if get_origin(hint) is Annotated)
+    return tuple(_slot(field, hint, entry) for field, hint, entry in declared if isinstance(entry, Entry))
+
+
+def _slot(field: str, hint: Any, entry: Entry) -> _Slot:
+    optional = get_origin(hint) in (Union, types.UnionType)
+    if optional:
+        hint = next(option for option in get_args(hint) if option is not type(None))
+    make, of = get_origin(hint), get_args(hint)
+    one = "*" if not entry.shape else entry.shape
+    shapes = tuple(tuple(int(x) if x.isdigit() else x for x in shape.split(",")) for shape in one.split("|"))
+    if hint in _NUMBERS:
+        kind, made = "number", hint
+    elif make is np.ndarray:
+        kind, made = "array", np.dtype(get_args(of[1])[0])
+    elif make is dict:
+        kind, made = "named", of[1] if of[1] in _NUMBERS else np.dtype(get_args(get_args(of[1])[1])[0])
+    elif make in (list, tuple, deque):
+        kind, made = ("values", of[0]) if of[0] in _NUMBERS else ("records", of[0])
+        if get_origin(of[0]) is tuple:
+            kind, made = "values", get_args(of[0])[0]
+        if get_origin(of[0]) is np.ndarray:
+            kind, made = "arrays", np.dtype(get_args(get_args(of[0])[1])[0])
+    else:
+        kind, made = ("record" if is_dataclass(hint) or issubclass(hint, tuple) else "part"), hint
+    name = field.lstrip("_") if entry.name is None else entry.name
+    least = len(of) if make is tuple and Ellipsis not in of else 0
+    return _Slot(field, name, entry, kind, made, optional, make, shapes, least)
+
+
+# --- Saving.
+
+
+def save(record: Any, copies: bool = True) -> StateDict:
+    """The declared fields of ``record`` under flat names; ``copies=False``: with the arrays themselves."""
+    state: StateDict = {}
+    _save(record, "", state, copies)
+    return state
+
+
+def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
+    kind_of = getattr(type(record), "KIND", None)
+    if kind_of is not None:
+        state[f"{prefix}kind"] = kind_of
+    for slot in _slots(_type(record)):
+        value, name, kind = getattr(record, slot.field), prefix + slot.name, slot.kind
+        if kind == "number":
+            state[name] = slot.of(value)
+        elif kind == "array":
+            if value is not None:
+                state[name] = value.copy() if copies else value
+        elif kind == "values" or kind == "arrays":
+            made, row = np.array(() if value is None else value, dtype=slot.of), slot.shapes[0]
+            # Without a row, the array has the length of one all the same.
+            state[name] = made.reshape(-1, row[1]) if len(row) == 2 and isinstance(row[1], int) else made
+        elif kind == "named":
+            below = f"{name}." if slot.name else prefix
+            of = slot.of if slot.of in _NUMBERS else np.array
+            state.update((below + key, of(one)) for key, one in value.items())
+        elif kind == "records":
+            for i, one in enumerate(value):
+                _save(one, f"{name}{i}.", state, copies)
+        elif value is not None:
+            _save(value, f"{name}." if slot.name else prefix, state, copies)
+
+
+def copied(record: T) -> T:
+    """An independent copy of a record; its undeclared fields, and what is frozen, are shared."""
+    params = getattr(type(record), "__dataclass_params__", None)
+    if params is None or params.frozen:
+        return record
+    changes: dict[str, Any] = {}
+    for slot in _slots(_type(record)):
+        value = getattr(record, slot.field)
+        if value is None:
+            continue
+        if slot.kind in ("array", "named"):
+            changes[slot.field] = value.copy()
+        elif slot.kind in ("values", "records", "arrays"):
+            changes[slot.field] = slot.make(copied(x) if slot.kind == "records" else x for x in value)
+        elif slot.kind == "record":
+            changes[slot.field] = copied(value)
+    return replace(record, **changes)  # type: ignore[type-var]
+
+
+# --- Loading.
+
+Sizes = Mapping[str, int]
+Given = Mapping[str, Any]
+
+
+def load(cls: type[T], state: Mapping[str, Any], sizes: Sizes | None = None, given: Given | None = None) -> T:
+    """A record from its ``save``. Raises ModelFileError with the entry, what it is and what is expected.
+
+    ``sizes`` : of named dimensions. ``given`` : undeclared fields by name; those of a nested record by its field.
+    """
+    return _build(cls, _values_of_all(cls, state, sizes or {}, given or {}), given or {})
+
+
+def restore(part: Any, state: Mapping[str, Any], sizes: Sizes | None = None, given: Given | None = None) -> None:
+    """Set the declared fields of ``part`` from its ``save``. Raises as ``load``; then nothing is changed."""
+    values = _values_of_all(type(part), state, sizes or {}, given or {})
+    _check(part, values)
+    _put(part, values)
+
+
+def _check(part: Any, values: dict[str, Any]) -> None:
+    """Let a part that has ``check_state`` compare its new values with what it was made with."""
+    if hasattr(part, "check_state"):
+        try:
+            part.check_state(values)
+        except ValueError as error:
+            raise Refused.by_check(error) from error
+    for slot in _slots(_type(part)):
+        if slot.kind == "part":
+            _check(getattr(part, slot.field), values[slot.field])
+
+
+def _put(part: Any, values: dict[str, Any]) -> None:
+    for slot in _slots(_type(part)):
+        value = values[slot.field]
+        if slot.kind == "part":
+            _put(getattr(part, slot.field), value)
+        else:
+            setattr(part, slot.field, deque(value, getattr(part, slot.field).maxlen) if slot.make is deque else value)
+
+
+def _build(cls: type[T], values: dict[str, Any], given: Given) -> T:
+    own = {name: value for name, value in given.items() if name not in values}
+    try:
+        made = cls(**values, **own)
+        check = getattr(made, "check_state", None)
+        if check is not None:
+            check()
+    except ValueError as error:
+        raise Refused.by_check(error) from error
+    return made
+
+
+def _values_of_all(cls: Any, state: Mapping[str, Any], sizes: Sizes, given: Given) -> dict[str, Any]:
+    """Field to value, with no entry left over."""
+    parts = parted(state)
+    values = _values(cls, parts, sizes, given, {})
+    _no_more(parts)
+    return values
+
+
+def _no_more(parts: Mapping[str, StateDict]) -> None:
+    for part, entries in parts.items():
+        rest = next(iter(entries), "")
+        raise Refused(f"{part}.{rest}" if rest else part, _words(entries.get(rest)), "no entry of this name")
+
+
+def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, bound: dict[str, int]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    kind = getattr(cls, "KIND", None)
+    if kind is not None:
+        _number(str, _leaf(parts, "kind"), Entry("", among=(kind,)), "kind")
+    for slot in _slots(cls):
+        name, of, below = slot.name, slot.of, given.get(slot.field, {})
+        if slot.kind == "number":
+            values[slot.field] = _number(of, _leaf(parts, name), slot.entry, name)
+        elif slot.kind == "array" and slot.optional and name not in parts:
+            values[slot.field] = None
+        elif slot.kind in ("array", "arrays", "values"):
+            values[slot.field] = _sequence(slot, _leaf(parts, name), sizes, bound)
+        elif slot.kind == "named":
+            given_names = slot.entry.among or tuple(parts.get(name, ()))
+            below_parts = parts if not name else {key: {"": value} for key, value in parts.pop(name, {}).items()}
+            with within(f"{name}." if name else ""):
+                values[slot.field] = {key: _one(slot, _leaf(below_parts, key), key) for key in given_names}
+                _no_more({} if not name else below_parts)
+        elif slot.kind == "records":
+            found: list[Any] = []
+            while f"{name}{len(found)}" in parts and len(found) < slot.entry.most:
+                found.append(_nested(slot, f"{name}{len(found)}", parts, sizes, below))
+            if len(found) < slot.least:
+                raise Refused(f"{name}{len(found)}", "nothing", "a record")
+            values[slot.field] = slot.make(found)
+        elif not name:
+            inner = _values(of, parts, sizes, below, bound)
+            values[slot.field] = inner if slot.kind == "part" else _build(of, inner, below)
+        elif slot.optional and name not in parts:
+            values[slot.field] = None
+        else:
+            values[slot.field] = _nested(slot, name, parts, sizes, below)
+    return values
+
+
+def _nested(slot: _Slot, name: str, parts: dict[str, StateDict], sizes: Sizes, given: Given) -> Any:
+    with within(f"{name}."):
+        values = _values_of_all(slot.of, parts.pop(name, {}), sizes, given)
+        return values if slot.kind == "part" else _build(slot.of, values, given)
+
+
+def _leaf(parts: dict[str, StateDict], name: str) -> Any:
+    entries = parts.pop(name, None)
+    if entries is None or "" not in entries or len(entries) > 1:
+        raise Refused(name, "nothing" if entries is None else f"entries {', '.join(list(entries)[:3])}", "one entry")
+    return entries[""]
+
+
+def _one(slot: _Slot, value: Any, name: str) -> Any:
+    """A number or array of a dictionary."""
+    if slot.of in _NUMBERS:
+        return _number(slot.of, value, slot.entry, name)
+    return _sequence(slot._replace(kind="array", name=name), value, {}, {})
+
+
+def _number(of: Any, value: Any, entry: Entry, name: str) -> Any:
+    """``value`` as a number, truth value or text of the type ``of``."""
+    if of is type(value) is float and -MOST_FLOAT <= value <= MOST_FLOAT and entry.low <= value <= entry.high:
+        return value  # most are
+    # JSON has no NaN: a file stores it as an array of shape ().
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.shape == () and value.dtype == float):
+        value = value.item()
+    if type(value) is not of and not (of is float and type(value) is int):
+        raise Refused(name, _words(value), _NUMBERS[of])
+    if of is str:
+        if entry.among and value not in entry.among:
+            raise Refused(name, repr(value)[:80], repr(entry.among[0]) if len(entry.among) == 1 else str(entry.among))
+        if len(value) > min(entry.most, MOST_TEXT):
+            raise Refused(name, f"{len(value)} characters", f"at most {min(entry.most, MOST_TEXT)}")
+        return value
+    if of is bool:
+        return value
+    if type(value) is int and abs(value) > MOST_INT:
+        raise Refused(name, str(value)[:40], "an integer from -3 x 2^61 to 3 x 2^61")
+    if isfinite(value):
+        small = of is int or not entry.finite or abs(value) <= MOST_FLOAT
+        if not (entry.low <= value <= entry.high and small):
+            raise Refused(name, repr(value), f"a number {_range(entry) or f'of at most {MOST_FLOAT:g}'}")
+    elif entry.finite:
+        raise Refused(name, repr(value), _NUMBERS[of])
+    return of(value)
+
+
+def _sequence(slot: _Slot, value: Any, sizes: Sizes, bound: dict[str, int]) -> Any:
+    """``value`` as the array, numbers or arrays that ``slot`` declares."""
+    entry, name, dtype = slot.entry, slot.name, np.dtype(slot.of)
+    if not isinstance(value, np.ndarray) or value.dtype != dtype or not _fits(slot, value.shape, sizes, bound):
+        raise Refused(name, _words(value), f"an array of {dtype}, a shape of {_shapes(slot, sizes, bound)}")
+    if value.size and dtype.kind != "b":
+        known = value if entry.finite or dtype.kind != "f" else value[np.isfinite(value)]
+        limit = MOST_FLOAT if dtype.kind == "f" else MOST_INT
+        low, high = max(entry.low, -limit), min(entry.high, limit)
+        # NaN is in no range.
+        if known.size and not (low <= known.min() and known.max() <= high):
+            expected = f"finite numbers {_range(entry) or f'of at most {limit:g}'}"
+            raise Refused(name, f"elements from {known.min():g} to {known.max():g}", expected)
+    if slot.kind == "array":
+        return np.array(value, order="C")
+    if slot.kind == "arrays":
+        return slot.make(np.array(row) for row in value)
+    if slot.optional and not value.size:
+        return None
+    return slot.make(value.tolist() if value.ndim == 1 else map(tuple, value.tolist()))
+
+
+def _fits(slot: _Slot, got: tuple[int, ...], sizes: Sizes, bound: dict[str, int]) -> bool:
+    for shape in slot.shapes:
+        if len(shape) != len(got):
+            continue
+        for x, n in zip(shape, got, strict=True):
+            size = x if isinstance(x, int) else sizes.get(x, bound.get(x))
+            if n != size and (size is not None or n > slot.entry.most):
+                break
+        else:
+            bound.update((x, n) for x, n in zip(shape, got, strict=True) if isinstance(x, str) and x != "*")
+            return True
+    return False
+
+
+def _shapes(slot: _Slot, sizes: Sizes, bound: dict[str, int]) -> str:
+    named = [[sizes.get(str(x), bound.get(str(x), "n" if x == "*" else x)) for x in shape] for shape in slot.shapes]
+    return " or ".join("(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")" for shape in named)
+
+
+def _range(entry: Entry) -> str:
+    if entry.low > -inf:
+        return f"from {entry.low:g}" + (f" to {entry.high:g}" if entry.high < inf else "")
+    return f"up to {entry.high:g}" if entry.high < inf else ""
+
+
+def _words(value: Any) -> str:
+    return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else repr(value)[:80]
+
+
+# --- The page.
+
+
+class Row(NamedTuple):
+    """An entry for people. ``shape`` : "" for a number or a text."""
+
+    name: str
+    shape: str
+    unit: str
+    range: str
+    meaning: str
+
+
+def rows(cls: Any, prefix: str = "", apart: Collection[Any] = ()) -> Iterator[Row]:
+    """The entries that ``save`` writes of a record of ``cls``, in its order; without those of records in ``apart``."""
+    for slot in _slots(cls):
+        entry, name, inner = slot.entry, prefix + slot.name, prefix
+        if slot.kind in ("record", "part", "records"):
+            if slot.name:
+                inner = f"{name}{'N' if slot.kind == 'records' else ''}."
+                yield Row(inner, "", "", "may be absent" if slot.optional else "", entry.meaning)
+            if slot.of not in apart:
+                yield from rows(slot.of, inner, apart)
+            continue
+        limits = [_range(entry), "" if entry.finite else "may be NaN or infinite"]
+        if slot.kind == "named":
+            names = entry.among if entry.among and not slot.name else ("NAME",)
+            name = f"{name}.NAME" if slot.name else prefix + ", ".join(names)
+        elif slot.of is bool or slot.of == np.dtype(bool):
+            limits = ["a truth value"]
+        elif slot.of is str:
+            limits = [", ".join(f"`{word}`" for word in entry.among if word) or "a text"]
+        shape = (
+            ""
+            if slot.of in _NUMBERS and slot.kind in ("number", "named")
+            else " or ".join(str(",".join(map(str, s))) for s in slot.shapes)
+        )
+        yield Row(name, shape, entry.unit, ", ".join(filter(None, limits)), entry.meaning)

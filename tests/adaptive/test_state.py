@@ -1,0 +1,240 @@
+"""The declared state: what is saved loads to the same, and what is not as declared is refused by name."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adaptive.errors import InputError, ModelFileError
+from adaptive.state import MOST_FLOAT, MOST_INT, Entry, copied, load, restore, rows, save
+from adaptive.types import BoolArray, FloatArray, IntArray, StateDict
+
+SIZES = {"p": 3}
+
+
+class Mark(NamedTuple):
+    beta: Annotated[FloatArray, Entry("estimate", "V", "p")]
+    at: Annotated[int, Entry("when", low=0)]
+
+
+@dataclass(slots=True)
+class Held:
+    u_V: Annotated[list[float], Entry("voltages", "V", "held", finite=False, most=50)]
+    y_um: Annotated[list[float], Entry("readings", "µm", "held", finite=False, most=50)]
+    fault: Annotated[str, Entry("name of the fault", among=("", "stuck"))] = ""
+
+
+@dataclass(frozen=True)
+class Frame:
+    KIND = "frame"
+
+    gain: Annotated[float, Entry("gain", low=0.0)]
+    places: Annotated[tuple[int, ...], Entry("places", shape="*", low=0, most=20)] = ()
+
+    def __post_init__(self) -> None:
+        if not self.gain > 0.0:
+            raise InputError(f"gain: got {self.gain}, expected a positive number")
+
+
+@dataclass(slots=True)
+class Whole:
+    seq: Annotated[int, Entry("number of the last sample", low=-1)]
+    t_s: Annotated[float, Entry("its time", "s", finite=False)]
+    valid: Annotated[bool, Entry("whether it is valid")]
+    why: Annotated[str, Entry("the reason", most=40)]
+    P: Annotated[FloatArray, Entry("covariance", "V²", "p,p|0,0")]
+    order: Annotated[IntArray, Entry("slots", shape="p", low=0, high=2)]
+    good: Annotated[BoolArray, Entry("which are good", shape="p")]
+    counts: Annotated[dict[str, int], Entry("outcomes", low=0, among=("learnt", "refused"))]
+    motion: Annotated[tuple[float, float, float] | None, Entry("motion", "µm", "3|0")]
+    hold: Annotated[Held | None, Entry("held readings")]
+    frame: Annotated[Frame, Entry("the frame", name="")]
+    marks: Annotated[tuple[Mark, Mark], Entry("marks", name="mark")]
+    pasts: Annotated[list[Mark], Entry("places before", name="past", most=2)]
+    base: object = None
+
+    def check_state(self) -> None:
+        if sorted(self.order.tolist()) != list(range(self.order.size)):
+            raise ValueError("order: no permutation")
+
+
+doubles = st.floats(-MOST_FLOAT, MOST_FLOAT)
+
+
+@st.composite
+def wholes(draw: st.DrawFn) -> Whole:
+    def array(*shape: int) -> FloatArray:
+        size = math.prod(shape)
+        return np.array(draw(st.lists(doubles, min_size=size, max_size=size)), dtype=np.float64).reshape(shape)
+
+    def mark() -> Mark:
+        return Mark(array(3), draw(st.integers(0, MOST_INT)))
+
+    n = draw(st.integers(0, 4))
+    held = Held(
+        array(n).tolist(), [draw(doubles | st.just(math.nan)) for _ in range(n)], draw(st.sampled_from(["", "stuck"]))
+    )
+    return Whole(
+        draw(st.integers(-1, MOST_INT)), draw(st.floats()),
+        draw(st.booleans()), draw(st.text(max_size=40)), draw(st.sampled_from([array(3, 3), np.empty((0, 0))])),
+        np.array(draw(st.permutations(range(3)))), np.array(draw(st.lists(st.booleans(), min_size=3, max_size=3))),
+        {"learnt": draw(st.integers(0, 9)), "refused": 0}, draw(st.none() | st.tuples(doubles, doubles, doubles)),
+        draw(st.sampled_from([None, held])), Frame(draw(st.floats(1e-9, 1e9)), tuple(range(n))), (mark(), mark()),
+        [mark() for _ in range(draw(st.integers(0, 2)))],
+    )  # fmt: skip
+
+
+def same(a: StateDict, b: StateDict) -> bool:
+    return a.keys() == b.keys() and all(
+        type(a[name]) is type(b[name])
+        and np.array_equal(a[name], b[name], equal_nan=np.asarray(a[name]).dtype == float)
+        for name in a
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(wholes())
+def test_what_is_saved_loads_to_the_same_and_shares_nothing(whole: Whole) -> None:
+    state = save(whole)
+    again = load(Whole, state, SIZES, {"base": "given"})
+    assert same(save(again), state)
+    assert again.base == "given"
+    for other in (again, copied(whole)):
+        before = save(whole)
+        other.P[:], other.order[:] = 7.0, 0
+        other.counts["learnt"] += 1
+        for mark in other.marks:
+            mark.beta[:] = 1.0
+        if other.hold is not None:
+            other.hold.u_V.append(1.0)
+        if other is again:
+            assert same(save(whole), before)
+
+
+WRONG: list[Any] = [
+    None, True, -1, 0, 5, 2**62, 2**63, 10**400, 0.5, -1e308, math.nan, math.inf, "", "stuck", "x" * 50, [], [1], {},
+    np.array(np.nan), np.array(1), np.zeros(0), np.zeros(3), np.zeros(3, np.int64), np.zeros(3, np.bool_), np.zeros(4),
+    np.zeros((3, 3)), np.zeros((0, 0)), np.zeros((2, 3)), np.full((3, 3), np.nan), np.full(3, 1e300), np.arange(3),
+    np.zeros(60), np.zeros(3, np.float32), np.array(["x"]), np.array([None]), np.full(3, -1),
+]  # fmt: skip
+
+
+@settings(max_examples=400, deadline=None)
+@given(wholes(), st.data())
+def test_every_entry_that_is_changed_is_refused_by_name_or_loads_to_a_valid_record(
+    whole: Whole, data: st.DataObject
+) -> None:
+    state = save(whole)
+    name = data.draw(st.sampled_from([*sorted(state), "extra", "hold.extra", "mark0.extra", "mark2.at", "past7.at"]))
+    if data.draw(st.booleans()) or name not in state:
+        changed = state | {name: data.draw(st.sampled_from(WRONG))}
+    else:
+        changed = {key: value for key, value in state.items() if key != name}
+    said, made = "", None
+    try:
+        made = load(Whole, changed, SIZES)
+    except ModelFileError as error:
+        said = str(error)
+    if made is None:
+        assert name.split(".")[0].rstrip("012") in said
+        assert "start from the model file" in said
+    else:
+        again = save(made)
+        assert same(save(load(Whole, again, SIZES)), again)
+        assert made.P.shape in ((3, 3), (0, 0))
+        assert np.isfinite(made.P).all()
+        assert made.hold is None or len(made.hold.u_V) == len(made.hold.y_um) <= 50
+
+
+WHOLE = Whole(
+    0, 0.0, True, "", np.eye(3), np.arange(3), np.ones(3, bool), {"learnt": 0, "refused": 0}, None,
+    Held([1.0], [math.nan]), Frame(1.0), (Mark(np.zeros(3), 0), Mark(np.ones(3), 1)), [],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"P": np.zeros((2, 2))}, r"entry P: got float64 \(2, 2\), expected an array of float64, a shape of \(3, 3\)"),
+        ({"order": np.zeros(3, np.int64)}, "order: no permutation"),
+        ({"order": np.full(3, 9)}, "order: got elements from 9 to 9, expected finite numbers from 0 to 2"),
+        ({"seq": -2}, "seq: got -2, expected a number from -1"),
+        ({"seq": 2**70}, "seq: got .* expected an integer from -3 x 2.61"),
+        ({"gain": math.inf}, "gain: got inf, expected a finite number"),
+        ({"gain": 0.0}, "gain: got 0.0, expected a positive number"),
+        ({"kind": "map"}, "kind: got 'map', expected 'frame'"),
+        ({"hold.fault": "drunk"}, "hold.fault: got 'drunk', expected .*stuck"),
+        ({"hold.y_um": np.zeros(2)}, r"hold.y_um: got float64 \(2,\), expected .* a shape of \(1,\)"),
+        ({"hold.u_V": np.zeros(51), "hold.y_um": np.zeros(51)}, "hold.u_V"),
+        ({"counts.lost": 1}, "counts.lost: got 1, expected no entry of this name"),
+        ({"mark1.beta": np.full(3, np.nan)}, "mark1.beta: got elements from nan to nan, expected finite numbers"),
+        ({"past0.beta": np.zeros(3)}, "past0.at: got nothing, expected one entry"),
+        ({"why": "x" * 41}, "why: got 41 characters, expected at most 40"),
+        ({"seq.more": 1}, "seq: got entries , more, expected one entry"),
+    ],
+)
+def test_a_refusal_says_what_is_expected(changes: StateDict, words: str) -> None:
+    with pytest.raises(ModelFileError, match=words):
+        load(Whole, save(WHOLE) | changes, SIZES)
+
+
+class Part:
+    """An object that is filled in place."""
+
+    count: Annotated[int, Entry("steps", low=0)]
+    _last: Annotated[deque[FloatArray], Entry("last vectors", "V", "*,p|0")]
+    mark: Annotated[Mark, Entry("a mark")]
+
+    def __init__(self) -> None:
+        self.count, self._last, self.mark = 0, deque(maxlen=2), Mark(np.zeros(3), 0)
+
+
+class Owner:
+    inner: Annotated[Part, Entry("an inner part")]
+    flat: Annotated[Part, Entry("another, among the entries of its owner", name="")]
+
+    def __init__(self) -> None:
+        self.inner, self.flat = Part(), Part()
+
+
+def test_an_object_is_filled_in_place_or_stays_as_it_is() -> None:
+    one, two = Owner(), Owner()
+    one.inner.count, one.flat.count, one.flat.mark = 4, 5, Mark(np.ones(3), 9)
+    one.inner._last.extend(np.full(3, float(k)) for k in range(5))
+    state, inner = save(one), two.inner
+    assert set(state) == {
+        f"{part}{name}" for part in ("", "inner.") for name in ("count", "last", "mark.beta", "mark.at")
+    }
+    restore(two, state, SIZES)
+    assert two.inner is inner
+    assert same(save(two), state)
+    assert two.inner._last.maxlen == 2
+    for name in state:
+        with pytest.raises(ModelFileError, match=name.split(".")[0]):
+            restore(two, state | {"count": 8, name: "no"}, SIZES)
+        assert same(save(two), state)
+
+
+@dataclass(slots=True)
+class Few:
+    x: Annotated[FloatArray, Entry("a vector", "V", "p", low=-1.0, high=1.0)] = field(
+        default_factory=lambda: np.ones(3)
+    )
+    n: Annotated[int, Entry("a count", low=0)] = 0
+
+
+def test_the_page_lists_every_entry_that_is_saved() -> None:
+    assert [(row.name, row.shape, row.unit, row.range) for row in rows(Few)] == [
+        ("x", "p", "V", "from -1 to 1"),
+        ("n", "", "", "from 0"),
+    ]
+    listed = {row.name for row in rows(Whole)}
+    past = replace(WHOLE, pasts=[Mark(np.zeros(3), 0)], marks=(), counts={"NAME": 0})
+    assert {name.replace("past0", "pastN") for name in save(past)} - {"gain", "kind", "places"} <= listed
