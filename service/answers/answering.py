@@ -8,7 +8,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,6 +135,7 @@ class Served:
     trust : weight of the learning model inside its domain, 0 to 1.
     trouble : name of what is wrong with the samples or the learner, empty while nothing is.
     frozen : whether an operator has stopped learning: models and trust stay those of that moment.
+    blend_share : distance outside the learnt domain, in learnt spans, at which the stand-in answers alone.
     held : while frozen, memory of the stand-in at that moment, for queries that bring a memory of their own.
     """
 
@@ -147,6 +148,7 @@ class Served:
     stand_in: str = ""
     trust: float = 1.0
     trouble: str = ""
+    blend_share: float = 0.5
     frozen: bool = False
     held: FloatArray | None = None
 
@@ -218,13 +220,10 @@ def answer(
         check_domain(query.pending.y_um, limits, "pending.y_um")
         check_voltages(query.pending.u_V, limits, "pending.u_V")
         check_count(query.pending)
-    memory, y_um, v_um_per_s, a_um_per_s2 = query.memory, query.y_um, query.v_um_per_s, query.a_um_per_s2
-    resumes_V = math.nan
-    if memory is None:
-        way, resumed = under_way(query, served.seq, model.dt_s)
-        memory = carried(model, served.memories[name], way)
-        if resumed is not None:
-            y_um, v_um_per_s, a_um_per_s2, resumes_V = resumed
+    if query.memory is None:
+        memory, points, resumes_V = begin_from(model, served.memories[name], query, served.seq)
+    else:
+        memory, points, resumes_V = query.memory, (query.y_um, query.v_um_per_s, query.a_um_per_s2), math.nan
     if memory.size != model.memory_size:
         raise FieldError(
             "memory",
@@ -242,10 +241,10 @@ def answer(
     got = answer_safely(
         model,
         memory,
-        (y_um, v_um_per_s, a_um_per_s2),
+        points,
         query.u_before_V,
         # The trust in the samples concerns only models that learn from them.
-        Rules(limits, config.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
+        Rules(limits, served.blend_share, trust * served.trust if learns(name, config) else 1.0, stale),
         served.standing_in_for(name, query.memory is not None),
         blends(name, default, config),
         resumes_V,
@@ -254,27 +253,66 @@ def answer(
     return got._replace(snapshot_seq=served.seq, model=name, behind=behind, tracked_memory=query.memory is None)
 
 
-def under_way(
-    query: FeedforwardQuery, seq: int, dt_s: float
-) -> tuple[Pending | None, tuple[FloatArray, FloatArray, FloatArray, float] | None]:
-    """(what is under way after sample ``seq``, how the answer resumes from its last point).
+class Beginning(NamedTuple):
+    """Where an answer begins.
 
-    The last point under way is asked for again, ahead of the points of the query: (n + 1,) displacements, µm,
-    velocities, µm/s, and accelerations, µm/s², and the voltage, V, that was commanded there. What the model asks for
-    there now is another voltage: the difference fades (``service.answers.fallback``), so that a new snapshot is no
-    step. Its
-    velocity is the first point's less a step of its acceleration. None where nothing is under way.
+    Attributes
+    ----------
+    memory : (m,) at the first of the points. points : (n,) or (n + 1,) displacements µm, velocities µm/s and
+    accelerations µm/s². resumes_V : where finite, the first point was commanded already, with this voltage, V.
     """
-    pending = query.pending
+
+    memory: FloatArray
+    points: tuple[FloatArray, FloatArray, FloatArray]
+    resumes_V: float = math.nan
+
+
+def begin_from(model: InverseModel, memory: FloatArray, query: FeedforwardQuery, seq: int) -> Beginning:
+    """The answer of ``model`` from its tracked ``memory`` (m,) after sample ``seq``, along what is under way.
+
+    The last point under way is asked for again, ahead of the points of the query: what the model asks for there now is
+    another voltage than was commanded, and the difference fades (``service.answers.fallback``), so that a new snapshot
+    is no step. Velocity and acceleration of that point are not sent. Of `_last_motions`, those count whose voltage is
+    nearest to the commanded one, so that a turn of the motion there is not taken for a difference of the models.
+    """
+    pending, points = query.pending, (query.y_um, query.v_um_per_s, query.a_um_per_s2)
     # What was commanded for samples before the last one seen is long done.
     if pending is None or pending.first + pending.y_um.size <= seq:
-        return None, None
+        return Beginning(memory, points)
     seen = min(max(seq + 1 - pending.first, 0), pending.y_um.size - 1)
-    way = Pending(pending.first + seen, pending.y_um[seen:-1], pending.u_V[seen:-1])
-    y_um = np.concatenate([pending.y_um[-1:], query.y_um])
-    v, a = query.v_um_per_s, query.a_um_per_s2
-    v_um_per_s, a_um_per_s2 = np.concatenate([v[:1] - a[:1] * dt_s, v]), np.concatenate([a[:1], a])
-    return way, (y_um, v_um_per_s, a_um_per_s2, float(pending.u_V[-1]))
+    memory = carried(model, memory, Pending(pending.first + seen, pending.y_um[seen:-1], pending.u_V[seen:-1]))
+    last_um, last_V = pending.y_um[-1:], float(pending.u_V[-1])
+    v_um_per_s, a_um_per_s2 = _last_motions(pending.y_um[-3:].tolist(), query, model.dt_s)
+    errors_V = np.array(
+        [
+            abs(
+                float(model.feedforward(last_um, v_um_per_s[i : i + 1], a_um_per_s2[i : i + 1], memory).u_V[0]) - last_V
+            )
+            for i in range(v_um_per_s.size)
+        ]
+    )
+    i = int(np.argmin(np.where(np.isfinite(errors_V), errors_V, np.inf)))
+    first = (last_um, v_um_per_s[i : i + 1], a_um_per_s2[i : i + 1])
+    y, v, a = (np.concatenate([one, other]) for one, other in zip(first, points, strict=True))
+    return Beginning(memory, (y, v, a), last_V)
+
+
+def _last_motions(way_um: list[float], query: FeedforwardQuery, dt_s: float) -> tuple[FloatArray, FloatArray]:
+    """(k,) velocities, µm/s, and accelerations, µm/s², that the last point under way may have been commanded with.
+
+    From the first point of the query by a polynomial of third order; by the straight line from the point before; by
+    central differences. ``way_um`` : its displacement after those before it, up to three in all.
+    """
+    y, v, a = query.y_um.item(0), query.v_um_per_s.item(0), query.a_um_per_s2.item(0)
+    jerk = 6.0 * (y - v * dt_s + 0.5 * a * dt_s**2 - way_um[-1]) / dt_s**3
+    speeds, accelerations = [v - a * dt_s + 0.5 * jerk * dt_s**2], [a - jerk * dt_s]
+    if len(way_um) > 1:
+        speeds.append((way_um[-1] - way_um[-2]) / dt_s)
+        accelerations.append(0.0)
+    if len(way_um) > 2:
+        speeds.append((y - way_um[-2]) / (2.0 * dt_s))
+        accelerations.append((v - (way_um[-1] - way_um[-3]) / (2.0 * dt_s)) / (2.0 * dt_s))
+    return np.array(speeds), np.array(accelerations)
 
 
 def check_count(pending: Pending) -> None:

@@ -21,7 +21,7 @@ from adaptive.errors import DehystError
 from adaptive.inverse_model import LssvmInverse
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
-from service.answers.answering import carried, derivatives, trust_by_age, under_way
+from service.answers.answering import begin_from, derivatives, trust_by_age
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
 from service.answers.guard import Limits, check_domain, check_voltages, guard, limit_voltage
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
@@ -316,15 +316,12 @@ class Follower:
         message = kept[-1]
         if query.as_of != NEWEST:
             message = next((old for old in reversed(kept) if old.snapshot_seq <= query.as_of), kept[0])
-        model, memory, resumes_V = message.model, query.memory, math.nan
-        points = query.y_um, query.v_um_per_s, query.a_um_per_s2
-        if memory is None:
-            way, resumed = under_way(query, message.snapshot_seq, model.dt_s)
-            memory = carried(model, message.memory, way)
-            if resumed is not None:
-                *points_before, resumes_V = resumed
-                points = points_before[0], points_before[1], points_before[2]
-        elif memory.size != model.memory_size:
+        model = message.model
+        if query.memory is None:
+            memory, points, resumes_V = begin_from(model, message.memory, query, message.snapshot_seq)
+        else:
+            memory, points, resumes_V = query.memory, (query.y_um, query.v_um_per_s, query.a_um_per_s2), math.nan
+        if memory.size != model.memory_size:
             raise FieldError("memory", f"{memory.size} values", f"{model.memory_size} for model {self.name!r}")
         trust, stale = (message.safety.trust, False) if query.as_of != NEWEST else self._standing()
         rules = Rules(self.limits, message.safety.blend_share, trust, stale)

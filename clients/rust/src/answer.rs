@@ -227,6 +227,23 @@ fn forward(snapshot: &mut Snapshot, memory: &mut [f64], motion: &Motion, trust: 
     done
 }
 
+/// Velocities and accelerations that the last point under way may have been commanded with: from the first point of the
+/// query by a polynomial of third order; by the straight line from the point before; by central differences.
+fn last_motions(way_um: &[f64], y: f64, v: f64, a: f64, h: f64) -> Vec<(f64, f64)> {
+    let k = way_um.len();
+    let last = way_um[k - 1];
+    let jerk = 6.0 * (y - v * h + 0.5 * a * (h * h) - last) / (h * h * h);
+    let mut found = vec![(v - a * h + 0.5 * jerk * (h * h), a - jerk * h)];
+    if k > 1 {
+        found.push(((last - way_um[k - 2]) / h, 0.0));
+    }
+    if k > 2 {
+        let centre = (last - way_um[k - 3]) / (2.0 * h);
+        found.push(((y - way_um[k - 2]) / (2.0 * h), (v - centre) / (2.0 * h)));
+    }
+    found
+}
+
 /// The reply to a query as the service gives it from this snapshot. Allocates: not for a controller's loop.
 pub fn reply(snapshot: &mut Snapshot, query: &Query, limits: &Limits, age_s: Option<f64>) -> Result<Reply> {
     limits.check()?;
@@ -263,7 +280,17 @@ pub fn reply(snapshot: &mut Snapshot, query: &Query, limits: &Limits, age_s: Opt
         let dt_s = model.dt_s;
         let before = |first: f64, rest: &[f64]| [&[first], rest].concat();
         let (v, a) = (&query.v_um_per_s, &query.a_um_per_s2);
-        let (y, v, a) = (before(pending.y_um[k - 1], &query.y_um), before(v[0] - a[0] * dt_s, v), before(a[0], a));
+        let mut nearest = (f64::INFINITY, (0.0, 0.0));
+        for (i, pair) in last_motions(&pending.y_um, query.y_um[0], v[0], a[0], dt_s).into_iter().enumerate() {
+            let (mut then, mut u) = (memory.clone(), f64::NAN);
+            model.evaluate(1, |_| [pending.y_um[k - 1], pair.0, pair.1], &mut then, scratch, |_, step| u = step.u_v);
+            let error = (u - pending.u_v[k - 1]).abs();
+            if i == 0 || error < nearest.0 {
+                nearest = (if error.is_finite() { error } else { f64::INFINITY }, pair);
+            }
+        }
+        let (last_v, last_a) = nearest.1;
+        let (y, v, a) = (before(pending.y_um[k - 1], &query.y_um), before(last_v, v), before(last_a, a));
         let motion = Motion { y_um: &y, v_um_per_s: &v, a_um_per_s2: &a };
         (u_v, std_v, flags) = (vec![0.0; n + 1], vec![0.0; n + 1], vec![0; n + 1]);
         let mut out = Out { u_v: &mut u_v, std_v: &mut std_v, flags: &mut flags };

