@@ -20,7 +20,7 @@ from adaptive.compiled import all_finite, compiled, compiled_reassociating, dot,
 from adaptive.errors import InputError
 from adaptive.features import FeatureArrays, FeatureMap, advance, fill
 from adaptive.kernels import rbf_column, weigh
-from adaptive.state import Entry, load, save
+from adaptive.state import Entry, Kinded, load, save
 from adaptive.types import BoolArray, Feedforward, FloatArray, IntArray, StateDict
 
 # --- The compiled loops: voltages and standard deviations of a trajectory, and its memory.
@@ -228,7 +228,7 @@ def _with_margins(domain: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class LssvmInverse:
+class LssvmInverse(Kinded):
     """Immutable inverse LSSVM; implements ``adaptive.types.InverseModel``.
 
     ``anchor`` and ``allowed_V``: whatever was learnt, no answer is further from the identified model.

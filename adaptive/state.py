@@ -27,7 +27,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache
 from math import inf, isfinite
-from typing import Annotated, Any, Final, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 
@@ -68,6 +81,21 @@ class Entry:
     name: str | None = None
     most: int = MOST_ROWS
     among: tuple[str, ...] = ()
+
+
+class Kinded:
+    """A class whose states say of which kind they are."""
+
+    KIND: ClassVar[str]
+
+
+@runtime_checkable
+class Checked(Protocol):
+    """A record that checks what its fields must have in common; a part that is filled in place gets its new values."""
+
+    def check_state(self, *values: Any) -> None:
+        """Raise ValueError, ``NAME: got ..., expected ...``, where it does not fit."""
+        ...
 
 
 class Refused(ModelFileError):
@@ -175,9 +203,8 @@ def save(record: Any, copies: bool = True) -> StateDict:
 
 
 def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
-    kind_of = getattr(type(record), "KIND", None)
-    if kind_of is not None:
-        state[f"{prefix}kind"] = kind_of
+    if isinstance(record, Kinded):
+        state[f"{prefix}kind"] = record.KIND
     for slot in _slots(_type(record)):
         value, name, kind = getattr(record, slot.field), prefix + slot.name, slot.kind
         if kind == "number":
@@ -202,7 +229,7 @@ def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
 
 def copied(record: T) -> T:
     """An independent copy of a record; its undeclared fields, and what is frozen, are shared."""
-    params = getattr(type(record), "__dataclass_params__", None)
+    params = vars(type(record)).get("__dataclass_params__")
     if params is None or params.frozen:
         return record
     changes: dict[str, Any] = {}
@@ -242,7 +269,7 @@ def restore(part: Any, state: Mapping[str, Any], sizes: Sizes | None = None, giv
 
 def _check(part: Any, values: dict[str, Any]) -> None:
     """Let a part that has ``check_state`` compare its new values with what it was made with."""
-    if hasattr(part, "check_state"):
+    if isinstance(part, Checked):
         try:
             part.check_state(values)
         except ValueError as error:
@@ -265,9 +292,8 @@ def _build(cls: type[T], values: dict[str, Any], given: Given) -> T:
     own = {name: value for name, value in given.items() if name not in values}
     try:
         made = cls(**values, **own)
-        check = getattr(made, "check_state", None)
-        if check is not None:
-            check()
+        if isinstance(made, Checked):
+            made.check_state()
     except ValueError as error:
         raise Refused.by_check(error) from error
     return made
@@ -289,9 +315,8 @@ def _no_more(parts: Mapping[str, StateDict]) -> None:
 
 def _values(cls: Any, parts: dict[str, StateDict], sizes: Sizes, given: Given, bound: dict[str, int]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    kind = getattr(cls, "KIND", None)
-    if kind is not None:
-        _number(str, _leaf(parts, "kind"), Entry("", among=(kind,)), "kind")
+    if issubclass(cls, Kinded):
+        _number(str, _leaf(parts, "kind"), Entry("", among=(cls.KIND,)), "kind")
     for slot in _slots(cls):
         name, of, below = slot.name, slot.of, given.get(slot.field, {})
         if slot.kind == "number":

@@ -49,7 +49,9 @@ def test_an_ability_is_a_protocol_not_a_string(measures: dict[str, Any]) -> None
 
 
 def test_no_attribute_is_set_on_an_object_of_another_module(measures: dict[str, Any]) -> None:
-    found = [line for line in measures["set from outside"] if line.split(": ")[1] not in SET_ON_LIBRARIES]
+    # `adaptive.state` fills any object of ours by its declaration: that is what it is for.
+    lines = [line for line in measures["set from outside"] if not line.startswith("adaptive/state.py")]
+    found = [line for line in lines if line.split(": ")[1] not in SET_ON_LIBRARIES]
     assert not found, "\n".join(found)
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adaptive.errors import InputError, ModelFileError
-from adaptive.state import MOST_FLOAT, MOST_INT, Entry, copied, load, restore, rows, save
+from adaptive.state import MOST_FLOAT, MOST_INT, Entry, Kinded, copied, load, restore, rows, save
 from adaptive.types import BoolArray, FloatArray, IntArray, StateDict
 
 SIZES = {"p": 3}
@@ -32,7 +32,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Kinded):
     KIND = "frame"
 
     gain: Annotated[float, Entry("gain", low=0.0)]
