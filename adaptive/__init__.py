@@ -13,7 +13,7 @@ Identify the inverse of a stage, and follow the stage when its gain has dropped 
 >>> for k in range(4000):
 ...     gate = learner.handle(Sample(seq=k, t_s=k * dt_s, u_V=u_V[k], y_um=0.9 * y_um[k]))
 >>> errors = learner.diagnostics()
->>> errors["rms_error_pct"] < 0.3 * errors["frozen_rms_error_pct"]  # the learnt and the identified model
+>>> errors["rms_error_pct"] < 0.5 * errors["frozen_rms_error_pct"]  # the learnt and the identified model
 True
 >>> still = np.zeros(1)
 >>> answer = learner.snapshot().feedforward(np.array([30.0]), still, still, learner.memory())

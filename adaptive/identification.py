@@ -71,11 +71,11 @@ class IdentifyConfig:
 
 
 #: Prior standard deviations of the linear part, as shares of the voltage range.
-PRIOR_FREE, PRIOR_MOTION, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRIOR_SLOW = (
-    10.0, 0.3, 0.1, 0.05, 0.01, 0.03, 0.03,
-)  # fmt: skip
+PRIOR_FREE, PRIOR_POWER, PRIOR_PLAY, PRIOR_PRODUCT, PRIOR_ARC, PRIOR_SLOW = 10.0, 0.1, 0.05, 0.01, 0.03, 0.03
+#: Prior standard deviations of a stage's lag and of 1/omega of its first mode, s; 0.8 ms is a mode of 200 Hz.
+PRIOR_LAG_S, PRIOR_INERTIA_S = 5e-3, 8e-4
 #: Correlation time of the model error, s: samples within this time count as one measurement.
-CORRELATION_S = 0.02
+CORRELATION_S = 0.03
 #: Largest gamma for the residual of a linear part. The evidence takes the rows for independent, but the residual of one
 #: pass is smooth in time even where the next pass has another one. Left alone it fits each pass with narrow kernels and
 #: a large gamma, and the kernel part is then wrong on other motion. At 6 and below, stated deviations
@@ -94,7 +94,11 @@ SEARCH = InferenceConfig(
 def prior_deviations(features: FeatureMap, u_range_V: float) -> FloatArray:
     """(p,) prior standard deviations of the linear part, V per normalised input."""
     plays = len(features.thresholds_um)
-    shares = [PRIOR_FREE, PRIOR_FREE, PRIOR_MOTION, PRIOR_MOTION, PRIOR_POWER, PRIOR_POWER]
+    # A lag and a mode of a stage have times of their own: what they add grows with the motion, not with its recording.
+    range_um = features.y_max_um - features.y_min_um
+    lag = PRIOR_LAG_S * features.v_scale_um_per_s / range_um
+    inertia = PRIOR_INERTIA_S**2 * features.a_scale_um_per_s2 / range_um
+    shares = [PRIOR_FREE, PRIOR_FREE, lag, inertia, PRIOR_POWER, PRIOR_POWER]
     shares += [PRIOR_PLAY] * plays + [PRIOR_PRODUCT] * (plays * features.asymmetric)
     shares += [PRIOR_ARC] * len(features.arc_lengths_um) + [PRIOR_SLOW] * len(features.time_constants_s)
     return u_range_V * np.array(shares)
@@ -278,9 +282,11 @@ def identify_lssvm(
         raise InputError("u_V, y_um: constant, expected a moving stage; excite it over its range")
     if inputs not in ("two", "memory"):
         raise InputError(f"inputs: got {inputs!r}, expected 'two' or 'memory'")
-    memory = inputs == "memory"
+    memory, taught = inputs == "memory", u
     if memory:
-        motion = smooth_recording(y, SmootherConfig.for_rate(dt_s, config.cutoff_hz))
+        # The voltage is smoothed alike: what the smoother takes from the motion must not be looked for in it.
+        smoother = SmootherConfig.for_rate(dt_s, config.cutoff_hz)
+        motion, taught = smooth_recording(y, smoother), np.ascontiguousarray(smooth_recording(u, smoother)[:, 0])
     else:
         smooth = zero_phase_lowpass(y, dt_s)
         motion = np.column_stack([smooth, backward_difference(smooth, dt_s), np.zeros_like(smooth)])
@@ -290,17 +296,17 @@ def identify_lssvm(
     columns = [np.ascontiguousarray(motion[:, i]) for i in range(3)]
     every = -(-u.size // config.rows)
     basis, kernel = _rows(features, columns, every)
-    samples, u, dt_s = u.size, u[::every], dt_s * every
+    samples, u, taught, dt_s = u.size, u[::every], taught[::every], dt_s * every
     split = round(u.size * (1.0 - config.heldout))
-    hyper = tune(features, basis, kernel, u, dt_s, config) if config.tune else None
+    hyper = tune(features, basis, kernel, taught, dt_s, config) if config.tune else None
     gamma = hyper[0] if hyper else config.gamma
     widths = hyper[1] if hyper else np.full(features.kernel_size, config.width)
-    trial = fit_model(features, basis[:split], kernel[:split], u[:split], dt_s, config, gamma, widths)
+    trial = fit_model(features, basis[:split], kernel[:split], taught[:split], dt_s, config, gamma, widths)
     predicted = basis @ trial.beta + kernels.gram(kernel, trial.support, widths) @ trial.alpha
     u_range, y_range = float(np.ptp(u)), float(np.ptp(y))
     errors = predicted - u
     rmse_V = float(np.sqrt(np.mean(errors[split:] ** 2)))
-    full = fit_model(features, basis, kernel, u, dt_s, config, gamma, widths)
+    full = fit_model(features, basis, kernel, taught, dt_s, config, gamma, widths)
     report = IdentificationReport(
         samples=samples,
         support=full.support.shape[0],
@@ -325,7 +331,8 @@ def identify_lssvm(
         widths=widths,
         gamma=gamma,
         domain=domain,
-        noise_variance=full.noise_variance,
+        # Answers are voltages as they are applied: what the smoother has taken from them is an error too.
+        noise_variance=full.noise_variance + float(np.mean((u - taught) ** 2)),
         kernel_variance=full.kernel_variance,
         beta_covariance=full.covariance,
         span_V=u_range,

@@ -20,7 +20,7 @@ from adaptive.online.config import LearnerConfig
 from adaptive.online.dead_reckoning import answers, drive_V, mean_slope
 from adaptive.online.gates import LEARNT, PASSED, REASONS
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.learner import MARK_S, Learner, swing_of
+from adaptive.online.learner import MARK_S, Learner
 from adaptive.types import BoolArray, FloatArray, IntArray, Sample, StateDict, parted
 
 #: Results of a sample, by their number in a fleet.
@@ -30,15 +30,18 @@ MARKS: Final = ("mark", "next_mark", "confirmed0", "confirmed1")
 
 #: Arrays by their name in a learner's state.
 _ARRAYS: Final = {
-    "x": "front.track.smoother.x", "ring": "front.track.smoother.ring", "voltages": "front.track.u_V",
-    "readings": "front.track.y_um", "good": "front.track.good", "motion": "front.track.motion",
-    "memory": "front.track.memory", "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta",
+    "x": "front.track.smoother.x", "ring": "front.track.smoother.ring", "drive_x": "front.track.drive.x",
+    "drive_ring": "front.track.drive.ring", "voltages": "front.track.u_V",
+    "rates": "front.track.rates", "known": "front.known", "readings": "front.track.y_um", "good": "front.track.good",
+    "motion": "front.track.motion", "memory": "front.track.memory",
+    "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta",
     "covariance": "filter.covariance", "domain": "domain", "point": "point", "born": "window.born",
     "own": "window.own_weights",
 }  # fmt: skip
 #: Numbers of an ordinary learner that are the same as others.
 _ALIASES: Final = {
-    "front.reckoned_seq": "front.gates.seq", "front.track.features.gain": "front.track.served.gain",
+    "front.reckoned_seq": "front.gates.seq", "front.track.drive.count": "front.track.smoother.count",
+    "front.track.features.gain": "front.track.served.gain",
     "front.track.features.offset_um": "front.track.served.offset_um",
 }  # fmt: skip
 #: Samples by outcome, by their names in a learner's state.
@@ -97,7 +100,11 @@ class Rows(NamedTuple):
     numbers: Any
     x: FloatArray
     ring: FloatArray
+    drive_x: FloatArray
+    drive_ring: FloatArray
     voltages: FloatArray
+    rates: FloatArray
+    known: FloatArray
     readings: FloatArray
     good: BoolArray
     motion: FloatArray
@@ -122,14 +129,13 @@ class Rows(NamedTuple):
 
 class Fixed(NamedTuple):
     """What does not change. config : one record. axis (B,) : a record for each axis. features (B, ...) : of the
-    identified models. beta, walks, bursts (B, p) : of them and their filters; swing (B, p) : see `swing_of`. models,
+    identified models. beta, walks, bursts (B, p) : of them and their filters. models,
     sizes (M, ...) : M distinct identified models as `LssvmInverse.packed` has them. The others are the smoother's."""
 
     config: Any
     axis: Any
     features: FeatureArrays
     beta: FloatArray
-    swing: FloatArray
     walks: FloatArray
     bursts: FloatArray
     models: FloatArray
@@ -176,7 +182,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
             "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
             "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0, "a_scale": f.a_scale_um_per_s2,
-            "model": number, "frame_gain": f.gain,
+            "model": number,
         })  # fmt: skip
     models = [bases[numbers.index(number)].packed for number in range(max(numbers) + 1)]
     packed = np.zeros((len(models), max(row.size for row, _ in models)))
@@ -188,7 +194,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         _records([settings], LearnerConfig().state_dict() | steps),
         _records(axes, dict.fromkeys(axes[0], 0.0) | {"tells": False, "model": 0}),
         FeatureArrays(*map(np.array, zip(*(base.features.arrays for base in bases), strict=True))),
-        np.array([base.beta for base in bases]), np.array([swing_of(base) for base in bases]),
+        np.array([base.beta for base in bases]),
         np.array(walks), np.array(bursts), packed, np.array([sizes for _, sizes in models]),
         *map(np.array, (smoother.transition, smoother.gain, smoother.lag_gains, smoother.scale)),
     )  # fmt: skip

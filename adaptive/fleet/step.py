@@ -21,6 +21,7 @@ from adaptive.online.drift import RestCreep, update
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
 from adaptive.online.kernel_window import NOWHERE, WeightConfig
+from adaptive.online.kernel_window import due as window_due
 from adaptive.online.learner import Judgement
 from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following
 from adaptive.smoothing import smooth_one
@@ -38,6 +39,7 @@ ODD: Final = -4
 _judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
 _follow, _rest_shift_um, _leave_rest, _weight_of = Following.take, RestCreep.shift_um, RestCreep.leave, WeightConfig.of
 _note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
+_forget_slopes = Following.forget_slopes
 _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
     OUTCOMES.index(name)
     for name in (gates.FROZEN, gates.OUTLIER, gates.NUMERICS, gates.SATURATED, gates.UNEXCITED, gates.LEARNT)
@@ -112,11 +114,12 @@ def _admit(s: Rows, c: Fixed, b: int, sample: Any) -> int:
         return DOUBT if without == "" else _number_of(refused)
     if sample.seq != g.seq + 1:
         return DOUBT
-    gates.watch_voltage(a, g, sample.u_V, f.span_V)
+    gates.watch_voltage(g, sample.u_V)
     _note_taken(g, sample, 1)
     stuck = gates.watch_reading(g, sample.u_V, sample.y_um, f.span_V)
     innovation = (sample.y_um - s.x[b, 0]) / f.range_um
-    known = g.since_start > a.settle
+    slope, bend = s.drive_x[b, 1] * c.output_scale[1], s.drive_x[b, 2] * c.output_scale[2]
+    known = g.since_start > a.settle and intake.is_known(s.known[b, 0], slope, bend)
     if stuck or (known and abs(innovation) > gates.surprise(a, g, f.span_V)):
         return DOUBT
     if known and sample.seq % max(1, round(intake.LOOK_S / dt_s)) == 0 and _lags(s, c, b, sample.y_um):
@@ -140,6 +143,9 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
         _remember_place(s, b, True)
     slot, motion = smoother.count % slots, s.motion[b]
     s.readings[b, slot], s.voltages[b, slot], s.good[b, slot] = y_um, u_V, True
+    smooth_one(u_V, smoother.count, s.drive_x[b], s.drive_ring[b], c.transition, c.gain, c.lag_gains, motion)
+    front.track["smooth_V"] = motion[0]
+    s.rates[b, 0], s.rates[b, 1] = motion[1] * c.output_scale[1], motion[2] * c.output_scale[2]
     smooth_one(y_um, smoother.count, s.x[b], s.ring[b], c.transition, c.gain, c.lag_gains, motion)
     smoother["count"] += 1
     for i in range(3):
@@ -178,7 +184,7 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, w: Any) -> None:
             refused = gates.SETTLING
         elif not good:
             refused = gates.GLITCH
-        due = now % config.filter_every == 0 or now % config.learn_every == 0
+        due = now % config.filter_every == 0 or window_due(now, config.learn_every)
         if not due or (refused != "" and refused != gates.SATURATED):
             sample["outcome"] = _number_of(refused if refused != "" else gates.PASSED)
             continue
@@ -194,8 +200,8 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         b = axes[k]
         t, r, f, h, motion = w[b], s.numbers[b], c.axis[b], s.basis[b], s.motion[b]
         now, at, _, near_bad = _instant(s, b)
-        u, before = s.voltages[b, at], s.voltages[b, (now - 1) % s.voltages.shape[1]]
-        saturated = gates.check_pair(config.admission, u, before, motion[0]) != ""
+        u, before = r.front.track.smooth_V, s.voltages[b, (now - 1) % s.voltages.shape[1]]
+        saturated = gates.check_pair(config.admission, s.voltages[b, at], before, motion[0]) != ""
         kept = s.numbers[b : b + 1].copy()
         t["lets_go"] = t["learns"] = False
         t["outcome"] = _SATURATED if saturated else _number_of(gates.PASSED)
@@ -237,11 +243,14 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
             else:
                 _leave_rest(r.rest)
             t["outcome"] = _UNEXCITED if rests else _LEARNT
-        if now % config.learn_every == 0 and not (saturated or rests or r.frozen) and r.judgement.valid:
+            if not rests and r.judgement.valid:
+                for i in range(2):
+                    s.known[b, 2, i] = max(s.known[b, 2, i], abs(s.rates[b, i]))
+                for i in range(3):
+                    s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
+                    s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
+        if window_due(now, config.learn_every) and not (saturated or rests or r.frozen):
             t["learns"], t["target_V"] = True, u - dot(h, s.beta[b], p)
-            for i in range(3):
-                s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
-                s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
 
 
 @compiled
@@ -273,19 +282,20 @@ def _finds_fault(
         if not saturated:
             r["confirmed"] = False
             follows = r.front.following
+            known = intake.is_known(s.known[b, 0], s.rates[b, 0], s.rates[b, 1])
             if f.tells:
                 fastest_V_per_s = config.envelope.drift_per_s * f.drive_V
-                odd = _follow(follows, u, frozen_V, f.drive_V, config.check_s, fastest_V_per_s)
-                fault = fault or (odd and r.front.credit > 0) or follows.still >= DOUBTED_STEPS
-            if f.tells and r.front.credit > 0:
-                frame, most = r.front.track.served.gain / f.frame_gain, config.envelope.gain
-                bounded = f.allowed_V > 0.0  # only a model with a linear part is
-                fault = fault or (
-                    bounded and not learner.gain_is_possible(c.swing[b], c.beta[b], s.beta[b], frame, most)
-                )
+                p_V = u - target + dot(h, s.marks[b, 0, 0], p)
+                odd = _follow(follows, u, p_V, f.drive_V, config.check_s, fastest_V_per_s)
+                if not known:
+                    _forget_slopes(follows)
+                fault = fault or (odd and known and r.front.credit > 0) or follows.still >= DOUBTED_STEPS
+            if f.tells and known and r.front.credit > 0:
                 r["confirmed"] = follows.good >= CONFIRMED or r.past_count == 0
             # `Intake.follow`: a model that may not judge confirms nothing, but notes where the readings have moved.
-            places = r.confirmed or (f.tells and r.front.credit <= 0 and follows.steps == 0 and follows.still == 0)
+            places = r.confirmed or (
+                f.tells and not (known and r.front.credit > 0) and follows.steps == 0 and follows.still == 0
+            )
         confirms = r.confirmed
     if fault:
         return True
@@ -293,6 +303,7 @@ def _finds_fault(
         # A good estimate becomes the next mark; see `Parts.judge`.
         _move_mark(s, b, 1, 0)
         _mark_now(s, b, 1)
+        s.known[b, 0], s.known[b, 1] = s.known[b, 1], s.known[b, 2]
         if s.ages[b, 2] < s.ages[b, 0]:
             _move_mark(s, b, 0, 2)
     if confirms:

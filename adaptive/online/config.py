@@ -33,7 +33,7 @@ class LearnerConfig:
     learn_every: int = 10
     filter_every: int = 2
     eviction: Eviction = "nearest"
-    cutoff_hz: float = 120.0
+    cutoff_hz: float = 200.0
     lag: int | None = None
     serving_age_s: float = 0.08
     valid_enter: float = 0.004

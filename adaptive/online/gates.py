@@ -26,6 +26,8 @@ from adaptive.types import Sample
 
 #: Limit of plausible readings and voltages, µm or V.
 ABSURD = 1e9
+#: Share of the voltage between the rails by which a voltage may be beyond them.
+RAIL_SLACK = 0.02
 #: Decay of a kink of the voltage per sample, and allowed prediction error as a multiple of the motion it causes.
 KINK_DECAY, KINK_SHARE = 0.9, 2.0
 #: Samples over which the smoother's prediction errors are averaged; each counts at most this many times the rms.
@@ -129,7 +131,6 @@ class AdmissionState:
     t_s: Annotated[float, Entry("its time", "s")] = 0.0
     since_start: Annotated[int, Entry("samples since the smoother started", low=0)] = 0
     since_jump: Annotated[int, Entry("samples since the smoother was moved to a place that had jumped", low=0)] = 0
-    since_step: Annotated[int, Entry("samples since the voltage stepped", low=0)] = 0
     since_glitch: Annotated[int, Entry("samples since the sensor was last found wrong", low=0)] = 1_000_000_000
     moved: Annotated[int, Entry("the smoother's count when the stage last left a place", low=0)] = 0
     anchor_um: Annotated[float, Entry("where the stage then was", "µm")] = 0.0
@@ -173,6 +174,10 @@ def check_sample(config: AdmissionConfig, state: AdmissionState, sample: Sample,
     # The square of a reading must be finite too.
     if not (isfinite(sample.t_s) and abs(sample.u_V) < ABSURD and abs(sample.y_um) < ABSURD):
         return NOT_FINITE
+    # No amplifier gives a voltage beyond its rails: the sample is of another stage, or in another unit.
+    slack_V = RAIL_SLACK * (config.u_max_V - config.u_min_V)
+    if not config.u_min_V - slack_V <= sample.u_V <= config.u_max_V + slack_V:
+        return OUT_OF_RANGE
     if state.seq < 0:
         return ""
     if sample.seq == state.seq:
@@ -202,13 +207,9 @@ def new_counters() -> dict[str, int]:
 
 
 @shared
-def watch_voltage(config: AdmissionConfig, state: AdmissionState, u_V: float, span_V: float) -> None:
-    """Detect a commanded step: a kink of the voltage that moves the stage by more than the share of a glitch.
-
-    For ``settle`` samples after it, readings far from the prediction are the stage's response, not a glitch.
-    """
+def watch_voltage(state: AdmissionState, u_V: float) -> None:
+    """Note a voltage and its kink: the smoother's prediction cannot know the motion that a kink causes."""
     kink = abs(u_V - 2.0 * state.u_V + state.u_before_V)
-    state.since_step = 0 if kink > 0.25 * config.glitch_share * span_V else state.since_step + 1
     state.kink_V = max(kink, KINK_DECAY * state.kink_V)
     state.u_before_V, state.u_V = state.u_V, u_V
 
@@ -219,7 +220,7 @@ def surprise(config: AdmissionConfig, state: AdmissionState, span_V: float) -> f
 
     A multiple of the usual prediction error, plus the motion that a recent kink of the voltage can cause.
     """
-    usual = min(max(config.surprise_share, config.surprise_sigma * state.innovation2**0.5), config.glitch_share)
+    usual = max(config.surprise_share, config.surprise_sigma * state.innovation2**0.5)
     return float(usual + KINK_SHARE * state.kink_V / span_V)
 
 
@@ -250,8 +251,8 @@ def watch_reading(state: AdmissionState, u_V: float, y_um: float, span_V: float)
 
 @shared
 def settling(config: AdmissionConfig, state: AdmissionState) -> bool:
-    """Whether the smoother has just started or the voltage stepped: large prediction errors are then expected."""
-    return min(state.since_start, state.since_step) <= config.settle
+    """Whether the smoother has just started: it does not know the velocity yet."""
+    return state.since_start <= config.settle
 
 
 @shared

@@ -18,6 +18,8 @@ from dataclasses import replace
 from math import nan
 from typing import Annotated, Any
 
+import numpy as np
+
 from adaptive.compiled import shared
 from adaptive.features import FeatureMap
 from adaptive.inverse_model import LssvmInverse
@@ -54,7 +56,19 @@ CLEAN_S = 0.06
 #: and while not, s; windows after which one has shown nothing.
 CREDIT, FIRST_CREDIT, FAILURE, CONTROL_S, CONTROL_AGAIN_S, CONTROL_WINDOWS = 3, 0, 2, 5.0, 0.3, 4
 
+#: Rates of the voltage above the largest known ones by this factor are unknown motion, in which no reading is judged.
+BEYOND = 1.25
+
 Model = Callable[[], LssvmInverse]
+
+
+@shared
+def is_known(known: FloatArray, slope: float, bend: float) -> bool:
+    """Whether rates of the voltage, V/s and V/s², are not beyond the learnt ones ``known`` (2,).
+
+    Only there the model can tell a wrong reading from motion that it has not learnt yet.
+    """
+    return bool(abs(slope) <= BEYOND * known[0] and abs(bend) <= BEYOND * known[1])
 
 
 @shared
@@ -72,6 +86,9 @@ class Intake:
     """
 
     gates: Annotated[AdmissionState, Entry("state of the gates")]
+    known: Annotated[
+        FloatArray, Entry("largest rates of the voltage learnt: at the two good estimates, now", "V/s, V/s²", "3,2")
+    ]
     following: Annotated[Following, Entry("check that the readings follow the drive")]
     track: Annotated[Track | None, Entry("of the stage, before the first reading none")]
     _hold: Annotated[Hold | None, Entry("readings that are held back")]
@@ -124,6 +141,7 @@ class Intake:
         # A model that does not depend on the displacement cannot check a sensor.
         self._tells = answers(base)
         self._slope_V_per_um, self._drive_V = mean_slope(base), drive_V(base)
+        self.known = known_rates(base)
         # A control trial judges readings that are trusted. A fault that it finds is the model's, and costs the model
         # credit: without credit the model may not judge the sensor. Samples until the next control trial.
         self._control = None
@@ -201,7 +219,7 @@ class Intake:
         missing = sample.seq - self._reckoned_seq - 1 if gates.seq >= 0 else 0
         between = self._missed_V(sample.u_V, missing)
         for u in (*between, sample.u_V):
-            admission.watch_voltage(c, gates, u, self.base.span_V)
+            admission.watch_voltage(gates, u)
         if not refused:
             gates.take(sample, sample.seq - gates.seq if gates.seq >= 0 else 1)
         self._reckoned_seq = sample.seq
@@ -218,13 +236,15 @@ class Intake:
             return self._without_reading(self._keep(track, model, sample.u_V, nan), refused)
         stuck = admission.watch_reading(gates, sample.u_V, sample.y_um, self.base.span_V)
         innovation = (sample.y_um - track.predicted_um) / self.range_um
-        known = track.motion is not None and gates.since_start > c.settle
+        known = track.motion is not None and gates.since_start > c.settle and is_known(self.known[0], *track.rates_now)
         limit = admission.surprise(c, gates, self.base.span_V)
         if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
             self._hold = self._lagging(track, model(), sample.y_um)
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
-        if self._hold is None and not doubtful:
+        # Of readings that are held back too, but for ringing: what surprises the smoother again and again is usual.
+        if self._hold is None or not self._hold.rang:
             admission.watch_innovation(c, gates, innovation)
+        if self._hold is None and not doubtful:
             self._until_control -= 1
             if known and self.missing is None and (self._control is not None or self._until_control <= 0):
                 self._check_model(track, sample, model)
@@ -288,7 +308,7 @@ class Intake:
             return False
         gap.move(lambda: self._of_track(track, model()), every * self.dt_s)
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
-        if pair.good and not admission.check_pair(self._admission, pair.u_V, pair.u_before_V, pair.y_um):
+        if pair.good and not admission.check_pair(self._admission, *pair.applied_V, pair.y_um):
             # The smoother's first instants are worse: it does not know the velocity when it begins.
             gap.correct(motion, pair.u_V, min(1.0, (gap.since / (2 * track.lag)) ** 2))
             track.remember(gap.memory)
@@ -360,9 +380,9 @@ class Intake:
         before_um = reckoning.y_um
         for u in past.u_V[max(len(past.u_V) - lag, 0) :]:
             reckoning.advance(u)
+        known = reckoning.std_um <= self._least_um
         reckoning.begin_way()
         dx_um, dy_um = reckoning.y_um - before_um, track.steps_over_lag(y_um)[1]
-        known = reckoning.std_um <= self._least_um
         if known and abs(dx_um) > self._least_um and not LAGS[0] <= dy_um / dx_um <= LAGS[1]:
             return Hold(reckoning, reckoning.y_um)
         self._look_from = self.gates.since_start + lag
@@ -685,7 +705,7 @@ class Intake:
     def follow(self, pair: Pair, p_V: float, since_s: float) -> bool:
         """Check with one pair whether the readings follow the drive; True where they do not and a trial is due.
 
-        ``p_V`` : voltage of the identified model for the pair's motion. ``since_s`` : time since the last check, s.
+        ``p_V`` : voltage of the last good model for the pair's motion. ``since_s`` : time since the last check, s.
         """
         track, self.confirmed = self.track, False
         assert track is not None
@@ -697,7 +717,10 @@ class Intake:
             return False
         fastest_V_per_s = self._envelope.drift_per_s * self._drive_V
         fault = self.following.take(pair.u_V, p_V, self._drive_V, since_s, fastest_V_per_s)
-        if not self._judges:
+        known = is_known(self.known[0], *pair.rates)
+        if not known:
+            self.following.forget_slopes()
+        if not (self._judges and known):
             # A model that cannot say where the stage is still says that it moves.
             if self.following.moved:
                 self._pasts = [*self._pasts[-1:], Past.of(track)]
@@ -720,6 +743,18 @@ class Intake:
         """Whether the stage, now at ``y_um``, has not left its place for a while."""
         count = self.track.state.count if self.track is not None else 0
         return admission.at_rest(self._admission, self.gates, y_um, count, self.range_um, self.dt_s)
+
+    def learn_rates(self, rates: tuple[float, float]) -> None:
+        """Motion with these rates of the voltage, V/s and V/s², has been learnt."""
+        np.maximum(self.known[2], np.abs(rates), out=self.known[2])
+
+    def forget_rates(self) -> None:
+        """Only the motion of the identified model is known again."""
+        self.known = known_rates(self.base)
+
+    def mark_rates(self) -> None:
+        """The present estimate becomes the newer good one."""
+        self.known[:2] = self.known[1:]
 
     # ---- keeping
 
@@ -745,10 +780,17 @@ class Intake:
         restore(self, save(other), self.sizes, self.given)
 
 
+def known_rates(base: LssvmInverse) -> FloatArray:
+    """(3, 2) rates of the voltage that an identified model knows, see `Intake.known`, V/s and V/s²."""
+    fastest = np.abs(base.domain[2:].reshape(2, 2)).max(axis=1) * abs(mean_slope(base))
+    return np.tile(fastest, (3, 1))
+
+
 def _from_past(past: Past, model: LssvmInverse, upto: int | None = None) -> Reckoning:
     """From a place in the past over the voltages since; over the first ``upto`` of them where that is given."""
     reckoning = Reckoning.begin(model, past.motion, past.u_before_V, past.lag_V, past.lag_um, past.memory)
     for u in past.u_V if upto is None else past.u_V[: max(upto, 0)]:
         reckoning.advance(u)
-    reckoning.begin_way()
+    if upto is None:
+        reckoning.begin_way()
     return reckoning

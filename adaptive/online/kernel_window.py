@@ -76,6 +76,15 @@ SAME = 0.98
 NOWHERE = -1
 
 
+@shared
+def due(now: int, every: int) -> bool:
+    """Whether the window learns at step ``now``: once in each block of ``every``, one place later than in the last.
+
+    At a fixed place it would meet periodic motion in the same few phases for ever.
+    """
+    return now % every == (now // every) % every
+
+
 @dataclass(slots=True)
 class Turn:
     """Where the window is on its way through its slots."""

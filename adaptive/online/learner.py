@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, sqrt
+from math import inf, isfinite, sqrt
 from typing import Annotated, Any
 
 import numpy as np
 
-from adaptive.compiled import dot, shared
+from adaptive.compiled import shared
 from adaptive.errors import DehystError, ModelFileError
-from adaptive.features import FeatureMap
+from adaptive.features import ACCELERATION, VELOCITY, FeatureMap
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online import gates as admission
 from adaptive.online.config import LearnerConfig
@@ -27,7 +27,7 @@ from adaptive.online.drift import DriftFilter, Mark, RestCreep
 from adaptive.online.gates import LEARNT, PASSED, REASONS, check_pair, new_counters
 from adaptive.online.glitch_or_jump import level_of
 from adaptive.online.intake import Intake
-from adaptive.online.kernel_window import ResidualWindow
+from adaptive.online.kernel_window import ResidualWindow, due
 from adaptive.online.missing_motion import MissingMotion
 from adaptive.online.track import Pair
 from adaptive.state import Entry, Refused, restore, save, within
@@ -205,29 +205,6 @@ def basis_over(features: FeatureMap, shares: Sequence[float], v_um_per_s: float 
     return rows
 
 
-def swing_of(model: LssvmInverse) -> FloatArray:
-    """(p,) basis at three quarters of the range less that at one quarter."""
-    low, high = basis_over(model.features, (0.25, 0.75))
-    swing: FloatArray = high - low
-    return swing
-
-
-@shared
-def gain_is_possible(swing: FloatArray, identified: FloatArray, beta: FloatArray, frame: float, most: float) -> bool:
-    """Whether a stage can have the gain of the learnt linear part ``beta`` (p,) in its frame.
-
-    Frame and linear part may each differ from those identified by the factor ``most`` of the envelope.
-
-    ``swing`` : (p,) see `swing_of`. ``frame`` : gain of the frame over that identified.
-    """
-    p = swing.size
-    learnt_V, identified_V = dot(swing, beta, p), dot(swing, identified, p)
-    if not learnt_V * identified_V > 0.0:  # it has no gain, or one of the other sign
-        return False
-    gain = frame * identified_V / learnt_V
-    return bool(1.0 / (most * most) <= gain <= most * most)
-
-
 @shared
 def time_at_rail(rail_s: float, saturated: bool, step_s: float) -> float:
     """Time of the voltage at a limit, or off it where negative, s, after one more check."""
@@ -301,7 +278,6 @@ class Parts:
         if allowed_V is None:
             allowed_V = config.envelope.shape * drive_V(base) + self.window.reach_V if base.features.linear else 0.0
         self.allowed_V = allowed_V
-        self.swing = swing_of(base) if base.features.linear else np.empty(0)
         v = base.features.v_scale_um_per_s
         self.rows = np.concatenate([basis_over(base.features, COMPARED, way * v) for way in (-1.0, 1.0)])
         self.rail_s = 0.0
@@ -318,10 +294,10 @@ class Parts:
         self.filter.expect_change()
         self.window.expect_change()
 
-    def follow(self, basis: FloatArray, target_V: float, u_V: float, weight: float, rest: bool) -> bool:
-        """One step of the filter with ``target_V`` at basis (p,); False for an outlier, which is not learnt.
+    def follow(self, basis: FloatArray, target_V: float, pair: Pair, weight: float, rest: bool) -> bool:
+        """One step of the filter with ``target_V`` at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
-        ``u_V`` : the voltage there. ``rest`` : whether the stage is at rest.
+        ``rest`` : whether the stage is at rest.
         """
         said = self.filter.update(basis, target_V, not rest, weight)
         if said == "outlier":
@@ -330,7 +306,10 @@ class Parts:
             self.window.expect_change()
         if self.judgement.valid and not self.intake.on_probation:
             self.window.let_go(self.config.weights.before_change)
-        self.take_rest(u_V, moving=not rest)
+        self.take_rest(pair.u_V, moving=not rest)
+        if self.judgement.valid and not rest:
+            self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
+            self.intake.learn_rates(pair.rates)
         return True
 
     def take_rest(self, u_V: float, moving: bool) -> None:
@@ -361,6 +340,7 @@ class Parts:
             self.events["rollbacks"] += 1
         elif j.judged % max(1, round(MARK_S / step_s)) == 0 and j.short_V2 < (0.5 * c.valid_enter * span_V) ** 2:
             self.mark, self.next_mark = self.next_mark, self.filter.mark()
+            self.intake.mark_rates()
             self.mark_ages = (self.mark_ages[1], j.judged)
             if self.confirmed_ages[0] < self.mark_ages[0]:
                 # Where the stage moves little, nothing is confirmed for long; a good second counts as much.
@@ -394,18 +374,6 @@ class Parts:
                 self.begin_again()
         else:
             self.left = self.left and self.left_s > -LEFT_S
-
-    @property
-    def gain_is_possible(self) -> bool:
-        """Whether a stage can have the learnt gain.
-
-        The distance in volts does not tell: while the stage moves little, a wrong gain causes small errors only.
-        """
-        if not self.swing.size:
-            return True
-        base, most = self.intake.base, self.config.envelope.gain
-        frame = self.intake.served.gain / base.features.gain
-        return gain_is_possible(self.swing, base.beta, self.filter.beta, frame, most)
 
     def watch_trial(self) -> bool:
         """Update ``alone`` after a sample; returns whether it has changed."""
@@ -443,6 +411,7 @@ class Parts:
         """Forget everything learnt and start again from the identified model."""
         base, c = self.intake.base, self.config
         self.intake.to_base_frame()
+        self.intake.forget_rates()
         self.filter.go_back(self.first)
         self.window = ResidualWindow.from_model(base, c.window, c.eviction, c.solver)
         self.mark = self.next_mark = self.jump_mark = self.proven_mark = self.filter.mark()
@@ -675,6 +644,8 @@ class Learner:
             parts.undo_jump()
         if taken.jump_um:
             parts.take_jump(taken.jump_um, fresh=not taken.undone, first=taken.first)
+            if intake.track is not None and intake.track.features is intake.track.served:
+                parts.expect_change()  # of a trial: no instant in the frame from before is still to be learnt
         moved = taken.undone or taken.jump_um or taken.distrusted or taken.renamed
         # An ordinary sample neither begins nor ends a trial of the sensor.
         if (taken.refused or taken.jump_um) and (parts.watch_trial() or moved):
@@ -698,11 +669,11 @@ class Learner:
         waits = self._waits(pair)
         if waits:
             return waits
-        refused = check_pair(c.admission, pair.u_V, pair.u_before_V, pair.y_um)
+        refused = check_pair(c.admission, *pair.applied_V, pair.y_um)
         # A saturated sample is not learnt, but it shows where the stage is, and so the error of the model.
         if refused and refused != admission.SATURATED:
             return refused
-        filter_due, window_due = pair.now % c.filter_every == 0, pair.now % c.learn_every == 0
+        filter_due, window_due = pair.now % c.filter_every == 0, due(pair.now, c.learn_every)
         if not (filter_due or window_due):
             return refused or admission.PASSED
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
@@ -721,7 +692,7 @@ class Learner:
             served_V = float(self._basis.dot(parts.delay.push(beta)))
             parts.judge(target - served_V, pair.u_V - frozen_V)
             if pair.now % parts.check_every == 0:
-                found = self._check(pair, beta, target, frozen_V, bool(refused))
+                found = self._check(pair, beta, target, bool(refused))
                 if found:
                     return found
             if refused:
@@ -733,16 +704,15 @@ class Learner:
             self._cache = None
             if intake.stands_still:
                 return admission.UNTRUSTED
-            if not parts.follow(self._basis, target, pair.u_V, weight, rest):
+            if not parts.follow(self._basis, target, pair, weight, rest):
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:
             return refused
         learns = not (rest or self._frozen or intake.on_probation or intake.stands_still)
-        if window_due and learns and parts.judgement.valid:
+        if window_due and learns:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
             parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
-            parts.widen_domain(motion)
         self._cache = None
         return outcome
 
@@ -758,12 +728,14 @@ class Learner:
             return admission.SETTLING
         return "" if pair.good else admission.GLITCH
 
-    def _check(self, pair: Pair, beta: FloatArray, target_V: float, frozen_V: float, saturated: bool) -> str:
+    def _check(self, pair: Pair, beta: FloatArray, target_V: float, saturated: bool) -> str:
         """Check envelope, rails and sensor. Returns the gate that forbids learning, or ""."""
         parts, intake = self.parts, self.parts.intake
-        parts.watch_shape(pair.u_V - target_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
+        kernel_V = pair.u_V - target_V
+        parts.watch_shape(kernel_V + float(self._basis.dot(beta)) - float(self._basis.dot(self.base.beta)))
         parts.watch_rail(saturated)
-        if saturated or (not intake.follow(pair, frozen_V, parts.check_s) and parts.gain_is_possible):
+        p_V = kernel_V + float(self._basis.dot(parts.mark.beta))
+        if saturated or not intake.follow(pair, p_V, parts.check_s):
             if intake.confirmed:
                 parts.confirm()
             return ""
@@ -852,6 +824,19 @@ class Learner:
     def features(self) -> FeatureMap:
         """The feature map that is served."""
         return self.parts.intake.served
+
+    @property
+    def extrapolation_V(self) -> float:
+        """Standard deviation that an answer gains one learnt span outside the learnt velocity or acceleration, V.
+
+        By the covariance of the filter; infinite for a model without a linear part.
+        """
+        f, parts = self.base.features, self.parts
+        if not f.linear:
+            return inf
+        variances = parts.filter.covariance.diagonal()[VELOCITY : ACCELERATION + 1]
+        spans = (parts.domain[3::2] - parts.domain[2::2]) / (f.v_scale_um_per_s, f.a_scale_um_per_s2)
+        return float(np.max(np.sqrt(np.maximum(variances, 0.0)) * spans))
 
     def warm(self) -> None:
         """Load or compile every step on a copy, so that no sample waits seconds for the compiler."""

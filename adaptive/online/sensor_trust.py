@@ -97,11 +97,19 @@ class Following:
     drift_V_per_s: Annotated[float, Entry("mean rate of p - u, with forgetting", "V/s")] = 0.0
     drift2: Annotated[float, Entry("mean square rate of p - u, with forgetting", "V²/s²", low=0.0)] = 0.0
 
+    @shared
     def forget(self) -> None:
         """Discard all steps so far."""
         self.u_V = self.p_V = math.nan
         self.last_V, self.way_V = math.nan, 0.0
         self.steps = self.good = self.still = 0
+        self.count = self.driven = self.uu = self.pp = self.up = 0.0
+        self.drift_V_per_s = self.drift2 = 0.0
+
+    @shared
+    def forget_slopes(self) -> None:
+        """Keep only whether the readings stand still: how far they should move is not known."""
+        self.good = 0
         self.count = self.driven = self.uu = self.pp = self.up = 0.0
         self.drift_V_per_s = self.drift2 = 0.0
 

@@ -29,10 +29,11 @@ class Step(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), its voltage and the one before, V.
+    """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), and its voltage, V, smoothed alike.
 
-    good : whether the readings at that instant and before it are good. near_bad : whether the smoother has used a bad
-    reading for it.
+    rates : of that voltage, V/s and V/s². applied_V : the voltages that were applied at that instant and just before
+    it, V. good : whether the readings at that instant and before it are good. near_bad : whether the smoother has used
+    a bad reading for it.
     """
 
     now: int
@@ -40,7 +41,8 @@ class Pair(NamedTuple):
     v_um_per_s: float
     a_um_per_s2: float
     u_V: float
-    u_before_V: float
+    rates: tuple[float, float]
+    applied_V: tuple[float, float]
     good: bool
     near_bad: bool
 
@@ -98,11 +100,14 @@ class Track:
     """A track with its state; ``base`` is the feature map of the model that the learner started from.
 
     ``features`` and ``served`` differ for a lag after a jump. ``frozen_memory`` knows of no jump.
+    ``drive`` smooths the voltage as ``state`` does the motion: what the smoother takes from the motion is then missing
+    in both, so that turns, steps and fast motion teach what slow motion does.
     """
 
     smoother: FixedLagSmoother
     base: FeatureMap
     state: Annotated[SmootherState, Entry("state of the smoother", name="smoother")]
+    drive: Annotated[SmootherState, Entry("state of the smoother of the voltage")]
     u_V: Annotated[FloatArray, Entry("ring of voltages by the smoother's count", "V", "slots", finite=False)]
     y_um: Annotated[FloatArray, Entry("ring of readings by the smoother's count", "µm", "slots", finite=False)]
     good: Annotated[BoolArray, Entry("ring of which readings are good", "", "slots")]
@@ -113,6 +118,8 @@ class Track:
     motion: Annotated[
         Motion | None, Entry("last smoothed motion, ``lag`` samples old, if any", "µm, µm/s, µm/s²", "3|0")
     ] = None
+    smooth_V: Annotated[float, Entry("smoothed voltage of that motion", "V")] = 0.0
+    rates: Annotated[tuple[float, float], Entry("its rates", "V/s, V/s²", "2")] = (0.0, 0.0)
     switch: Annotated[int, Entry("the smoother's count until which the two maps differ", low=0)] = 0
 
     def check_state(self) -> None:
@@ -128,7 +135,8 @@ class Track:
         slots = smoother.config.lag + 2
         rings = np.zeros(slots), np.zeros(slots), np.zeros(slots, dtype=np.bool_)
         memories = served.rest_memory(y_um), base.rest_memory(y_um)
-        return cls(smoother, base, smoother.initial_state(y_um), *rings, served, served, *memories)
+        state, drive = smoother.initial_state(y_um), smoother.initial_state(0.0)
+        return cls(smoother, base, state, drive, *rings, served, served, *memories)
 
     def restart(self, y_um: float) -> None:
         """Begin smoothing anew; the hysteresis memory follows to where the stage now is.
@@ -136,7 +144,7 @@ class Track:
         Over the readings that were not smoothed yet too: where many samples are lost there is nothing else.
         """
         self.memory, self.frozen_memory = self.memory_now(False), self.memory_now(True)
-        self.state = self.smoother.initial_state(y_um)
+        self.state, self.drive = self.smoother.initial_state(y_um), self.smoother.initial_state(0.0)
         self.good[:] = False
         self.features, self.motion, self.switch = self.served, None, 0
 
@@ -150,6 +158,12 @@ class Track:
         return self.state.x.item(0)
 
     @property
+    def rates_now(self) -> tuple[float, float]:
+        """Rates of the voltage as the smoother expects them at the next sample, V/s and V/s²."""
+        _, slope, bend = self.smoother.scale.tolist()
+        return self.drive.x.item(1) * slope, self.drive.x.item(2) * bend
+
+    @property
     def last_um(self) -> float:
         """The last reading that was smoothed."""
         return self.y_um.item((self.state.count - 1) % self.y_um.shape[0])
@@ -157,8 +171,9 @@ class Track:
     def copy(self) -> Track:
         """An independent copy."""
         return Track(
-            self.smoother, self.base, self.state.copy(), self.u_V.copy(), self.y_um.copy(), self.good.copy(),
-            self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion, self.switch,
+            self.smoother, self.base, self.state.copy(), self.drive.copy(), self.u_V.copy(), self.y_um.copy(),
+            self.good.copy(), self.features, self.served, self.memory.copy(), self.frozen_memory.copy(), self.motion,
+            self.smooth_V, self.rates, self.switch,
         )  # fmt: skip
 
     def move(self, served: FeatureMap, slope: float, shift_um: float) -> None:
@@ -185,9 +200,13 @@ class Track:
         state, slots = self.state, self.u_V.shape[0]
         slot = state.count % slots
         self.y_um[slot], self.u_V[slot], self.good[slot] = step
+        if not state.count:
+            self.drive.x[0] = step.u_V
+        drive = self.smoother.step(self.drive, step.u_V)
         self.motion = self.smoother.step(state, step.y_um)
-        if self.motion is None:
+        if self.motion is None or drive is None:
             return None, False
+        self.smooth_V, self.rates = drive[0], drive[1:]
         switched = self.features is not self.served and state.count > self.switch
         if switched:
             self.features = self.served
@@ -209,7 +228,9 @@ class Track:
         # As bytes: numpy's own "all" of so few costs as much as a step of the smoother.
         near_bad = 0 in self.good.tobytes()
         good = not near_bad or bool(self.good[at] and self.good[before])
-        return Pair(now, *self.motion, self.u_V.item(at), self.u_V.item(before), good, near_bad)
+        return Pair(
+            now, *self.motion, self.smooth_V, self.rates, (self.u_V.item(at), self.u_V.item(before)), good, near_bad
+        )
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""

@@ -688,6 +688,17 @@ class Competition:
         }
         return {"champion": self.champion, "changes": self._choice.changes, "contestants": table}
 
+    def reach(self, stand_in: str) -> float:
+        """How far outside its learnt domain the favourite is still as good as the contestant ``stand_in``, in spans.
+
+        There the deviation that the favourite states for its extrapolation equals the rms error of ``stand_in`` on
+        this stage. 0 where either is not known.
+        """
+        favourite = self.favourite
+        if stand_in not in self.names or not isinstance(favourite, Learner):
+            return 0.0
+        return self.judge.rms_V(self.names.index(stand_in)) / max(favourite.extrapolation_V, 1e-300)
+
     def counters(self) -> dict[str, int]:
         """Those of the favourite and of the competition."""
         own = {"champion_changes": self._choice.changes, "contestants_failed": sum(self._out)}

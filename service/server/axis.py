@@ -35,10 +35,12 @@ from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
     NOT_LEARNING,
     POISON,
+    UNUSABLE,
     LearnerSupervisor,
     ModelWatch,
     ModelWatchConfig,
     Revive,
+    blend_share_of,
     champion_of,
     fingerprint,
     stored_model,
@@ -180,6 +182,7 @@ class ServedEntries:
     default: Annotated[str, Entry("name of the model that answers where a query names none", most=1000)]
     trust: Annotated[float, Entry("weight of the learning model inside its domain", low=0.0, high=1.0)]
     trouble: Annotated[str, Entry("what is wrong with the samples or the learner, empty for nothing", most=1000)]
+    blend_share: Annotated[float, Entry("distance from the domain at which the stand-in answers alone", low=1e-9)]
 
 
 @dataclass(slots=True)
@@ -353,7 +356,7 @@ class Axis:
         served, config = served or self.newest, self.config
         return Safety(
             blends(name, served.default, config),
-            config.blend_share,
+            served.blend_share,
             served.trust if learns(name, config) else 1.0,
             config.stale_s if learns(name, config) and not served.frozen else 0.0,
             config.last_good_s,
@@ -401,7 +404,8 @@ class Axis:
             if self.supervisor.adoptions:
                 self.supervisor.adopt_due(number)
             self.supervisor.watch.take(u_V, y_um, verdict)
-            self.tracker.add(seq, u_V, y_um)
+            if verdict not in UNUSABLE:
+                self.tracker.add(seq, u_V, y_um)
             self._recent[seq % _RECENT] = seq, y_um
             due = seq // every > self.newest.seq // every
             if due:
@@ -498,7 +502,10 @@ class Axis:
         memories = {name: model.rest_memory(rest_um) for name, model in models.items()}
         # A model of the learner's own form is no stand-in for it.
         usable = (name for name in STAND_INS if name in models and name not in (config.learn, config.served))
-        return Served(-1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(usable, ""))
+        return Served(
+            -1, 0.0, math.nan, models, memories, config.served, config.stand_in or next(usable, ""),
+            blend_share=config.blend_share,
+        )  # fmt: skip
 
     def _take_snapshot(self, seq: int, t_s: float, u_V: float) -> None:
         last, supervisor = self.newest, self.supervisor
@@ -511,6 +518,9 @@ class Axis:
         served = replace(
             last, seq=seq, t_s=t_s, u_V=u_V, models=models, memories=memories,
             trust=last.trust if last.frozen else supervisor.watch.trust, trouble=supervisor.watch.trouble,
+            blend_share=last.blend_share
+            if last.frozen
+            else blend_share_of(supervisor.learner, last.stand_in, self.config.blend_share),
         )  # fmt: skip
         self._snapshots = (*self._snapshots, served)[-self.config.snapshots_kept :]
 
@@ -568,7 +578,9 @@ class Axis:
         of another identification can be refused.
         """
         served = self.newest
-        answers = ServedEntries(served.seq, served.t_s, served.u_V, served.default, served.trust, served.trouble)
+        answers = ServedEntries(
+            served.seq, served.t_s, served.u_V, served.default, served.trust, served.trouble, served.blend_share
+        )
         held = served.held if served.frozen else None
         state = save(AxisEntries(self.handled_seq, answers, self._gates, served.memories, held))
         for name, part in (("sequence", self.sequence), ("clock", self.clock), ("tracker", self.tracker)):
@@ -627,8 +639,8 @@ class Axis:
         s = own.served
         served = replace(
             now, seq=s.seq, t_s=s.t_s, u_V=s.u_V, models=models, memories=memories,
-            default=s.default if s.default in models else now.default, trust=s.trust, trouble=s.trouble, frozen=False,
-            held=None,
+            default=s.default if s.default in models else now.default, trust=s.trust, trouble=s.trouble,
+            blend_share=s.blend_share, frozen=False, held=None,
         )  # fmt: skip
         if not supervisor.frozen:
             return served, own

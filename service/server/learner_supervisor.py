@@ -18,9 +18,19 @@ import numpy as np
 
 from adaptive.errors import DehystError, ModelFileError
 from adaptive.inverse_model import LssvmInverse
+from adaptive.online.gates import (
+    FROZEN,
+    LEARNT,
+    NOT_FINITE,
+    OUT_OF_RANGE,
+    PASSED,
+    REDUNDANT,
+    TIMING,
+    UNEXCITED,
+)
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, RAIL
 from adaptive.online.sensor_trust import OUT_OF_ENVELOPE, SENSOR_FAULTS
-from adaptive.state import Entry, load, part_of, restore, save
+from adaptive.state import Entry, Kinded, load, part_of, restore, save
 from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict, prefixed
 from baselines.competition.champion import ChampionInverse
 from baselines.competition.competition import Competition, check_like
@@ -39,6 +49,8 @@ from service.protocol.model import build_model, stored_kind
 # - sensor_frozen: the reading has not changed for a while in which the voltage has.
 # - samples_poisoned: most samples of the last while were refused for their values.
 # - model_bad: the newest model is not finite, or far from every other, at positions all over the range.
+# - nothing_learnt: the stage has moved for seconds and no sample of it was learnt; the detail names the gate. The
+#   newest model is served all the same.
 # - learner_failed: the learner raised; another one is started from the last good model after a while.
 # - sensor_stuck, sensor_gain, sensor_sign, sensor_foreign, out_of_envelope: the learner reports that the readings do
 #   not follow the voltage as those of this stage can.
@@ -54,6 +66,13 @@ SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"
 MODEL_BAD: Final = "model_bad"
 LEARNER_FAILED: Final = "learner_failed"
+NOTHING_LEARNT: Final = "nothing_learnt"
+#: Verdicts on samples whose values cannot be used: they move no memory.
+UNUSABLE: Final = frozenset({NOT_FINITE, OUT_OF_RANGE, TIMING})
+#: Verdict on samples that nobody learns from.
+NOT_LEARNING: Final = "not_learning"
+#: Verdicts that are no refusal of a sample in motion.
+_NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
 #: After these the learner has restarted, because the model from before was wrong.
 BEGUN_AGAIN: Final = frozenset({RAIL, MODEL_LEFT_ENVELOPE})
 #: What lets the learner follow such a change.
@@ -80,10 +99,11 @@ class ModelWatchConfig:
     frozen_s, frozen_share : the sensor is frozen if the reading does not change for this time, s, while the voltage
     changes by this share of its range.
     poisoned_s, poisoned_share : time constant, s, and share of bad values from which samples are poisoned.
-    insane_share : distance from the baseline, as a share of the voltage range, that no drift explains.
+    insane_share : distance from the identified model, as a share of the voltage range, that no drift explains.
     recover_s : time without trouble, s, after which the newest model is served again.
     mark_s : age, s, from which a model counts as one from before the trouble.
     last_good_s, ramp_s : times, s, for which the last good model is served, and in which the baseline takes over.
+    silent_s : time of refused motion without a sample that is learnt, s, after which that is a trouble.
     revive_s : time, s, after which a failed learner is replaced.
     """
 
@@ -96,6 +116,7 @@ class ModelWatchConfig:
     mark_s: float = 0.5
     last_good_s: float = 60.0
     ramp_s: float = 1.0
+    silent_s: float = 2.0
     revive_s: float = 5.0
 
 
@@ -109,9 +130,11 @@ class ModelWatch:
         Entry(
             "counts of samples, the repeated reading and its voltages, and the share of bad readings", finite=False,
             name="",
-            among=("count", "still", "y", "u_low", "u_high", "bad", "marked", "since", "clean", "seen", "failed"),
+            among=("count", "still", "y", "u_low", "u_high", "bad", "marked", "since", "clean", "seen", "failed",
+                   "silent", "silent_low", "silent_high"),
         ),
     ]  # fmt: skip
+    _gate: Annotated[str, Entry("gate that refused the last sample in motion", name="gate", most=1000)]
 
     def __init__(self, config: ModelWatchConfig, dt_s: float, limits: Limits) -> None:
         self.config = config
@@ -127,7 +150,9 @@ class ModelWatch:
         self._n = {
             "count": 0, "still": 0, "y": math.nan, "u_low": math.inf, "u_high": -math.inf,
             "bad": 0.0, "marked": 0, "since": 0, "clean": 0, "seen": 0, "failed": 0,
+            "silent": 0, "silent_low": math.inf, "silent_high": -math.inf,
         }  # fmt: skip
+        self._gate = ""
 
     def take(self, u_V: float, y_um: float, verdict: str) -> None:
         """Take one sample in order, with the learner's verdict."""
@@ -138,6 +163,12 @@ class ModelWatch:
             n["u_low"], n["u_high"] = min(n["u_low"], u_V), max(n["u_high"], u_V)
         else:
             n["still"], n["y"], n["u_low"], n["u_high"] = 0, y_um, u_V, u_V
+        if verdict in _NOT_REFUSED or self.trouble not in ("", NOTHING_LEARNT):
+            n["silent"], n["silent_low"], n["silent_high"] = 0, math.inf, -math.inf
+        else:
+            n["silent"] += 1
+            n["silent_low"], n["silent_high"] = min(n["silent_low"], u_V), max(n["silent_high"], u_V)
+            self._gate = verdict
         # A repeated reading belongs to the trouble sensor_frozen.
         bad = 1.0 if verdict in _BAD_VALUES and not n["still"] else 0.0
         n["bad"] += (bad - n["bad"]) * self._dt_s / c.poisoned_s
@@ -151,15 +182,26 @@ class ModelWatch:
         moved = n["u_high"] - n["u_low"] >= c.frozen_share * self._span_V
         if n["still"] * self._dt_s >= c.frozen_s and moved:
             return SENSOR_FROZEN
-        return ""
+        drives = n["silent_high"] - n["silent_low"] >= c.frozen_share * self._span_V
+        return NOTHING_LEARNT if n["silent"] * self._dt_s > c.silent_s and drives else ""
+
+    @property
+    def why(self) -> str:
+        """What is wrong, in words, where the watch itself has found it."""
+        if self.trouble != NOTHING_LEARNT:
+            return ""
+        silent_s = self.config.silent_s
+        return f"no sample for {silent_s:g} s, the last one refused as {self._gate}; the next that passes ends it"
 
     def judge(
-        self, candidate: InverseModel | None, baseline: InverseModel | None, reported: str = "", distrusts: bool = False
-    ) -> InverseModel | None:
+        self, candidate: InverseModel | None, identified: InverseModel | None, reported: str = "",
+        distrusts: bool = False,
+    ) -> InverseModel | None:  # fmt: skip
         """The model to serve: ``candidate`` or one from before; None: keep the present one. Once per snapshot.
 
-        ``candidate`` : the newest model, None if the learner has failed. ``reported`` : the trouble that the learner
-        reports. ``distrusts`` : whether it has the sensor on trial. Sets `trouble` and `trust`.
+        ``candidate`` : the newest model, None if the learner has failed. ``identified`` : the one that it began with.
+        ``reported`` : the trouble that the learner reports. ``distrusts`` : whether it has the sensor on trial.
+        Sets `trouble` and `trust`.
         """
         n, c = self._n, self.config
         now, elapsed = n["count"], n["count"] - n["seen"]
@@ -167,10 +209,8 @@ class ModelWatch:
         found = reported or self._trouble_of_samples()
         if found in SENSOR_FAULTS and self.trouble in (SENSOR_FROZEN, SAMPLES_POISONED):
             found = self.trouble  # the same trouble, already named
-        if not found and candidate is None:
-            found = LEARNER_FAILED
-        if not found and candidate is not None and candidate is not self._good and not self._sane(candidate, baseline):
-            found = MODEL_BAD
+        if not found:
+            found = self._trouble_of_model(candidate, identified)
         if found:
             n["clean"] = 0
             if found != self.trouble:
@@ -186,17 +226,22 @@ class ModelWatch:
                 self.trouble = ""
         if self.trouble in BEGUN_AGAIN and candidate is not None:
             self._mark = self._next_mark = self._good = candidate
-        elif self.trouble and distrusts and candidate is not None and self._sane(candidate, baseline):
+        elif self.trouble and distrusts and candidate is not None and self._sane(candidate, identified):
             # The learner has itself gone back to before the fault, which is better than an old snapshot.
             self._good = candidate
-        if not self.trouble and candidate is not None:
+        if self.trouble in ("", NOTHING_LEARNT) and candidate is not None:
             self._good = candidate
-            if (now - n["marked"]) * self._dt_s >= c.mark_s or self._mark is None:
+            if not self.trouble and ((now - n["marked"]) * self._dt_s >= c.mark_s or self._mark is None):
                 self._mark, self._next_mark, n["marked"] = self._next_mark or candidate, candidate, now
         old = bool(self.trouble) and (now - n["since"]) * self._dt_s > c.last_good_s
         step = elapsed * self._dt_s / c.ramp_s
         self.trust = max(0.0, self.trust - step) if old else min(1.0, self.trust + step)
         return self._good
+
+    def _trouble_of_model(self, candidate: InverseModel | None, identified: InverseModel | None) -> str:
+        if candidate is None:
+            return LEARNER_FAILED
+        return "" if candidate is self._good or self._sane(candidate, identified) else MODEL_BAD
 
     def failed_long(self) -> bool:
         """Whether to replace a failed learner now; call once per snapshot while it has failed."""
@@ -218,12 +263,12 @@ class ModelWatch:
         """Whether the samples may be learnt."""
         return self.trouble not in POISON
 
-    def _sane(self, model: InverseModel, baseline: InverseModel | None) -> bool:
-        """Whether the model is finite over the range and no further from the baseline than drift explains."""
+    def _sane(self, model: InverseModel, identified: InverseModel | None) -> bool:
+        """Whether the model is finite over the range and no further from the identified one than drift explains."""
         low, high = self._limits.y_min_um, self._limits.y_max_um
         if not (math.isfinite(low) and math.isfinite(high)):
             low, high = 0.0, 1.0
-            baseline = None
+            identified = None
         # Up and down over the range: on one branch alone a right model may be at its bound in most places.
         y = low + (high - low) * _SWEEP
         u = voltages_along(model, y)
@@ -233,9 +278,9 @@ class ModelWatch:
             still = np.zeros(y.size)
             if np.mean(model.at_bound(y, still, still, model.rest_memory(float(y[0])), u)) > 0.5:
                 return False
-        if baseline is None:
+        if identified is None:
             return True
-        other = voltages_along(baseline, y)
+        other = voltages_along(identified, y)
         inside = np.isfinite(other)
         return bool((np.abs(u - other)[inside] <= self.config.insane_share * self._span_V).all())
 
@@ -247,7 +292,7 @@ class ModelWatch:
     def check_state(self, values: dict[str, Any]) -> None:
         """Raise ValueError where a count is no number."""
         for name, value in values["_n"].items():
-            if name not in ("y", "u_low", "u_high") and not math.isfinite(value):
+            if name not in ("y", "u_low", "u_high", "silent_low", "silent_high") and not math.isfinite(value):
                 raise ValueError(f"{name}: got {value}, expected a finite number")
 
     def restored(self, state: StateDict, models: dict[str, InverseModel]) -> ModelWatch:
@@ -286,7 +331,7 @@ def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
 def stored_model(state: StateDict, like: InverseModel, what: str) -> InverseModel:
     """The model with ``state`` and its kind. Raises ModelFileError where it cannot stand in the place of ``like``."""
     kind = str(state.get("kind"))
-    if not hasattr(type(like), "KIND"):  # else its own entry
+    if not isinstance(like, Kinded):  # else its own entry
         state.pop("kind", None)
     made = build_model(kind, state, what)
     check_like(made, like, "kind")
@@ -355,9 +400,23 @@ def _same_frame(model: InverseModel, learner: OnlineModel) -> bool:
 # champion as ``auto``: the model that answers where a query names none.
 
 
+#: Largest distance, in learnt spans, at which the stand-in answers alone.
+MOST_BLEND_SHARE: Final = 100.0
+
+
 def champion_of(learner: OnlineModel | None) -> dict[str, InverseModel]:
     """The champion under its name; empty without a competition."""
     return {AUTO: learner.champion_model()} if isinstance(learner, Competition) else {}
+
+
+def blend_share_of(learner: OnlineModel | None, stand_in: str, least: float) -> float:
+    """Distance outside the learnt domain, in learnt spans, at which ``stand_in`` answers alone; at least ``least``.
+
+    Twice the distance at which the learner is as uncertain as the stand-in has been wrong: the model with the smaller
+    error on this stage answers.
+    """
+    reach = learner.reach(stand_in) if isinstance(learner, Competition) else 0.0
+    return max(least, min(2.0 * reach, MOST_BLEND_SHARE))
 
 
 def standing_of(learner: OnlineModel | None) -> dict[str, Any] | None:
@@ -369,8 +428,6 @@ def standing_of(learner: OnlineModel | None) -> dict[str, Any] | None:
 
 #: Interval at which the learner's state is kept to go back to while there is no trouble, s of samples.
 MARK_S: Final = 1.0
-#: Verdict on samples that nobody learns from.
-NOT_LEARNING: Final = "not_learning"
 
 #: Starts a learner from a model, after the one before has failed.
 Revive = Callable[[InverseModel], OnlineModel]
@@ -456,7 +513,7 @@ class LearnerSupervisor:
         alive = not self._failed
         reported, distrusts = (self.learner.trouble, self.learner.distrusts) if alive else ("", False)
         before = self.watch.trouble
-        good = self.watch.judge(candidate, last.models.get(last.stand_in), reported, distrusts)
+        good = self.watch.judge(candidate, self.learner.base, reported, distrusts)
         now = self.watch.trouble
         if not now and not before:
             self._mark(self.learner, received)
@@ -577,7 +634,8 @@ class LearnerSupervisor:
         if not now:
             self._note("recovered", before)
             return
-        why = f" ({self.learner.why})" if reported and self.learner is not None else ""
+        why = self.learner.why if reported and self.learner is not None else self.watch.why
+        why = f" ({why})" if why else ""
         served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
         widen = f"; {_WIDEN[now]}" if now in _WIDEN else ""
         self._note("trouble", f"{now}{why}: {served} is served, then {stand_in or 'nothing else'}{widen}")

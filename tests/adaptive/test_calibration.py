@@ -38,10 +38,10 @@ GAIN_STEP: tuple[ParameterChange, ...] = ((6.0, {"gain_drift.gain": -0.06}),)
 ONE, INTERVAL_95 = 1.0, 1.96
 #: (least, most) share within the one, and within the other.
 Limits = tuple[tuple[float, float], tuple[float, float]]
-TEST_SIGNAL: Limits = ((0.57, 0.66), (0.92, 0.975))
-OTHER_BAND: Limits = ((0.69, 0.88), (0.94, 0.99))
+TEST_SIGNAL: Limits = ((0.55, 0.66), (0.92, 0.975))
+OTHER_BAND: Limits = ((0.69, 0.93), (0.94, 0.995))
 SERVED_BASELINE: Limits = ((0.62, 0.81), (0.9, 1.0))
-LEARNING: Limits = ((0.72, 0.86), (0.93, 0.985))
+LEARNING: Limits = ((0.72, 0.86), (0.93, 0.992))
 #: Of the measured stack; its held-out end is so like what was learnt that the interval is nearly twice too wide there.
 HELD_OUT_END: Limits = ((0.85, 0.97), (0.97, 1.0))
 OTHER_RECORDING: Limits = ((0.65, 0.79), (0.88, 0.97))

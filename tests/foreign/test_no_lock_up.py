@@ -58,7 +58,7 @@ TONES = ((0.22, 1.0, 0.3), (0.10, 2.0, 1.1), (0.05, 4.0, 2.0), (0.02, 7.0, 0.5))
 PERIOD, WINDOW = 1000, 500
 #: By how much the error may be larger than before, times and as a share of the range, after two and three seconds.
 FACTOR = 1.1
-SOUND, WRONG = {2.0: 1.0e-3, 3.0: 0.5e-3}, {2.0: 20e-3, 3.0: 1.0e-3}
+SOUND, WRONG = {2.0: 1.5e-3, 3.0: 0.5e-3}, {2.0: 20e-3, 3.0: 1.0e-3}
 #: No event changes the stage by more than this in all.
 MOST_GAIN, MOST_ZERO = 1.2, 0.1
 #: The largest jump of the count leaves room for numbers after it.

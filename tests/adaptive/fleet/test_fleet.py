@@ -193,35 +193,6 @@ def doctor(fleet: Fleet, singles: list[Learner], axis: int, beta: np.ndarray) ->
     fleet.load_axis(axis, doctored)
 
 
-def test_a_learnt_gain_that_no_stage_has_is_taken_back_as_in_a_single_learner(models: list[LssvmInverse]) -> None:
-    """By the check within the batch, at the first instant that is due, on its axis alone."""
-    config, at = LearnerConfig(window=60), 2500
-    u, y = small_motion(3500)
-    fleet, singles = Fleet(models, FleetConfig(config)), [Learner(model, config) for model in models]
-    compare(fleet, singles, 0, u[:, :at], y[:, :at], 250)
-    learnt = [single.parts.filter.beta.copy() for single in singles]
-    for axis in (1, 2):
-        doctor(fleet, singles, axis, 2.0 * learnt[axis])
-        assert not singles[axis].parts.gain_is_possible
-    # A sample takes them back into the batch: what is found there is found by the fleet's own check. Outcomes are
-    # compared alone: a frozen axis serves what it served before, a single learner its confirmed estimate.
-    compare(fleet, singles, at, u[:, at : at + 1], y[:, at : at + 1], 2, gaps=False)
-    assert fleet.apart == {}
-    compare(fleet, singles, at + 1, u[:, at + 1 : at + 11], y[:, at + 1 : at + 11], 11, gaps=False)
-    for axis, single in enumerate(singles):
-        assert fleet.learner_of(axis).counters()["distrusts"] == single.counters()["distrusts"] == int(axis in (1, 2))
-        beta = fleet.learner_of(axis).parts.filter.beta
-        np.testing.assert_allclose(beta, single.parts.filter.beta, rtol=0.0, atol=ALIKE)
-        np.testing.assert_allclose(beta, learnt[axis], rtol=0.0, atol=0.01 * models[axis].span_V)
-    # The readings are those of the stages: the trials end well.
-    fleet.freeze([1, 2], False)
-    for axis in (1, 2):
-        singles[axis].thaw()
-    compare(fleet, singles, at + 11, u[:, at + 11 :], y[:, at + 11 :], 50)
-    assert fleet.troubles() == {}
-    assert [fleet.learner_of(axis).counters()["begun_again"] for axis in range(4)] == [0, 0, 0, 0]
-
-
 def test_a_model_that_leaves_its_envelope_ends_in_the_identified_one_as_in_a_single_learner(
     models: list[LssvmInverse],
 ) -> None:

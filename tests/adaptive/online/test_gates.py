@@ -31,7 +31,7 @@ CONFIG = AdmissionConfig(u_min_V=0.0, u_max_V=8.0, y_min_um=-1.0, y_max_um=90.0)
 
 
 def state(**changes: float) -> AdmissionState:
-    made = AdmissionState(seq=10, t_s=0.010, since_start=1000, since_jump=1000, since_step=1000)
+    made = AdmissionState(seq=10, t_s=0.010, since_start=1000, since_jump=1000)
     for name, value in changes.items():
         setattr(made, name, value)
     return made
@@ -83,8 +83,9 @@ def test_what_is_usual_is_no_surprise() -> None:
         gates.watch_innovation(CONFIG, s, 0.0005)
     assert gates.surprise(CONFIG, s, 8.0) == pytest.approx(CONFIG.surprise_sigma * 0.0005, rel=0.02)
     for _ in range(20_000):
-        gates.watch_innovation(CONFIG, s, 0.5)
-    assert gates.surprise(CONFIG, s, 8.0) == CONFIG.glitch_share
+        gates.watch_innovation(CONFIG, s, 0.05)
+    # However large: where the smoother is wrong again and again, the motion is so fast, and nothing is a glitch.
+    assert gates.surprise(CONFIG, s, 8.0) == pytest.approx(CONFIG.surprise_sigma * 0.05, rel=0.02)
 
 
 def test_glitches_hardly_raise_what_is_usual() -> None:
@@ -101,25 +102,25 @@ def test_a_slow_sample_rate_widens_what_is_no_surprise() -> None:
         assert CONFIG.at(dt_s).glitch_share == pytest.approx(factor * CONFIG.glitch_share)
 
 
-def test_a_commanded_step_is_no_surprise() -> None:
+def test_a_commanded_step_is_no_surprise_and_stops_no_learning() -> None:
     s = state(u_V=4.0, u_before_V=4.0)
-    gates.watch_voltage(CONFIG, s, 4.001, 8.0)
+    before = gates.surprise(CONFIG, s, 8.0)
+    gates.watch_voltage(s, 4.5)
+    assert gates.surprise(CONFIG, s, 8.0) > before + 0.5 / 8.0
     assert not gates.settling(CONFIG, s)
-    gates.watch_voltage(CONFIG, s, 4.5, 8.0)
-    assert gates.settling(CONFIG, s)
-    for _ in range(CONFIG.settle + 2):
-        gates.watch_voltage(CONFIG, s, 4.5, 8.0)
-    assert not gates.settling(CONFIG, s)
+    for _ in range(100):
+        gates.watch_voltage(s, 4.5)
+    assert gates.surprise(CONFIG, s, 8.0) == pytest.approx(before, rel=1e-2)
 
 
 def test_a_small_kink_of_the_voltage_widens_the_limit_for_a_while() -> None:
     s = state(u_V=4.0, u_before_V=4.0)
-    gates.watch_voltage(CONFIG, s, 4.016, 8.0)
+    gates.watch_voltage(s, 4.016)
     assert not gates.settling(CONFIG, s)
     limits = []
     for _ in range(40):
         limits.append(gates.surprise(CONFIG, s, 8.0))
-        gates.watch_voltage(CONFIG, s, 4.016, 8.0)
+        gates.watch_voltage(s, 4.016)
     assert limits[0] == pytest.approx(CONFIG.surprise_share + gates.KINK_SHARE * 0.002)
     assert limits[-1] < 1.05 * CONFIG.surprise_share
 
@@ -428,26 +429,6 @@ def test_a_model_that_has_left_its_envelope_ends_in_the_identified_one(
     assert 700 < told.count(MODEL_LEFT_ENVELOPE) < 1300
     assert set(told[1300:]) == {""}
     assert learner.counters()["begun_again"] == 1
-    assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
-
-
-def test_a_learnt_gain_that_no_stage_has_is_taken_back_at_once(
-    model: LssvmInverse, all_strokes: Recording, warm: StateDict
-) -> None:
-    """Not after the 0.1 s for which the voltage may be far off: where the stage moves little it never is."""
-    learner = Learner.from_state(warm)
-    learner.freeze()  # or it would find its way by itself, slowly
-    before = learner.parts.filter.beta.copy()
-    doubled(learner)
-    assert not learner.parts.gain_is_possible
-    feed(learner, all_strokes, AT, AT + 10)
-    assert learner.counters()["distrusts"] == 1
-    assert np.allclose(learner.parts.filter.beta, before, rtol=0.0, atol=0.01 * model.span_V)
-    # The readings are those of the stage: the trial that has begun ends well.
-    learner.thaw()
-    feed(learner, all_strokes, AT + 10, AT + 1000)
-    assert learner.trouble == ""
-    assert learner.counters()["begun_again"] == 0
     assert learner.diagnostics()["recent_rms_error_pct"] < 0.3
 
 

@@ -887,11 +887,12 @@ def test_the_identified_model_is_served_once_the_last_estimate_may_have_moved_as
     assert [alone for t_s, alone in served] == [
         min(MOVES * moved_V * max(1.0, t_s / moved_s), most_V) >= error_V for t_s, _ in served
     ]
-    assert served[10][1] == (share > 0.5)
-    assert served[-1][1] == (share > 0.1)
+    if fault == "sign_rest":  # a stuck reading makes the error of the identified model grow before it has its name
+        assert served[10][1] == (share > 0.5)
+        assert served[-1][1] == (share > 0.1)
     feed(learner, (u, y), at + 1500, at + 1500 + BACK)
     assert not learner.distrusts
-    assert not np.array_equal(learner.snapshot().beta, model.beta)
+    assert learner.parts.judgement.fallback == np.array_equal(learner.snapshot().beta, model.beta)
 
 
 def test_a_model_that_has_lost_its_credit_judges_no_sensor_until_it_reckons_right_again(

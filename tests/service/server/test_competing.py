@@ -359,7 +359,7 @@ def test_what_takes_too_long_is_ended_and_counted(
     assert "timeout_s" in status["last"]["detail"]
 
 
-@pytest.mark.parametrize("retuner", [{"period_s": 1.0}], indirect=True)
+@pytest.mark.parametrize("retuner", [{"period_s": 1.0, "fresh": 200}], indirect=True)
 @pytest.mark.alone
 def test_it_begins_by_itself_while_the_stage_moves_and_not_at_rest(
     bundle: Bundle, recorded: tuple[np.ndarray, np.ndarray], retuner: Retuner
