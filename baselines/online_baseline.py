@@ -318,9 +318,9 @@ class LeastSquaresOnline(OnlineBaseline):
     _pending: Annotated[FloatArray, Entry("part of a row that depends on the voltage", "", "pending|0")]
 
     @property
+    @abstractmethod
     def pending_size(self) -> int:
         """Number of regressors that depend on the voltage."""
-        raise NotImplementedError
 
     @property
     def sizes(self) -> dict[str, int]:
