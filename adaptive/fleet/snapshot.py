@@ -84,8 +84,9 @@ def _pack(
         out[4], out[5], out[6] = r.window.kernel_variance, 1.0 / (1.0 + 1.0 / F[b, GAMMA]), f.allowed_V
         out[7:13:2] = s.domain[b, ::2] - margin * span
         out[8:13:2] = s.domain[b, 1::2] + margin * span
-        beta[:], inverse_widths[:], alpha[:] = s.beta[b], widths[b], V[b, ALPHA, :n]
-        beta[0] += F[b, BETA]
+        share = r.window.share
+        beta[:], inverse_widths[:], alpha[:] = s.beta[b], widths[b], share * V[b, ALPHA, :n]
+        beta[0] += share * F[b, BETA]
         scaled[:] = support[b, :, :n]
         if bounded:
             out[at : at + beta.size] = c.beta[b]

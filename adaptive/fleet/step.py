@@ -20,7 +20,7 @@ from adaptive.online import gates, intake, learner
 from adaptive.online.drift import RestCreep, update
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.kernel_window import NOWHERE, WeightConfig
+from adaptive.online.kernel_window import NOWHERE, KernelShare, WeightConfig
 from adaptive.online.kernel_window import due as window_due
 from adaptive.online.learner import Judgement
 from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following
@@ -39,7 +39,7 @@ ODD: Final = -4
 _judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
 _follow, _rest_shift_um, _leave_rest, _weight_of = Following.take, RestCreep.shift_um, RestCreep.leave, WeightConfig.of
 _note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
-_forget_slopes = Following.forget_slopes
+_forget_slopes, _weigh = Following.forget_slopes, KernelShare.take
 _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
     OUTCOMES.index(name)
     for name in (gates.FROZEN, gates.OUTLIER, gates.NUMERICS, gates.SATURATED, gates.UNEXCITED, gates.LEARNT)
@@ -209,7 +209,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
         t["weight"] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
         if now % config.filter_every == 0:
-            target = u - kernel_V[k]
+            target = u - r.window.share * kernel_V[k]
             if not isfinite(target):
                 t["outcome"] = _NUMERICS
                 continue
@@ -225,7 +225,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
             if r.frozen:
                 t["outcome"] = _FROZEN
                 continue
-            weight = t.weight
+            weight, left_V = t.weight, u - dot(h, s.beta[b], p)
             said = update(
                 config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
                 target, not rests, weight, gain, row,
@@ -242,6 +242,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
                 s.frames[b, 0] = served.offset_um
             else:
                 _leave_rest(r.rest)
+                _weigh(r.window, kernel_V[k], left_V, config.step_s)
             t["outcome"] = _UNEXCITED if rests else _LEARNT
             if not rests and r.judgement.valid:
                 for i in range(2):

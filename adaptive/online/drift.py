@@ -144,12 +144,15 @@ def update_constant(
 class DriftConfig:
     """Process noise of each direction (standard deviation after one second), measurement noise, and detection limits.
 
-    All but ``gain_*``, ``burst_ratio`` and ``gate_*`` are shares of the model's voltage span.
+    All but ``gain_*``, ``alike_s``, ``burst_ratio`` and ``gate_*`` are shares of the model's voltage span.
 
     gain_walk : relative change of the whole linear part. offset_walk : change of the constant.
     motion_walk : change of the velocity and acceleration coefficients, at full scale of the feature map.
     shape_walk : change of all other coefficients.
-    noise : standard deviation of one measurement; larger than the sensor's, since model errors are correlated in time.
+    noise : least standard deviation of one measurement; larger than the sensor's, since model errors are correlated in
+    time. alike_s : time within which they are alike, s: the variance of one measurement is the long-term mean square
+    innovation times the measurements within it. A stage whose model is wrong by much is so learnt more slowly, and its
+    measurements are no outliers.
     burst_gain, burst_offset, burst_motion : standard deviations that are added when a sudden change is detected.
     burst_ratio : detection threshold: short-term over long-term mean square innovation.
     burst_floor : an rms innovation below this is never a change.
@@ -160,8 +163,9 @@ class DriftConfig:
     gain_walk: float = 0.005
     offset_walk: float = 0.005
     motion_walk: float = 0.00125
-    shape_walk: float = 0.000125
+    shape_walk: float = 0.000375
     noise: float = 0.0013
+    alike_s: float = 0.01
     burst_gain: float = 0.03
     burst_offset: float = 0.005
     burst_motion: float = 0.0025
@@ -227,7 +231,7 @@ def update(
     else:
         P[0, 0] += walks[0]
         innovation, variance = innovation_of(x, P, basis, target_V, row)
-    noise_V2 = (c.noise * span_V) ** 2 / weight
+    noise_V2 = max((c.noise * span_V) ** 2, c.alike_s / step_s * s.slow_V2) / weight
     if innovation * innovation > c.gate_sigma**2 * (variance + noise_V2) and s.rejected < c.gate_persistence:
         s.rejected += 1
         return "outlier"

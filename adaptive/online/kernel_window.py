@@ -94,6 +94,32 @@ class Turn:
     next: Annotated[int, Entry("slots from this on may hold some, -1 for none", low=NOWHERE)] = NOWHERE
 
 
+#: Time over which the share of the kernel part is taken, s: a stroke of a usual motion.
+SHARE_S = 0.5
+
+
+@dataclass(slots=True)
+class KernelShare:
+    """How much of the kernel part the last measurements bear out: its least-squares factor, from 0 to 1.
+
+    The kernel part is local: it can be of another motion than the present one. Then it is noise to the linear part,
+    which learns faster without it.
+    """
+
+    product_V2: Annotated[float, Entry("mean product of the kernel part and what the linear part leaves", "V²")]
+    square_V2: Annotated[float, Entry("mean square of the kernel part", "V²", low=0.0)]
+    share: Annotated[float, Entry("share of the kernel part that is served", low=0.0, high=1.0)] = 1.0
+
+    @shared
+    def take(self, kernel_V: float, left_V: float, step_s: float) -> None:
+        """Take one measurement: the kernel part there, and what the linear part leaves of the voltage, V."""
+        fast = min(1.0, step_s / SHARE_S)
+        self.product_V2 += (kernel_V * left_V - self.product_V2) * fast
+        self.square_V2 += (kernel_V * kernel_V - self.square_V2) * fast
+        if self.square_V2 > 0.0:
+            self.share = min(max(self.product_V2 / self.square_V2, 0.0), 1.0)
+
+
 @dataclass(slots=True)
 class KernelState:
     """What a `ResidualWindow` holds beside the arrays of its solver."""
@@ -101,6 +127,7 @@ class KernelState:
     born: Annotated[IntArray, Entry("step that each sample came with", "", "N")]
     own_weights: Annotated[FloatArray, Entry("weight that each sample came with", "", "N")]
     turn: Annotated[Turn, Entry("place in the window", name="")]
+    share: Annotated[KernelShare, Entry("how much of the kernel part counts", name="")]
     kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)]
     gamma: Annotated[float, Entry("regularisation", low=0.0)]
     widths: Annotated[tuple[float, ...], Entry("kernel widths", "", "d", low=1e-100)]
@@ -195,6 +222,7 @@ class ResidualWindow:
         # The weights that samples came with, before they faded.
         self._own = np.ones(capacity)
         self._turn = Turn()
+        self._share = KernelShare(0.0, 0.0)
 
     @classmethod
     def from_model(
@@ -209,6 +237,7 @@ class ResidualWindow:
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
+            made._share.product_V2 = made._share.square_V2 = float(np.mean(made._at_samples_V**2))
         return made
 
     @classmethod
@@ -241,8 +270,13 @@ class ResidualWindow:
     @property
     def reach_V(self) -> float:
         """Largest size of the kernel part at the samples of a window that was just made from a model, V."""
-        window, gamma = self._window, self._config.gamma
-        return float(np.max(np.abs(window.y - window.alpha / gamma), initial=0.0))
+        return float(np.max(np.abs(self._at_samples_V), initial=0.0))
+
+    @property
+    def _at_samples_V(self) -> FloatArray:
+        """(n,) kernel part at the samples of such a window."""
+        at: FloatArray = self._window.y - self._window.alpha / self._config.gamma
+        return at
 
     @property
     def residual_V(self) -> float:
@@ -254,9 +288,22 @@ class ResidualWindow:
         """The form in use, ``inverse`` or ``cholesky``."""
         return self._window.form
 
-    def mean(self, kernel: FloatArray) -> float:
-        """Prediction at one point (d,), V."""
+    @property
+    def share(self) -> float:
+        """Share of the kernel part that is served, 0 to 1; see `KernelShare`."""
+        return self._share.share
+
+    def predict(self, kernel: FloatArray) -> float:
+        """The whole kernel part at one point (d,), V."""
         return self._window.predict(kernel)
+
+    def mean(self, kernel: FloatArray) -> float:
+        """The share of it that is served, V."""
+        return self._share.share * self._window.predict(kernel)
+
+    def weigh(self, kernel_V: float, left_V: float, step_s: float) -> None:
+        """Take one measurement for the share; see `KernelShare.take`."""
+        self._share.take(kernel_V, left_V, step_s)
 
     def learn(self, kernel: FloatArray, target_V: float, weight: float = 1.0) -> str:
         """Learn one sample with a noise weight. Returns "learnt", or "numerics" where the step was refused and undone.
@@ -293,8 +340,9 @@ class ResidualWindow:
         let_go(self._window.arrays, self._turn, most, self._born, self._own)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
-        """Kernel inputs (n, d), dual weights (n,) and bias, V. Copies."""
-        return self._window.X, self._window.alpha, self._window.bias
+        """Kernel inputs (n, d), dual weights (n,) and bias, V, of the share that is served. Copies."""
+        share = self._share.share
+        return self._window.X, share * self._window.alpha, share * self._window.bias
 
     def counters(self) -> dict[str, int]:
         """Events of the window's numerics; see `Window.counters`."""
@@ -330,7 +378,7 @@ class ResidualWindow:
         made = object.__new__(ResidualWindow)
         c = self._config
         made.eviction, made._turn, made._born = self.eviction, replace(self._turn), self._born.copy()
-        made._own = self._own.copy()
+        made._own, made._share = self._own.copy(), replace(self._share)
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
@@ -352,7 +400,10 @@ class ResidualWindow:
     def state_dict(self, arrays: bool = True) -> StateDict:
         """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
         c, healing = self._config, self._healing.state()
-        kept = (self._born.copy(), self._own.copy(), self._turn, self.kernel_variance, c.gamma, c.widths, healing)
+        kept = (
+            self._born.copy(), self._own.copy(), self._turn, self._share,
+            self.kernel_variance, c.gamma, c.widths, healing,
+        )  # fmt: skip
         return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
 
     def read(self, values: StateDict, arrays: bool = True) -> KernelState:
@@ -372,5 +423,5 @@ class ResidualWindow:
         solver = state.solver if isinstance(state, KernelSolverState) else None
         self._window = Window(self._config, kept) if solver is None else Window.of(self._config, solver)
         self._healing = Healing.of(self._window, state.healing)
-        self._born, self._own, self._turn = state.born, state.own_weights, state.turn
+        self._born, self._own, self._turn, self._share = state.born, state.own_weights, state.turn, state.share
         self.kernel_variance = state.kernel_variance

@@ -294,14 +294,17 @@ class Parts:
         self.filter.expect_change()
         self.window.expect_change()
 
-    def follow(self, basis: FloatArray, target_V: float, pair: Pair, weight: float, rest: bool) -> bool:
-        """One step of the filter with ``target_V`` at basis (p,) of ``pair``; False for an outlier, not learnt then.
+    def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, weight: float, rest: bool) -> bool:
+        """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
-        ``rest`` : whether the stage is at rest.
+        ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
         """
-        said = self.filter.update(basis, target_V, not rest, weight)
+        left_V = pair.u_V - float(basis.dot(self.filter.beta))
+        said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest, weight)
         if said == "outlier":
             return False
+        if not rest:
+            self.window.weigh(kernel_V, left_V, self.filter.step_s)
         if said == "burst":
             self.window.expect_change()
         if self.judgement.valid and not self.intake.on_probation:
@@ -683,7 +686,8 @@ class Learner:
         weight = c.weights.of(pair.near_bad, intake.on_probation, a_share)
         outcome = refused or admission.PASSED
         if filter_due:
-            target = pair.u_V - parts.window.mean(parts.point)
+            kernel_V = parts.window.predict(parts.point)
+            target = pair.u_V - parts.window.share * kernel_V
             beta = parts.filter.beta
             if not isfinite(target):
                 return admission.NUMERICS
@@ -704,7 +708,7 @@ class Learner:
             self._cache = None
             if intake.stands_still:
                 return admission.UNTRUSTED
-            if not parts.follow(self._basis, target, pair, weight, rest):
+            if not parts.follow(self._basis, kernel_V, pair, weight, rest):
                 return admission.OUTLIER
             outcome = admission.UNEXCITED if rest else admission.LEARNT
         if refused:
