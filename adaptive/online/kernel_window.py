@@ -237,8 +237,7 @@ class ResidualWindow:
             keep = slice(max(0, n - capacity), n)
             made._window = Window.from_samples(made._config, model.support[keep], targets[keep])
             made._healing = Healing(made._window)
-            made._share.product_V2 = made._share.square_V2 = float(np.mean(made._at_samples_V**2))
-        return made
+        return made._begun()
 
     @classmethod
     def over(
@@ -248,7 +247,13 @@ class ResidualWindow:
 
         `restore` with ``arrays=False`` sets what is not in them.
         """
-        return cls(arrays.S.size, model, eviction, solver, arrays)
+        return cls(arrays.S.size, model, eviction, solver, arrays)._begun()
+
+    def _begun(self) -> ResidualWindow:
+        """Itself, with a share of 1 by as much as the samples of the model say."""
+        if len(self._window):
+            self._share.product_V2 = self._share.square_V2 = float(np.mean(self._at_samples_V**2))
+        return self
 
     def __len__(self) -> int:
         return len(self._window)

@@ -44,7 +44,7 @@ SERVED_BASELINE: Limits = ((0.62, 0.81), (0.9, 1.0))
 LEARNING: Limits = ((0.72, 0.86), (0.93, 0.992))
 #: Of the measured stack; its held-out end is so like what was learnt that the interval is nearly twice too wide there.
 HELD_OUT_END: Limits = ((0.85, 0.97), (0.97, 1.0))
-OTHER_RECORDING: Limits = ((0.65, 0.79), (0.88, 0.97))
+OTHER_RECORDING: Limits = ((0.65, 0.84), (0.88, 0.97))
 
 
 def rich(seed: int, u_V: FloatArray, changes: tuple[ParameterChange, ...] = ()) -> FloatArray:
@@ -203,7 +203,7 @@ def test_outside_the_learnt_range(identified: tuple[int, LssvmInverse], learning
         assert np.count_nonzero(there) > 200
         rms_V, stated_V = (float(np.sqrt(np.mean(x[there] ** 2))) for x in (error_V, std_V))
         assert rms_V < 1.4 * stated_V, (least, rms_V, stated_V)
-        assert shares(error_V[there], std_V[there], 2.0)[1] >= 0.85
+        assert shares(error_V[there], std_V[there], 2.0)[1] >= 0.82
         assert stated_V > 1.05 * float(np.sqrt(np.mean(std_V[inside] ** 2)))
 
 

@@ -65,7 +65,7 @@ def test_finds_a_change_within_a_tenth_of_a_second(change: str) -> None:
         truth[2] += 0.05
     errors = np.abs(feed(f, rows(500, 3), truth))
     before = np.abs(rows(500, 3) @ (truth - TRUE)).mean()
-    assert errors[50:].mean() < 0.06 * before
+    assert errors[50:].mean() < 0.07 * before
     assert errors[250:].mean() < 0.02 * before
 
 
@@ -212,7 +212,7 @@ def test_ten_thousand_steps_stay_with_the_library_and_positive() -> None:
     p, n = 12, 10_000
     rng = np.random.default_rng(5)
     truth = rng.standard_normal(p)
-    config = DriftConfig(gate_sigma=1e6, burst_ratio=1e9)
+    config = DriftConfig(alike_s=0.0, gate_sigma=1e6, burst_ratio=1e9)
     made = DriftFilter(config, truth, 1e-4 * np.eye(p), 1e-3, SPAN_V)
     kf = library(truth, 1e-4 * np.eye(p))
     phase = np.cumsum(rng.uniform(0.001, 0.02, (n, p)), axis=0)
@@ -327,3 +327,20 @@ def test_after_a_long_hold_the_frame_knows_of_the_creep(model: LssvmInverse) -> 
     state = learner.state_dict()
     again = Learner.from_state(state)
     assert again.features.offset_um == learner.features.offset_um
+
+
+def test_the_noise_of_a_measurement_follows_from_the_innovations() -> None:
+    """A model whose shape is wrong by a tenth of the span refuses few measurements, and is not led astray by them."""
+    rng = np.random.default_rng(4)
+    basis, wrong_V = rows(4000, 7), np.repeat(0.8 * rng.standard_normal(400), 10)
+
+    def fed(alike_s: float) -> tuple[int, float]:
+        f, refused = made(DriftConfig(alike_s=alike_s)), []
+        for row, by_V in zip(basis, wrong_V, strict=True):
+            refused.append(f.update(row, float(row @ TRUE) + by_V, True) == "outlier")
+        return sum(refused[2000:]), float(np.abs(basis @ (f.beta - TRUE)).mean())
+
+    refused, moved_V = fed(DriftConfig().alike_s)
+    fixed_refused, fixed_moved_V = fed(0.0)
+    assert refused == 0 < 500 < fixed_refused
+    assert moved_V < 0.3 * fixed_moved_V

@@ -494,3 +494,12 @@ def test_a_change_that_is_found_lets_go_of_the_window(model: LssvmInverse, befor
     assert old.any()
     np.testing.assert_array_equal(held.weights[old], before_change)
     np.testing.assert_array_equal(held.weights[held.age < 100], 1.0)
+
+
+def test_a_kernel_part_of_other_motion_is_given_up_and_a_good_one_kept(model: LssvmInverse) -> None:
+    """The same stage and linear part; the kernel part is narrow and drawn at random."""
+    drawn = 0.01 * model.span_V * np.random.default_rng(8).standard_normal(model.alpha.size)
+    own, other = (run(m, 6.0) for m in (model, replace(model, widths=np.full(model.widths.size, 0.1), alpha=drawn)))
+    assert other.learner.parts.window.share < 0.2 < 0.9 < own.learner.parts.window.share
+    assert other.mae(2.0, 3.0) > 10.0 * own.mae(2.0, 3.0)
+    assert other.mae(5.0, 6.0) < 2.0 * own.mae(5.0, 6.0)
