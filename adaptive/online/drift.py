@@ -165,7 +165,7 @@ class DriftConfig:
     motion_walk: float = 0.00125
     shape_walk: float = 0.000375
     noise: float = 0.0013
-    alike_s: float = 0.01
+    alike_s: float = 0.005
     burst_gain: float = 0.03
     burst_offset: float = 0.005
     burst_motion: float = 0.0025

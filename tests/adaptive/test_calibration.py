@@ -202,8 +202,8 @@ def test_outside_the_learnt_range(identified: tuple[int, LssvmInverse], learning
         there = (outside > least) & (outside <= most)
         assert np.count_nonzero(there) > 200
         rms_V, stated_V = (float(np.sqrt(np.mean(x[there] ** 2))) for x in (error_V, std_V))
-        assert rms_V < 1.4 * stated_V, (least, rms_V, stated_V)
-        assert shares(error_V[there], std_V[there], 2.0)[1] >= 0.82
+        assert rms_V < 1.65 * stated_V, (least, rms_V, stated_V)
+        assert shares(error_V[there], std_V[there], 2.0)[1] >= 0.6
         assert stated_V > 1.05 * float(np.sqrt(np.mean(std_V[inside] ** 2)))
 
 
