@@ -29,7 +29,7 @@ from service.protocol import query as wire_reply
 from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
 from service.protocol.keys import Keys
-from service.security.peers import PeerSecret
+from service.security.authenticator import Authenticator
 from service.stage_node.faults import decode_fault
 from service.storage import checkpoint
 
@@ -118,14 +118,14 @@ def _parts(data: bytes) -> None:
 
 
 def _claims() -> Target:
-    """Keys of liveliness tokens: whatever they say, nobody who lacks the secret has a claim."""
+    """Keys of liveliness tokens: whatever they say, nobody who lacks the key has a claim."""
     keys = Keys("demo", "x")
-    claims = Claims(keys, "i-me", PeerSecret(b"0123456789abcdef"))
+    claims = Claims(keys, "i-me", Authenticator(b"0123456789abcdef"))
 
     def target(data: bytes) -> None:
         claims.update(f"{keys.base}/claim/{data.decode(errors='replace')}", True)
         if claims.highest() is not None or claims.next_epoch() != 1:
-            raise AssertionError("a claim without proof was believed")
+            raise AssertionError("a claim without a tag was believed")
 
     return target
 
