@@ -20,7 +20,7 @@ from adaptive.inverse_model import LssvmInverse
 from benchmarks.forged_states import edited, make_axis, recording
 from benchmarks.small_models import small_models
 from service.failover.role_control import Claims
-from service.failover.state_transfer import join_parts
+from service.failover.state_transfer import joined
 from service.operating.verbs import Request, decode_request, encode_request
 from service.protocol import delta as wire_delta
 from service.protocol import model as wire_model
@@ -109,7 +109,7 @@ def _changing() -> Target:
 def _parts(data: bytes) -> None:
     """Parts of a state, each of up to three bytes after its header: joined if complete, else nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
-    whole = join_parts((piece[:8], piece[8:]) for piece in pieces)
+    whole = next(joined(("sender", piece) for piece in pieces), None)
     if whole is None:
         return
     of = int.from_bytes(pieces[0][4:8], "little")

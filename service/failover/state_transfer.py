@@ -76,23 +76,47 @@ def fetch_state(
     )
     signed = unsigned = 0
 
-    def parts() -> Iterator[tuple[str, bytes, bytes]]:
+    def parts() -> Iterator[tuple[str, bytes]]:
         """Whoever else answers must not even be waited for."""
         nonlocal signed, unsigned
         for reply in _until_silent(replies, _SILENCE_S + _SILENCE_PAUSES * pause_s):
-            if reply.ok is None:
-                yield str(reply.replier_id), b"", b""
-            elif (right := question.answer(reply.ok)) is None:
-                unsigned += 1
-            else:
-                signed += 1
-                yield str(reply.replier_id), right.payload[: _PLACE.size], right.payload[_PLACE.size :]
+            right = None if reply.ok is None else question.answer(reply.ok)
+            signed += right is not None
+            unsigned += right is None and reply.ok is not None
+            if right is not None or reply.ok is None:  # an error reply is a part that fits nowhere
+                yield str(reply.replier_id), b"" if right is None else right.payload
 
-    for data in joined_by_sender(parts()):
+    for data in joined(parts()):
         return data
     if unsigned and not signed:
         raise ServiceError(f"{key}: a state came from somebody who does not know the key, or is of another release")
     return None
+
+
+def joined(parts: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
+    """What each sender has sent, as soon as it is whole, from (sender, part with its place) in any mixture.
+
+    Ends `_OTHERS_S` after the first part where no sender is left whose parts fit together.
+    """
+    came: dict[str, list[bytes]] = {}
+    counts: dict[str, int] = {}
+    until_s = math.inf
+    for sender, part in parts:
+        until_s = min(until_s, time.monotonic() + _OTHERS_S)
+        if came and not any(counts.values()) and time.monotonic() > until_s:
+            return
+        if sender in came or len(came) < _MOST_SENDERS:
+            had = came.setdefault(sender, [])
+            i, n = _PLACE.unpack_from(part) if len(part) >= _PLACE.size else (-1, 0)
+            fits = i == len(had) < n <= _MAX_PARTS and counts.setdefault(sender, n) == n
+            if not fits or len(part) > _PLACE.size + _PART_BYTES:
+                counts[sender] = 0  # none of its parts fits any more
+                had.clear()
+                continue
+            had.append(part[_PLACE.size :])
+            if len(had) == n:
+                yield b"".join(had)
+                counts[sender] = 0
 
 
 def tell_standbys(
@@ -149,59 +173,3 @@ def _until_silent(
             continue
         last_s = time.monotonic()
         yield reply
-
-
-class PartJoiner:
-    """Joins the parts of one sender.
-
-    Attributes
-    ----------
-    spoilt : whether a part is missing or malformed. done : whether the whole has come.
-    """
-
-    def __init__(self) -> None:
-        self.spoilt = self.done = False
-        self._joined, self._taken, self._total = bytearray(), 0, 0
-
-    def take(self, place: bytes, part: bytes) -> bytes | None:
-        """The whole after its last part, given with its attachment; else None."""
-        if self.spoilt or self.done:
-            return None
-        i, n = _PLACE.unpack(place) if len(place) == _PLACE.size else (-1, 0)
-        taken = self._taken
-        if i != taken or not taken < n <= _MAX_PARTS or (taken and n != self._total) or len(part) > _PART_BYTES:
-            self.spoilt = True
-            self._joined.clear()
-            return None
-        self._joined += part
-        self._taken, self._total = taken + 1, n
-        self.done = self._taken == n
-        return bytes(self._joined) if self.done else None
-
-
-def join_parts(parts: Iterable[tuple[bytes, bytes]]) -> bytes | None:
-    """The joined parts of one sender, given as (attachment, part); None if one is missing or malformed."""
-    joiner = PartJoiner()
-    for place, part in parts:
-        whole = joiner.take(place, part)
-        if joiner.done or joiner.spoilt:
-            return whole
-    return None
-
-
-def joined_by_sender(parts: Iterable[tuple[str, bytes, bytes]]) -> Iterator[bytes]:
-    """What each sender has sent, as soon as it is whole, from parts (sender, attachment, part) in any mixture.
-
-    Ends `_OTHERS_S` after the first part where no sender is left whose parts fit together.
-    """
-    joiners: dict[str, PartJoiner] = {}
-    others_until_s = math.inf
-    for sender, place, part in parts:
-        others_until_s = min(others_until_s, time.monotonic() + _OTHERS_S)
-        if joiners and all(joiner.spoilt for joiner in joiners.values()) and time.monotonic() > others_until_s:
-            return
-        if sender not in joiners and len(joiners) >= _MOST_SENDERS:
-            continue
-        whole = joiners.setdefault(sender, PartJoiner()).take(place, part)
-        if whole is not None:
-            yield whole
