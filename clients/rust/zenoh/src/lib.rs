@@ -13,8 +13,8 @@ mod link;
 
 pub use link::Link;
 
-use dehyst::json::{self, Value};
 use dehyst::authenticator::{Heard, Question, Sender, STAMP};
+use dehyst::json::{self, Value};
 use dehyst::{Authenticator, Error, Follower, Limits, Publisher, Result, Update};
 use std::hash::{BuildHasher, RandomState};
 use std::sync::mpsc::{SyncSender, TryRecvError};
@@ -270,7 +270,8 @@ impl Asker {
             let stamp = random();
             let asked = self.session.get(selector).timeout(left.max(Duration::from_millis(100)));
             // Whoever answers first must not keep the others' replies from us.
-            let asked = asked.target(QueryTarget::All).consolidation(ConsolidationMode::None).attachment(stamp.to_vec());
+            let asked =
+                asked.target(QueryTarget::All).consolidation(ConsolidationMode::None).attachment(stamp.to_vec());
             let asked = if payload.is_empty() { asked } else { asked.payload(payload) };
             let replies = asked.wait().map_err(|error| failed("query", error, "an open session"))?;
             let (mut failure, mut unsigned) = (None, 0);
