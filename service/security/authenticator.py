@@ -74,7 +74,7 @@ class Authenticator:
         if self._keyed is None:
             return b""
         # As fast as Python can: it takes part in every answer.
-        pieces = []
+        pieces: list[bytes] = []
         for part in parts:
             data = part.encode() if isinstance(part, str) else part
             pieces += (_LENGTH(len(data)), data)

@@ -248,3 +248,31 @@ def test_a_service_that_has_other_limits_since_its_restart_is_still_believed(tmp
         with Service(read_config(config)):
             assert client.point(80.0).u_V > 5.0
             assert client.limits.u_max_V == HIGH_V
+
+
+@pytest.mark.parametrize("deltas", [True, False])
+def test_a_follower_goes_on_with_the_service_that_replaces_the_first(tmp_path: Path, deltas: bool) -> None:
+    """By the same key, and by another one, which it does not believe."""
+    config = write_config(tmp_path, port := unused_port(), extra=f'served = "{LEARNING}"')
+    endpoint = f"tcp/127.0.0.1:{port}"
+    (tmp_path / "other").write_bytes(b"0123456789abcdef")
+    (tmp_path / "other").chmod(0o600)
+    service = Service(read_config(config))
+    service.start()
+    with Client.connect(endpoint, wait_s=20.0, retry_s=20.0) as client:
+        follower = client.follow(LEARNING, deltas=deltas)
+        teach(client, 0)
+        eventually(lambda: follower.received > 5)
+        service.close()
+        with Service(replace(read_config(config), key=tmp_path / "other")), open_client(endpoint, 20.0) as session:
+            before = follower.received
+            eventually(lambda: any(reply.ok for reply in session.get(KEYS.status, timeout=1.0)))
+            with Client.connect(endpoint, wait_s=20.0, key=tmp_path / "other") as stranger:
+                teach(stranger, 1000)
+            assert follower.received == before
+        with Service(read_config(config)):
+            client.status()
+            for first in range(2000, 8000, 500):  # once a second it asks who publishes
+                teach(client, first)
+            eventually(lambda: follower.received > before + 5)
+            assert follower.snapshot_seq >= 2000
