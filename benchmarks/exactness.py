@@ -24,7 +24,7 @@ from service.config.settings import AxisConfig, read_config
 from service.failover.state_transfer import fetch_state
 from service.protocol.errors import ServiceError
 from service.protocol.samples import joined
-from service.security.peers import PeerSecret, read_secret
+from service.security.authenticator import own_authenticator
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.server.learner_supervisor import fingerprint
@@ -66,7 +66,7 @@ def exactness(running: RunningSetup, client: Client, adopted: Adopted) -> dict[s
     running.feed.stop()
     count = int(running.feed.last_json()["sent"])
     status = _drained(client, count)
-    live = _live_state(client, read_secret(read_config(running.setup.config).peer_secret))
+    live = _live_state(client)
     axis = taught(running.setup, count, adopted.retuned)
     differs = differing(live, offline_state(axis))
     told = fingerprint(axis.newest.models[axis.config.learn])
@@ -134,11 +134,11 @@ def _drained(client: Client, count: int) -> dict[str, Any]:
         time.sleep(0.05)
 
 
-def _live_state(client: Client, secret: PeerSecret) -> StateDict:
+def _live_state(client: Client) -> StateDict:
     """The state of the service as it sends it to a standby. Raises ServiceError if it does not."""
     until = time.monotonic() + CONNECT_S
     while time.monotonic() < until:
-        data = fetch_state(client._session, client.keys.state, CONNECT_S, secret=secret)
+        data = fetch_state(client._session, client.keys.state, CONNECT_S, authenticator=own_authenticator())
         if data is not None:
             return decode_checkpoint(data)[1]
         time.sleep(0.1)  # it refuses while its learner is busy

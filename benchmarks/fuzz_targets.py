@@ -20,7 +20,7 @@ from adaptive.inverse_model import LssvmInverse
 from benchmarks.forged_states import edited, make_axis, recording
 from benchmarks.small_models import small_models
 from service.failover.role_control import Claims
-from service.failover.state_transfer import join_parts
+from service.failover.state_transfer import joined
 from service.operating.verbs import Request, decode_request, encode_request
 from service.protocol import delta as wire_delta
 from service.protocol import model as wire_model
@@ -29,7 +29,7 @@ from service.protocol import query as wire_reply
 from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
 from service.protocol.keys import Keys
-from service.security.peers import PeerSecret
+from service.security.authenticator import Authenticator
 from service.stage_node.faults import decode_fault
 from service.storage import checkpoint
 
@@ -109,7 +109,7 @@ def _changing() -> Target:
 def _parts(data: bytes) -> None:
     """Parts of a state, each of up to three bytes after its header: joined if complete, else nothing."""
     pieces = [data[i : i + 11] for i in range(0, len(data), 11)]
-    whole = join_parts((piece[:8], piece[8:]) for piece in pieces)
+    whole = next(joined(("sender", piece) for piece in pieces), None)
     if whole is None:
         return
     of = int.from_bytes(pieces[0][4:8], "little")
@@ -118,14 +118,14 @@ def _parts(data: bytes) -> None:
 
 
 def _claims() -> Target:
-    """Keys of liveliness tokens: whatever they say, nobody who lacks the secret has a claim."""
+    """Keys of liveliness tokens: whatever they say, nobody who lacks the key has a claim."""
     keys = Keys("demo", "x")
-    claims = Claims(keys, "i-me", PeerSecret(b"0123456789abcdef"))
+    claims = Claims(keys, "i-me", Authenticator(b"0123456789abcdef"))
 
     def target(data: bytes) -> None:
         claims.update(f"{keys.base}/claim/{data.decode(errors='replace')}", True)
         if claims.highest() is not None or claims.next_epoch() != 1:
-            raise AssertionError("a claim without proof was believed")
+            raise AssertionError("a claim without a tag was believed")
 
     return target
 

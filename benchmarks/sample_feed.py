@@ -18,6 +18,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import SampleBatch
 from service.runtime.session import SURELY, open_client, wait_followed
 from service.runtime.stopping import StopSignal
+from service.security.authenticator import own_authenticator
 
 STAGE, AXIS = "bench", "x"
 #: How long the stage waits for a subscriber before its first sample, s.
@@ -43,7 +44,8 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
     with np.load(path) as kept:
         u_V, y_um = kept["u_V"], kept["y_um"]
     with open_client(endpoint, 10.0) as session:
-        publisher = session.declare_publisher(Keys(STAGE, AXIS).sample, congestion_control=SURELY, express=True)
+        by, key = own_authenticator(), Keys(STAGE, AXIS).sample
+        publisher = session.declare_publisher(key, congestion_control=SURELY, express=True)
         if not wait_followed(publisher, _SUBSCRIBED_S):
             print("no subscriber to the samples", file=sys.stderr)
             return 1
@@ -58,7 +60,8 @@ def feed(endpoint: str, path: Path, rate_hz: float, batch: int, first: int) -> i
                 late += 1
             worst_s = max(worst_s, -rest)
             made = sent(u_V, y_um, rate_hz, batch, first + k)
-            publisher.put(wire.encode_samples(made.seq, made.t_s, made.u_V, made.y_um))
+            payload = wire.encode_samples(made.seq, made.t_s, made.u_V, made.y_um)
+            publisher.put(payload, attachment=by.published(key, payload))
             k += 1
         taken_s = time.perf_counter() - start
         time.sleep(_FLUSH_S)

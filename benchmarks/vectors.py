@@ -32,7 +32,7 @@ from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.fleet.wire import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES, encode_fleet
 from service.protocol.delta import Change, DeltaMessage, FollowedState, doubles, encode_delta
-from service.protocol.keys import AUTO
+from service.protocol.keys import AUTO, Keys
 from service.protocol.model import Safety, check_model, encode_model
 from service.protocol.query import Pending, Trajectory, decode_query, encode_query, encode_reply
 from service.protocol.samples import (
@@ -45,6 +45,7 @@ from service.protocol.samples import (
     encode_reference,
     encode_samples,
 )
+from service.security.authenticator import Authenticator
 
 SEED: Final = 20
 DT_S: Final = 1e-3
@@ -527,6 +528,46 @@ def fleet_payloads() -> dict[str, tuple[int, dict[str, list[float] | list[list[f
     }
 
 
+#: Key of the authenticators, and a stamp of a query, of a service and of a stage.
+SHARED: Final = b"0123456789abcdef0123456789abcdef"
+ASKED, SERVICE, STAGE = (bytes(range(first, first + 16)) for first in (0x10, 0xA0, 0xE0))
+
+
+def authenticators() -> list[str]:
+    """Lines ``case kind key stamp parameters asked_stamp asked payload tag``; "-": none."""
+    keys, tag = Keys("demo", "x"), Authenticator(SHARED).tag
+    plain = {name: payload for name, (payload, _) in plain_payloads().items()}
+    files = {"samples.payload": plain["samples"], "deltas.query.payload": delta_query()}
+    files |= {f"deltas-{step.name}.{step.message}.payload": step.payload for step in delta_steps()}
+    files |= {f"deltas-{step.name}.reply.payload": step.reply for step in delta_steps() if step.reply}
+    first = next(step for step in delta_steps() if step.message == "change")
+    change, whole, reply = (
+        f"deltas-{first.name}.change.payload",
+        "deltas-base.fetched.payload",
+        "deltas-base.reply.payload",
+    )
+    rows = (
+        ("point", "reply", keys.feedforward, SERVICE, "", ASKED, "deltas.query.payload", reply),
+        ("model", "reply", keys.model, SERVICE, "name=auto;changes=1", ASKED, "-", whole),
+        ("change", "put", keys.champion_delta, SERVICE, "", b"", "-", change),
+        ("samples", "put", keys.sample, STAGE, "", b"", "-", "samples.payload"),
+        ("state", "query", keys.state, ASKED, "pause_s=0.001", b"", "-", "-"),
+        ("claim", "claim", keys.claim(2, "i4711-ab12cd34"), b"", "", b"", "-", "-"),
+    )
+    table = [f"# secret {SHARED.hex()}", "# case kind key stamp parameters asked_stamp asked payload tag"]
+    for case, kind, key, stamp, parameters, asked_stamp, asked, payload in rows:
+        said, query = files.get(payload, b""), files.get(asked, b"")
+        parts = {
+            "reply": (key, stamp, asked_stamp, parameters, query, said),
+            "put": (key, stamp, said),
+            "query": (key, stamp, parameters, said),
+            "claim": (key,),
+        }[kind]
+        cells = (case, kind, key, stamp.hex(), parameters, asked_stamp.hex(), asked, payload, tag(kind, *parts).hex())
+        table.append(" ".join(cell or "-" for cell in cells))
+    return table
+
+
 def write(out: Path) -> int:
     """Write all files to ``out``, which is created; returns the bytes written."""
     out.mkdir(parents=True, exist_ok=True)
@@ -573,6 +614,7 @@ def write(out: Path) -> int:
         files[f"refused-{name}.payload"] = payload
         table.append(f"refused-{name}.payload {kind} {at}")
     files["refused.txt"] = ("\n".join(table) + "\n").encode()
+    files["authenticators.txt"] = ("\n".join(authenticators()) + "\n").encode()
     for name, payload in files.items():
         (out / name).write_bytes(payload)
     return sum(map(len, files.values()))

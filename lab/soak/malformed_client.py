@@ -1,4 +1,7 @@
-"""A client that sends malformed messages to every key of an axis that is open to clients."""
+"""A client that sends malformed messages to every key of an axis that is open to clients.
+
+It has the key, as a faulty program of the laboratory has: its samples are signed, and refused for what they are.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from service.protocol.query import encode_query
 from service.protocol.samples import encode_reference, encode_samples
 from service.runtime.session import SURELY, open_client
 from service.runtime.stopping import StopSignal
+from service.security.authenticator import own_authenticator
 
 #: Messages per second: many, but other clients must still get through.
 RATE_HZ: Final = 200.0
@@ -30,6 +34,7 @@ def send_malformed(endpoint: str, base_key: str, seed: int) -> int:
     rng = np.random.default_rng(seed)
     counts = {"error": 0, "answer": 0, "nothing": 0, "published": 0}
     with open_client(endpoint, 20.0) as session:
+        by_key = own_authenticator()
         print("ready", flush=True)
         due = time.monotonic()
         count = 0
@@ -38,7 +43,9 @@ def send_malformed(endpoint: str, base_key: str, seed: int) -> int:
             count += 1
             payload = PAYLOADS[target](rng)
             if target == "sample":
-                session.put(f"{base_key}/sample", payload, congestion_control=SURELY)
+                key = f"{base_key}/sample"
+                attached = by_key.published(key, payload)
+                session.put(key, payload, attachment=attached, congestion_control=SURELY)
                 counts["published"] += 1
             else:
                 counts[_result_of_query(session, f"{base_key}/{target}{_parameters(target, rng)}", payload)] += 1

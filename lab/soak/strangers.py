@@ -1,8 +1,8 @@
-"""Strangers to a service: processes on its network that do not know its secret, and try to move it.
+"""Strangers to a service: processes on its network that do not have its key, and try to move it.
 
 ``python -m lab.soak.strangers forge ENDPOINT SEED MODEL.npz`` answers whoever asks for the state with forged ones, and
 with some that it begins and never ends, and makes standbys ask. ``... claim ENDPOINT SEED`` claims to serve, and tells
-again what the one that serves claims. Both ask for the state too, with proofs that they have seen. They
+again what the one that serves claims. Both ask for the state too, with signatures that they have seen. They
 print ``ready``, run until they are stopped, and print JSON: how often they ``tried``, and how many ``states`` they were
 given.
 """
@@ -31,6 +31,7 @@ from service.failover.state_transfer import fetch_state, send_state
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
 from service.runtime.stopping import StopSignal
+from service.security.authenticator import STAMP, TAG
 from service.server.axis_loading import load_axis
 from service.storage.checkpoint import CheckpointMeta, encode_checkpoint
 
@@ -64,21 +65,23 @@ class Stranger:
         self.counts = {"tried": 0, "states": 0}
         self.session = session
         self.keys = Keys(STAGE, AXIS)
-        #: Parameters of the last query with a proof.
-        self.seen = ""
+        #: Parameters and attachment of the last signed query.
+        self.seen: tuple[str, bytes] | None = None
 
     def ask_for_state(self) -> None:
-        """Ask for the state without a proof, as a standby asks where there is no secret, and with one that it sent."""
+        """Ask for the state unsigned, as a standby asks where there is no key, and with the signature that one sent."""
         self.counts["tried"] += 1
         self.counts["states"] += fetch_state(self.session, self.keys.state, _ASK_S) is not None
-        if self.seen:
-            replies = self.session.get(f"{self.keys.state}?{self.seen}", timeout=_ASK_S)
+        if self.seen is not None:
+            parameters, attached = self.seen
+            replies = self.session.get(f"{self.keys.state}?{parameters}", attachment=attached, timeout=_ASK_S)
             self.counts["states"] += any(reply.ok is not None for reply in replies)
 
     def see(self, query: zenoh.Query) -> None:
-        """Keep the proof in a query for the state."""
-        if query.parameters.get("proof") is not None:
-            self.seen = str(query.parameters)
+        """Keep what a query for the state carries."""
+        attached = None if query.attachment is None else query.attachment.to_bytes()
+        if attached and len(attached) > STAMP:
+            self.seen = str(query.parameters), attached
 
 
 def forge(endpoint: str, seed: int, model: Path) -> int:
@@ -106,7 +109,7 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
                 with query:
                     return
             held.append(query)
-            query.reply(keys.state, bytes(50_000), attachment=struct.pack("<II", 0, 50))
+            query.reply(keys.state, struct.pack("<II", 0, 50) + bytes(50_000), attachment=bytes(32))
 
         queryable = session.declare_queryable(keys.state, answer)
         for _ in range(_CROWD):
@@ -128,21 +131,23 @@ def forge(endpoint: str, seed: int, model: Path) -> int:
 
 
 def claim(endpoint: str, seed: int) -> int:
-    """Claim to serve, by one name after the other, unsigned and with signatures of nobody, and say to be alive."""
+    """Claim to serve, by one name after the other, unsigned and with tags of nobody, and answer for the status."""
     stop = StopSignal()
     rng = np.random.default_rng(seed)
     with open_client(endpoint, 20.0) as session, ExitStack() as stack:
         stranger = Stranger(stack.enter_context(open_client(endpoint, 20.0)))
         keys = stranger.keys
 
-        def alive(query: zenoh.Query) -> None:
-            stranger.see(query)
+        def see(query: zenoh.Query) -> None:
             with query:
-                name = query.parameters.get("alive")
-                if name is not None:
-                    query.reply(keys.state, str(name).encode())
+                stranger.see(query)
 
-        queryable = session.declare_queryable(keys.state, alive)
+        def alive(query: zenoh.Query) -> None:
+            with query:
+                name = json.dumps({"instance": f"i{max(0, len(tokens) - 1)}-rogue"})
+                query.reply(keys.status, name, attachment=bytes(32))
+
+        queryables = [session.declare_queryable(keys.state, see), session.declare_queryable(keys.status, alive)]
         tokens: list[Any] = []
         claims: list[str] = []
         again: dict[str, Any] = {}
@@ -151,15 +156,15 @@ def claim(endpoint: str, seed: int) -> int:
         )
         print("ready", flush=True)
         while not stop.reason:
-            signature = "" if len(tokens) % 2 else rng.bytes(16).hex()
-            key = keys.claim(EPOCH + len(tokens), f"i{len(tokens)}-rogue", signature)
+            tag = "" if len(tokens) % 2 else rng.bytes(TAG).hex()
+            key = keys.claim(EPOCH + len(tokens), f"i{len(tokens)}-rogue", tag)
             tokens.append(session.liveliness().declare_token(key))
             for real in set(claims) - again.keys():
                 if "-rogue" not in real:
                     again[real] = session.liveliness().declare_token(real)
             stranger.ask_for_state()
             time.sleep(PAUSE_S)
-        for entity in (queryable, heard, *again.values(), *tokens):
+        for entity in (*queryables, heard, *again.values(), *tokens):
             entity.undeclare()
     print(json.dumps(stranger.counts), flush=True)
     return 0

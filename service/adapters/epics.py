@@ -16,7 +16,6 @@ Variables of an axis whose service does not answer have the alarm INVALID. Sourc
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Callable
@@ -28,11 +27,12 @@ import zenoh
 from adaptive.errors import DehystError
 from service.adapters.adapter import load_library
 from service.cli.options import add_connection, add_epilog, add_shared
-from service.operating.remote import operate
+from service.operating.remote import operate, statuses
 from service.protocol.errors import FieldError, ServiceError
 from service.protocol.keys import AUTO, Keys
 from service.runtime.session import is_loopback, open_client
 from service.runtime.stopping import StopSignal
+from service.security.authenticator import own_authenticator
 
 EPILOG = """\
 The variables are PREFIX:STATUS, :TRUST, :MODEL_ERROR, :SAMPLE, :SERVED and, to be written, :FREEZE and :ENABLE.
@@ -70,6 +70,7 @@ class EpicsAxis:
         timeout_s: float = 2.0,
     ) -> None:  # fmt: skip
         self._session, self._keys, self._timeout_s = session, keys, timeout_s
+        self._by = own_authenticator()
         server = load_library("p4p.server", "p4p")
         threads = load_library("p4p.server.thread", "p4p")
         scalars = load_library("p4p.nt", "p4p")
@@ -131,11 +132,9 @@ class EpicsAxis:
         return shown
 
     def _status(self) -> dict[str, Any]:
-        for reply in self._session.get(self._keys.status, timeout=self._timeout_s):
-            if reply.ok is not None:
-                status = json.loads(reply.ok.payload.to_bytes())
-                if isinstance(status, dict) and "trust" in status:
-                    return status
+        for status in statuses(self._session, self._keys.stage, self._keys.axis, self._timeout_s, self._by):
+            if "trust" in status:
+                return status
         raise ServiceError(f"{self._keys.base}: no reply within {self._timeout_s:g} s; is the service running?")
 
     def _post(self, name: str, value: Any, severity: int, message: str) -> None:
@@ -146,7 +145,7 @@ class EpicsAxis:
         variable.post(value, timestamp=stamp_unix_s, severity=severity, message=message[:80])
 
     def _freeze(self, on: bool) -> None:
-        operate(self._session, self._keys, "freeze" if on else "thaw", "epics", timeout_s=self._timeout_s)
+        operate(self._session, self._keys, "freeze" if on else "thaw", "epics", None, self._timeout_s, self._by)
         self.poll()
 
     def _enable(self, on: bool) -> None:

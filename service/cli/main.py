@@ -167,6 +167,8 @@ def main(argv: Sequence[str] | None = None, commands: Mapping[str, Command] = CO
     from service.runtime.logging_setup import set_up_logging
 
     set_up_logging(parsed.log_level)
+    if key := vars(parsed).get("key"):
+        os.environ["DEHYST_KEY"] = key  # for whatever this command starts, too
     if commands[parsed.command].compiles:
         from service.warm import at_first_use
 

@@ -26,6 +26,10 @@ _SHARED: Final[dict[str, dict[str, Any]]] = {
         "help": "how long to wait for the endpoint to come up, s (%(default)s)",
     },
     "zenoh-config": {"type": Path, "metavar": "FILE", "help": "zenoh's own configuration, for TLS and passwords"},
+    "key": {
+        "metavar": "FILE",
+        "help": "the key that 'dehyst serve' prints, where it is not this user's own; -: check nothing (DEHYST_KEY)",
+    },
     "insecure-beyond-loopback": {
         "action": "store_true", "help": "let everybody in who reaches an address on another machine",
     },
@@ -59,7 +63,7 @@ def add_shared(parser: Any, *names: str, **changes: Mapping[str, Any]) -> None:
 
 
 def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1.0) -> None:
-    """The options of a client: ``--endpoint --wait --zenoh-config``, and ``--timeout`` unless it is None."""
+    """The options of a client: ``--endpoint --wait --zenoh-config --key``, and ``--timeout`` unless it is None."""
     from service.runtime.session import DEFAULT_ENDPOINT
 
     parser.add_argument(
@@ -70,7 +74,7 @@ def add_connection(parser: Any, wait_s: float = 0.0, timeout_s: float | None = 1
     )
     if timeout_s is not None:
         add_shared(parser, timeout={"default": timeout_s})
-    add_shared(parser, "zenoh-config", wait={"default": wait_s})
+    add_shared(parser, "zenoh-config", "key", wait={"default": wait_s})
 
 
 def add_selection(parser: Any) -> None:

@@ -6,33 +6,47 @@
         more = client.trajectory(next_y_um, after=answer)
 
 Queries change nothing in the service: any of them can be repeated. The client repeats an unanswered query itself for
-``retry_s``. With the endpoints of a service and of its standby it continues with the one that is alive.
+``retry_s``. With the endpoints of a service and of its standby it continues with the one that is alive. It takes the
+first reply that carries the authenticator of the service (`service.security.authenticator`) and keeps the known limits;
+others are passed over and counted, and the first one is logged.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 import zenoh
 from numpy.typing import ArrayLike, NDArray
 
+from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from service.answers.answering import derivatives
 from service.answers.guard import Limits, guard
 from service.client.follower import Follower
-from service.protocol.errors import BehindError, BusyError, FieldError, NoReplyError, ReplyTimeoutError, error_from_json
+from service.protocol.errors import (
+    BehindError,
+    BusyError,
+    FieldError,
+    NoReplyError,
+    ReplyTimeoutError,
+    ServiceError,
+    UnsignedReplyError,
+    error_from_json,
+)
 from service.protocol.keys import AUTO, Keys
 from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, Trajectory, decode_reply, encode_query
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference, encode_samples
 from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
+from service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
 
 # --- How a query continues from the answer before it: its memory, its last voltage, and what is under way.
 #
@@ -114,6 +128,8 @@ def continued(
 
 # --- Queries of a client: one reply each, an exception that states why there is none, and repetition without an answer.
 
+_LOGGER: Final = logging.getLogger("dehyst.client")
+_T = TypeVar("_T")
 _BEHIND_PAUSE_S: Final = 0.001
 #: Default time for which an unanswered query is repeated, s. A standby takes over within some hundredths of a second if
 #: the service has died, within about a second if it has only stopped.
@@ -121,6 +137,44 @@ RETRY_S: Final = 2.0
 _RETRY_PAUSE_S: Final = 0.003
 #: Queries longer than this, bytes, are more than a hundred points, which are not answered at once.
 _SHORT_BYTES: Final = 4096
+#: By which a step may exceed the slew limit through round-off, relative.
+_ROUND_OFF: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What a client knows of its axis, from the status."""
+
+    status: dict[str, Any]
+    limits: Limits
+    dt_s: float
+
+    @classmethod
+    def read(cls, payload: bytes, keys: Keys) -> Known:
+        """Of a status of the axis of ``keys``. Raises FieldError."""
+        status = json.loads(payload)
+        if not isinstance(status, dict) or not {"dt_s", "limits"} <= status.keys():
+            raise FieldError("status", repr(status)[:80], "a status of this wire version")
+        names = status.get("stage"), status.get("axis")
+        if names != (keys.stage, keys.axis):
+            raise FieldError("status", f"that of {names}", f"that of {(keys.stage, keys.axis)}")
+        dt_s = status["dt_s"]
+        if not (isinstance(dt_s, float) and 0.0 < dt_s < math.inf):
+            raise FieldError("dt_s", repr(dt_s)[:80], "a sample time in s")
+        return cls(status, Limits.from_json(status["limits"]), dt_s)
+
+    def check(self, answer: Trajectory, n: int) -> None:
+        """Raise FieldError where ``answer`` is not ``n`` voltages within the limits."""
+        u_V, limits = answer.u_V, self.limits
+        if n == 1 == u_V.size and limits.u_min_V <= u_V.item(0) <= limits.u_max_V:
+            return  # as fast as it can be
+        if u_V.size != n:
+            raise FieldError("u_V", f"{u_V.size} voltages", f"{n}, one for each point")
+        if not (limits.u_min_V <= u_V.min() and u_V.max() <= limits.u_max_V):
+            raise FieldError("u_V", f"{u_V.min():g} to {u_V.max():g} V", f"{limits.u_min_V:g} to {limits.u_max_V:g} V")
+        step_V = limits.slew_V_per_s * self.dt_s * (1.0 + _ROUND_OFF) + _ROUND_OFF
+        if n > 1 and not np.abs(np.diff(u_V)).max() <= step_V:
+            raise FieldError("u_V", f"a step of {np.abs(np.diff(u_V)).max():g} V", f"at most {step_V:g} V a sample")
 
 
 class RetryingQueries:
@@ -132,18 +186,26 @@ class RetryingQueries:
 
     Attributes
     ----------
-    retries : count of repetitions.
+    retries : count of repetitions. refused : replies that were passed over: without the right authenticator, malformed
+    or beyond what is known. known : from the newest status; None before any.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, timeout_s: float, retry_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, timeout_s: float, retry_s: float, authenticator: Authenticator
+    ) -> None:
         self.timeout_s, self.retry_s = timeout_s, retry_s
-        self.retries = 0
-        self._session, self._keys = session, keys
-        self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True)
+        self.retries = self.refused = 0
+        self.known: Known | None = None
+        self._session, self._keys, self._by = session, keys, authenticator
+        self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True, **EVERYBODY)
         # Of low priority, so that a megabyte there and back delays no other message, and the service hands it over at
         # once: twice as fast, because its queue has room for it. The source gives this session its share.
         self._long = session.declare_querier(
-            keys.feedforward, timeout=timeout_s, priority=zenoh.Priority.DATA_LOW, congestion_control=SURELY
+            keys.feedforward,
+            timeout=timeout_s,
+            priority=zenoh.Priority.DATA_LOW,
+            congestion_control=SURELY,
+            **EVERYBODY,
         )
         self._source = zenoh.SourceInfo(self._long.id, 0)
 
@@ -152,36 +214,62 @@ class RetryingQueries:
         self._querier.undeclare()  # type: ignore[no-untyped-call]
         self._long.undeclare()  # type: ignore[no-untyped-call]
 
-    def once(self, selector: str) -> bytes:
-        """The payload of the one reply, without repetition. Raises NoReplyError, ReplyTimeoutError, RefusedError."""
-        return self._one(self._session.get(selector, timeout=self.timeout_s))
+    def get(self, key: str, parameters: str, read: Callable[[Signed], _T], once: bool = False) -> _T:
+        """What ``read`` makes of the first right reply; repeated for ``retry_s`` while there is none, unless ``once``.
 
-    def get(self, selector: str) -> bytes:
-        """As :meth:`once`, but repeated for ``retry_s`` while there is no answer."""
-        return self._repeated(lambda: self.once(selector))
+        Raises NoReplyError, ReplyTimeoutError, RefusedError, and what ``read`` raises of the only reply.
+        """
+
+        def ask() -> _T:
+            question = self._by.question(parameters)
+            replies = self._session.get(
+                f"{key}?{parameters}" if parameters else key,
+                timeout=self.timeout_s,
+                attachment=question.attachment,
+                **EVERYBODY,
+            )
+            return self._first(replies, question, read)
+
+        return ask() if once else self._repeated(ask)
 
     def status(self, once: bool = False) -> dict[str, Any]:
         """The present status of the axis; ``once`` : without repetition."""
-        status = json.loads((self.once if once else self.get)(self._keys.status))
-        if not isinstance(status, dict) or "dt_s" not in status:
-            raise FieldError("status", repr(status)[:80], "a status of this wire version")
-        return status
+        return self._read_known(once).status
 
-    def feedforward(self, payload: bytes, wait_s: float) -> Trajectory:
-        """The answer to an encoded query, which is repeated for ``retry_s`` while there is none.
+    def _read_known(self, once: bool) -> Known:
+        keys = self._keys
+        known = self.known = self.get(keys.status, "", lambda signed: Known.read(signed.payload, keys), once)
+        return known
+
+    def feedforward(self, payload: bytes, wait_s: float, n: int) -> Trajectory:
+        """The answer to an encoded query for ``n`` points, which is repeated for ``retry_s`` while there is none.
 
         ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
         BehindError after that.
         """
 
-        def ask() -> bytes:
+        def read(signed: Signed) -> Trajectory:
+            answer = decode_reply(signed.payload)
+            try:
+                if self.known is not None:
+                    self.known.check(answer, n)
+            except FieldError:
+                if not signed.stamp:
+                    raise
+                # It is the service: started again with other limits.
+                self._read_known(once=True).check(answer, n)
+            return answer
+
+        def ask() -> Trajectory:
+            question = self._by.question(payload=payload)
+            sent: dict[str, Any] = {"payload": payload, "attachment": question.attachment}
             if len(payload) <= _SHORT_BYTES:
-                return self._one(self._querier.get(payload=payload))
-            return self._one(self._long.get(payload=payload, source_info=self._source))
+                return self._first(self._querier.get(**sent), question, read)
+            return self._first(self._long.get(**sent, source_info=self._source), question, read)
 
         start = time.monotonic()
         while True:
-            answer = decode_reply(self._repeated(ask))
+            answer = self._repeated(ask)
             if not answer.behind:
                 return answer
             if time.monotonic() - start >= wait_s:
@@ -191,7 +279,7 @@ class RetryingQueries:
                 )
             time.sleep(_BEHIND_PAUSE_S)
 
-    def _repeated(self, ask: Callable[[], bytes]) -> bytes:
+    def _repeated(self, ask: Callable[[], _T]) -> _T:
         start = time.monotonic()
         while True:
             try:
@@ -209,22 +297,47 @@ class RetryingQueries:
                 self.retries += 1
                 time.sleep(error.retry_after_s)
 
-    def _one(self, replies: Iterable[zenoh.Reply]) -> bytes:
-        error: bytes | None = None
+    def _first(self, replies: Iterable[zenoh.Reply], question: Question, read: Callable[[Signed], _T]) -> _T:
+        """The first right reply. Anybody can send an error, so one counts only where there is no right reply."""
+        failure: DehystError | None = None
+        unsigned = 0
         for reply in replies:
-            if reply.ok is not None:
-                return bytes(reply.ok.payload.to_bytes())
-            if reply.err is not None:
-                error = bytes(reply.err.payload.to_bytes())
-        if error is None:
-            raise NoReplyError(
-                f"{self._keys.base}: no reply within {self.timeout_s:g} s. Check that a service for stage "
-                f"{self._keys.stage!r}, axis {self._keys.axis!r} is running and that your role may query it"
-            )
-        failure = error_from_json(error)
+            if reply.ok is None:
+                if reply.err is not None and not isinstance(failure, ServiceError):
+                    failure = error_from_json(reply.err.payload.to_bytes())
+                continue
+            signed = question.answer(reply.ok)
+            try:
+                if signed is not None:
+                    return read(signed)
+                unsigned += 1
+                reason = "it carries no authenticator of the service"
+            except (DehystError, ValueError) as error:
+                reason = str(error)
+                failure = failure or (error if isinstance(error, DehystError) else FieldError("reply", error, "JSON"))
+            self._refuse(reason)
+        raise self._failed(failure, unsigned)
+
+    def _refuse(self, reason: str) -> None:
+        if not self.refused:
+            _LOGGER.warning("%s: a reply is passed over: %s; later ones are only counted", self._keys.base, reason)
+        self.refused += 1
+
+    def _failed(self, failure: DehystError | None, unsigned: int) -> DehystError:
+        base = self._keys.base
         if isinstance(failure, ReplyTimeoutError):
-            raise ReplyTimeoutError(f"{self._keys.base}: no answer within {self.timeout_s:g} s; ask again")
-        raise failure
+            return ReplyTimeoutError(f"{base}: no answer within {self.timeout_s:g} s; ask again")
+        if failure is not None:
+            return failure
+        if unsigned:
+            return UnsignedReplyError(
+                f"{base}: {unsigned} replies, none with the authenticator by {self._by.path}. Name the key that "
+                "'dehyst serve' prints (--key, DEHYST_KEY); for a service with --open: --key -, DEHYST_KEY=-"
+            )
+        return NoReplyError(
+            f"{base}: no reply within {self.timeout_s:g} s. Check that a service for stage "
+            f"{self._keys.stage!r}, axis {self._keys.axis!r} is running and that your role may query it"
+        )
 
 
 # --- The client.
@@ -255,14 +368,15 @@ class Client:
         timeout_s: float = 1.0,
         owns_session: bool = False,
         retry_s: float = RETRY_S,
+        authenticator: Authenticator | None = None,
     ) -> None:
         self.keys = keys
+        self._by = own_authenticator() if authenticator is None else authenticator
         self._commanded = (-1, math.nan)
         self._session = session
         self._owns = owns_session
         self._followers: list[Follower] = []
-        self._queries = RetryingQueries(session, keys, timeout_s, retry_s)
-        self._status: dict[str, Any] | None = None
+        self._queries = RetryingQueries(session, keys, timeout_s, retry_s, self._by)
 
     @classmethod
     def connect(
@@ -274,6 +388,7 @@ class Client:
         wait_s: float = 0.0,
         zenoh_config: Path | None = None,
         retry_s: float = RETRY_S,
+        key: Path | None = None,
     ) -> Client:
         """Connect to the service at ``endpoint``, or to one of several, and check that it serves this axis.
 
@@ -282,6 +397,8 @@ class Client:
         timeout_s : of each query, s. retry_s : time for which an unanswered query is repeated, s.
         wait_s : time to wait for the service to start, s.
         zenoh_config : configuration file of zenoh with TLS and passwords (docs/access.md); None without.
+        key : file with the key of the service (docs/access.md); None: the one of this user on this machine, or without
+            one nothing is checked.
 
         Raises SessionError if the endpoint does not answer, NoReplyError if the axis is not served there.
         """
@@ -289,10 +406,11 @@ class Client:
         until = time.monotonic() + max(wait_s, _SETTLE_S)
         session = open_client(endpoint, wait_s, zenoh_config)
         try:
-            client = cls(session, keys, timeout_s, owns_session=True, retry_s=retry_s)
+            # Only now: the first start of a service makes the key before it listens.
+            client = cls(session, keys, timeout_s, True, retry_s, own_authenticator(key))
             while True:
                 try:
-                    client._status = client._queries.status(once=True)
+                    client._queries.status(once=True)
                     return client
                 except NoReplyError:
                     if time.monotonic() >= until:
@@ -325,19 +443,23 @@ class Client:
         return self._queries.retries
 
     @property
+    def refused(self) -> int:
+        """Count of replies that were passed over: without the right authenticator, or beyond what is known."""
+        return self._queries.refused
+
+    @property
     def dt_s(self) -> float:
         """Sample time of the axis, s: the distance of the points of a trajectory."""
-        return float(self._known()["dt_s"])
+        return self._known().dt_s
 
     @property
     def limits(self) -> Limits:
         """The limits that the service enforces."""
-        return Limits.from_json(self._known()["limits"])
+        return self._known().limits
 
     def status(self) -> dict[str, Any]:
         """The present status of the axis (docs/protocol.md)."""
-        self._status = self._queries.status()
-        return self._status
+        return self._queries.status()
 
     def point(
         self,
@@ -355,7 +477,7 @@ class Client:
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
         query = continued(memory, model, u_before_V, after, begin)
-        answer = self._queries.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s)
+        answer = self._queries.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s, 1)
         if begin is not None:
             answer = with_pending(answer, query["pending"], begin, np.array([y_um]))
         return Answer(answer.u_V.item(0), answer.std_V.item(0), answer.flags.item(0), *answer[3:])
@@ -395,7 +517,7 @@ class Client:
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
-        answer = self._queries.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s)
+        answer = self._queries.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s, y.size)
         return answer if begin is None else with_pending(answer, query["pending"], begin, y)
 
     def follow(
@@ -407,7 +529,7 @@ class Client:
         is constant and fetched once. "auto" holds all competing models: the learning model alone is faster to evaluate.
         Without ``deltas`` whole snapshots are followed: fewer, larger, and those that queries are answered from.
         """
-        status = self._known()
+        status = self._known().status
         name = model or str(status["served"])
 
         learning, keys = str(status.get("learning")), self.keys
@@ -415,9 +537,24 @@ class Client:
         of = {learning: keys.model_delta, AUTO: keys.champion_delta} if deltas else {}
         key = (of or {learning: keys.model, AUTO: keys.champion}).get(name)
         deltas = deltas and key is not None
-        selector = f"{keys.model}?name={name}" + (";changes=1" if deltas else "")
+        parameters = f"name={name}" + (";changes=1" if deltas else "")
+        heard = Heard(self._by, key or keys.model)
+
+        def read(signed: Signed) -> bytes:
+            heard.meet(signed.stamp)
+            return signed.payload
+
         follower = Follower(
-            self._session, key, name, lambda: self._queries.get(selector), self.limits, memory, deltas=deltas, keep=keep
+            self._session,
+            key,
+            name,
+            lambda: self._queries.get(keys.model, parameters, read),
+            self.limits,
+            memory,
+            deltas=deltas,
+            keep=keep,
+            heard=heard,
+            dt_s=self.dt_s,
         )
         self._followers.append(follower)
         return follower
@@ -460,9 +597,9 @@ class Client:
         May be called by another thread than the queries. Waits while the network is slow; nothing is dropped. Raises
         InputError if the lengths differ.
         """
-        self._session.put(
-            self.keys.sample, encode_samples(seq, t_s, u_V, y_um), express=True, congestion_control=SURELY
-        )
+        payload, key = encode_samples(seq, t_s, u_V, y_um), self.keys.sample
+        attached = self._by.published(key, payload)
+        self._session.put(key, payload, attachment=attached, express=True, congestion_control=SURELY)
 
     def subscribe_commands(self, receive: Callable[[bytes], None]) -> Subscription:
         """Call ``receive`` with the payload of each message on ``.../command``, in a thread of zenoh.
@@ -474,5 +611,8 @@ class Client:
         )
         return subscriber
 
-    def _known(self) -> dict[str, Any]:
-        return self._status or self.status()
+    def _known(self) -> Known:
+        if self._queries.known is None:
+            self.status()
+        assert self._queries.known is not None
+        return self._queries.known

@@ -1,7 +1,8 @@
 """A follower: holds the newest state of a model in the caller's process and answers there, without the wire.
 
 It takes whole models, or their changes (`service.protocol.delta`). Of changes, a lost or wrong one is noticed by the
-fingerprints and repaired by fetching the whole model; until then the last good state answers.
+fingerprints and repaired by fetching the whole model; until then the last good state answers. What does not carry the
+authenticator of the service is passed over, as is a model of another sample time.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from service.protocol.query import (
     Trajectory,
 )
 from service.protocol.samples import column
+from service.security.authenticator import NO_KEY, Heard
 
 #: Voltage below which what fades has faded, V.
 _FADED_V: Final = 1e-9
@@ -48,6 +50,8 @@ _KEPT_CHANGES: Final = 1024
 _PAUSE_S: Final = (0.005, 1.0)
 #: How long `Follower.close` waits for a fetch, s.
 _CLOSE_S: Final = 2.0
+#: Pause between two questions who it is that publishes, s.
+_MEET_S: Final = 1.0
 
 
 class Changes:
@@ -210,6 +214,8 @@ class Follower:
     ----------
     key : where models, or with ``deltas`` their changes, are published; None: the model does not change.
     fetch : asks for the whole model. keep : newest states that `answer` can go back to.
+    heard : decides which publications are the service's; None: all. ``fetch`` tells it who answered.
+    dt_s : sample time of the axis, s; NaN: that of the first model.
 
     Attributes
     ----------
@@ -233,9 +239,15 @@ class Follower:
         *,
         deltas: bool = False,
         keep: int = 1,
+        heard: Heard | None = None,
+        dt_s: float = math.nan,
     ) -> None:
         self.limits = limits
         self.name = name
+        self._fetch, self._dt_s = fetch, dt_s
+        self._heard = heard or Heard(NO_KEY, "")
+        self._meeting: threading.Thread | None = None
+        self._met_s = -math.inf
         self.received = 0
         self.changes = Changes(fetch, self._take) if deltas else None
         self._refused = 0
@@ -282,7 +294,7 @@ class Follower:
     @property
     def refused(self) -> int:
         """Count of messages that could not be used."""
-        return self._refused + (0 if self.changes is None else self.changes.refused)
+        return self._refused + self._heard.refused + (0 if self.changes is None else self.changes.refused)
 
     @property
     def last_error(self) -> str:
@@ -485,12 +497,32 @@ class Follower:
             self._subscriber = None
         if self.changes is not None:
             self.changes.close()
+        if self._meeting is not None and self._meeting is not threading.current_thread():
+            self._meeting.join(_CLOSE_S)
 
     def _on_model(self, sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        if self.changes is not None:
+        payload = self._heard.take(sample)
+        if payload is None:
+            if self._heard.is_unknown and time.monotonic() - self._met_s >= _MEET_S:
+                self._met_s = time.monotonic()
+                self._meeting = threading.Thread(target=self._meet, name="follower-meets", daemon=True)
+                self._meeting.start()
+        elif self.changes is not None:
             self.changes.take(payload)
+        else:
+            self._take_whole(payload)
+
+    def _meet(self) -> None:
+        """Somebody else publishes, by the same key: ask who serves now, and take its model."""
+        try:
+            payload = self._fetch()
+        except DehystError as error:
+            self._last_error = str(error)
             return
+        if self.changes is None:  # of changes, the next one shows that some are missing
+            self._take_whole(payload)
+
+    def _take_whole(self, payload: bytes) -> None:
         try:
             self._take(decode_model(payload))
         except DehystError as error:
@@ -500,6 +532,10 @@ class Follower:
     def _take(self, message: ModelMessage) -> None:
         if message.name != self.name:
             raise FieldError("model", repr(message.name), repr(self.name))
+        if math.isnan(self._dt_s):
+            self._dt_s = message.model.dt_s
+        if message.model.dt_s != self._dt_s:
+            raise FieldError("dt_s", message.model.dt_s, f"{self._dt_s:g} s; follow anew if the service was changed")
         with self._moved:
             self._kept.append(message)
             self._newest = (message, time.monotonic())

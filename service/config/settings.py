@@ -15,9 +15,8 @@ from service.fleet.settings import FleetSettings
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO, check_name
 from service.protocol.samples import MAX_COUNT
-from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint, is_loopback
+from service.runtime.session import DEFAULT_ENDPOINT, check_endpoint
 from service.security.check import check_reach
-from service.security.peers import OWN_SECRET
 
 #: The model that learns.
 LEARN = "lssvm_adaptive"
@@ -154,14 +153,17 @@ class ServeConfig:
         tuple[str, ...],
         Setting(help="where 'dehyst serve --standby' listens; clients look for it there", check=check_endpoint),
     ] = ()
-    peer_secret: Annotated[
+    key: Annotated[
         Path | None,
         Setting(
-            help="file with the secret by which the instances of this service prove themselves to each other; default: "
-            "one made beside this file where all endpoints are of this machine",
-            example=OWN_SECRET,
+            help="file with the key that service, standby, clients and stage share; default: that of this user on this "
+            "machine, which the first start makes (docs/access.md)",
+            example="dehyst.key",
         ),
     ] = None
+    open: Annotated[
+        bool, Setting(help="true: no key; nothing is signed, and everybody on the wire is believed (--open)")
+    ] = False
     busy_after_s: Annotated[
         float,
         Setting(
@@ -204,9 +206,6 @@ def parse_config(text: str, where: str, folder: Path, insecure_beyond_loopback: 
     if len(set(names)) < len(names):
         raise FieldError(f"{where}: axis", ", ".join(names), "a different name for each axis")
     _check_folders(where, config.axes)
-    endpoints = (*config.listen, *config.standby_listen, *config.connect)
-    if config.peer_secret is None and all(map(is_loopback, endpoints)):
-        config = replace(config, peer_secret=folder / OWN_SECRET)
     return replace(config, axes=tuple(_with_reports_in(folder, axis) for axis in config.axes))
 
 

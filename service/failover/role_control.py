@@ -16,21 +16,13 @@ import zenoh
 
 from adaptive.errors import DehystError, ModelFileError
 from service.failover.standby_model import PeerFiles, StandbyModel, restore_from_peer
-from service.failover.state_transfer import (
-    MAX_PAUSE_S,
-    NO_SECRET,
-    PAUSE_S,
-    confirm_switch,
-    fetch_state,
-    gives_sign_of_life,
-    told_switch,
-)
+from service.failover.state_transfer import MAX_PAUSE_S, PAUSE_S, fetch_state, status_of
 from service.operating.server import FREEZE, THAW, Switch
 from service.operating.verbs import MAX_WHO
 from service.protocol.container import fields_of
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
-from service.security.peers import Nonces, PeerSecret
+from service.security.authenticator import NO_KEY, Authenticator
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 
 # --- Claims to serve an axis, and the rule that decides which instance serves.
@@ -47,7 +39,7 @@ class Claim:
 
     epoch: int
     instance: str
-    signature: str = field(default="", compare=False)
+    tag: str = field(default="", compare=False)
 
 
 #: Greatest epoch that is taken for one: a take-over every second for thirty years.
@@ -68,12 +60,12 @@ class Claims:
 
     Attributes
     ----------
-    changed : set after every update. unproven : count of claims that were ignored because they prove nothing.
+    changed : set after every update. unsigned : count of claims that were ignored because their tag is wrong.
     """
 
-    def __init__(self, keys: Keys, instance: str, secret: PeerSecret = NO_SECRET) -> None:
-        self.unproven = 0
-        self._secret = secret
+    def __init__(self, keys: Keys, instance: str, authenticator: Authenticator = NO_KEY) -> None:
+        self.unsigned = 0
+        self._by = authenticator
         self._ignored: set[Claim] = set()
         self.keys = keys
         self.instance = instance
@@ -87,8 +79,9 @@ class Claims:
         claim = parse_claim(key)
         if claim is None or claim.instance == self.instance:
             return
-        if not self._secret.proves(claim.signature, *claim_parts(self.keys, claim.epoch, claim.instance)):
-            self.unproven += alive
+        right = claim_tag(self._by, self.keys, claim.epoch, claim.instance)
+        if right and claim.tag != right:
+            self.unsigned += alive
             self.changed.set()
             return
         with self._lock:
@@ -113,9 +106,9 @@ class Claims:
             return self._highest_epoch + 1
 
 
-def claim_parts(keys: Keys, epoch: int, instance: str) -> tuple[object, ...]:
-    """What the signature of a claim is made of."""
-    return "claim", keys.base, epoch, instance
+def claim_tag(authenticator: Authenticator, keys: Keys, epoch: int, instance: str) -> str:
+    """The tag of a claim, of which others repeat at most what was said; "" without a key."""
+    return authenticator.tag("claim", keys.claim(epoch, instance)).hex()
 
 
 # --- Whether an instance behind routers is connected to one of them.
@@ -163,8 +156,8 @@ _TRANSFER_PAUSE_S: Final = 0.3
 #: Time after which a rival with a lower claim that still serves has not received this instance's claim, s.
 _CLAIM_LOST_S: Final = 2.0
 _POLL_S: Final = 1.0
-#: Longest wait for a sign of life of an instance that claims to serve, s, and pause between two that a standby asks
-#: for, s. It believes nothing else: statuses and liveliness tokens can be told again by anybody.
+#: Longest wait for the status of an instance that claims to serve, s, and pause between two that a standby asks for, s.
+#: It believes nothing else: a liveliness token can be held by anybody, long after its instance.
 _LIFE_S: Final = 2.0
 _ASK_S: Final = 1.0
 #: Pause between two transfers of the state to a standby that has one, s: that its model differs anybody may say.
@@ -198,13 +191,12 @@ class RoleControl:
         peer_files: PeerFiles,
     ) -> None:
         self.server = server
-        self.claims = Claims(server.keys, server.instance, server.secret)
-        self._unproven = 0
+        self.claims = Claims(server.keys, server.instance, server.authenticator)
+        self._unsigned = 0
         #: When the instance that serves last gave a sign of life, by ``time.monotonic``, s, and its name.
         self._alive: tuple[str, float] = ("", 0.0)
         #: When a state was last asked for, by ``time.monotonic``, s.
         self._fetched_s = -math.inf
-        self._proofs = Nonces()
         self.model = StandbyModel(
             server.axis, server.loop.sink, on_restored=server.checkpoints.copy_now, on_gap=self._refetch_state
         )
@@ -215,9 +207,8 @@ class RoleControl:
         self._session = session
         self._search_s = search_s
         self._stopping = False
-        #: Whether the state of the serving instance must be fetched, and whether that is going on.
+        #: Whether the state of the serving instance must be fetched.
         self._outdated = True
-        self._fetching = False
         #: The last *freeze* or *thaw* of the one that serves, and by whom, until a state from it includes it.
         self._switch: tuple[str, str] | None = None
         self._token: Any = None
@@ -238,7 +229,6 @@ class RoleControl:
         self._entities = [
             self._session.liveliness().declare_subscriber(keys.claim_any, self._on_claim, history=True),
             self._session.declare_subscriber(keys.event, self._on_event),
-            self._session.declare_subscriber(keys.status, self._on_status),
             self._session.declare_queryable(keys.switch, self._on_switch),
         ]
         self._thread.start()
@@ -265,12 +255,12 @@ class RoleControl:
     def _on_switch(self, query: zenoh.Query) -> None:
         """A freeze or thaw of the instance that serves must hold even if that one dies before its state has come."""
         with query:
-            key, secret, highest = self.server.keys.switch, self.server.secret, self.claims.highest()
-            if self.server.role == PRIMARY or highest is None:
+            key, by_key, highest = self.server.keys.switch, self.server.authenticator, self.claims.highest()
+            if self.server.role == PRIMARY or highest is None or query.payload is None:
                 return  # the sender counts those who confirm
-            if (told := told_switch(query, key, secret, self._proofs)) is None:
+            if not by_key.is_asked_by_ours(query, key):
                 return
-            switch = fields_of(told)
+            switch = fields_of(query.payload.to_bytes())
             verb, by = switch.get("verb"), switch.get("by")
             if switch.get("instance") != highest.instance or verb not in (FREEZE, THAW) or not isinstance(by, str):
                 return
@@ -279,15 +269,12 @@ class RoleControl:
                 return  # told again by somebody: the state that came since includes it, and what followed
             self._switch = verb, by[:MAX_WHO]
             self._refetch_state()
-            confirm_switch(query, key, secret)
+            query.reply(key, held := b"held", attachment=by_key.answered(query, key, held))
 
-    def _on_status(self, sample: zenoh.Sample) -> None:
-        """Compare the digest of the served model, published once a second, with the own one of the same sample."""
-        status = fields_of(sample.payload.to_bytes())
+    def _compare(self, status: dict[str, Any]) -> None:
+        """Compare the digest of the served model with the own one of the same sample."""
         server = self.server
-        if server.role == PRIMARY or not server.synced or status.get("instance") == server.instance:
-            return
-        if self._outdated or self._fetching:
+        if not server.synced or self._outdated:
             return  # the present model is about to be replaced
         seq, theirs = status.get("snapshot_seq"), status.get("fingerprint")
         if isinstance(seq, int) and isinstance(theirs, str) and server.axis.differs(seq, theirs):
@@ -314,12 +301,12 @@ class RoleControl:
             self.claims.changed.wait(wait_s)
 
     def _decide(self, until: float) -> None:
-        self._note_unproven()
+        self._note_unsigned()
         highest = self.claims.highest()
         if self.server.role == PRIMARY:
             if highest is not None and highest > Claim(self._epoch, self.server.instance):
                 # Who does not answer queries is no successor.
-                if self._answers(highest):
+                if self._status_of(highest) is not None:
                     self._stand_down(highest.instance)
             else:
                 self._check_rival(highest)
@@ -336,38 +323,38 @@ class RoleControl:
             self._take_state()
         self._check_alive(highest)
 
-    def _answers(self, rival: Claim) -> bool:
-        """Whether ``rival`` answers; if not, its claim is ignored from now on."""
+    def _status_of(self, rival: Claim) -> dict[str, Any] | None:
+        """The status of ``rival``; where it does not answer, its claim is ignored from now on."""
         server = self.server
-        session, key = self._session, server.keys.state
 
         def wanted() -> bool:
             return not self._stopping and self.claims.highest() == rival
 
-        if gives_sign_of_life(session, key, rival.instance, _LIFE_S, server.secret, wanted):
-            return True
-        if not wanted() or self._reachability.is_cut_off():
-            return False
+        key, instance = server.keys.status, rival.instance
+        status = status_of(self._session, key, instance, _LIFE_S, server.authenticator, wanted)
+        if status is not None or not wanted() or self._reachability.is_cut_off():
+            return status
         self.claims.ignore(rival)
         detail = f"{rival.instance} claims to serve as number {rival.epoch} and does not answer: its claim is ignored"
         server.axis.note("claim_ignored", detail)
-        return False
+        return None
 
     def _check_alive(self, highest: Claim) -> None:
-        """Ask the instance that serves for a sign of life: its claim may be told by somebody else, long after it."""
+        """Ask the instance that serves for its status: its claim may be told by somebody else, long after it."""
         now = time.monotonic()
         if self._alive[0] != highest.instance:
             self._alive = (highest.instance, now)
-        elif now - self._alive[1] > _ASK_S and self._answers(highest):
+        elif now - self._alive[1] > _ASK_S and (status := self._status_of(highest)) is not None:
             self._alive = (highest.instance, time.monotonic())
+            self._compare(status)
 
-    def _note_unproven(self) -> None:
-        """Note the first claims that prove nothing; the others are counted."""
-        unproven, before = self.claims.unproven, self._unproven
-        self._unproven = unproven
-        self.server.set_claims_refused(unproven)
-        if unproven and not before:
-            detail = "a claim without the signature of this service's instances is ignored; see peer_secret"
+    def _note_unsigned(self) -> None:
+        """Note the first claim with a wrong tag; the others are counted."""
+        unsigned, before = self.claims.unsigned, self._unsigned
+        self._unsigned = unsigned
+        self.server.set_claims_refused(unsigned)
+        if unsigned and not before:
+            detail = "a claim without the authenticator of this service is ignored; see docs/access.md"
             self.server.axis.note("claim_ignored", f"{detail}; later ones are only counted")
 
     def _check_rival(self, rival: Claim | None) -> None:
@@ -392,10 +379,8 @@ class RoleControl:
         server, before = self.server, self._token
         self._epoch = max(self._epoch + 1, self.claims.next_epoch())
         server.set_epoch(self._epoch)
-        signature = server.secret.sign(*claim_parts(server.keys, self._epoch, server.instance))
-        self._token = self._session.liveliness().declare_token(
-            server.keys.claim(self._epoch, server.instance, signature)
-        )
+        tag = claim_tag(server.authenticator, server.keys, self._epoch, server.instance)
+        self._token = self._session.liveliness().declare_token(server.keys.claim(self._epoch, server.instance, tag))
         if before is not None:
             before.undeclare()
 
@@ -450,18 +435,18 @@ class RoleControl:
 
     def _take_state(self) -> None:
         """Fetch and restore the state of the serving instance; after a failure the next decision tries again."""
-        self._fetching, self._outdated = True, False  # a callback may set it again meanwhile
+        self._outdated = False  # a callback may set it again meanwhile
         taken = False
         try:
             taken = self._fetch_and_restore()
         finally:
-            self._fetching = False
             self._outdated = self._outdated or not taken
 
     def _fetch_and_restore(self) -> bool:
         self._fetched_s = time.monotonic()
         try:
-            data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s, self.server.secret)
+            by_key = self.server.authenticator
+            data = fetch_state(self._session, self.server.keys.state, _TRANSFER_S, self._pause_s, by_key)
         except ServiceError as error:
             if str(error) != self._refusal:
                 self.server.axis.note("standby_refused", str(error))

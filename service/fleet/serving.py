@@ -38,6 +38,8 @@ from service.protocol.keys import Keys
 from service.protocol.model import model_parts
 from service.protocol.samples import FLEET_CHANGES, FLEET_QUERY, FLEET_REPLY, FLEET_SAMPLES
 from service.runtime.session import open_service
+from service.security.authenticator import HeardSamples
+from service.server.process import authenticator_of
 from service.server.query_answers import guarded
 from service.storage.model_file import read_bundle
 
@@ -125,13 +127,15 @@ class FleetService:
         assert config.fleet is not None
         self.config, self.settings = config, config.fleet
         self.keys = Keys(config.stage, NAME)
+        self._by = authenticator_of(config)
+        self._heard = HeardSamples(self._by, self.keys.sample)
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self._fleet = load_fleet(self.settings)
         self._checkpoints = None
         self._durable = False
         self._operations = OperationsServer(
             self.keys, self.instance, self, Journal(self.settings.checkpoints), lambda *_: None,
-            settle=lambda: self._durable, replayed=False,
+            settle=lambda: self._durable, replayed=False, authenticator=self._by,
         )  # fmt: skip
         if self.settings.checkpoints is not None:
             folder, period_s = self.settings.checkpoints, self.settings.checkpoint_s
@@ -186,6 +190,7 @@ class FleetService:
         return {
             "ready": True, "instance": self.instance, "role": "primary", "synced": True, "stage": self.config.stage,
             "listen": list(self.config.listen), "connect": list(self.config.connect), "key": self.keys.base,
+            "key_file": None if self._by.path is None else str(self._by.path),
             "axes": {NAME: [f"{self.settings.axes} axes", self.settings.device]},
         }  # fmt: skip
 
@@ -198,7 +203,9 @@ class FleetService:
 
     def _on_samples(self, sample: zenoh.Sample) -> None:
         try:
-            batch = decode_fleet(FLEET_SAMPLES, sample.payload.to_bytes())
+            if (payload := self._heard.take(sample)) is None:
+                return
+            batch = decode_fleet(FLEET_SAMPLES, payload)
         except DehystError:
             self._count(malformed=1)
             return
@@ -216,7 +223,7 @@ class FleetService:
             self._count(queries=1)
             return answer(query.payload.to_bytes() if query.payload is not None else b"")
 
-        return guarded(key, counted, lambda _: self._count(query_errors=1))
+        return guarded(key, counted, lambda _: self._count(query_errors=1), authenticator=self._by)
 
     def _in_turn(self, key: str, answer: Callable[[bytes], bytes]) -> Callable[[zenoh.Query], None]:
         """The same in the thread that learns, because it reads the learners."""
@@ -250,7 +257,8 @@ class FleetService:
             now_s = time.monotonic()
             if now_s - told_s >= _STATUS_S:
                 told_s = now_s
-                self._session.put(self.keys.status, to_json(self.status()), encoding=JSON)
+                status, key = to_json(self.status()), self.keys.status
+                self._session.put(key, status, encoding=JSON, attachment=self._by.published(key, status))
             if now_s - changed_s >= 1.0 / self.settings.model_hz:
                 changed_s = now_s
                 self._publish_changes(publisher)
@@ -284,7 +292,7 @@ class FleetService:
         if axes.size:
             frames, beta = now[axes, :2], now[axes, 2:]
             changes = encode_fleet(FLEET_CHANGES, snapshot_seq=[seq], axes=axes, frames=frames, beta=beta)
-            publisher.put(changes)
+            publisher.put(changes, attachment=self._by.published(self.keys.model, changes))
 
     def _publish_followed(self) -> None:
         """Send what has changed of the models of single axes to those that follow them."""
@@ -299,7 +307,8 @@ class FleetService:
             now, message = before.replaced(self._state_of(axis, memory, before))
             self._followed[axis] = publisher, now, follows
             if message is not None:
-                publisher.put(encode_delta(message))
+                payload, key = encode_delta(message), f"{self.keys.model_delta}/{axis}"
+                publisher.put(payload, attachment=self._by.published(key, payload))
 
     def _state_of(self, axis: int, memory: Any, like: FollowedState | None = None) -> FollowedState:
         model = self._fleet.model_of(axis)

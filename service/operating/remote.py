@@ -12,8 +12,16 @@ import zenoh
 
 from service.operating.verbs import Request, encode_request
 from service.protocol.container import fields_of
-from service.protocol.errors import FieldError, NoReplyError, ReplyTimeoutError, ServiceError, error_from_json
+from service.protocol.errors import (
+    FieldError,
+    NoReplyError,
+    ReplyTimeoutError,
+    ServiceError,
+    UnsignedReplyError,
+    error_from_json,
+)
 from service.protocol.keys import ROOT, Keys
+from service.security.authenticator import EVERYBODY, Authenticator, own_authenticator
 
 # --- Commands and statuses over the wire.
 
@@ -32,25 +40,35 @@ def operate(
     who: str,
     arguments: Mapping[str, Any] | None = None,
     timeout_s: float = 5.0,
+    authenticator: Authenticator | None = None,
 ) -> dict[str, Any]:
     """Command the axis; returns the reply of the service, with ``seq`` and ``result`` (docs/operating.md).
 
     Raises RefusedError with the service's message, NoReplyError if there is no reply (a refusal by access control
     gives none either), ReplyTimeoutError after ``timeout_s``. A command without a reply may have been applied: read
-    the status before you repeat it.
+    the status before you repeat it. ``authenticator`` : None: by the key of this user.
     """
+    by = own_authenticator() if authenticator is None else authenticator
     payload = encode_request(Request(verb, who, arguments or {}))
     until = time.monotonic() + _SETTLE_S
     while True:
         error: bytes | None = None
-        for reply in session.get(keys.operate, payload=payload, timeout=timeout_s):
+        question, unsigned = by.question(payload=payload), 0
+        for reply in session.get(
+            keys.operate, payload=payload, timeout=timeout_s, attachment=question.attachment, **EVERYBODY
+        ):
             if reply.ok is not None:
-                answer = json.loads(reply.ok.payload.to_bytes())
+                if (signed := question.answer(reply.ok)) is None:
+                    unsigned += 1
+                    continue
+                answer = json.loads(signed.payload)
                 if not isinstance(answer, dict) or answer.get("ok") is not True:
                     raise FieldError("answer", repr(answer)[:80], "an answer of this version")
                 return answer
             elif reply.err is not None:
-                error = bytes(reply.err.payload.to_bytes())
+                error = error or reply.err.payload.to_bytes()
+        if unsigned and error is None:
+            raise UnsignedReplyError(f"{keys.operate}: {unsigned} replies, none with the authenticator by {by.path}")
         if error is not None:
             raise _with_advice(error_from_json(error), keys, timeout_s)
         if time.monotonic() >= until:
@@ -61,19 +79,28 @@ def operate(
         time.sleep(_PAUSE_S)
 
 
-def statuses(session: zenoh.Session, stage: str = "*", axis: str = "*", timeout_s: float = 1.0) -> list[dict[str, Any]]:
-    """The status of every instance of every axis that replies, ordered by stage, axis and role; may be empty."""
+def statuses(
+    session: zenoh.Session,
+    stage: str = "*",
+    axis: str = "*",
+    timeout_s: float = 1.0,
+    authenticator: Authenticator | None = None,
+) -> list[dict[str, Any]]:
+    """The status of every instance of every axis that replies, ordered by stage, axis and role; may be empty.
+
+    ``authenticator`` : None: by the key of this user. Replies without it are left out.
+    """
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
+    by = own_authenticator() if authenticator is None else authenticator
+    question = by.question()
     # Two instances reply on one key; consolidation would drop one of them.
     for reply in session.get(
-        f"{ROOT}/{stage}/{axis}/status",
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=timeout_s,
+        f"{ROOT}/{stage}/{axis}/status", timeout=timeout_s, attachment=question.attachment, **EVERYBODY
     ):
-        if reply.ok is None:
+        signed = None if reply.ok is None else question.answer(reply.ok)
+        if signed is None:
             continue
-        status = fields_of(reply.ok.payload.to_bytes())
+        status = fields_of(signed.payload)
         if all(name in status for name in ("stage", "axis", "instance")):
             found[str(status["stage"]), str(status["axis"]), str(status["instance"])] = status
     return in_order(found.values())
@@ -87,7 +114,10 @@ def in_order(found: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 class Standbys:
     """The statuses of standbys, which answer no queries but publish their status once a second."""
 
-    def __init__(self, session: zenoh.Session, stage: str = "*", axis: str = "*") -> None:
+    def __init__(
+        self, session: zenoh.Session, stage: str = "*", axis: str = "*", authenticator: Authenticator | None = None
+    ) -> None:
+        self._by = own_authenticator() if authenticator is None else authenticator
         self._received: dict[str, tuple[float, dict[str, Any]]] = {}
         self._subscriber = session.declare_subscriber(f"{ROOT}/{stage}/{axis}/standby/*", self._on_status)
 
@@ -101,7 +131,8 @@ class Standbys:
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        status = fields_of(sample.payload.to_bytes())
+        signed = self._by.heard(sample, str(sample.key_expr))
+        status = {} if signed is None else fields_of(signed.payload)
         if "instance" in status and len(self._received) < _MOST_STANDBYS:
             self._received[str(sample.key_expr)] = (time.monotonic(), status)
 

@@ -22,6 +22,7 @@ from service.operating.verbs import MAX_BYTES, Outcome, Request, decode_request
 from service.protocol.container import JSON, fields_of, to_json
 from service.protocol.errors import FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
+from service.security.authenticator import NO_KEY, Authenticator
 from service.storage.output import append_line
 
 # --- The journal of operations: one JSON line per operation in a folder of the axis.
@@ -226,6 +227,7 @@ class OperationsServer:
     tell : tells the standbys of a freeze or thaw, by whom; returns how many hold it.
     settle : waits until a checkpoint of the last command is on the disk; False if it is not.
     replayed : whether a start applies the last command of the journal, so that one in the journal is durable.
+    authenticator : signs the answers.
     """
 
     def __init__(
@@ -240,7 +242,9 @@ class OperationsServer:
         tell: Callable[[str, str], int] = lambda _verb, _who: 0,
         settle: Callable[[], bool] = lambda: False,
         replayed: bool = True,
+        authenticator: Authenticator = NO_KEY,
     ) -> None:
+        self._by = authenticator
         self._keys = keys
         self._instance = instance
         self._verbs = verbs
@@ -364,7 +368,8 @@ class OperationsServer:
             # Leaving the context finishes the query; otherwise the caller waits until its time is over.
             with query:
                 try:
-                    query.reply(self._keys.operate, self.handle(payload), encoding=JSON)
+                    key, answer = self._keys.operate, self.handle(payload)
+                    query.reply(key, answer, encoding=JSON, attachment=self._by.answered(query, key, answer))
                 except zenoh.ZError:
                     continue  # the caller is gone
                 except Exception as error:

@@ -5,6 +5,7 @@
     ServiceError
     ├── SessionError        a zenoh session cannot be opened: port in use, no answer, bad endpoint
     ├── NoReplyError        no service answered: not running, stopped meanwhile, or access refused
+    │   └── UnsignedReplyError  somebody answered, and none of the replies carries the authenticator of the service
     ├── ReplyTimeoutError   the service is running but did not answer in time (also the built-in TimeoutError)
     ├── RefusedError        the service refused the request; has field, got and expected
     ├── BusyError           the service has too much to do; has the time to ask again after
@@ -33,6 +34,10 @@ class SessionError(ServiceError):
 
 class NoReplyError(ServiceError):
     """A query got no reply. It can be repeated: queries change nothing in the service."""
+
+
+class UnsignedReplyError(NoReplyError):
+    """Somebody answered, and no reply carries the authenticator of the service: another key, or a stranger."""
 
 
 class ReplyTimeoutError(ServiceError, TimeoutError):

@@ -117,13 +117,13 @@ class Keys:
         """Matches the claims of all instances that serve this axis."""
         return f"{self.base}/claim/*/*/**"
 
-    def claim(self, epoch: int, instance: str, signature: str = "") -> str:
+    def claim(self, epoch: int, instance: str, tag: str = "") -> str:
         """Liveliness: ``instance`` serves since take-over number ``epoch``; the highest claim has precedence.
 
-        ``signature`` : of the claim, by the secret of the service's instances; "" without one.
+        ``tag`` : of the claim, by the key of the service; "" without one.
         """
         key = f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
-        return f"{key}/{signature}" if signature else key
+        return f"{key}/{tag}" if tag else key
 
     def standby(self, instance: str) -> str:
         """Liveliness, and publication 1 Hz: JSON, the status of a standby."""

@@ -12,14 +12,14 @@ import zenoh
 
 from service.answers.answering import trust_by_age
 from service.background.retuner import Retuner
-from service.failover.state_transfer import NO_SECRET, tell_standbys
+from service.failover.state_transfer import tell_standbys
 from service.intake.sample_queue import SampleQueue
 from service.operating.server import Journal, OperationsServer
 from service.operating.verbs import Background, Verbs
 from service.protocol.container import to_json
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
-from service.security.peers import PeerSecret
+from service.security.authenticator import NO_KEY, Authenticator, HeardSamples
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
@@ -49,7 +49,7 @@ class AxisServer:
     ----------
     instance : name of this process on the wire. wake : wakes the publishing thread, which calls `tick`.
     sink : records samples, or None. watcher : the background diagnosis, or None.
-    secret : by which the instances of this service prove themselves to each other.
+    authenticator : signs what is sent, and checks what others of this service send.
     long_queries : of all axes of the process; None: of this one alone.
 
     Attributes
@@ -68,11 +68,12 @@ class AxisServer:
         wake: Callable[[], None],
         sink: SampleSink | None = None,
         watcher: SampleWatcher | None = None,
-        secret: PeerSecret = NO_SECRET,
+        authenticator: Authenticator = NO_KEY,
         long_queries: LongQueries | None = None,
     ) -> None:
         self.keys = keys
-        self.secret = secret
+        self.authenticator = authenticator
+        self._samples = HeardSamples(authenticator, keys.sample)
         self.axis = axis
         self.instance = instance
         self.role = STANDBY
@@ -95,11 +96,11 @@ class AxisServer:
         self._long_queries = long_queries or LongQueries()
         deltas = DeltaStreams(axis)
         self._answers = QueryAnswers(
-            keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, instance, secret, deltas
+            keys, axis, self.checkpoints, self._latency, self.status, self._long_queries, authenticator, deltas
         )
         self._operations = self._operations_server()
         self._publications = Publications(
-            session, keys, instance, self.loop, self._latency, self._answers, self.status, deltas
+            session, keys, instance, self.loop, self._latency, self._answers, self.status, deltas, authenticator
         )
         self._session = session
         self._stale = False
@@ -224,11 +225,12 @@ class AxisServer:
             samples=lambda: self._operated_at,
             tell=self._tell_standbys,
             settle=lambda: self.checkpoints.wait_written(_WRITTEN_S),
+            authenticator=self.authenticator,
         )
 
     def _tell_standbys(self, verb: str, by: str) -> int:
         switch = to_json({"instance": self.instance, "verb": verb, "by": by, "samples": self._operated_at})
-        return tell_standbys(self._session, self.keys.switch, switch, _TOLD_S, self.secret)
+        return tell_standbys(self._session, self.keys.switch, switch, _TOLD_S, self.authenticator)
 
     # ---- the publishing thread
 
@@ -292,8 +294,13 @@ class AxisServer:
             operations=self._operations.counters(),
             waiting_points=self._long_queries.waiting_points,
             disk=self._disk(),
-            peers={"claims_refused": self.claims_refused, "states_refused": self._answers.states_refused},
+            peers={
+                "claims_refused": self.claims_refused,
+                "states_refused": self._answers.states_refused,
+                "samples_refused": self._samples.refused,
+            },
             health=self._health,
+            signed=bool(self.authenticator),
         )
 
     def _disk(self) -> dict[str, float | None] | None:
@@ -306,8 +313,14 @@ class AxisServer:
             return self._write_rate.look(time.monotonic(), recorded + kept.bytes_in_all)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
+        payload = self._samples.take(sample)
+        if payload is None:
+            if self._samples.refused == 1:
+                detail = "messages without the authenticator of the stage are left out; later ones are only counted"
+                self.axis.note("samples_refused", detail)
+            return
         try:
-            batch = decode_samples(sample.payload.to_bytes())
+            batch = decode_samples(payload)
         except Exception as error:
             if self.loop.queue.count_malformed() == 1:
                 self.axis.note("malformed_samples", f"{error}; later ones are only counted")

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import zenoh
@@ -21,13 +22,14 @@ from service.failover.standby_model import PeerFiles, standby_folder
 from service.protocol.errors import FieldError, SessionError
 from service.protocol.keys import Keys
 from service.runtime.memory import TRIM_S, give_back, keep_little
-from service.runtime.session import is_loopback, open_service
-from service.security.peers import PeerSecret, new_secret, read_secret
+from service.runtime.session import open_service
+from service.security.authenticator import NO_KEY, Authenticator, default_key, read_key
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis
 from service.server.axis_loop import SampleSink, SampleWatcher
 from service.server.axis_server import PRIMARY, STANDBY, AxisServer
 from service.server.long_queries import LongQueries
+from service.server.status import UNSIGNED
 from service.storage.checkpoint import learn_again, restore_newest
 
 _LOGGER: Final = logging.getLogger("dehyst.service")
@@ -67,35 +69,27 @@ def make_watcher(axis: Axis) -> SampleWatcher | None:
     return Watcher(axis, axis.config.diagnosis)
 
 
-def secret_of(config: ServeConfig, standby: bool) -> PeerSecret:
-    """The secret of the instances of this service.
+def authenticator_of(config: ServeConfig, standby: bool = False) -> Authenticator:
+    """By the key of this service, which is made where it is missing; without one (``open``) a warning is logged.
 
-    Where none is named, and none can be made beside the configuration, this instance believes nobody. Raises FieldError
-    if a second one belongs to it, which could not prove itself then.
+    Raises FieldError where a key cannot be used, or a pair of instances can share none.
     """
-    secret, path = read_secret(config.peer_secret), config.peer_secret
-    if secret or path is None:
-        return secret
-    if standby or config.standby_listen:
-        raise FieldError(
-            "peer_secret",
-            f"nothing, and {path} cannot be written",
-            "a file with a secret that both instances can read",
-            "name one; see docs/operating.md",
-        )
-    _LOGGER.warning("peer_secret: %s cannot be written: no standby can follow or replace this service", path)
-    return new_secret()
-
-
-def warn_without_secret(config: ServeConfig, secret: PeerSecret) -> None:
-    """Log a warning where others than this machine's processes are believed without a proof."""
-    beyond = [endpoint for endpoint in (*config.listen, *config.connect) if not is_loopback(endpoint)]
-    if beyond and not secret:
-        _LOGGER.warning(
-            "peer_secret: none, and %s is beyond this machine: who may hold liveliness tokens there can depose this "
-            "service, and is given its state; see docs/access.md",
-            ", ".join(beyond),
-        )
+    path = config.key or default_key()
+    if config.open or path is None:
+        _LOGGER.warning("%s", UNSIGNED)
+        return NO_KEY
+    try:
+        return read_key(path, make=path != config.key)
+    except OSError as error:
+        if standby or config.standby_listen:
+            raise FieldError(
+                "key",
+                f"nothing, and {path} cannot be written",
+                "a file with a key that both instances can read",
+                "name one as key, or in DEHYST_KEY; see docs/access.md",
+            ) from error
+        _LOGGER.warning("key: %s cannot be written: no client can check an answer, and no standby can follow", path)
+        return Authenticator(secrets.token_bytes(32))
 
 
 def as_standby(config: ServeConfig) -> ServeConfig:
@@ -160,6 +154,7 @@ class Service:
         ]
         self.standby = standby
         self._stopped = stopped
+        self._key: Path | None = None
         self.instance = f"i{os.getpid()}-{secrets.token_hex(4)}"
         self.axes: list[AxisServer] = []
         self._long_queries = LongQueries(config.busy_after_s)
@@ -183,8 +178,8 @@ class Service:
         """
         config = self.config
         # Everything that can be refused is read before anything appears on the wire.
-        secret = secret_of(config, self.standby)
-        warn_without_secret(config, secret)
+        authenticator = authenticator_of(config, self.standby)
+        self._key = authenticator.path
         loaded = [load_axis(config.stage, axis) for axis in config.axes]
         # Of a pair the one that stands by connects to the other, which waits for that. Where each connected to the
         # other and one was stopped, both connections were made anew when it went on, and once in some ten times zenoh
@@ -202,7 +197,7 @@ class Service:
                     self._wake.set,
                     make_recorder(axis.config),
                     make_watcher(axis),
-                    secret,
+                    authenticator,
                     self._long_queries,
                 )
                 self.axes.append(server)
@@ -256,6 +251,7 @@ class Service:
             "connect": list(self.config.connect),
             "stage": self.config.stage,
             "axes": {axis.keys.axis: list(axis.axis.newest.models) for axis in self.axes},
+            "key_file": None if self._key is None else str(self._key),
             "key": self.axes[0].keys.base if len(self.axes) == 1 else f"dehyst/v1/{self.config.stage}/*",
         }
 

@@ -14,14 +14,14 @@ import zenoh
 
 from adaptive.errors import DehystError
 from service.answers.slices import Pace
-from service.failover.state_transfer import NO_SECRET, UnprovenError, check_asker, send_sign_of_life, send_state
+from service.failover.state_transfer import send_state
 from service.protocol.container import JSON, to_json
 from service.protocol.errors import BusyError, FieldError, ServiceError, error_to_json
 from service.protocol.keys import Keys
 from service.protocol.model import encode_model
 from service.protocol.query import decode_query, encode_reply, points_of
 from service.protocol.samples import MAX_COUNT
-from service.security.peers import Nonces, PeerSecret
+from service.security.authenticator import NO_KEY, Authenticator
 from service.server.axis import Axis
 from service.server.deltas import DeltaStreams
 from service.server.long_queries import SHORT, LongQueries
@@ -89,8 +89,12 @@ class QueryAnswers:
     ----------
     long_queries : answers the feedforward queries that are not short.
     latency : takes the time of every short one. status : makes the status.
-    instance, secret : of this process, for other instances that ask for its state or for a sign of life.
+    authenticator : signs the answers, and tells who may have the state.
     deltas : the models whose changes are published.
+
+    Attributes
+    ----------
+    states_refused : queries for the state that are not signed by an instance of this service.
     """
 
     def __init__(
@@ -101,8 +105,7 @@ class QueryAnswers:
         latency: LatencyMeter,
         status: Callable[[], dict[str, Any]],
         long_queries: LongQueries,
-        instance: str = "",
-        secret: PeerSecret = NO_SECRET,
+        authenticator: Authenticator = NO_KEY,
         deltas: DeltaStreams | None = None,
     ) -> None:
         self._deltas = deltas
@@ -112,11 +115,8 @@ class QueryAnswers:
         self._latency = latency
         self._status = status
         self._long = long_queries
-        self._instance = instance
-        self._secret = secret
-        #: Queries for the state without a proof that an instance of this service asks.
+        self._by = authenticator
         self.states_refused = 0
-        self._proofs = Nonces()
         self._sends = threading.BoundedSemaphore(_MOST_STATES)
 
     def declare(self, session: zenoh.Session) -> list[Any]:
@@ -153,8 +153,9 @@ class QueryAnswers:
             assert data is not None
             reply = encode_reply(self._axis.answer(decode_query(data)))
             # Leaving the context finishes the query; otherwise the caller waits until its time is over.
+            key = self._keys.feedforward
             with query:
-                query.reply(self._keys.feedforward, reply)
+                query.reply(key, reply, attachment=self._by.answered(query, key, reply, asked=data))
             self._latency.add(time.perf_counter() - start)
         except BusyError as error:
             self._latency.add_long(busy=True)
@@ -176,7 +177,7 @@ class QueryAnswers:
         def send(reply: bytes) -> None:
             try:
                 with query:
-                    query.reply(key, reply)
+                    query.reply(key, reply, attachment=self._by.answered(query, key, reply))
                 self._latency.add_long()
             except Exception as error:
                 refuse(error)
@@ -217,22 +218,21 @@ class QueryAnswers:
             time.sleep(_ROUTING_S)
             with query:
                 try:
-                    send_state(query, self._keys.state, self._state_buffers(), self._secret)
+                    send_state(query, self._keys.state, self._state_buffers(), self._by)
                 except Exception as error:
                     query.reply_err(error_to_json(error), encoding=JSON)
                 finally:
                     self._sends.release()
 
         try:
-            check_parameters(query.parameters, "pause_s", "nonce", "proof", "alive")
-            if send_sign_of_life(query, self._keys.state, self._instance, self._secret):
-                return
+            check_parameters(query.parameters, "pause_s")
             # First: strangers must not keep the places of instances, or have a thread each.
-            check_asker(query, self._keys.state, self._secret, self._proofs)
+            if not self._by.is_asked_by_ours(query, self._keys.state):
+                self.states_refused += 1
+                raise ServiceError("the state is for instances of this service: sign the query, each time anew")
             if not self._sends.acquire(blocking=False):
                 raise ServiceError(f"{_MOST_STATES} states are being sent: ask again later")
         except Exception as error:
-            self.states_refused += isinstance(error, UnprovenError)
             with query:
                 query.reply_err(error_to_json(error), encoding=JSON)
             return
@@ -249,7 +249,7 @@ class QueryAnswers:
             if not isinstance(error, DehystError):
                 self._axis.note("internal_error", f"{key}: {type(error).__name__}: {error}")
 
-        return guarded(key, answer, note, parameters)
+        return guarded(key, answer, note, parameters, self._by)
 
 
 def guarded(
@@ -257,10 +257,11 @@ def guarded(
     answer: Callable[[zenoh.Query], bytes],
     failed: Callable[[Exception], None],
     parameters: tuple[str, ...] = (),
+    authenticator: Authenticator = NO_KEY,
 ) -> Callable[[zenoh.Query], None]:
     """A callback that replies to each query, and never raises: what ``answer`` raises goes to ``failed`` and back.
 
-    ``parameters`` : those that its selector may have.
+    ``parameters`` : those that its selector may have. ``authenticator`` : signs the reply.
     """
 
     def callback(query: zenoh.Query) -> None:
@@ -268,7 +269,9 @@ def guarded(
         with query:
             try:
                 check_parameters(query.parameters, *parameters)
-                query.reply(key, answer(query))
+                stamp = authenticator.stamp()
+                reply = answer(query)
+                query.reply(key, reply, attachment=authenticator.answered(query, key, reply, stamp))
             except Exception as error:
                 failed(error)
                 query.reply_err(error_to_json(error), encoding=JSON)

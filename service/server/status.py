@@ -17,6 +17,7 @@ from service.protocol.model import stored_kind
 from service.protocol.samples import VERSION
 from service.runtime.memory import in_use
 from service.runtime.session import SURELY, is_followed
+from service.security.authenticator import NO_KEY, Authenticator
 from service.security.refusals import refusal_counters
 from service.server.axis import SampleCounts
 from service.server.axis_loop import AxisLoop
@@ -28,6 +29,8 @@ from service.server.query_answers import LatencyMeter, QueryAnswers
 # --- The status of one axis, as JSON; docs/protocol.md lists the fields.
 
 SCHEMA: Final = 1
+#: Warning of a service without a key.
+UNSIGNED: Final = "open: without a key nothing is signed, and everybody on the wire is believed; see docs/access.md"
 #: Fields of the learner's diagnostics that a status repeats.
 _QUALITY: Final = (
     "recent_rms_error_pct", "rms_error_pct", "share_within_std", "std_V", "gain", "offset_V", "valid", "fallback",
@@ -52,12 +55,13 @@ def axis_status(
     peers: dict[str, int] | None = None,
     disk: dict[str, float | None] | None = None,
     health: Health | None = None,
+    signed: bool = True,
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
     ``losses`` : name of the way in which samples are lost. ``checkpoints``, ``operations`` : their counters.
     ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
-    ``disk`` : what is written, see `WriteRate`.
+    ``disk`` : what is written, see `WriteRate`. ``signed`` : whether answers carry an authenticator.
     """
     axis, queue, figures = loop.axis, loop.queue, loop.figures
     # One snapshot and one set of counts for all fields: others may come meanwhile.
@@ -128,7 +132,7 @@ def axis_status(
         **status,
         "state": state,
         "state_reason": reason,
-        "warnings": list(axis.warnings.values()),
+        "warnings": [*axis.warnings.values(), *([] if signed else [UNSIGNED])],
         "rate_per_s": None if health.per_s is None else round(health.per_s, 1),
         "thinning": loop.thinner.factor,
     }
@@ -176,6 +180,7 @@ class Publications:
     ----------
     instance : sender of the events, and name under which a standby publishes its status.
     answers : encodes the models. status : makes the status. deltas : the models whose changes are published.
+    authenticator : signs models, changes and status.
     """
 
     def __init__(
@@ -188,7 +193,9 @@ class Publications:
         answers: QueryAnswers,
         status: Callable[[], dict[str, Any]],
         deltas: DeltaStreams,
+        authenticator: Authenticator = NO_KEY,
     ) -> None:
+        self._by = authenticator
         self._deltas = deltas
         self._session, self._keys, self._instance = session, keys, instance
         self._axis, self._loop, self._latency = loop.axis, loop, latency
@@ -225,7 +232,7 @@ class Publications:
                     urgent = zenoh.Priority.INTERACTIVE_HIGH
                     publisher = session.declare_publisher(key, congestion_control=drop, express=True, priority=urgent)
                     self._publishers[key] = publisher
-                    self._deltas.publish(name, publisher.put, partial(is_followed, publisher))
+                    self._deltas.publish(name, partial(self._put, key), partial(is_followed, publisher))
 
     def stand_down(self) -> None:
         """Publish the events that wait, and then only the status of a standby."""
@@ -252,19 +259,26 @@ class Publications:
             self._publish_diagnostics()
             if due:
                 self._loop.figures.follow(is_followed(self._publishers["diagnostics"]))
-                self._publishers["status"].put(to_json(self._status()))
+                self._put("status", to_json(self._status()))
             self.publish_events()
         elif due and self._standby is not None:
-            self._standby.put(to_json(self._status()))
+            payload = to_json(self._status())
+            attached = self._by.published(self._keys.standby(self._instance), payload)
+            self._standby.put(payload, attachment=attached)
+
+    def _put(self, name: str, payload: bytes) -> None:
+        """Publish what others act upon."""
+        publisher = self._publishers[name]
+        publisher.put(payload, attachment=self._by.published(str(publisher.key_expr), payload))
 
     def _publish_models(self, now_s: float) -> None:
         newest, config, publishers = self._axis.newest, self._axis.config, self._publishers
         if newest is self._published or now_s - self._published_at_s < 1.0 / config.model_hz:
             return
         if config.learn and is_followed(publishers["model"]):
-            publishers["model"].put(self._answers.encoded(config.learn))
+            self._put("model", self._answers.encoded(config.learn))
         if AUTO in newest.models and is_followed(publishers["champion"]):
-            publishers["champion"].put(self._answers.encoded(AUTO))
+            self._put("champion", self._answers.encoded(AUTO))
         self._published, self._published_at_s = newest, now_s
 
     def _publish_diagnostics(self) -> None:

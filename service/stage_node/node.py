@@ -26,6 +26,7 @@ from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
+from service.security.authenticator import own_authenticator
 from service.stage_node.exchange import CommandBuffer, SampleRing, Sender
 from service.stage_node.faults import Injector, fault_key, sound_key
 from sim.stage.config import StageConfig
@@ -107,13 +108,18 @@ class AxisPort:
         self.commands = CommandBuffer(begin=config.first)
         self.injector = Injector(config.stage.dt_s, apply) if config.inject else None
         # Samples must not be lost: a full channel blocks the sender thread, not the loop, and drops nothing.
-        self._publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
+        publisher = session.declare_publisher(keys.sample, congestion_control=SURELY, express=True)
+        self._publisher, by = publisher, own_authenticator()
+
+        def put(payload: bytes) -> None:
+            publisher.put(payload, attachment=by.published(keys.sample, payload))
+
         sound = None
         if self.injector is not None:
             sound = session.declare_publisher(sound_key(config.name, axis), express=True)
         self._sound = sound
         put_sound = None if sound is None else sound.put
-        self.ring = SampleRing(config.stage.dt_s, self._publisher.put, self.injector, config.first, put_sound)
+        self.ring = SampleRing(config.stage.dt_s, put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
         self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
         if self.injector is not None:

@@ -21,6 +21,7 @@ from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
+from service.security.authenticator import own_authenticator
 from service.viewer.records import Diagnostics, Event, Health, IntArray, Record, Status, Tracking, event_record
 
 # --- Samples and their references
@@ -170,6 +171,7 @@ class Consumer:
     def __init__(self, session: zenoh.Session, config: ConsumerConfig, outputs: Sequence[BatchOutput]) -> None:
         self.config = config
         self.counts: Counter[str] = Counter()
+        self._by = own_authenticator()
         self._outputs = outputs
         self._inbox: deque[tuple[str, str, bytes]] = deque()
         main = ReferenceRing()
@@ -184,7 +186,8 @@ class Consumer:
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._subscribers = [
-            session.declare_subscriber(key, self._callback(kind, model)) for kind, model, key in _subscriptions(config)
+            session.declare_subscriber(key, self._callback(kind, model, key))
+            for kind, model, key in _subscriptions(config)
         ]
         self._thread = threading.Thread(target=self._run, name="view-batches")
         self._thread.start()
@@ -206,10 +209,12 @@ class Consumer:
                 self._next_health = 0.0
                 self._offer(everything=True)
 
-    def _callback(self, kind: str, model: str) -> Callable[[zenoh.Sample], None]:
+    def _callback(self, kind: str, model: str, key: str) -> Callable[[zenoh.Sample], None]:
         def take(sample: zenoh.Sample) -> None:
             self.counts["messages"] += 1
-            if len(self._inbox) >= self.config.inbox:
+            if kind == "status" and self._by.heard(sample, key) is None:
+                self.counts["unsigned"] += 1  # not of the service
+            elif len(self._inbox) >= self.config.inbox:
                 self.counts["inbox_full"] += 1
             else:
                 self._inbox.append((kind, model, sample.payload.to_bytes()))

@@ -26,6 +26,7 @@ from service.protocol.delta import FollowedState, decode_delta
 from service.protocol.model import ModelMessage, decode_model
 from service.protocol.query import Trajectory, decode_query, decode_reply
 from service.protocol.samples import decode_command, decode_reference, decode_samples
+from service.security.authenticator import Authenticator, HeardSamples
 from tests.service.protocol import page_client
 
 FOLDER = vectors.DEFAULT_OUT
@@ -335,6 +336,55 @@ def test_the_service_refuses_with_the_field_of_the_table(file: str, kind: str, f
     with pytest.raises(InputError) as caught:
         decode[kind]((FOLDER / file).read_bytes())
     assert vars(caught.value)["field"] == field
+
+
+def parts_of(row: list[str]) -> tuple[bytes | str, ...]:
+    """What the tag of a line of ``authenticators.txt`` is made of, by the page."""
+    _, kind, key, stamp, parameters, asked_stamp, asked, payload, _ = ("" if cell == "-" else cell for cell in row)
+    query, said = ((FOLDER / name).read_bytes() if name else b"" for name in (asked, payload))
+    stamps = bytes.fromhex(stamp), bytes.fromhex(asked_stamp)
+    return {
+        "reply": ("reply", key, *stamps, parameters, query, said),
+        "put": ("put", key, stamps[0], said),
+        "query": ("query", key, stamps[0], parameters, said),
+        "claim": ("claim", key),
+    }[kind]
+
+
+def test_service_and_page_make_the_same_authenticators() -> None:
+    rows = table("authenticators.txt")
+    assert {row[1] for row in rows} == {"reply", "put", "query", "claim"}
+    secret = bytes.fromhex((FOLDER / "authenticators.txt").read_text().split()[2])
+    for row in rows:
+        parts = parts_of(row)
+        assert page_client.tag(secret, *parts).hex() == row[-1], row[0]
+        assert Authenticator(secret).tag(*parts).hex() == row[-1], row[0]
+
+
+def test_a_client_from_the_page_alone_believes_what_is_signed() -> None:
+    secret = bytes.fromhex((FOLDER / "authenticators.txt").read_text().split()[2])
+    found = {row[0]: row for row in table("authenticators.txt")}
+    _, key, stamp, asked_stamp, parameters, asked, said = parts_of(found["model"])
+    assert isinstance(key, str)
+    assert isinstance(parameters, str)
+    assert all(isinstance(part, bytes) for part in (stamp, asked_stamp, asked, said))
+    trust, right = page_client.Trust(secret), bytes.fromhex(found["model"][3] + found["model"][-1])
+    asked_with = bytes.fromhex(found["model"][5])
+    payload = (FOLDER / found["model"][7]).read_bytes()
+    change, told = bytes.fromhex(found["change"][3] + found["change"][-1]), (FOLDER / found["change"][7]).read_bytes()
+    assert not trust.publication(found["change"][2], change, told)  # it does not know the service yet
+    assert not trust.reply(key, bytes(16), parameters, b"", right, payload)
+    assert not trust.reply(key, asked_with, parameters, b"", right, payload + b"x")
+    assert trust.reply(key, asked_with, parameters, b"", right, payload)
+    assert not trust.publication(found["change"][2], change, told)  # it is in the model: not after it
+    trust.number -= 1
+    assert not trust.publication(found["change"][2], change, told[:-1])
+    assert [trust.publication(found["change"][2], change, told) for _ in range(2)] == [True, False]
+    stage, heard = page_client.Stage(secret), HeardSamples(Authenticator(secret), "key")
+    for number in range(3):
+        attached = SimpleNamespace(to_bytes=lambda number=number: stage.attachment("key", b"samples"))
+        message: Any = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: b"samples"), attachment=attached)
+        assert heard.take(message) == b"samples", number
 
 
 def test_the_command_makes_the_same_vectors(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ struct Mailbox {
     received: AtomicU64,
     refused: AtomicU64,
     name: String,
+    dt_s: f64,
     /// Serialises publishers; the follower never touches it.
     feeding: Mutex<Feeding>,
 }
@@ -78,6 +79,10 @@ impl Publisher {
         let taken = feeding.changes.take(payload).and_then(|(update, snapshot)| match &snapshot {
             Some(new) if new.model.name != self.0.name => {
                 Err(Error::new("model", &new.model.name, format!("{:?}", self.0.name)))
+            }
+            // The slew limit of a sample follows from it.
+            Some(new) if new.model.dt_s != self.0.dt_s => {
+                Err(Error::new("dt_s", new.model.dt_s, format!("{} s", self.0.dt_s)))
             }
             _ => Ok((update, snapshot)),
         });
@@ -167,6 +172,7 @@ impl Follower {
             received: AtomicU64::new(1),
             refused: AtomicU64::new(0),
             name: snapshot.model.name.clone(),
+            dt_s: snapshot.model.dt_s,
             feeding: Mutex::new(Feeding { changes: Changes::new(payload)?, last_error: String::new() }),
         };
         Ok(Follower {

@@ -19,6 +19,7 @@
 //! The same through C: `include/dehyst.h`.
 
 pub mod answer;
+pub mod authenticator;
 mod delta;
 mod error;
 pub mod ffi;
@@ -30,6 +31,7 @@ mod snapshot;
 pub mod wire;
 
 pub use answer::{Limits, Motion, Out};
+pub use authenticator::Authenticator;
 pub use delta::{Changes, Update};
 pub use error::{Error, Result};
 pub use follower::{flag_names, Follower, Point, Publisher, Report};

@@ -18,8 +18,13 @@ import numpy as np
 import pytest
 import zenoh
 
+import tests.conftest  # noqa: F401  the key that service and clients share
 from service.client.client import Client
-from tests.service.conftest import ServeProcess, unused_port, write_config
+from service.protocol.delta import FollowedState, encode_delta
+from service.protocol.model import model_parts
+from service.protocol.query import Answer as Reply
+from service.protocol.query import decode_reply, encode_query, encode_reply
+from tests.service.conftest import ServeProcess, make_models, unused_port, write_config
 
 LIBRARY = os.environ.get("DEHYST_ZENOH_LIBRARY", "")
 pytestmark = pytest.mark.skipif(not LIBRARY, reason="DEHYST_ZENOH_LIBRARY names no library: build clients/rust/zenoh")
@@ -95,6 +100,55 @@ def test_the_native_follower_is_the_python_follower(native: ctypes.CDLL, endpoin
         assert report.received > 10
         assert report.refused == 0
         assert report.gain == pytest.approx(0.94, abs=0.01)
+    native.dehyst_close(handle)
+
+
+def test_a_liar_beside_the_service_is_not_believed(native: ctypes.CDLL, endpoint: str) -> None:
+    handle, link, answer, size = ctypes.c_void_p(), ctypes.c_void_p(), Answer(), ctypes.c_size_t()
+    native.dehyst_link_open.argtypes = [
+        *[ctypes.c_char_p] * 4, ctypes.c_double, ctypes.POINTER(ctypes.c_void_p),
+    ]  # fmt: skip
+    native.dehyst_link_ask.argtypes = [
+        ctypes.c_void_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t,
+        ctypes.POINTER(ctypes.c_size_t),
+    ]  # fmt: skip
+    with Client.connect(endpoint) as client:
+        keys, session = client.keys, client._session
+        honest = client.point(40.0, model="linear")
+        status = client.status()
+        status["limits"]["u_max_V"] = 1000.0
+        lie = Reply(np.array([1e6]), np.zeros(1), np.zeros(1, dtype=np.uint8), np.zeros(0), 7, "linear")
+        says = {keys.status: json.dumps(status).encode(), keys.feedforward: encode_reply(lie)}
+
+        def tell(query: zenoh.Query) -> None:
+            with query:
+                query.reply(query.key_expr, says[str(query.key_expr)], attachment=query.attachment)
+
+        liars = [session.declare_queryable(key, tell, complete=True) for key in says]
+        time.sleep(0.3)
+        assert native.dehyst_open(endpoint.encode(), b"demo", b"x", b"lssvm_adaptive", 5.0, ctypes.byref(handle)) == 0
+        assert native.dehyst_link_open(endpoint.encode(), b"demo", b"x", None, 5.0, ctypes.byref(link)) == 0
+        query, reply = encode_query(40.0, 0.0, 0.0, model="linear"), ctypes.create_string_buffer(10_000)
+        for _ in range(20):
+            asked = native.dehyst_link_ask(
+                link, b"feedforward", query, len(query), reply, len(reply), ctypes.byref(size)
+            )
+            assert asked == 0, native.dehyst_error()
+            assert decode_reply(reply.raw[: size.value]).u_V.item() == honest.u_V
+        assert native.dehyst_point(handle, 40.0, 0.0, 0.0, ctypes.byref(answer)) == 0
+        honest_V = answer.u_V
+        model = make_models(1000.0)["lssvm_adaptive"]
+        state = FollowedState.of(*model_parts("lssvm_adaptive", model, np.zeros(model.memory_size)), 10**9, None)
+        for _ in range(50):
+            session.put(keys.model_delta, encode_delta(state.whole()), attachment=bytes(32))
+            time.sleep(1e-3)
+        assert native.dehyst_point(handle, 40.0, 0.0, 0.0, ctypes.byref(answer)) == 0
+        assert answer.u_V == pytest.approx(honest_V, abs=0.01)
+        assert native.dehyst_point(handle, 80.0, 0.0, 0.0, ctypes.byref(answer)) == 0
+        assert answer.u_V <= honest_V + 2.02
+        for entity in liars:
+            entity.undeclare()  # type: ignore[no-untyped-call]
+    native.dehyst_link_close(link)
     native.dehyst_close(handle)
 
 

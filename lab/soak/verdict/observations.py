@@ -28,6 +28,7 @@ from adaptive.types import FloatArray
 from lab.soak.controller import AXIS, STAGE, STRAY, ControlTask
 from lab.soak.fault_plan import FAULT_KINDS
 from lab.soak.machine_load import MachineLoad
+from service.operating.remote import statuses
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import SURELY, open_client
@@ -797,13 +798,10 @@ class Monitor:
 
     def ask(self) -> list[dict[str, Any]]:
         """The status of every service that answers now; the first is the one that answers queries."""
-        found = []
-        for reply in self._session.get(Keys(STAGE, AXIS).status, timeout=0.5):
-            if reply.ok is not None:
-                status = json.loads(reply.ok.payload.to_bytes())
-                with self._lock:
-                    self.statuses[str(status["instance"])] = (self.now(), status)
-                found.append(status)
+        found = statuses(self._session, STAGE, AXIS, 0.5)
+        for status in found:
+            with self._lock:
+                self.statuses[str(status["instance"])] = (self.now(), status)
         return found
 
     def put(self, key: str, value: dict[str, Any]) -> None:

@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--standby", action="store_true", help="run as hot standby: learn the same, and take over when the service dies"
     )
+    add("--open", action="store_true", help="without a key: nothing is signed, and everybody on the wire is believed")
     add_shared(parser, "insecure-beyond-loopback", "duration")
     add_shared(parser, quiet={"help": "print no line a minute"})
     add_shared(parser, json={"help": "print the ready line and the last status as JSON"})
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         raise FieldError("--config", "nothing", "a TOML file", "'dehyst serve --example' prints an example")
     with starting() as started:
         config = _with_listen(read_config(args.config, args.insecure_beyond_loopback), args.listen, args.standby)
+        config = replace(config, open=config.open or args.open)
         if config.fleet is not None:
             return _run_fleet(config, args, started)
         from service.runtime.stopping import StopSignal
@@ -151,7 +153,8 @@ def _print_ready(ready: dict[str, Any], as_json: bool) -> None:
     where = ", ".join((*ready["listen"], *ready["connect"]))
     axes = "; ".join(f"{name}: {', '.join(models)}" for name, models in ready["axes"].items())
     role = ready["role"] + ("" if ready["synced"] else " WITHOUT the model of the primary")
-    print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}", flush=True)
+    signed = f"signed by the key in {ready['key_file']}" if ready["key_file"] else "NOT signed"
+    print(f"ready as {role} at {where}, keys {ready['key']}/..., models {axes}; {signed}", flush=True)
 
 
 def _with_listen(config: ServeConfig, listen: list[str] | None, standby: bool) -> ServeConfig:

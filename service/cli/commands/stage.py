@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
     add("--examples", type=Path, metavar="DIR", help="write the files that the examples of --help name, and exit")
     add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
-    add_shared(parser, "zenoh-config", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
+    add_shared(parser, "zenoh-config", "key", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
 
 
 def parse_change(text: str) -> ParameterChange:

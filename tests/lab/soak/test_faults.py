@@ -107,7 +107,8 @@ class Session:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def put(self, key: str, payload: bytes, congestion_control: object) -> None:
+    def put(self, key: str, payload: bytes, attachment: bytes, congestion_control: object) -> None:
+        assert len(attachment) == 32
         self.sent.append(key)
 
     def get(self, key: str, payload: bytes, timeout: float) -> list[Any]:

@@ -18,6 +18,7 @@ import zenoh
 from adaptive.errors import InputError
 from lab.cli import main
 from service.answers.answering import derivatives
+from service.answers.guard import Limits
 from service.client.client import Client
 from service.protocol import samples as wire
 from service.protocol.delta import FollowedState
@@ -34,6 +35,7 @@ from service.protocol.keys import Keys
 from service.protocol.model import decode_model
 from service.protocol.query import BLENDED, LIMITED_SLEW, LIMITED_VOLTAGE, STALE, STAND_IN, FeedforwardQuery
 from service.runtime.session import open_client, open_service
+from service.security.authenticator import own_authenticator
 
 pytestmark = pytest.mark.e2e
 DT_S = 1e-3
@@ -155,7 +157,7 @@ def test_the_changes_add_up_to_the_model_of_the_service_and_a_lost_one_is_repair
     assert changes.lost >= 1
     assert changes.repairs >= 1
     assert (changes.mismatches, follower.refused) == (0, 0)
-    payload = client._queries.get(f"{client.keys.model}?name=auto;changes=1")
+    payload = client._queries.get(client.keys.model, "name=auto;changes=1", lambda signed: signed.payload)
     assert FollowedState.decode(payload).fingerprint == changes.fingerprint
     whole, moved = decode_model(payload), follower.model
     for name, value in whole.model.state_dict().items():  # type: ignore[attr-defined]
@@ -285,9 +287,13 @@ def ask_until_unanswered(client: Client) -> None:
 def test_every_question_is_repeated_while_another_service_takes_over(free_port: int) -> None:
     endpoint, keys = f"tcp/127.0.0.1:{free_port}", Keys("demo", "x")
 
+    by, limits = own_authenticator(), Limits(0.0, 10.0, 2000.0).to_json()
+    status = {"stage": "demo", "axis": "x", "dt_s": DT_S, "limits": limits, "instance": "a"}
+
     def tell(query: zenoh.Query) -> None:
         with query:
-            query.reply(keys.status, json.dumps({"dt_s": DT_S, "instance": "a"}))
+            payload = json.dumps(status).encode()
+            query.reply(keys.status, payload, attachment=by.answered(query, keys.status, payload))
 
     with open_service([endpoint]) as server:
         first = server.declare_queryable(keys.status, tell)

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from service.client.client import Client
+from service.failover.state_transfer import status_of
 from service.protocol.errors import BusyError, RefusedError, error_from_json
 from service.protocol.keys import Keys
 from service.protocol.query import encode_query
 from service.runtime.session import open_client, open_service
+from service.security.authenticator import own_authenticator
 
 pytestmark = pytest.mark.e2e
 N = 40_000
@@ -64,10 +66,13 @@ def test_parameters_that_nobody_knows_are_refused_once(client: Client, selector:
     assert repr(selector.split("?")[1].split("=")[0]) == said["got"]
 
 
-def test_another_instance_asked_for_a_sign_of_life_says_so(client: Client) -> None:
-    (reply,) = client._session.get(f"{client.keys.state}?alive=somebody;nonce=1")
-    assert reply.err is not None
-    assert json.loads(reply.err.payload.to_bytes())["field"] == "alive"
+def test_another_instance_asked_for_a_sign_of_life_gives_none(client: Client) -> None:
+    by, key = own_authenticator(), client.keys.status
+    instance = str(client.status()["instance"])
+    assert status_of(client._session, key, "somebody", 0.5, by) is None
+    found = status_of(client._session, key, instance, 5.0, by)
+    assert found is not None
+    assert found["instance"] == instance
 
 
 def test_more_points_than_configured_are_refused(serve: Any) -> None:

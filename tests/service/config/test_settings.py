@@ -61,7 +61,7 @@ def test_the_example_has_every_key_and_every_default(tmp_path: Path) -> None:
     given = {"recorder": tmp_path / "recordings/x", "checkpoints": tmp_path / "checkpoints/x", "stand_in": "mpi"}
     limits = replace(shown.axes[0].limits, y_min_um=-5.0, y_max_um=95.0)
     assert full.axes == (replace(shown.axes[0], limits=limits, **given),)  # type: ignore[arg-type]
-    assert replace(full, axes=(), zenoh_config=None) == replace(shown, axes=())
+    assert replace(full, axes=(), zenoh_config=None, key=None) == replace(shown, axes=())
 
 
 def test_the_page_of_the_configuration_is_the_schema() -> None:

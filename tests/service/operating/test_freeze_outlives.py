@@ -15,7 +15,6 @@ import zenoh
 from service.client.client import Client
 from service.operating.remote import operate
 from service.runtime.session import open_client, wait_followed
-from service.security.peers import OWN_SECRET
 from tests.service.conftest import unused_port, write_config
 from tests.service.living import Process, Stage, eventually, samples
 
@@ -99,8 +98,7 @@ def test_a_standby_that_takes_over_within_20_ms_of_the_answer_is_frozen(tmp_path
         for folder, options in ((first_config, ()), (second_config, ("--standby",))):
             folder.mkdir()
             config = write_config(folder, ports[0], extra='recorder = "rec"\nserved = "lssvm_adaptive"\n')
-            secret = f'peer_secret = "{tmp_path / OWN_SECRET}"\n'
-            config.write_text(f'standby_listen = ["{endpoints[1]}"]\nlease_s = 0.6\n{secret}' + config.read_text())
+            config.write_text(f'standby_listen = ["{endpoints[1]}"]\nlease_s = 0.6\n' + config.read_text())
             processes.append(Process("serve", "--config", str(config), *options))
         with (
             open_client(endpoints, 20.0) as session,

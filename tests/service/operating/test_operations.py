@@ -31,6 +31,7 @@ from service.protocol import samples as wire
 from service.protocol.errors import FieldError, NoReplyError, RefusedError, ServiceError
 from service.protocol.keys import Keys
 from service.runtime.session import open_client, open_service
+from service.security.authenticator import NO_KEY, own_authenticator
 from tests.service.living import eventually
 
 KEYS = Keys("demo", "x")
@@ -85,8 +86,9 @@ def make(axis: FakeAxis, folder: Path | None, role: str = "primary") -> tuple[Op
     )
     journal = Journal(folder, wall_s=lambda: 1234.5)
     return OperationsServer(
-        KEYS, "i1-00", verbs, journal, lambda name, detail: events.append((name, detail)), lambda: role
-    ), events
+        KEYS, "i1-00", verbs, journal, lambda name, detail: events.append((name, detail)), lambda: role,
+        authenticator=own_authenticator(),
+    ), events  # fmt: skip
 
 
 def ask(verb: str, who: str = "alice", **arguments: Any) -> bytes:
@@ -238,6 +240,23 @@ def test_over_the_wire(wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServe
         (reply,) = list(client.get(KEYS.operate, payload=payload, timeout=5.0))
         assert json.loads(reply.err.payload.to_bytes())["error"] == "InputError"
     assert server.counters() == {"done": 1, "refused": 6, "unlogged": 0}
+
+
+def test_who_only_says_that_a_command_is_done_is_not_believed(
+    wire_axis: tuple[FakeAxis, zenoh.Session, OperationsServer],
+) -> None:
+    axis, client, _ = wire_axis
+    said = json.dumps({"ok": True, "seq": 7, "result": {}})
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            query.reply(KEYS.operate, said, attachment=query.attachment)
+
+    liar = client.declare_queryable(KEYS.operate, lie, complete=True)
+    time.sleep(0.2)
+    assert operate(client, KEYS, "freeze", "alice")["seq"] == 41
+    assert axis.done == [("freeze", "alice")]
+    liar.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_more_than_can_wait_is_refused_at_once(
@@ -395,12 +414,15 @@ def test_statuses_of_two_instances_on_one_key_are_both_heard(free_port: int) -> 
     def answer(name: str) -> Callable[[zenoh.Query], None]:
         def callback(query: zenoh.Query) -> None:
             with query:
-                query.reply(KEYS.status, json.dumps({**STATUS, "instance": name}))
+                status = json.dumps({**STATUS, "instance": name}).encode()
+                query.reply(KEYS.status, status, attachment=by[name].answered(query, KEYS.status, status))
 
         return callback
 
+    by = {"a": own_authenticator(), "b": own_authenticator(), "liar": NO_KEY}
     with open_service([endpoint]) as hub, open_client(endpoint) as other, open_client(endpoint) as client:
         entities = [hub.declare_queryable(KEYS.status, answer("a")), other.declare_queryable(KEYS.status, answer("b"))]
+        entities.append(other.declare_queryable(KEYS.status, answer("liar")))
         until = time.monotonic() + 5.0
         while len(found := statuses(client)) < 2 and time.monotonic() < until:
             time.sleep(0.05)

@@ -1,4 +1,4 @@
-"""A client written from docs/protocol.md alone: struct, json, zlib and numpy, and nothing of this project.
+"""A client written from docs/protocol.md alone: struct, json, zlib, hashlib and numpy, and nothing of this project.
 
 `decode_query`, `decode_reply`, `decode_model` read payloads, `Changes` sums up model changes; `Model` evaluates every
 kind; `answer` gives the reply to a query as the service does, by the page's sections "Evaluating a model" and "Limits,
@@ -7,13 +7,64 @@ stand-in and flags".
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import json
 import math
+import os
 import struct
 import zlib
 from typing import Any
 
 import numpy as np
+
+# --- The authenticator.
+
+
+def tag(secret: bytes, *parts: bytes | str) -> bytes:
+    """Of the parts of a message, under the key of the service."""
+    text = [part.encode() if isinstance(part, str) else part for part in parts]
+    data = b"".join(struct.pack("<Q", len(part)) + part for part in text)
+    return hashlib.blake2b(data, key=secret, digest_size=16).digest()
+
+
+class Trust:
+    """What a client believes: `replies` of its own queries, and `publications` of who answered them, in order."""
+
+    def __init__(self, secret: bytes) -> None:
+        self.secret, self.sender, self.number = secret, b"", -1
+
+    def reply(self, key: str, stamp: bytes, parameters: str, asked: bytes, attached: bytes, payload: bytes) -> bool:
+        """Whether this answers the query that was sent with ``stamp``."""
+        right = tag(self.secret, "reply", key, attached[:16], stamp, parameters, asked, payload)
+        if not hmac.compare_digest(attached[16:], right):
+            return False
+        if key.endswith("/model"):  # what is published from now on follows this
+            self.sender, self.number = attached[:8], int.from_bytes(attached[8:16], "little")
+        return True
+
+    def publication(self, key: str, attached: bytes, payload: bytes) -> bool:
+        """Whether this is said by who answered, and for the first time."""
+        right = tag(self.secret, "put", key, attached[:16], payload)
+        number = int.from_bytes(attached[8:16], "little")
+        if not hmac.compare_digest(attached[16:], right) or attached[:8] != self.sender or number <= self.number:
+            return False
+        self.number = number
+        return True
+
+
+class Stage:
+    """Signs what a stage publishes."""
+
+    def __init__(self, secret: bytes) -> None:
+        self.secret, self.sender, self.number = secret, os.urandom(8), 0
+
+    def attachment(self, key: str, payload: bytes) -> bytes:
+        """Of the next message."""
+        self.number += 1
+        stamp = self.sender + struct.pack("<Q", self.number)
+        return stamp + tag(self.secret, "put", key, stamp, payload)
+
 
 # --- Payloads.
 

@@ -20,6 +20,7 @@ from service.cli.commands.view import twins
 from service.protocol import samples as wire
 from service.protocol.keys import Keys
 from service.runtime.session import open_service
+from service.security.authenticator import own_authenticator
 from service.viewer.consumer import Consumer, ConsumerConfig
 from service.viewer.records import Diagnostics, Event, Health, Record, Status, Tracking, event_record
 
@@ -57,7 +58,7 @@ class Feed:
     """Stage, controller and service in one: publishes what they would, with the wire's own formats."""
 
     def __init__(self, session: Any, stage: str, errors_um: dict[str, float]) -> None:
-        self._put = session.put
+        self._put, self._by = session.put, own_authenticator()
         self.stage, self.errors_um = stage, errors_um
         self.sent = 0
 
@@ -79,8 +80,9 @@ class Feed:
         self.sent += n
 
     def say(self, what: str, fields: Any, axis: str = "x") -> None:
-        payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
-        self._put(getattr(Keys(self.stage, axis), what), payload)
+        payload, key = fields if isinstance(fields, bytes) else json.dumps(fields).encode(), Keys(self.stage, axis)
+        signed = self._by.published(key.status, payload) if what == "status" else None
+        self._put(getattr(key, what), payload, attachment=signed)
 
 
 def wait_for(condition: Any, timeout_s: float = 20.0) -> None:
@@ -103,6 +105,7 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
             wait_for(lambda: len(basket.of(Diagnostics)) == 50)
             feed.say("event", {"seq": 500, "event": "drift", "detail": "gain 0.94"})
             feed.say("status", {"stage": "demo"})
+            session.put(Keys("demo", "x").status, b'{"stage": "a stranger"}', attachment=bytes(32))
             feed.say("sample", b"nonsense")
             feed.say("reference", b"")
             feed.say("diagnostics", b"\xff{")
@@ -127,6 +130,7 @@ def test_the_consumer_joins_units_and_counts_what_it_cannot_read() -> None:
         assert error == pytest.approx(np.full(51 * BATCH, error_um))
     assert len(basket.of(Diagnostics)) == 51
     assert [s.fields for s in basket.of(Status)] == [{"stage": "demo"}]
+    assert consumer.counts["unsigned"] == 1
     event, ahead, far = basket.of(Event)
     assert (event.seq, event.text, event.level) == (500, "drift: gain 0.94", "WARN")
     assert event.t_s == pytest.approx(0.5), "told by its sequence number"

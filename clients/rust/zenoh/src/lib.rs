@@ -13,12 +13,16 @@ mod link;
 
 pub use link::Link;
 
+use dehyst::authenticator::{Heard, Question, Sender, STAMP};
 use dehyst::json::{self, Value};
-use dehyst::{Error, Follower, Limits, Publisher, Result, Update};
+use dehyst::{Authenticator, Error, Follower, Limits, Publisher, Result, Update};
+use std::hash::{BuildHasher, RandomState};
 use std::sync::mpsc::{SyncSender, TryRecvError};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
+use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Subscriber;
+use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session, Wait};
 
 /// Which service, and which of its models.
@@ -34,6 +38,8 @@ pub struct Options {
     pub timeout: Duration,
     /// zenoh's own JSON5 file with certificates and passwords; the endpoints here come over it.
     pub zenoh_config: Option<std::path::PathBuf>,
+    /// File with the key of the service; none: `DEHYST_KEY`, or that of this user on this machine.
+    pub key: Option<std::path::PathBuf>,
 }
 
 impl Default for Options {
@@ -45,6 +51,7 @@ impl Default for Options {
             model: String::new(),
             timeout: Duration::from_secs(2),
             zenoh_config: None,
+            key: None,
         }
     }
 }
@@ -52,7 +59,7 @@ impl Default for Options {
 /// Keeps the models coming: session and subscription end when it is dropped.
 pub struct Feed {
     _subscriber: Option<Subscriber<()>>,
-    session: Session,
+    asker: Asker,
     base: String,
     timeout: Duration,
 }
@@ -85,13 +92,15 @@ pub fn open(options: &Options) -> Result<Live> {
     let session = zenoh::open(config(options)?)
         .wait()
         .map_err(|error| failed("endpoints", error, "the endpoint of a running service"))?;
-    let mut feed = Feed { _subscriber: None, session, base, timeout: options.timeout };
+    let asker = Asker { session, by: Arc::new(Authenticator::find(options.key.as_deref())?) };
+    let mut feed = Feed { _subscriber: None, asker, base, timeout: options.timeout };
     let status = feed.status()?;
     let text = |name: &str| status.get(name).and_then(Value::text).unwrap_or("").to_string();
     let name = if options.model.is_empty() { text("served") } else { options.model.clone() };
     let limits = limits_of(&status)?;
     // Subscribe before the fetch, so that no model is missed between the two; a follower is made by the fetch.
-    let (early, waiting) = std::sync::mpsc::sync_channel::<Vec<u8>>(64);
+    let (early, waiting) = std::sync::mpsc::sync_channel::<(Vec<u8>, Vec<u8>)>(64);
+    let sender = Arc::new(Mutex::new(Sender::default()));
     let publisher = Arc::new(OnceLock::<Publisher>::new());
     let key = match name.as_str() {
         "auto" => Some("champion"),
@@ -101,35 +110,46 @@ pub fn open(options: &Options) -> Result<Live> {
     // A service that publishes no changes publishes whole models.
     let changes = status.get("delta_hz").and_then(Value::number).is_some_and(|rate| rate > 0.0);
     let whole = format!("{}/model?name={name}{}", feed.base, if changes { ";changes=1" } else { "" });
-    let repair = repairer(feed.session.clone(), whole.clone(), publisher.clone());
-    if let Some(key) = key {
-        let key = if changes { format!("{key}_delta") } else { key.to_string() };
-        let publisher = publisher.clone();
-        let repair = repair.clone();
+    let repair = repairer(feed.asker.clone(), whole.clone(), publisher.clone(), sender.clone());
+    let key = key.map(|key| format!("{}/{key}{}", feed.base, if changes { "_delta" } else { "" }));
+    if let Some(key) = key.clone() {
+        let (publisher, repair, sender) = (publisher.clone(), repair.clone(), sender.clone());
+        let by = feed.asker.by.clone();
         let subscriber = feed
+            .asker
             .session
-            .declare_subscriber(format!("{}/{key}", feed.base))
+            .declare_subscriber(key.clone())
             .callback(move |sample| {
-                let payload = sample.payload().to_bytes();
-                match publisher.get() {
-                    Some(publisher) => {
-                        // What is refused is counted there. A whole model is complete again; changes are not.
-                        if !matches!(publisher.update(&payload), Ok(Update::Taken | Update::Known | Update::Waits)) {
-                            let _ = repair.try_send(()); // one that waits already is enough
-                        }
+                let (payload, attached) = (sample.payload().to_bytes(), bytes_of(sample.attachment()));
+                let Some(publisher) = publisher.get() else {
+                    return drop(early.try_send((payload.into_owned(), attached)));
+                };
+                let complete = match locked(&sender).hear(&by, &key, &attached, &payload) {
+                    // What is refused is counted there. A whole model is complete again; changes are not.
+                    Heard::Taken => {
+                        matches!(publisher.update(&payload), Ok(Update::Taken | Update::Known | Update::Waits))
                     }
-                    None => drop(early.try_send(payload.into_owned())),
+                    Heard::Refused => true,
+                    Heard::Unknown => false, // another instance serves
+                };
+                if !complete {
+                    let _ = repair.try_send(()); // one that waits already is enough
                 }
             })
             .wait()
             .map_err(|error| failed("model", error, "a subscription"))?;
         feed._subscriber = Some(subscriber);
     }
-    let follower = Follower::new(&feed.get(&whole)?, limits)?;
+    let (model, attached) = feed.asker.get(&whole, &[], feed.timeout)?;
+    let follower = Follower::new(&model, limits)?;
+    locked(&sender).meet(&attached);
     let own = follower.publisher();
     let mut missing = false;
-    while let Ok(payload) = waiting.try_recv() {
-        missing = !matches!(own.update(&payload), Ok(Update::Taken | Update::Known));
+    while let Ok((payload, attached)) = waiting.try_recv() {
+        let key = key.as_deref().unwrap_or_default();
+        if locked(&sender).hear(&feed.asker.by, key, &attached, &payload) == Heard::Taken {
+            missing = !matches!(own.update(&payload), Ok(Update::Taken | Update::Known));
+        }
     }
     drop(publisher.set(own));
     if missing {
@@ -139,14 +159,21 @@ pub fn open(options: &Options) -> Result<Live> {
 }
 
 /// A thread that fetches the whole model when it is told that a change is missing. It ends with the sender.
-fn repairer(session: Session, selector: String, publisher: Arc<OnceLock<Publisher>>) -> SyncSender<()> {
+fn repairer(
+    asker: Asker,
+    selector: String,
+    publisher: Arc<OnceLock<Publisher>>,
+    whose: Arc<Mutex<Sender>>,
+) -> SyncSender<()> {
     let (sender, missing) = std::sync::mpsc::sync_channel::<()>(1);
     let work = move || {
         while missing.recv().is_ok() {
             let mut pause = Duration::from_millis(5);
             while let Some(publisher) = publisher.get() {
-                let got =
-                    get(&session, &selector, Duration::from_secs(2)).and_then(|payload| publisher.update(&payload));
+                let got = asker.get(&selector, &[], Duration::from_secs(2)).and_then(|(payload, attached)| {
+                    locked(&whose).meet(&attached);
+                    publisher.update(&payload)
+                });
                 // Until the changes that came meanwhile follow the model that was fetched.
                 if matches!(got, Ok(Update::Taken)) {
                     break;
@@ -203,48 +230,83 @@ impl Feed {
         json::parse(&self.get(&format!("{}/status", self.base))?)
     }
 
-    /// The one reply to a query, which is repeated until the time-out while nobody answers.
+    /// The reply to a query, which is repeated until the time-out while nobody answers.
     pub fn get(&self, selector: &str) -> Result<Vec<u8>> {
-        get(&self.session, selector, self.timeout)
+        Ok(self.asker.get(selector, &[], self.timeout)?.0)
     }
 }
 
-/// The one reply to a query, which is repeated until the time-out while nobody answers.
-fn get(session: &Session, selector: &str, timeout: Duration) -> Result<Vec<u8>> {
-    get_with(session, selector, None, timeout)
+fn locked(sender: &Mutex<Sender>) -> std::sync::MutexGuard<'_, Sender> {
+    sender.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-fn get_with(session: &Session, selector: &str, payload: Option<&[u8]>, timeout: Duration) -> Result<Vec<u8>> {
-    let until = Instant::now() + timeout;
-    loop {
-        let left = until.saturating_duration_since(Instant::now());
-        let asked = session.get(selector).timeout(left.max(Duration::from_millis(100)));
-        let asked = match payload {
-            Some(payload) => asked.payload(payload),
-            None => asked,
-        };
-        let replies = asked.wait().map_err(|error| failed("query", error, "an open session"))?;
-        while let Ok(reply) = replies.recv() {
-            match reply.result() {
-                Ok(sample) => return Ok(sample.payload().to_bytes().into_owned()),
-                Err(error) => {
-                    let payload = error.payload().to_bytes();
-                    if let Some(pause) = busy(&payload) {
-                        // Others ask for too much; the service says when to ask again.
-                        std::thread::sleep(pause.min(until.saturating_duration_since(Instant::now())));
-                        continue;
+fn bytes_of(attached: Option<&ZBytes>) -> Vec<u8> {
+    attached.map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default()
+}
+
+/// 16 bytes that nobody can foresee: a keyed hash under keys of the operating system.
+fn random() -> [u8; STAMP] {
+    let half = || RandomState::new().hash_one(Instant::now()).to_le_bytes();
+    let mut made = [0; STAMP];
+    made[..8].copy_from_slice(&half());
+    made[8..].copy_from_slice(&half());
+    made
+}
+
+/// Asks a service, and believes what carries its authenticator.
+#[derive(Clone)]
+struct Asker {
+    session: Session,
+    by: Arc<Authenticator>,
+}
+
+impl Asker {
+    /// The first right reply to a query and its attachment. The query is repeated until the time-out while there is none.
+    fn get(&self, selector: &str, payload: &[u8], timeout: Duration) -> Result<(Vec<u8>, Vec<u8>)> {
+        let until = Instant::now() + timeout;
+        let parameters = selector.split_once('?').map_or("", |(_, parameters)| parameters);
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let stamp = random();
+            let asked = self.session.get(selector).timeout(left.max(Duration::from_millis(100)));
+            // Whoever answers first must not keep the others' replies from us.
+            let asked =
+                asked.target(QueryTarget::All).consolidation(ConsolidationMode::None).attachment(stamp.to_vec());
+            let asked = if payload.is_empty() { asked } else { asked.payload(payload) };
+            let replies = asked.wait().map_err(|error| failed("query", error, "an open session"))?;
+            let (mut failure, mut unsigned) = (None, 0);
+            while let Ok(reply) = replies.recv() {
+                match reply.result() {
+                    Ok(sample) => {
+                        let question = Question { key: sample.key_expr().as_str(), parameters, payload, stamp };
+                        let (reply, attached) = (sample.payload().to_bytes(), bytes_of(sample.attachment()));
+                        if self.by.answers(&question, &attached, &reply) {
+                            return Ok((reply.into_owned(), attached));
+                        }
+                        unsigned += 1;
                     }
-                    if !String::from_utf8_lossy(&payload).to_lowercase().contains("timeout") {
-                        return Err(refusal(&payload));
-                    }
+                    // Anybody can send one: it counts where there is no right reply.
+                    Err(error) => drop(failure.get_or_insert_with(|| error.payload().to_bytes().into_owned())),
                 }
             }
+            if let Some(failure) = failure {
+                if let Some(pause) = busy(&failure) {
+                    // Others ask for too much; the service says when to ask again.
+                    std::thread::sleep(pause.min(until.saturating_duration_since(Instant::now())));
+                } else if !String::from_utf8_lossy(&failure).to_lowercase().contains("timeout") {
+                    return Err(refusal(&failure));
+                }
+            }
+            if Instant::now() >= until {
+                if unsigned > 0 {
+                    let got = format!("{unsigned} replies without the authenticator of the service");
+                    return Err(Error::new(selector, got, "the key that 'dehyst serve' prints, as key or DEHYST_KEY"));
+                }
+                let expected = "a running service for this stage and axis, which this role may query";
+                return Err(Error::new(selector, "no reply", expected));
+            }
+            std::thread::sleep(Duration::from_millis(50));
         }
-        if Instant::now() >= until {
-            let expected = "a running service for this stage and axis, which this role may query";
-            return Err(Error::new(selector, "no reply", expected));
-        }
-        std::thread::sleep(Duration::from_millis(50));
     }
 }
 

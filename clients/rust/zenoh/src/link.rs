@@ -1,14 +1,17 @@
 //! Bytes to and from the keys of an axis, without a model: what a stage, or a controller that asks ahead, needs.
 
-use crate::{base_of, config, failed, get_with, Options};
-use dehyst::Result;
+use crate::{base_of, config, failed, random, Asker, Options};
+use dehyst::{Authenticator, Result};
 use std::sync::mpsc::{channel, Receiver};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
-use zenoh::{pubsub::Subscriber, qos::CongestionControl, Session, Wait};
+use zenoh::{pubsub::Subscriber, qos::CongestionControl, Wait};
 
 /// A connection. It ends when it is dropped.
 pub struct Link {
-    session: Session,
+    asker: Asker,
+    /// Whose publications these are, and how many there were; held while one is sent, so that they arrive in order.
+    sent: Mutex<([u8; 8], u64)>,
     base: String,
     timeout: Duration,
     /// Payloads of the key that is received, and what takes them from the wire.
@@ -34,16 +37,21 @@ impl Link {
                 Some((payloads, subscriber))
             }
         };
-        Ok(Link { session, base, timeout: options.timeout, received })
+        let asker = Asker { session, by: Arc::new(Authenticator::find(options.key.as_deref())?) };
+        let [a, b, c, d, e, f, g, h, ..] = random();
+        let sent = Mutex::new(([a, b, c, d, e, f, g, h], 0));
+        Ok(Link { asker, sent, base, timeout: options.timeout, received })
     }
 
     /// Publish on a key; waits while the wire is full, so that nothing is dropped.
     pub fn send(&self, key: &str, payload: Vec<u8>) -> Result<()> {
-        self.session
-            .put(format!("{}/{key}", self.base), payload)
-            .congestion_control(CongestionControl::Block)
-            .wait()
-            .map_err(|error| failed("send", error, "an open session"))
+        let key = format!("{}/{key}", self.base);
+        let mut sent = self.sent.lock().unwrap_or_else(PoisonError::into_inner);
+        sent.1 += 1;
+        let attached = self.asker.by.publication(&key, sent.0, sent.1, &payload);
+        let put = self.asker.session.put(key, payload).congestion_control(CongestionControl::Block);
+        let put = if attached.is_empty() { put } else { put.attachment(attached) };
+        put.wait().map_err(|error| failed("send", error, "an open session"))
     }
 
     /// The next payload of the key that is received; none within `wait`.
@@ -53,6 +61,6 @@ impl Link {
 
     /// The one reply to a query with a payload, such as one of kind 4 on `feedforward`.
     pub fn ask(&self, key: &str, payload: &[u8]) -> Result<Vec<u8>> {
-        get_with(&self.session, &format!("{}/{key}", self.base), Some(payload), self.timeout)
+        Ok(self.asker.get(&format!("{}/{key}", self.base), payload, self.timeout)?.0)
     }
 }
