@@ -31,6 +31,7 @@ from benchmarks.ablation import (
     shift,
     table,
     variants_of,
+    worse_cases,
     worse_rows,
 )
 
@@ -158,6 +159,13 @@ def test_a_row_is_worse_where_its_cases_grow_by_more_than_other_noise_does() -> 
     assert rows(BASE) == []
 
 
+def test_a_single_case_that_gets_much_worse_is_told_but_makes_no_row() -> None:
+    groups = {"sensor": NAMES}
+    one = BASE | {"c0": case(1.0, worst=100.0), "c1": case(1.2, unnamed=True)}
+    assert worse_cases(one, BASE, REPEATED, groups) == ["c0: worst × 95.29", "c1: unnamed"]
+    assert worse_cases(REPEATED[0], BASE, REPEATED, groups) == []
+
+
 def test_more_comparisons_ask_for_more() -> None:
     grown = {name: case(1.0, worst=1.14) for name in NAMES}
     assert rows(grown, comparisons=10) == ["sensor worst × 1.13"]
@@ -183,7 +191,6 @@ class FallbackCase:
     name: str
     seed: int
     group: str = "intact"
-    first: bool = True
 
     def run(self, noise: int, settings: Settings) -> Numbers:
         rng = np.random.default_rng([self.seed, noise])
