@@ -56,7 +56,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
@@ -707,13 +707,13 @@ def field_variants() -> list[Variant]:
     tables: list[tuple[str, Any]] = [("", whole)]
     tables += [(f.name, getattr(whole, f.name)) for f in fields(whole) if is_dataclass(getattr(whole, f.name))]
     for table, config in tables:
-        for field in fields(config):
-            value = getattr(config, field.name)
+        for entry in fields(config):
+            value = getattr(config, entry.name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < abs(value) < gates.ABSURD:
                 continue
-            label = f"{table or 'learner'}.{field.name}"
+            label = f"{table or 'learner'}.{entry.name}"
             for name, factor in FACTORS.items():
-                new = {field.name: scaled(value, factor)}
+                new = {entry.name: scaled(value, factor)}
                 settings = {table: new} if table else new
                 found.append(Variant(f"{label} {name}", label, "field", settings, _nothing, frozenset(), f"{value}"))
     return found
@@ -928,13 +928,17 @@ HEAD = ("what", "value", "half / off", "twice", "better", "single cases that get
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The numbers of all variants so far, by name; the groups of cases; what each variant is of."""
+    """The numbers of all variants so far, by name; the groups of cases; what was planned.
+
+    untested : variants whose lines no case goes through.
+    """
 
     base: ByCase
     repeated: list[ByCase]
     groups: Mapping[str, Sequence[str]]
     variants: dict[str, ByCase]
     planned: Sequence[Variant]
+    untested: set[str] = field(default_factory=set)
 
     @property
     def comparisons(self) -> int:
@@ -958,9 +962,14 @@ class Results:
         return f"{rows} of {seen} rows and {cases} single cases"
 
 
+UNTESTED: Final = "no case goes there"
+
+
 def _told(results: Results, name: str) -> str:
     if name not in results.variants:
         return "not run"
+    if name in results.untested:
+        return UNTESTED
     rows, moved = results.worse(name), different(results.variants[name], results.base)
     if rows:
         return "**" + ", ".join(map(str, rows)) + "**"
@@ -974,14 +983,15 @@ def table(results: Results) -> str:
         groups.setdefault(variant.of, []).append(variant)
     parts: dict[str, list[tuple[str, ...]]] = {
         "changes nothing, to the last bit": [], "worth nothing: no row and no case gets worse beyond chance": [],
-        "open: single cases get worse, no row does": [], "worth its place": [], "not shifted": [],
+        "open: single cases get worse, no row does": [], "worth its place": [], "not tested by these cases": [],
+        "not shifted": [],
     }  # fmt: skip
     kinds = list(parts)
     for of, variants in groups.items():
         first = variants[0]
         done = [v for v in variants if v.name in results.variants]
         if first.impossible:
-            parts[kinds[4]].append((of, first.value, first.impossible, "", "", ""))
+            parts[kinds[5]].append((of, first.value, first.impossible, "", "", ""))
             continue
         if len(done) < len(variants):
             continue
@@ -990,9 +1000,10 @@ def table(results: Results) -> str:
         better = [f"{shift}{row}" for name, shift in shifts.items() for row in results.worse(name, -1)]
         single = [f"{shift}{text}" for name, shift in shifts.items() for text in results.single(name)]
         line = (of, first.value, cells[0], *(cells[1:] or "-"), ", ".join(better), "; ".join(single))
-        same = all(cell == "the same" for cell in cells)
+        same = all(cell in ("the same", UNTESTED) for cell in cells)
         worth = any(results.worse(v.name) for v in variants)
-        parts[kinds[0 if same else 3 if worth else 2 if single else 1]].append(line)
+        untested = all(cell == UNTESTED for cell in cells)
+        parts[kinds[4 if untested else 0 if same else 3 if worth else 2 if single else 1]].append(line)
     cases = sum(len(names) for names in results.groups.values())
     texts = [
         f"{cases} cases ({', '.join(f'{len(names)} {group}' for group, names in results.groups.items())}), "
@@ -1076,7 +1087,7 @@ def ablate(
     groups = {group: [case.name for case in cases if case.group == group] for group in GROUPS}
     groups = {group: names for group, names in groups.items() if names}
     mark = fingerprint(cases)
-    done = read(path, mark)
+    done, untested = read(path, mark)
     # As it is, in this process, which loads all that is compiled; twice, to see what is called.
     base, entered, seconds = dict[str, Numbers](), dict[str, frozenset[Place]](), dict[str, float]()
     inside = {file for variant in planned for file, _ in variant.places}
@@ -1090,7 +1101,7 @@ def ablate(
             raise SystemExit(f"{case.name}: not deterministic: {base[case.name]}, then {again}")
         _say(f"{case.name}: {', '.join(f'{name} {value:.3g}' for name, value in again.items())}")
     if UNMODIFIED not in done:
-        add(path, mark, UNMODIFIED, base)
+        add(path, mark, UNMODIFIED, base, len(cases))
     elif changed := different(done[UNMODIFIED], base):
         raise SystemExit(f"{path}: {changed[0]} came to other numbers than now: another machine, or another build")
     plan: list[tuple[Variant, int, Sequence[Case]]] = []
@@ -1105,11 +1116,14 @@ def ablate(
     repeated = [done[name] for k in range(1, REPEATED + 1) if (name := f"{NOISE} {k}") in done]
     known = {variant.name for variant in planned}
     results = Results(base, repeated, groups, {name: n for name, n in done.items() if name in known}, planned)
+    results.untested.update(untested)
     planned_s = sum(seconds[case.name] for _, _, part in plan for case in part)
     spent_s, begun = 0.0, time.monotonic()
     for variant, noise, numbers in run_all(plan, jobs, sum(seconds.values())):
         whole = {case.name: numbers.get(case.name, base[case.name]) for case in cases}
-        add(path, mark, variant.name, whole)
+        add(path, mark, variant.name, whole, len(numbers))
+        if not numbers:
+            results.untested.add(variant.name)
         if noise:
             repeated.append(whole)
         else:
@@ -1127,11 +1141,11 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def read(path: Path | None, mark: str) -> dict[str, ByCase]:
-    """The results in a file by variant, of the same learner and cases."""
+def read(path: Path | None, mark: str) -> tuple[dict[str, ByCase], set[str]]:
+    """The results in a file by variant, of the same learner and cases, and the variants for which no case was run."""
+    found, untested = dict[str, ByCase](), set[str]()
     if path is None or not path.exists():
-        return {}
-    found = {}
+        return found, untested
     for line in path.read_text().splitlines():
         try:
             entry = json.loads(line)
@@ -1139,15 +1153,17 @@ def read(path: Path | None, mark: str) -> dict[str, ByCase]:
             continue  # cut off
         if entry["mark"] == mark:
             found[entry["variant"]] = entry["cases"]
-    return found
+            if not entry["run"]:
+                untested.add(entry["variant"])
+    return found, untested
 
 
-def add(path: Path | None, mark: str, name: str, cases: ByCase) -> None:
-    """Add a line to a file."""
+def add(path: Path | None, mark: str, name: str, cases: ByCase, run: int) -> None:
+    """Add a line to a file. ``run`` : number of cases that were run; the others are as they are without the variant."""
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
-            file.write(json.dumps({"mark": mark, "variant": name, "cases": cases}) + "\n")
+            file.write(json.dumps({"mark": mark, "variant": name, "run": run, "cases": cases}) + "\n")
 
 
 if __name__ == "__main__":

@@ -209,23 +209,31 @@ def cases() -> list[ablation.Case]:
 def test_a_constant_that_matters_is_told_from_one_that_does_not(
     cases: list[ablation.Case], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    planned = [v for label in ("learner.FALLBACK_RATIO", "learner.NEWEST") for v in variants_of(constant(label))]
+    planned = [
+        v
+        for label in ("learner.FALLBACK_RATIO", "learner.NEWEST", "learner.LONG_S")
+        for v in variants_of(constant(label))
+    ]
     path, to = tmp_path / "a.jsonl", tmp_path / "table.md"
     results = ablate(cases, planned, jobs=2, path=path, to=to)
     assert [row.measure for row in results.worse("learner.FALLBACK_RATIO twice")] == ["median"]
     assert not results.worse("learner.FALLBACK_RATIO half")
-    # Nothing enters the function that reads it, so it was not run; it is the same for sure.
-    assert "learner.NEWEST half (0 cases run): the same" in capsys.readouterr().err
-    nothing, worth = to.read_text().split("### worth its place (1)")
-    assert "changes nothing, to the last bit (1)" in nothing
-    assert "learner.NEWEST | 100 | the same | the same" in nothing
+    # Gone through and the same, and not gone through: nothing was tried then.
+    assert "learner.LONG_S half (8 cases run): the same" in capsys.readouterr().err
+    _, nothing, worth, untested = to.read_text().split("###")
+    assert nothing.startswith(" changes nothing, to the last bit (1)")
+    assert "learner.LONG_S | 2.0 | the same | the same" in nothing
+    assert worth.startswith(" worth its place (1)")
     assert "learner.FALLBACK_RATIO | 1.3" in worth
+    assert untested.startswith(" not tested by these cases (1)")
+    assert "learner.NEWEST | 100 | no case goes there" in untested
     assert table(results) + "\n" == to.read_text()
 
     again = ablate(cases, [*planned, *variants_of(constant("learner.SHORT_S"))], path=path)
     said = capsys.readouterr().err
     assert "FALLBACK_RATIO" not in said
     assert "learner.SHORT_S twice (8 cases run)" in said
+    assert again.untested == results.untested
     assert again.worse("learner.FALLBACK_RATIO twice") == results.worse("learner.FALLBACK_RATIO twice")
 
 
