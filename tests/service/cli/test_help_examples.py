@@ -126,6 +126,7 @@ def test_modes_run_as_printed(folder: Path) -> None:
     assert [round(mode["frequency_hz"][0]) for mode in json.loads(in_json)["modes"]] == [90, 228]
 
 
+@pytest.mark.timeout(600)
 def test_a_diagnosis_runs_as_printed(folder: Path) -> None:
     """The example that reads one period of the drive beside many of readings; it takes a minute."""
     (periods,) = [example for example in examples("diagnose") if "--repeat" in example]
