@@ -612,6 +612,15 @@ def _without_gate(c: DriftConfig) -> DriftConfig:
     return replace(c, gate_sigma=1e9)
 
 
+def _of_fixed_noise(c: DriftConfig, *rest: Any) -> str:
+    return _UPDATE(_without_alike(c), *rest)
+
+
+@functools.cache
+def _without_alike(c: DriftConfig) -> DriftConfig:
+    return replace(c, alike_s=0.0)
+
+
 def _fixed_phase(now: int, every: int) -> bool:
     return now % every == 0
 
@@ -651,14 +660,15 @@ RULES: Final = (
     Rule("outliers are refused by the filter", ((drift, "update", _ungated),)),
     Rule("samples from before a change count less", ((ResidualWindow, "let_go", _nothing),)),
     Rule("the window learns", ((ResidualWindow, "learn", _always(LEARNT)),)),
-    Rule("the kernel part", ((ResidualWindow, "mean", _always(0.0)), (ResidualWindow, "arrays", _no_kernel))),
+    Rule("the kernel part", ((ResidualWindow, "predict", _always(0.0)), (ResidualWindow, "arrays", _no_kernel))),
+    Rule("only the share that is borne out of the kernel part", ((ResidualWindow, "weigh", _nothing),)),
+    Rule("the noise follows from the innovations", ((drift, "update", _of_fixed_noise),)),
     Rule("the window learns at moving phases", ((learner, "due", _fixed_phase),)),
     Rule("smoother settles first", ((gates, "settling", _always(False)),)),
     Rule("identified model during a trial", ((Parts, "watch_trial", _never_alone),)),
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
     Rule("trial: voltages over seconds end it", ((sensor_trust.Trial, "_obeyed_long", _always(False)),)),
     Rule("trial: a drift beside the motion", ((sensor_trust, "beside_drift", _always((0.0, 0.0))),)),
-    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
     Rule("trial: confirms jumps taken back", ((sensor_trust.Trial, "_confirms_reverted_jumps", _always(False)),)),
     Rule("trial: decides at rest", ((sensor_trust.Trial, "_at_rest", _always(sensor_trust.OPEN)),)),
 )  # fmt: skip

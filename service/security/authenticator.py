@@ -35,8 +35,8 @@ OPEN: Final = "-"
 _LEAST, _MOST = 16, 64
 #: Bytes of a stamp, of the sender in it, and of a tag.
 STAMP, SENDER, TAG = 16, 8, 16
-#: Stamps of queries, and senders of samples, that are remembered.
 _LENGTH: Final = struct.Struct("<Q").pack
+#: Stamps of queries, and senders of samples, that are remembered.
 _REMEMBERED: Final = 65_536
 _SENDERS: Final = 16
 #: For `zenoh.Session.get`: whoever answers first must not keep the others' replies from the caller.
