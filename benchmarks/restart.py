@@ -26,6 +26,8 @@ from sim.recordings import read
 
 #: Libraries that a service needs: the lower bound of its start.
 LIBRARIES = "import numpy, numba, scipy.linalg.cython_lapack, pyarrow.parquet, zenoh"
+#: Time from what is told to the kill, s: the journal is milliseconds behind, more on a busy machine.
+WRITTEN_S = 0.1
 RATE_HZ, BATCH = 1000.0, 5
 
 
@@ -38,7 +40,7 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
     then, which on a machine with idle cores is about as long; ``answered_s``: from the kill until a client that keeps
     asking has an answer; ``libraries_s``; ``ready_over_libraries``; each as a list. ``unlearnt_ms``: milliseconds of
     samples that the last status counted as handled and that the restarted learner does not know. ``records_lost``: of
-    those, how many are in no recording.
+    those, how many are in no recording; the kill comes ``WRITTEN_S`` after they were told.
     """
     rows: dict[str, list[float]] = {"ready_s": [], "answered_s": [], "libraries_s": [], "unlearnt_ms": []}
     rows["ready_cpu_s"] = []
@@ -54,6 +56,7 @@ def restart(rounds: int = 10, learn_s: float = 3.0) -> dict[str, Any]:
                 feed = setup.start_feed(first)
                 time.sleep(learn_s)
                 before = int(client.status()["seq"])
+                time.sleep(WRITTEN_S)
                 killed = time.monotonic()
                 service.kill()
                 feed.kill()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final
 
 from adaptive.errors import InputError
 from adaptive.online.drift import DriftConfig
@@ -11,6 +12,12 @@ from adaptive.online.kernel_window import Eviction, WeightConfig
 from adaptive.smoothing import SmootherConfig
 from adaptive.types import StateDict, joined, under
 from adaptive.window.window import SolverConfig
+
+#: Groups of settings that are tables of their own.
+_TABLES: Final[dict[str, type[Any]]] = {
+    "admission": AdmissionConfig, "drift": DriftConfig, "weights": WeightConfig, "solver": SolverConfig,
+    "envelope": EnvelopeConfig,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,25 +73,14 @@ class LearnerConfig:
 
     def state_dict(self) -> StateDict:
         """All fields under flat names."""
-        names = ("admission", "drift", "weights", "solver", "envelope")
-        parts = {name: asdict(getattr(self, name)) for name in names}
-        flat = joined(parts)
-        own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in parts}
-        # The file format has entries for two settings that no longer exist; older versions read them.
-        return {**own, **flat, "solver.backend": "compiled", "drift.algebra": "compiled"}
+        own = asdict(self)
+        return joined({name: own.pop(name) for name in _TABLES}) | own
 
     @classmethod
     def from_state(cls, values: StateDict) -> LearnerConfig:
         """Inverse of ``state_dict``."""
         own = {name: value for name, value in values.items() if "." not in name}
-        return cls(
-            **own,
-            admission=AdmissionConfig(**under("admission.", values)),
-            drift=DriftConfig(**{n: v for n, v in under("drift.", values).items() if n != "algebra"}),
-            weights=WeightConfig(**under("weights.", values)),
-            solver=SolverConfig(values["solver.form"], values["solver.accuracy"]),
-            envelope=EnvelopeConfig(**under("envelope.", values)),
-        )
+        return cls(**own, **{name: table(**under(f"{name}.", values)) for name, table in _TABLES.items()})
 
     def smoother(self, dt_s: float) -> SmootherConfig:
         """The smoother at a sample time."""

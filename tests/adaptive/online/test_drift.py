@@ -152,13 +152,6 @@ def test_the_compiled_filter_agrees_with_filterpy_through_changes_and_rests(monk
     np.testing.assert_allclose(reference.covariance, compiled.covariance, rtol=0.0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("table", "key"), [("solver", "backend"), ("drift", "algebra")])
-def test_a_state_from_before_a_setting_was_removed_is_read(table: str, key: str) -> None:
-    state = LearnerConfig().state_dict()
-    assert state[f"{table}.{key}"] == "compiled"
-    assert LearnerConfig.from_state(state) == LearnerConfig()
-
-
 # --- The compiled algebra of the drift filter is that of filterpy's Kalman filter, step by step and over many of them.
 
 SPAN_V = 8.0
