@@ -669,6 +669,7 @@ RULES: Final = (
     Rule("the place is reckoned again", ((Intake, "reckon_by", _nothing),)),
     Rule("trial: voltages over seconds end it", ((sensor_trust.Trial, "_obeyed_long", _always(False)),)),
     Rule("trial: a drift beside the motion", ((sensor_trust, "beside_drift", _always((0.0, 0.0))),)),
+    Rule("trial: shifted readings must bend alike", ((sensor_trust, "bends_otherwise", _always(False)),)),
     Rule("trial: confirms jumps taken back", ((sensor_trust.Trial, "_confirms_reverted_jumps", _always(False)),)),
     Rule("trial: decides at rest", ((sensor_trust.Trial, "_at_rest", _always(sensor_trust.OPEN)),)),
 )  # fmt: skip

@@ -220,7 +220,9 @@ OPEN_SLOPE = 0.15
 #: A shift of the zero is accepted after half a window under three conditions: the shift by the identified model is
 #: within these multiples of the shift by dead reckoning, the lines explain at least this share of the variance, and
 #: both slopes are this close to 1.
-ALIKE, PLAIN, PLAIN_SLOPE = (0.5, 2.5), 0.98, 0.12
+#: Straight lines in time are taken off position and readings, and what is left must agree. It is compared where that of
+#: the position is at least this multiple of the noise of a reading.
+ALIKE, PLAIN, PLAIN_SLOPE, BENDS_SIGMA = (0.5, 2.5), 0.98, 0.12, 2.0
 #: A drift of the zero beside the motion is accepted after half a window, if position and voltages explain this share of
 #: what is left beside the drift, both slopes are known with this standard deviation, and lie within this factor of 1.
 BESIDE, BESIDE_STD, BESIDE_SLOPE = 0.9, 0.1, 1.4
@@ -294,6 +296,8 @@ class Trial:
     shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
     open_slope: Annotated[float, Entry("jumps reverted when the trial began, 0 for none")] = 0.0
     open_shift_um: Annotated[float, Entry("their shift", "µm")] = 0.0
+    # They may be of another stage.
+    bent: Annotated[int, Entry("1 if readings that seemed shifted bend otherwise than the position", low=0)] = 0
     by_voltages: Annotated[int, Entry("1 if the position is not believed and voltages are compared", low=0)] = 0
     mean_u_V: Annotated[float, Entry("mean of u over LONG_S, with forgetting", "V")] = 0.0
     mean_p_V: Annotated[float, Entry("mean of p", "V")] = 0.0
@@ -392,9 +396,11 @@ class Trial:
         slope_error = max(abs(s.slope - 1.0), abs(voltages.slope - 1.0))
         usual = zero_moved and not self.fault and abs(off_um) <= now.envelope.jump * now.range_um
         plain = min(s.share, voltages.share) >= PLAIN and slope_error <= PLAIN_SLOPE
-        if usual and plain:
+        if usual and plain and not self.bent:
             # A clear shift of usual size, without a fault so far, needs only half a window.
-            return Decision(Outcome.CHANGED, 1.0, off_um)
+            self.bent = int(bends_otherwise(x, y, now.noise_um))
+            if not self.bent:
+                return Decision(Outcome.CHANGED, 1.0, off_um)
         drifted_um = 0.0 if self.fault or follows else self._drifted_um(u, y, x, p, now)
         if drifted_um:
             return Decision(Outcome.CHANGED, 1.0, drifted_um)
@@ -510,16 +516,31 @@ def beside_drift(x: FloatArray, y: FloatArray, noise: float) -> tuple[float, flo
 
     Zeros if the motion does not explain the rest, with a slope near 1. ``noise`` : standard deviation of a value y.
     """
+    s, std = _of_bends(x, y)
+    known = std <= BESIDE_STD and s.swing > SWING_SIGMA * noise
+    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
+        return 0.0, 0.0
+    off = slope_of(np.linspace(-1.0, 0.0, x.size), y - x)
+    return off.slope, off.constant
+
+
+def bends_otherwise(x: FloatArray, y: FloatArray, noise: float) -> bool:
+    """Whether (n,) values ``y`` bend in time, and not as the motion ``x`` does. ``noise`` : deviation of a value y.
+
+    Over a short time two motions of the same speed are alike; what is left beside their straight lines tells them
+    apart.
+    """
+    s, std = _of_bends(x, y)
+    return s.swing > BENDS_SIGMA * noise and abs(s.slope - 1.0) > PLAIN_SLOPE + 4.0 * std
+
+
+def _of_bends(x: FloatArray, y: FloatArray) -> tuple[Slope, float]:
+    """The line of (n,) values ``y`` over ``x``, both less their straight lines in time, and the slope's deviation."""
     t = np.linspace(-1.0, 0.0, x.size)
     over_x, over_y = slope_of(t, x), slope_of(t, y)
     dx, dy = x - over_x.slope * t - over_x.constant, y - over_y.slope * t - over_y.constant
     s = slope_of(dx, dy)
-    std = s.std * correlated(dy - s.slope * dx)
-    known = std <= BESIDE_STD and s.swing > SWING_SIGMA * noise
-    if not (known and s.share >= BESIDE and 1.0 / BESIDE_SLOPE <= s.slope <= BESIDE_SLOPE):
-        return 0.0, 0.0
-    off = slope_of(t, y - x)
-    return off.slope, off.constant
+    return s, s.std * correlated(dy - s.slope * dx)
 
 
 def _fault(s: Slope, spread: float, allowed: bool, unit: str = "um") -> tuple[str, str]:
