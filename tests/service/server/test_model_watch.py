@@ -72,7 +72,7 @@ def poisoned(k: FloatArray, y: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(("lie", "name"), [(frozen, "sensor_frozen"), (poisoned, "samples_poisoned")])
 def test_samples_that_lie_teach_nothing_and_the_model_from_before_is_served(lie: Any, name: str) -> None:
     bench = Bench(make_axis())
-    bench.run(3000)
+    bench.run(9000)
     before = bench.u_V
     assert bench.events == []
     bench.run(1000, lie)
@@ -107,7 +107,7 @@ def test_going_back_forgets_what_was_learnt_and_not_where_the_stage_has_been(lie
     """Else the learner would go on with turning points of seconds ago, and every caller with other ones."""
     bench, twin = Bench(make_axis()), Bench(make_axis())
     for each in (bench, twin):
-        each.run(3100)
+        each.run(9100)
     bench.run(900, lie)
     bench.run(1501)  # up to a snapshot
     twin.run(2401)
