@@ -72,8 +72,14 @@ def test_no_voltage_of_a_liar_is_handed_to_a_caller(endpoint: str, liar: zenoh.S
         for forged in (encode_reply(lie), encode_reply(small)):
             with ExitStack() as lying:
                 answers(liar, KEYS.feedforward, lambda _, forged=forged: forged, lying)  # type: ignore[misc]
-                assert {client.point(40.0).u_V for _ in range(50)} == {honest_V}
-                assert client.refused
+                before, told = client.refused, set()
+                # The right reply often comes first, and then the liar's is not even looked at.
+                for k in range(5000):
+                    told.add(client.point(40.0).u_V)
+                    if k >= 50 and client.refused > before:
+                        break
+                assert told == {honest_V}
+                assert client.refused > before
 
 
 def test_a_new_client_believes_no_limits_of_a_liar(endpoint: str, liar: zenoh.Session) -> None:
