@@ -241,7 +241,7 @@ class Intake:
         if known and self._hold is None and sample.seq % self._look_every == 0 and self._lags(track, sample.y_um):
             self._hold = self._lagging(track, model(), sample.y_um)
         doubtful = (known and abs(innovation) > limit) or (stuck and track.motion is not None)
-        # Of readings that are held back too, but for ringing: what surprises the smoother again and again is usual.
+        # Held readings count too, except while they ring: an error that repeats becomes the usual error.
         if self._hold is None or not self._hold.rang:
             admission.watch_innovation(c, gates, innovation)
         if self._hold is None and not doubtful:

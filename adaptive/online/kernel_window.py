@@ -100,10 +100,10 @@ SHARE_S = 0.5
 
 @dataclass(slots=True)
 class KernelShare:
-    """How much of the kernel part the last measurements bear out: its least-squares factor, from 0 to 1.
+    """Share of the kernel part that recent measurements confirm: its least-squares factor, from 0 to 1.
 
-    The kernel part is local: it can be of another motion than the present one. Then it is noise to the linear part,
-    which learns faster without it.
+    The kernel part is local. Where it was learnt from another motion than the present one, it only disturbs the linear
+    part, which then learns faster without it.
     """
 
     product_V2: Annotated[float, Entry("mean product of the kernel part and what the linear part leaves", "V²")]
@@ -250,7 +250,7 @@ class ResidualWindow:
         return cls(arrays.S.size, model, eviction, solver, arrays)._begun()
 
     def _begun(self) -> ResidualWindow:
-        """Itself, with a share of 1 by as much as the samples of the model say."""
+        """Itself, with a share of 1; the weight of this start is the mean square of the kernel part at its samples."""
         if len(self._window):
             self._share.product_V2 = self._share.square_V2 = float(np.mean(self._at_samples_V**2))
         return self

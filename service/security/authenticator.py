@@ -1,4 +1,4 @@
-"""Who speaks: one short authenticator, under a key that a service shares with its standbys, clients and stage.
+"""Message authentication: a short tag under a key that a service shares with its standbys, clients and stage.
 
 Everything that is acted upon carries 32 bytes, as zenoh's attachment: a *stamp* of 16 bytes, and a *tag* of 16 bytes,
 the keyed BLAKE2b of kind, key, stamp and payload (docs/protocol.md, "Authenticator").
@@ -39,7 +39,7 @@ _LENGTH: Final = struct.Struct("<Q").pack
 #: Stamps of queries, and senders of samples, that are remembered.
 _REMEMBERED: Final = 65_536
 _SENDERS: Final = 16
-#: For `zenoh.Session.get`: whoever answers first must not keep the others' replies from the caller.
+#: Options of `zenoh.Session.get`: the caller gets the replies of all instances, not the first one alone.
 EVERYBODY: Final[dict[str, Any]] = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
 
 
@@ -70,7 +70,7 @@ class Authenticator:
         return self._keyed is not None
 
     def tag(self, *parts: bytes | str) -> bytes:
-        """16 bytes that only who has the key can make for ``parts``; empty without a key."""
+        """The 16 bytes that only a holder of the key can make for ``parts``; empty without a key."""
         if self._keyed is None:
             return b""
         # As fast as Python can: it takes part in every answer.
@@ -83,7 +83,7 @@ class Authenticator:
         return hashed.digest()
 
     def proves(self, tag: bytes, *parts: bytes | str) -> bool:
-        """Whether ``tag`` is that of ``parts``; always without a key."""
+        """Whether ``tag`` is right for ``parts``; always True without a key."""
         return self._keyed is None or hmac.compare_digest(tag, self.tag(*parts))
 
     # ---- who publishes and answers
@@ -171,8 +171,8 @@ class Heard:
 
     Attributes
     ----------
-    refused : messages without a right tag. old : those that were said before. is_unknown : whether the last one that
-    was left out is of another sender than the last reply; ask then, and `meet` who answers.
+    refused : number of messages without a right tag. old : number of repeated ones. is_unknown : whether the last
+    message was left out because its sender is not that of the last reply; then query, and `meet` who replies.
     """
 
     def __init__(self, authenticator: Authenticator, key: str) -> None:
@@ -188,7 +188,7 @@ class Heard:
             self._last = sender, number
 
     def take(self, sample: zenoh.Sample) -> bytes | None:
-        """The payload of a publication; None where it is not believed, or said again."""
+        """The payload of a publication; None where it is refused, or repeated."""
         signed = self._by.heard(sample, self._key)
         self.is_unknown = False
         if signed is None:
@@ -221,7 +221,7 @@ class HeardSamples:
         self._last: OrderedDict[bytes, int] = OrderedDict()
 
     def take(self, sample: zenoh.Sample) -> bytes | None:
-        """The payload of a message; None where it is not believed, or said again."""
+        """The payload of a message; None where it is refused, or repeated."""
         signed = self._by.heard(sample, self._key)
         if signed is None:
             if not self._last:
