@@ -170,8 +170,8 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     """The constants of a fleet; ``templates`` : for each axis a learner of its model, frame aside."""
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
-             "mark_every": max(1, round(MARK_S / step_s)), "window_s": config.learn_every * dt_s,
-             "fifo": config.eviction == "fifo"}  # fmt: skip
+             "mark_every": max(1, round(MARK_S / step_s)), "window_every": config.window_every,
+             "window_s": config.window_every * step_s, "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
     for base, template, number in zip(bases, templates, numbers, strict=True):

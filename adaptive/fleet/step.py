@@ -184,8 +184,7 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, w: Any) -> None:
             refused = gates.SETTLING
         elif not good:
             refused = gates.GLITCH
-        due = now % config.filter_every == 0 or window_due(now, config.learn_every)
-        if not due or (refused != "" and refused != gates.SATURATED):
+        if now % config.filter_every != 0 or (refused != "" and refused != gates.SATURATED):
             sample["outcome"] = _number_of(refused if refused != "" else gates.PASSED)
             continue
         fill(motion[0], motion[1], motion[2], s.memory[b], _map(c, b, s.frames), s.basis[b], s.point[b])
@@ -208,49 +207,48 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         served, count = r.front.track.served, r.front.track.smoother.count
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
         t["weight"] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
-        if now % config.filter_every == 0:
-            target = u - r.window.share * kernel_V[k]
-            if not isfinite(target):
-                t["outcome"] = _NUMERICS
-                continue
-            fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
-            _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
-            frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
-            if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
-                s.numbers[b] = kept[0]
-                t["outcome"] = ODD
-                continue
-            if saturated:
-                continue
-            if r.frozen:
-                t["outcome"] = _FROZEN
-                continue
-            weight, left_V = t.weight, u - dot(h, s.beta[b], p)
-            said = update(
-                config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
-                target, not rests, weight, gain, row,
-            )  # fmt: skip
-            if said == "outlier":
-                t["outcome"] = _OUTLIER
-                continue
-            if said == "burst":
-                r.window["changed"], r.window["next"] = r.window.clock, 0
-            t["lets_go"] = r.judgement.valid and r.window.next != NOWHERE
-            if rests:
-                shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
-                served["offset_um"] += shift_um
-                s.frames[b, 0] = served.offset_um
-            else:
-                _leave_rest(r.rest)
-                _weigh(r.window, kernel_V[k], left_V, config.step_s)
-            t["outcome"] = _UNEXCITED if rests else _LEARNT
-            if not rests and r.judgement.valid:
-                for i in range(2):
-                    s.known[b, 2, i] = max(s.known[b, 2, i], abs(s.rates[b, i]))
-                for i in range(3):
-                    s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
-                    s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
-        if window_due(now, config.learn_every) and not (saturated or rests or r.frozen):
+        target = u - r.window.share * kernel_V[k]
+        if not isfinite(target):
+            t["outcome"] = _NUMERICS
+            continue
+        fill(motion[0], motion[1], motion[2], s.frozen_memory[b], _map(c, b, c.features.frame), basis, kernel)
+        _, beta, inverse_widths, alpha, scaled, _ = unpacked(c.models[f.model], c.sizes[f.model])
+        frozen_V = mean_of(basis, kernel, beta, scaled, alpha, inverse_widths)
+        if _finds_fault(s, c, b, h, target, u, frozen_V, saturated, now % config.check_every == 0):
+            s.numbers[b] = kept[0]
+            t["outcome"] = ODD
+            continue
+        if saturated:
+            continue
+        if r.frozen:
+            t["outcome"] = _FROZEN
+            continue
+        weight, left_V = t.weight, u - dot(h, s.beta[b], p)
+        said = update(
+            config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
+            target, not rests, weight, gain, row,
+        )  # fmt: skip
+        if said == "outlier":
+            t["outcome"] = _OUTLIER
+            continue
+        if said == "burst":
+            r.window["changed"], r.window["next"] = r.window.clock, 0
+        t["lets_go"] = r.judgement.valid and r.window.next != NOWHERE
+        if rests:
+            shift_um = _rest_shift_um(r.rest, s.beta[b, 0], u, f.span_V, f.range_um, config.step_s, config.creep_s)
+            served["offset_um"] += shift_um
+            s.frames[b, 0] = served.offset_um
+        else:
+            _leave_rest(r.rest)
+            _weigh(r.window, kernel_V[k], left_V, config.step_s)
+        t["outcome"] = _UNEXCITED if rests else _LEARNT
+        if not rests and r.judgement.valid:
+            for i in range(2):
+                s.known[b, 2, i] = max(s.known[b, 2, i], abs(s.rates[b, i]))
+            for i in range(3):
+                s.domain[b, 2 * i] = min(s.domain[b, 2 * i], motion[i])
+                s.domain[b, 2 * i + 1] = max(s.domain[b, 2 * i + 1], motion[i])
+        if not rests and window_due(now // config.filter_every, config.window_every):
             t["learns"], t["target_V"] = True, u - dot(h, s.beta[b], p)
 
 

@@ -24,7 +24,8 @@ _TABLES: Final[dict[str, type[Any]]] = {
 class LearnerConfig:
     """Frozen configuration of a learner.
 
-    window : samples that the LSSVM holds. learn_every, filter_every : samples between two steps of window and filter.
+    window : samples that the LSSVM holds. learn_every, filter_every : samples between two steps of window and filter;
+    the window learns only what the filter takes, so its number is rounded down to whole steps of the filter.
     eviction : whose slot a new sample takes: that of its nearest neighbour, or the oldest's ("fifo").
     cutoff_hz, lag : of the smoother; lag None for what the cut-off needs.
     serving_age_s : age of the model when its answers take effect, s; errors are judged at that age.
@@ -70,6 +71,11 @@ class LearnerConfig:
             raise InputError(
                 f"valid_enter, valid_leave: got {self.valid_enter}, {self.valid_leave}, expected 0 < enter <= leave"
             )
+
+    @property
+    def window_every(self) -> int:
+        """Updates of the filter between two steps of the window."""
+        return max(1, self.learn_every // self.filter_every)
 
     def state_dict(self) -> StateDict:
         """All fields under flat names."""

@@ -77,12 +77,13 @@ NOWHERE = -1
 
 
 @shared
-def due(now: int, every: int) -> bool:
-    """Whether the window learns at step ``now``: once in each block of ``every``, one place later than in the last.
+def due(updates: int, every: int) -> bool:
+    """Whether the window learns what the filter takes as its update number ``updates``: once in ``every`` of them.
 
-    At a fixed place it would meet periodic motion in the same few phases for ever.
+    It is one place later in each block than in the last: at a fixed place it would meet periodic motion in the same few
+    phases for ever.
     """
-    return now % every == (now // every) % every
+    return updates % every == (updates // every) % every
 
 
 @dataclass(slots=True)

@@ -676,49 +676,45 @@ class Learner:
         # A saturated sample is not learnt, but it shows where the stage is, and so the error of the model.
         if refused and refused != admission.SATURATED:
             return refused
-        filter_due, window_due = pair.now % c.filter_every == 0, due(pair.now, c.learn_every)
-        if not (filter_due or window_due):
+        if pair.now % c.filter_every:
             return refused or admission.PASSED
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
         track.features.fill(*motion, track.memory, self._basis, parts.point)
         rest = intake.rests(pair.y_um)
         a_share = pair.a_um_per_s2 / self.base.features.a_scale_um_per_s2
         weight = c.weights.of(pair.near_bad, intake.on_probation, a_share)
-        outcome = refused or admission.PASSED
-        if filter_due:
-            kernel_V = parts.window.predict(parts.point)
-            target = pair.u_V - parts.window.share * kernel_V
-            beta = parts.filter.beta
-            if not isfinite(target):
-                return admission.NUMERICS
-            self.base.features.fill(*motion, track.frozen_memory, self._frozen_basis, self._frozen_kernel)
-            frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
-            served_V = float(self._basis.dot(parts.delay.push(beta)))
-            parts.judge(target - served_V, pair.u_V - frozen_V)
-            if pair.now % parts.check_every == 0:
-                found = self._check(pair, beta, target, bool(refused))
-                if found:
-                    return found
-            if refused:
-                self._cache = None
-                return refused
-            if self._frozen:
-                return admission.FROZEN
-            # Where nothing is learnt, the stated deviation is of the errors until now all the same.
-            self._cache = None
-            if intake.stands_still:
-                return admission.UNTRUSTED
-            if not parts.follow(self._basis, kernel_V, pair, weight, rest):
-                return admission.OUTLIER
-            outcome = admission.UNEXCITED if rest else admission.LEARNT
+        kernel_V = parts.window.predict(parts.point)
+        target = pair.u_V - parts.window.share * kernel_V
+        beta = parts.filter.beta
+        if not isfinite(target):
+            return admission.NUMERICS
+        self.base.features.fill(*motion, track.frozen_memory, self._frozen_basis, self._frozen_kernel)
+        frozen_V = self.base.mean(self._frozen_basis, self._frozen_kernel)
+        served_V = float(self._basis.dot(parts.delay.push(beta)))
+        parts.judge(target - served_V, pair.u_V - frozen_V)
+        if pair.now % parts.check_every == 0:
+            found = self._check(pair, beta, target, bool(refused))
+            if found:
+                return found
+        # Where nothing is learnt, the stated deviation is of the errors until now all the same.
+        self._cache = None
         if refused:
             return refused
-        learns = not (rest or self._frozen or intake.on_probation or intake.stands_still)
-        if window_due and learns:
+        if self._frozen:
+            return admission.FROZEN
+        if intake.stands_still:
+            return admission.UNTRUSTED
+        if not parts.follow(self._basis, kernel_V, pair, weight, rest):
+            return admission.OUTLIER
+        if rest:
+            return admission.UNEXCITED
+        # The window learns only what the filter has just taken, and what that left. Alone it would take the first
+        # samples of a changed stage, which the filter still refuses, and the change would become local for good.
+        if due(pair.now // c.filter_every, c.window_every) and not intake.on_probation:
             outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
-            parts.window.fade(c.weights, c.learn_every * self.base.dt_s)
-        self._cache = None
-        return outcome
+            parts.window.fade(c.weights, c.window_every * parts.filter.step_s)
+            return outcome
+        return admission.LEARNT
 
     def _waits(self, pair: Pair) -> str:
         """The gate for which the pair is no measure of the model, or ""."""

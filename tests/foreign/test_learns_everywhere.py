@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptive.types import FloatArray
+from adaptive.inverse_model import LssvmInverse
+from adaptive.online.learner import Learner
+from adaptive.types import FloatArray, Sample
 from lab.rehearsal import Event, RehearsalConfig, identify, run_event
 from lab.rehearsal.plant import IdentifiedPlant
 from service.config.settings import AxisConfig
@@ -20,6 +22,7 @@ from service.server.learner_supervisor import NOTHING_LEARNT
 from service.storage.model_file import Bundle, BundleMeta
 from tests.foreign.motions import motion
 from tests.foreign.plants import StageFactory, issue_plant, random_plant
+from tests.service.conftest import make_models
 
 DT_S, SECOND = 1e-3, 1000
 CONFIG = RehearsalConfig(support=300, after_s=5.0)
@@ -45,6 +48,29 @@ def test_it_learns_turning_points_steps_and_fast_tones(name: str) -> None:
     late = record.t_s > 5.0
     errors = [float(np.abs(r.wanted_um - r.true_um)[late].mean()) for r in (record, run.frozen)]
     assert errors[0] < 0.7 * errors[1]
+
+
+def test_an_answer_at_rest_stays_while_a_smooth_motion_teaches() -> None:
+    """A gain that is wrong by 5 %, no noise: what is not asked about anew does not step, and comes out right.
+
+    The window once learnt the first samples before the filter did, and the two then undid each other for good: the
+    voltage of one place stepped by 5 % of the span within a sample.
+    """
+    model = make_models(DT_S)["lssvm_adaptive"]
+    assert isinstance(model, LssvmInverse)
+    learner = Learner.from_model(model)
+    k = np.arange(5 * SECOND)
+    y_um = 45.0 + 30.0 * np.sin(2.0 * np.pi * 3.0 * k * DT_S)
+    memory, said_V = None, []
+    for sample in map(Sample, k.tolist(), (k * DT_S).tolist(), ((y_um - 1.0) / 10.45).tolist(), y_um.tolist()):
+        learner.handle(sample)
+        if sample.seq >= SECOND // 2:
+            memory = learner.memory() if memory is None else memory
+            said = learner.snapshot().feedforward(np.array([40.0]), np.zeros(1), np.zeros(1), memory)
+            memory = said.memory
+            said_V.append(float(said.u_V[0]))
+    assert np.abs(np.diff(said_V)).max() < 0.01
+    assert said_V[-1] == pytest.approx(39.0 / 10.45, rel=1e-3)
 
 
 def axis_of(identified: IdentifiedPlant) -> Axis:
