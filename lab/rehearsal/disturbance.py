@@ -61,6 +61,13 @@ EVENT_KINDS: Final[dict[str, EventKind]] = {
     "sensor_gain": EventKind(SENSOR, READING, "factor", "the sensor shows a multiple of the motion"),
     "sign": EventKind(SENSOR, READING, "", "the sensor's sign is flipped"),
     "foreign": EventKind(SENSOR, READING, "", "the readings are those of another stage"),
+    "units": EventKind(SENSOR, MESSAGE, "", "voltages come in mV and readings in nm"),
+    "exchanged": EventKind(SENSOR, MESSAGE, "", "voltages and readings come in each other's place"),
+    "u_sign": EventKind(SENSOR, MESSAGE, "", "the voltages' sign is flipped"),
+    "u_constant": EventKind(SENSOR, MESSAGE, "", "the voltage of one sample is repeated"),
+    "u_late": EventKind(SENSOR, MESSAGE, "s", "the voltages are those of earlier samples"),
+    "u_scaled": EventKind(SENSOR, MESSAGE, "factor", "the voltages are a multiple of those that were applied"),
+    "other_stage": EventKind(SENSOR, MESSAGE, "s", "the samples are those of a like stage that is later by some time"),
 }
 
 
@@ -128,7 +135,9 @@ def _sized(event: Event) -> str:
         return f" by {1e3 * size:.3g} ms"
     if kind == "stuck_noise":
         return f" of {size:.1g} of the range"
-    if kind == "sensor_gain":
+    if kind in ("u_late", "other_stage"):
+        return f" by {1e3 * size:.3g} ms"
+    if kind in ("sensor_gain", "u_scaled"):
         return f" by {size:.3g}"
     if kind in ("losses", "duplicates"):
         return f", {100.0 * size:.3g} % of them"
@@ -153,7 +162,8 @@ CLASSES: Final[dict[str, tuple[str, float | None]]] = {
         kind: (kind, None)
         for kind in (
             "knock", "hum", "spikes", "bursts", "gap", "losses", "duplicates", "reversed", "number_jump",
-            "number_stray", "clock", "rail", "stuck", "stuck_noise", "sensor_gain", "sign", "foreign",
+            "number_stray", "clock", "rail", "stuck", "stuck_noise", "sensor_gain", "sign", "foreign", "units",
+            "exchanged", "u_sign", "u_constant", "u_late", "u_scaled", "other_stage",
         )
     },
 }  # fmt: skip
@@ -217,7 +227,13 @@ def draw(name: str, seed: int, at_s: float) -> Event:
     if kind == "sensor_gain":
         size = between(0.01, 0.5) if rng.uniform() < 0.5 else float(rng.uniform(1.6, 3.0))
         return replace(event, size=size, over_s=float(rng.uniform(2.0, 8.0)))
-    if kind in ("stuck", "sign", "foreign"):
+    if kind == "u_late":
+        return replace(event, size=between(0.005, 0.05), over_s=float(rng.uniform(2.0, 5.0)))
+    if kind == "other_stage":
+        return replace(event, size=between(0.2, 1.5), over_s=float(rng.uniform(2.0, 5.0)))
+    if kind == "u_scaled":
+        return replace(event, size=float(rng.uniform(1.5, 3.0)) ** float(sign), over_s=float(rng.uniform(2.0, 5.0)))
+    if EVENT_KINDS[kind].category == SENSOR:
         return replace(event, over_s=float(rng.uniform(2.0, 5.0)))
     return event
 
@@ -393,6 +409,8 @@ class MessageLine:
         self._last = max(self._first + 1, round(event.end_s / dt_s))
         self._acts = event.where == MESSAGE
         self._rng = np.random.default_rng(event.seed)
+        #: (2, ticks) voltages, V, and readings, µm, so far: samples that come later are taken from them.
+        self._past = np.zeros((2, 0))
 
     def carry(self, first: int, u_V: FloatArray, read_um: FloatArray) -> Message | None:
         """The message with the (n,) samples from ``first`` on, or None if none arrives."""
@@ -401,6 +419,9 @@ class MessageLine:
         t_s: FloatArray = seq.astype(np.float64) * self._dt_s
         order = np.arange(u_V.size)
         kind = self._event.kind if self._acts else ""
+        mixes_up = self._acts and self._event.category == SENSOR
+        if mixes_up:
+            self._past = np.concatenate([self._past, (u_V, read_um)], axis=1)
         inside = (tick >= self._first) & (tick < self._last)
         if kind == "number_jump":
             # A multiple of 1000, so that snapshots still fall on the same samples of a block.
@@ -419,6 +440,26 @@ class MessageLine:
                 order = np.repeat(order, 1 + (inside & (self._rng.uniform(size=order.size) < self._event.size)))
             elif kind == "reversed":
                 order = order[::-1]
+            elif mixes_up:
+                u_V, read_um = np.where(inside, self._mixed_up(kind, tick), (u_V, read_um))
         if not order.size:
             return None
         return Message(tick[order], SampleBatch(seq[order], t_s[order], u_V[order], read_um[order]))
+
+    def _mixed_up(self, kind: str, tick: NDArray[np.int64]) -> FloatArray:
+        """(2, n) voltages and readings of ``tick`` as a sender gives them that takes one thing for another."""
+        n = tick.size
+        u_V, read_um = now = self._past[:, -n:]
+        if kind == "units":
+            return 1e3 * now
+        if kind == "exchanged":
+            return now[::-1]
+        if kind == "u_sign":
+            return np.stack([-u_V, read_um])
+        if kind == "u_scaled":
+            return np.stack([self._event.size * u_V, read_um])
+        # The column of each sample that is sent in the place of this one: the first of the event, or an earlier one.
+        shown = np.arange(self._past.shape[1] - n, self._past.shape[1])
+        then = shown - (tick - self._first if kind == "u_constant" else round(self._event.size / self._dt_s))
+        earlier = self._past[:, np.maximum(then, 0)]
+        return earlier if kind == "other_stage" else np.stack([earlier[0], read_um])

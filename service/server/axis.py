@@ -26,6 +26,7 @@ from service.answers.guard import Limits
 from service.answers.slices import Pace
 from service.background.retuner import Retuned
 from service.config.settings import LEARN, AxisConfig
+from service.intake.command_witness import CommandWitness
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
@@ -33,6 +34,7 @@ from service.protocol.model import Safety, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
+    NOT_COMMANDED,
     NOT_LEARNING,
     POISON,
     UNUSABLE,
@@ -244,6 +246,7 @@ class Axis:
         self.sequence = SequenceTracker(self.dt_s)
         self.clock = SampleClock(self.dt_s)
         self.tracker = MemoryTracker(self.dt_s)
+        self.witness = CommandWitness(limits.u_max_V - limits.u_min_V)
         watch = ModelWatch(ModelWatchConfig(last_good_s=config.last_good_s), self.dt_s, limits)
         self.supervisor = LearnerSupervisor(config.learn, learner, watch, self.dt_s, self.note, revive)
         #: What moves between two snapshots, for followers.
@@ -329,8 +332,10 @@ class Axis:
         """
         handled = self.handled_seq  # read before the snapshots: one that is missing in them is then really not there
         got = answer(query, self._snapshots, handled, self.config, self.limits, self._age_s, pace)
-        if query.pending is not None and self._age_s is not None:
-            self._look_ahead(query.pending.first, most_ahead(handled, self._age_s, self.dt_s))
+        if query.pending is not None:
+            self.witness.note(query.pending, query.y_um, got.u_V)
+            if self._age_s is not None:
+                self._look_ahead(query.pending.first, most_ahead(handled, self._age_s, self.dt_s))
         return got
 
     def _look_ahead(self, first: int, most: int) -> None:
@@ -398,15 +403,20 @@ class Axis:
             if order in NEW_COUNT:
                 self._begin_count(order, seq, before)
             number = self.sequence.number(seq)
+            self._recent[seq % _RECENT] = seq, y_um
+            commanded = self.witness.take(seq, u_V)
+            if commanded is not None:
+                # In doubt the memory follows the commanded motion.
+                u_V, y_um = commanded
             sample = Sample(number, self._time_s(number, t_s, order in NEW_COUNT), u_V, y_um)
-            verdict = self._counted(self._teach(sample))
+            said = self._teach(sample)
+            verdict = self._counted(NOT_COMMANDED if commanded is not None and said not in UNUSABLE else said)
             verdicts.append(verdict)
             if self.supervisor.adoptions:
                 self.supervisor.adopt_due(number)
             self.supervisor.watch.take(u_V, y_um, verdict)
             if verdict not in UNUSABLE:
                 self.tracker.add(seq, u_V, y_um)
-            self._recent[seq % _RECENT] = seq, y_um
             due = seq // every > self.newest.seq // every
             if due:
                 self._take_snapshot(seq, t_s, u_V)
@@ -461,7 +471,7 @@ class Axis:
         """The learner's verdict on a sample in order; one with a doubtful time is refused before."""
         if self.clock.in_doubt and self.learning:
             return TIMING
-        verdict = self.supervisor.handle(sample)
+        verdict = self.supervisor.handle(sample, self.witness.doubts)
         if self.clock.must_resync(verdict) and self.learner is not None:
             self._note_limited(
                 "learner_resynced", f"it refused samples in order as {verdict}: its own count and time begin anew"
@@ -511,7 +521,7 @@ class Axis:
         last, supervisor = self.newest, self.supervisor
         models = last.models
         if supervisor.learner is not None:
-            learnt = supervisor.models(last, self.sequence.received)
+            learnt = supervisor.models(last, self.sequence.received, self.witness.why)
             # While frozen the samples are still judged, but what they change is not served.
             models = models if last.frozen else models | learnt
         memories = supervisor.memories(models, self.tracker.advance(models, last.memories), last.frozen)

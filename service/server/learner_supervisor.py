@@ -48,6 +48,8 @@ from service.protocol.model import build_model, stored_kind
 #
 # - sensor_frozen: the reading has not changed for a while in which the voltage has.
 # - samples_poisoned: most samples of the last while were refused for their values.
+# - voltage_differs: the samples do not show the voltages that were commanded for them. What was commanded stands in for
+#   them: the memory follows it.
 # - model_bad: the newest model is not finite, or far from every other, at positions all over the range.
 # - nothing_learnt: the stage has moved for seconds and no sample of it was learnt; the detail names the gate. The
 #   newest model is served all the same.
@@ -57,13 +59,14 @@ from service.protocol.model import build_model, stored_kind
 # - rail, model_left_envelope: the voltage was at a limit because the model was wrong, or the model has left the range
 #   in which a stage can be; the learner has restarted from the identified model.
 #
-# During the first two, and while the learner distrusts the sensor, nothing is learnt. Which model is served meanwhile:
-# the last good one from before the trouble; the learner's own where it has itself gone back to before the fault; the
-# identified one where the learner has restarted. A model that was not renewed for ``last_good_s`` gives way to the
-# baseline over a ramp.
+# During the first three, and while the learner distrusts the sensor, nothing is learnt. Served meanwhile: the last good
+# model from before the trouble; the learner's own where it has itself gone back to before the fault; the identified one
+# where the learner has restarted. A model that was not renewed for ``last_good_s`` gives way to the baseline, over a
+# ramp.
 
 SENSOR_FROZEN: Final = "sensor_frozen"
 SAMPLES_POISONED: Final = "samples_poisoned"
+VOLTAGE_DIFFERS: Final = "voltage_differs"
 MODEL_BAD: Final = "model_bad"
 LEARNER_FAILED: Final = "learner_failed"
 NOTHING_LEARNT: Final = "nothing_learnt"
@@ -71,6 +74,8 @@ NOTHING_LEARNT: Final = "nothing_learnt"
 UNUSABLE: Final = frozenset({NOT_FINITE, OUT_OF_RANGE, TIMING})
 #: Verdict on samples that nobody learns from.
 NOT_LEARNING: Final = "not_learning"
+#: Verdict on samples of which neither voltage nor reading is believed.
+NOT_COMMANDED: Final = "not_commanded"
 #: Verdicts that are no refusal of a sample in motion.
 _NOT_REFUSED: Final = frozenset({LEARNT, PASSED, UNEXCITED, REDUNDANT, FROZEN, NOT_LEARNING})
 #: After these the learner has restarted, because the model from before was wrong.
@@ -81,7 +86,9 @@ _WIDEN: Final = {
     MODEL_LEFT_ENVELOPE: "if it repeats, identify again, or widen learner.envelope.shape",
 }
 #: During these nothing is learnt.
-POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED}) | SENSOR_FAULTS
+POISON: Final = frozenset({SENSOR_FROZEN, SAMPLES_POISONED, VOLTAGE_DIFFERS}) | SENSOR_FAULTS
+#: Samples from before these have their names may have been learnt.
+_TAUGHT: Final = POISON - {VOLTAGE_DIFFERS}
 #: Refusals for the values of a sample. A stage at rest, or a sample out of sequence, is no trouble.
 _BAD_VALUES: Final = frozenset({"not_finite", "timing", "glitch", "out_of_range", "numerics"})
 #: Places at which a model is looked at, one after the other, as shares of the range.
@@ -216,8 +223,7 @@ class ModelWatch:
             if found != self.trouble:
                 if not self.trouble:
                     n["since"] = now
-                if found in POISON and self._mark is not None:
-                    # Bad samples from before the trouble had its name may have been learnt.
+                if found in _TAUGHT and self._mark is not None:
                     self._good = self._next_mark = self._mark
                 self.trouble = found
         elif self.trouble:
@@ -479,12 +485,17 @@ class LearnerSupervisor:
 
     # ---- for each sample
 
-    def handle(self, sample: Sample) -> str:
-        """Teach one sample; the learner's verdict."""
+    def handle(self, sample: Sample, doubtful: bool = False) -> str:
+        """Take one sample, and learn it unless it is ``doubtful``; the learner's verdict."""
         if self.learner is None or self._failed:
             return NOT_LEARNING
         try:
-            return self.learner.handle(sample)
+            if not doubtful:
+                return self.learner.handle(sample)
+            self.learner.freeze()
+            verdict = self.learner.handle(sample)
+            self._set_teaching()
+            return verdict
         except Exception as error:
             # A learner never raises on data. If it does, its state is in doubt: its last good model stays served.
             self._fail(f"{type(error).__name__}: {error}")
@@ -500,10 +511,11 @@ class LearnerSupervisor:
 
     # ---- for each snapshot
 
-    def models(self, last: Served, received: int) -> dict[str, InverseModel]:
+    def models(self, last: Served, received: int, differs: str = "") -> dict[str, InverseModel]:
         """The learner's models to serve after ``last``: the newest or the last good one, and the champion.
 
-        ``received`` : count of all samples that came.
+        ``received`` : count of all samples that came. ``differs`` : in which way samples do not show the commanded
+        voltages; "" while they do.
         """
         if self.learner is None:
             return {}
@@ -512,16 +524,19 @@ class LearnerSupervisor:
         candidate = self._snapshot(self.learner)
         alive = not self._failed
         reported, distrusts = (self.learner.trouble, self.learner.distrusts) if alive else ("", False)
+        why = self.learner.why if reported else ""
+        if differs:
+            reported, distrusts, why = VOLTAGE_DIFFERS, False, differs
         before = self.watch.trouble
         good = self.watch.judge(candidate, self.learner.base, reported, distrusts)
         now = self.watch.trouble
         if not now and not before:
             self._mark(self.learner, received)
         if now != before:
-            if before in POISON and not now:
+            if before in _TAUGHT and not now:
                 self._go_back(self.learner)
             self._set_teaching()
-            self._note_trouble(before, now, reported, last.stand_in)
+            self._note_trouble(before, now, why or self.watch.why, last.stand_in)
         for event in self.learner.take_events():
             self._note(*event)
         if good is None:
@@ -628,13 +643,12 @@ class LearnerSupervisor:
             self._set_teaching()
             self._note("learner_begun_anew", "from the last good model")
 
-    def _note_trouble(self, before: str, now: str, reported: str, stand_in: str) -> None:
+    def _note_trouble(self, before: str, now: str, why: str, stand_in: str) -> None:
         if now == LEARNER_FAILED:  # already noted
             return
         if not now:
             self._note("recovered", before)
             return
-        why = self.learner.why if reported and self.learner is not None else self.watch.why
         why = f" ({why})" if why else ""
         served = "the identified model" if now in BEGUN_AGAIN else "the last good model"
         widen = f"; {_WIDEN[now]}" if now in _WIDEN else ""

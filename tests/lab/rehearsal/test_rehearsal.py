@@ -26,7 +26,7 @@ from lab.rehearsal import (
     factory_of,
     rehearse,
 )
-from lab.rehearsal.disturbance import DisturbedPlant, DisturbedSensor, EventScale, MessageLine
+from lab.rehearsal.disturbance import MESSAGE, DisturbedPlant, DisturbedSensor, EventScale, MessageLine
 from lab.rehearsal.outcome import gaps_filled, longest_stretch, outcome
 from lab.rehearsal.plant import run_checked
 from lab.rehearsal.reference import Excursion
@@ -243,6 +243,28 @@ def carried(kind: str, size: float, over_s: float = 0.0, first: int = 2000) -> A
     event = Event(kind, kind, 2.0, size, over_s, seed=2)
     values = np.arange(float(first), first + 5.0)
     return MessageLine(event, DT_S, first_number=11).carry(first, values, values)
+
+
+def test_columns_are_mixed_up_while_it_lasts_and_not_longer() -> None:
+    """Voltage 1, 2, 3 ... and reading ten times that; an event of 5 samples from the second message on."""
+    expected = {
+        "units": lambda k: (1e3 * k, 1e4 * k),
+        "exchanged": lambda k: (10.0 * k, 1.0 * k),
+        "u_sign": lambda k: (-1.0 * k, 10.0 * k),
+        "u_constant": lambda k: (np.full(5, 6.0), 10.0 * k),
+        "u_late": lambda k: (k - 2.0, 10.0 * k),
+        "u_scaled": lambda k: (0.002 * k, 10.0 * k),
+        "other_stage": lambda k: (k - 2.0, 10.0 * k - 20.0),
+    }
+    assert set(expected) == {name for name, kind in EVENT_KINDS.items() if kind[:2] == (SENSOR, MESSAGE)}
+    for kind, shown in expected.items():
+        line = MessageLine(Event(kind, kind, 2.0, 0.002, 0.005), DT_S, first_number=11)
+        for first, values in ((1995, np.arange(1.0, 6.0)), (2000, np.arange(6.0, 11.0)), (2005, np.arange(11.0, 16.0))):
+            message = line.carry(first, values, 10.0 * values)
+            assert message is not None
+            u_V, y_um = shown(values) if first == 2000 else (values, 10.0 * values)
+            assert message.batch.u_V == pytest.approx(u_V), kind
+            assert message.batch.y_um == pytest.approx(y_um), kind
 
 
 def test_messages_are_lost_doubled_turned_round_and_misnumbered() -> None:

@@ -263,3 +263,44 @@ def test_samples_that_come_and_are_lost_are_a_trouble_within_two_seconds(serve: 
         ):
             assert lost() == name
             eventually(lambda: client.status()["trouble"] == "", 5.0)
+
+
+def test_samples_that_do_not_show_what_was_commanded(serve: Callable[..., Any]) -> None:
+    """A controller names what it has commanded; a sender that exchanges two columns is named, and moves nothing."""
+    process = serve()
+    with Client.connect(process.endpoint, timeout_s=5.0) as client, open_client(process.endpoint) as stage:
+        put = stage.declare_publisher(
+            f"{client.keys.base}/sample", congestion_control=zenoh.CongestionControl.BLOCK, express=True
+        )
+        answer, begin, n = None, 0, 20
+
+        def play(seconds: float, exchanged: bool) -> None:
+            nonlocal answer, begin
+            for _ in range(round(seconds / (n * DT_S))):
+                k = np.arange(begin, begin + n)
+                wave = 2.0 * np.pi * 2.0 * k * DT_S
+                answer = client.trajectory(45.0 + 30.0 * np.sin(wave), 377.0 * np.cos(wave), after=answer, begin=begin)
+                u_V, y_um = answer.u_V, 1.0 + 10.45 * answer.u_V
+                put.put(wire.encode_samples(k, k * DT_S, *((y_um, u_V) if exchanged else (u_V, y_um))))
+                begin += n
+                time.sleep(0.004)
+
+        def handled() -> dict[str, Any]:
+            return eventually(lambda: (status := client.status())["seq"] == begin - 1 and status)
+
+        play(2.0, exchanged=False)
+        assert handled()["trouble"] == ""
+        play(1.0, exchanged=True)
+        wrong = handled()
+        assert wrong["trouble"] == "voltage_differs"
+        assert "were commanded for it" in wrong["trouble_why"]
+        assert wrong["samples"]["gates"]["not_commanded"] > 900
+        before = answer
+        play(1.0, exchanged=False)
+        good = handled()
+        assert good["trouble"] == ""
+        # The voltages went on all the while: the stage is where it was wanted.
+        for said in (before, answer):
+            k = np.arange(begin - n - (0 if said is answer else 1000), begin - (0 if said is answer else 1000))
+            wanted_um = 45.0 + 30.0 * np.sin(2.0 * np.pi * 2.0 * k * DT_S)
+            assert np.abs(1.0 + 10.45 * said.u_V - wanted_um).max() < 0.5

@@ -1,0 +1,99 @@
+"""The second witness of a sample: the voltage that was commanded for it.
+
+A controller that asks for the next voltages names what is under way: the voltages that it has commanded, and the motion
+that they are for, by the numbers of the samples (`service.protocol.query.Pending`). A sample with such a number has to
+show that voltage. Where many in a row do not, the columns are exchanged, scaled or late, or the samples are those of
+another stage. Then what was commanded is the better witness of both voltage and place.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from adaptive.types import FloatArray
+from service.protocol.query import Pending
+
+#: Largest difference, as a share of the voltage range: rounding by a converter, noise of a voltage that is read back.
+TOLERANCE: Final = 0.01
+#: The voltage of a sample may be that of a neighbour: sender and stage count the instant of a voltage differently.
+_NEIGHBOURS: Final = 1
+#: A sample that differs adds one, one that agrees takes one away. Samples differ from this count on, until it is 0.
+DIFFERS_FROM: Final = 10
+_MOST_DOUBT: Final = 2 * DIFFERS_FROM
+#: Only who has told the voltage of this many samples that moved is believed: a voltage that is read back by another
+#: scale, or that of somebody who asks without moving the stage, never agrees.
+_CREDIT: Final = 50
+#: Queries that are kept: at one a sample, more than samples wait in messages and queue.
+_KEPT: Final = 256
+
+
+class CommandWitness:
+    """Compares the voltages of samples with those commanded.
+
+    `note` may be called from any thread, all else from the one that handles samples. Without a controller that names
+    what is under way nothing is compared. It is no part of the state: a replay does not know what was commanded.
+
+    Parameters
+    ----------
+    span_V : range of the voltages that may be commanded, V.
+    """
+
+    def __init__(self, span_V: float) -> None:
+        self._tolerance_V = TOLERANCE * span_V
+        # Newest last. A tuple that is replaced as a whole: two threads at once may lose a query, and no more.
+        self._claims: tuple[Pending, ...] = ()
+        self._doubt = 0
+        self._credit = 0
+        self._moved_V = float("nan")
+        #: What the last one that differed showed, in words; "" while the samples agree.
+        self.why = ""
+
+    @property
+    def doubts(self) -> bool:
+        """Whether a sample has differed lately: such ones teach nothing, so nothing has to be undone later."""
+        return self._doubt > 0 and self._credit >= _CREDIT
+
+    def note(self, pending: Pending, y_um: FloatArray, u_V: FloatArray) -> None:
+        """Keep what a controller has commanded, and the (n,) voltages, V, for ``y_um``, µm, that are its answer."""
+        claim = Pending(pending.first, np.concatenate([pending.y_um, y_um]), np.concatenate([pending.u_V, u_V]))
+        self._claims = (*self._claims[1 - _KEPT :], claim)
+
+    def take(self, seq: int, u_V: float) -> tuple[float, float] | None:
+        """(voltage, V, and displacement, µm) commanded for sample ``seq``, where its ``u_V`` is not to be believed.
+
+        None where it is, and where nothing is known.
+        """
+        known: tuple[float, float] | None = None
+        for claim in reversed(self._claims):
+            k = seq - claim.first
+            if not 0 <= k < claim.u_V.size:
+                continue
+            near_V = claim.u_V[max(0, k - _NEIGHBOURS) : k + 1 + _NEIGHBOURS]
+            if near_V.min() - self._tolerance_V <= u_V <= near_V.max() + self._tolerance_V:
+                self._agrees(u_V)
+                return known if self.why else None
+            known = known or (float(claim.u_V[k]), float(claim.y_um[k]))
+        if known is not None:
+            self._differs(seq, u_V, known[0])
+        elif self._doubt:
+            self._believe()
+        return known if self.why else None
+
+    def _agrees(self, u_V: float) -> None:
+        # A stage that holds its place agrees with everybody who has asked for that place.
+        if not abs(u_V - self._moved_V) <= self._tolerance_V:
+            self._moved_V = u_V
+            self._credit = min(self._credit + 1, _CREDIT)
+        self._believe()
+
+    def _believe(self) -> None:
+        self._doubt = max(self._doubt - 1, 0)
+        if not self._doubt:
+            self.why = ""
+
+    def _differs(self, seq: int, u_V: float, commanded_V: float) -> None:
+        self._doubt = min(self._doubt + 1, _MOST_DOUBT)
+        if self._doubt >= DIFFERS_FROM and self._credit >= _CREDIT:
+            self.why = f"sample {seq} shows {u_V:.6g} V, {commanded_V:.6g} V were commanded for it"
