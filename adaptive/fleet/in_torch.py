@@ -17,7 +17,7 @@ from torch import Tensor
 
 from adaptive.fleet import windows
 from adaptive.fleet.state import Fixed, Rows
-from adaptive.online.kernel_window import LEAST_FADED, NOWHERE, SAME
+from adaptive.online.kernel_window import NOWHERE, SAME
 from adaptive.types import FloatArray, IntArray
 from adaptive.window import arrays as ws
 from adaptive.window.arrays import ACCEPTED, WindowArrays
@@ -83,7 +83,7 @@ class TorchWindows:
         return np.asarray(((column * self._all["V"][at, ws.ALPHA]).sum(1) + self._all["F"][at, ws.BETA]).cpu())
 
     def learn(self, axes: IntArray, w: Any) -> IntArray:
-        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn` and ``fade``."""
+        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn`."""
         s, at, turns, config = self._rows, self._to(axes), self._rows.numbers["window"], self._fixed.config[0]
         points = self._to(s.point[axes])
         column, count = self._column(at, points), self._all["C"][at, ws.COUNT]
@@ -93,18 +93,12 @@ class TorchWindows:
             held = np.arange(s.born.shape[1]) < count.cpu().numpy()[:, None]
             nearest = self._to(np.where(held, s.born[axes], np.iinfo(np.int64).max).argmin(1))
         slots = torch.where(room, count, nearest)
-        targets, weights = self._to(w["target_V"][axes]), self._to(w["weight"][axes])
-        good = self._exchange(at, slots, points, targets, weights, column, True)
+        targets = self._to(w["target_V"][axes])
+        good = self._exchange(at, slots, points, targets, torch.ones_like(targets), column, True)
         status = np.full(axes.size, ACCEPTED)
         done, slot = axes[good], slots.cpu().numpy()[good]
         turns["clock"][done] += 1
-        s.born[done, slot], s.own[done, slot] = turns["clock"][done], w["weight"][done]
-        if config["weights"]["half_life_s"] > 0.0 and done.size:
-            slot = turns["clock"][done] % self._all["C"][self._to(done), ws.COUNT].cpu().numpy()
-            age_s = (turns["clock"][done] - s.born[done, slot]) * config["window_s"]
-            share = 0.5 ** (age_s / config["weights"]["half_life_s"])
-            faded = self._reweight(done, slot, s.own[done, slot] * np.maximum(share, LEAST_FADED))
-            self._alone(done[~faded], windows.fade)
+        s.born[done, slot] = turns["clock"][done]
         rest = ~good
         said = np.empty(int(rest.sum()), dtype=np.int64)
         self._alone(axes[rest], windows.learn, w, said)
@@ -114,14 +108,16 @@ class TorchWindows:
     def let_go(self, axes: IntArray) -> None:
         """`ResidualWindow.let_go` of each axis."""
         s, r, slots = self._rows, self._rows.numbers["window"], np.arange(self._rows.born.shape[1])
-        most = float(self._fixed.config["weights"]["before_change"][0])
-        old = (s.born[axes] <= r["changed"][axes, None]) & (s.own[axes] > most) & (slots >= r["next"][axes, None])
-        old &= slots < self._all["C"][self._to(axes), ws.COUNT].cpu().numpy()[:, None]
+        most = float(self._fixed.config["before_change"][0])
+        held = self._to(axes)
+        old = (s.born[axes] <= r["changed"][axes, None]) & (slots >= r["next"][axes, None])
+        old &= self._all["V"][held, ws.W].cpu().numpy() > most
+        old &= slots < self._all["C"][held, ws.COUNT].cpu().numpy()[:, None]
         found, slot = old.any(1), old.argmax(1)
         r["next"][axes[~found]] = NOWHERE
         at, slot = axes[found], slot[found]
         good = self._reweight(at, slot, np.full(at.size, most))
-        r["next"][at[good]], s.own[at[good], slot[good]] = slot[good] + 1, most
+        r["next"][at[good]] = slot[good] + 1
         self._alone(at[~good], windows.let_go)
 
     def _alone(self, axes: IntArray, work: Callable[..., None], *arguments: object) -> None:

@@ -36,7 +36,6 @@ _ARRAYS: Final = {
     "motion": "front.track.motion", "memory": "front.track.memory",
     "frozen_memory": "front.track.frozen_memory", "beta": "filter.beta",
     "covariance": "filter.covariance", "domain": "domain", "point": "point", "born": "window.born",
-    "own": "window.own_weights",
 }  # fmt: skip
 #: Numbers of an ordinary learner that are the same as others.
 _ALIASES: Final = {
@@ -120,7 +119,6 @@ class Rows(NamedTuple):
     basis: FloatArray
     point: FloatArray
     born: IntArray
-    own: FloatArray
     pasts: FloatArray
     past_voltages: FloatArray
     past_from: IntArray
@@ -171,7 +169,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
     parts, step_s, dt_s = templates[0].parts, float(templates[0].parts.filter.step_s), float(bases[0].dt_s)
     steps = {"dt_s": dt_s, "step_s": step_s, "check_s": float(parts.check_s), "check_every": parts.check_every,
              "mark_every": max(1, round(MARK_S / step_s)), "window_every": config.window_every,
-             "window_s": config.window_every * step_s, "fifo": config.eviction == "fifo"}  # fmt: skip
+             "fifo": config.eviction == "fifo"}  # fmt: skip
     settings = replace(config, admission=config.admission.at(dt_s)).state_dict() | steps
     axes, numbers, shape = [], distinct(bases), config.envelope.shape
     for base, template, number in zip(bases, templates, numbers, strict=True):
@@ -181,7 +179,7 @@ def fixed_of(bases: Sequence[LssvmInverse], config: LearnerConfig, templates: Se
         axes.append({
             "middle_um": 0.5 * (f.y_max_um + f.y_min_um), "range_um": f.y_max_um - f.y_min_um, "span_V": base.span_V,
             "drive_V": drive_V(base), "slope_V_per_um": mean_slope(base), "tells": answers(base),
-            "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0, "a_scale": f.a_scale_um_per_s2,
+            "allowed_V": shape * drive_V(base) + reach_V if f.linear else 0.0,
             "model": number,
         })  # fmt: skip
     models = [bases[numbers.index(number)].packed for number in range(max(numbers) + 1)]

@@ -20,7 +20,7 @@ from adaptive.online import gates, intake, learner
 from adaptive.online.drift import RestCreep, update
 from adaptive.online.gates import AdmissionState
 from adaptive.online.glitch_or_jump import MOST_BRIDGED
-from adaptive.online.kernel_window import NOWHERE, KernelShare, WeightConfig
+from adaptive.online.kernel_window import NOWHERE, KernelShare
 from adaptive.online.kernel_window import due as window_due
 from adaptive.online.learner import Judgement
 from adaptive.online.sensor_trust import CONFIRMED, DOUBTED_STEPS, Following
@@ -37,7 +37,7 @@ ODD: Final = -4
 # Compiled code knows methods by plain names only. Fields of a record are read as attributes, as those of the single
 # learner's dataclasses, and written as items.
 _judge, _is_valid, _falls_back = Judgement.take, Judgement.decide, Judgement.choose
-_follow, _rest_shift_um, _leave_rest, _weight_of = Following.take, RestCreep.shift_um, RestCreep.leave, WeightConfig.of
+_follow, _rest_shift_um, _leave_rest = Following.take, RestCreep.shift_um, RestCreep.leave
 _note_taken, _note_step, _count_again = AdmissionState.take, AdmissionState.step, Following.count_again
 _forget_slopes, _weigh = Following.forget_slopes, KernelShare.take
 _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
@@ -51,7 +51,7 @@ _FROZEN, _OUTLIER, _NUMERICS, _SATURATED, _UNEXCITED, _LEARNT = (
 SAMPLE: Final = np.dtype([
     ("seq", np.int64), ("t_s", np.float64), ("u_V", np.float64), ("y_um", np.float64), ("present", np.bool_),
     ("controls", np.bool_), ("outcome", np.int64), ("lets_go", np.bool_), ("learns", np.bool_),
-    ("target_V", np.float64), ("weight", np.float64),
+    ("target_V", np.float64),
 ], align=True)  # fmt: skip
 
 
@@ -155,14 +155,11 @@ def _advance(s: Rows, c: Fixed, b: int, u_V: float, y_um: float) -> None:
 
 
 @compiled
-def _instant(s: Rows, b: int) -> tuple[int, int, bool, bool]:
-    """The smoothed instant: its number and slot, whether its readings are good, and whether others nearby are not."""
+def _instant(s: Rows, b: int) -> tuple[int, int, bool]:
+    """The smoothed instant: its number and slot, and whether its readings are good."""
     slots = s.voltages.shape[1]
     now = s.numbers[b].front.track.smoother.count + 1 - slots
-    clean = True
-    for i in range(slots):
-        clean = clean and s.good[b, i]
-    return now, now % slots, clean or (s.good[b, now % slots] and s.good[b, (now - 1) % slots]), not clean
+    return now, now % slots, s.good[b, now % slots] and s.good[b, (now - 1) % slots]
 
 
 @compiled
@@ -177,7 +174,7 @@ def take(lo: int, hi: int, axes: IntArray, s: Rows, c: Fixed, w: Any) -> None:
             s.numbers[b] = kept[0]
             continue
         _advance(s, c, b, sample.u_V, sample.y_um)
-        now, at, good, _ = _instant(s, b)
+        now, at, good = _instant(s, b)
         motion = s.motion[b]
         refused = gates.check_pair(config.admission, s.voltages[b, at], s.voltages[b, (now - 1) % slots], motion[0])
         if gates.settling(config.admission, s.numbers[b].front.gates):
@@ -198,7 +195,7 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
     for k in range(lo, hi):
         b = axes[k]
         t, r, f, h, motion = w[b], s.numbers[b], c.axis[b], s.basis[b], s.motion[b]
-        now, at, _, near_bad = _instant(s, b)
+        now, at, _ = _instant(s, b)
         u, before = r.front.track.smooth_V, s.voltages[b, (now - 1) % s.voltages.shape[1]]
         saturated = gates.check_pair(config.admission, s.voltages[b, at], before, motion[0]) != ""
         kept = s.numbers[b : b + 1].copy()
@@ -206,7 +203,6 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         t["outcome"] = _SATURATED if saturated else _number_of(gates.PASSED)
         served, count = r.front.track.served, r.front.track.smoother.count
         rests = gates.at_rest(config.admission, r.front.gates, motion[0], count, f.range_um, config.dt_s)
-        t["weight"] = _weight_of(config.weights, near_bad, False, motion[2] / f.a_scale)
         target = u - r.window.share * kernel_V[k]
         if not isfinite(target):
             t["outcome"] = _NUMERICS
@@ -223,10 +219,10 @@ def teach(lo: int, hi: int, axes: IntArray, kernel_V: FloatArray, s: Rows, c: Fi
         if r.frozen:
             t["outcome"] = _FROZEN
             continue
-        weight, left_V = t.weight, u - dot(h, s.beta[b], p)
+        left_V = u - dot(h, s.beta[b], p)
         said = update(
             config.drift, r.filter, s.beta[b], s.covariance[b], c.walks[b], c.bursts[b], f.span_V, config.step_s, h,
-            target, not rests, weight, gain, row,
+            target, not rests, gain, row,
         )  # fmt: skip
         if said == "outlier":
             t["outcome"] = _OUTLIER

@@ -51,34 +51,24 @@ def _predict(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, out: 
 
 @compiled
 def learn(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed, w: Any, out: IntArray) -> None:
-    """`ResidualWindow.learn` and ``fade`` of each axis."""
-    config = c.config[0]
+    """`ResidualWindow.learn` of each axis."""
+    fifo = c.config[0].fifo
     for k in range(lo, hi):
         b = axes[k]
         A, r = arrays_of(handles[b]), s.numbers[b].window
         empty = A.C[COUNT] == 0
-        status = window.learn(A, r, s.point[b], w[b].target_V, w[b].weight, s.born[b], s.own[b], config.fifo)
+        status = window.learn(A, r, s.point[b], w[b].target_V, s.born[b], fifo)
         # An empty window has nothing that a new factorisation could mend.
         out[k] = ws.BAD_INPUT if empty and status == ILL_CONDITIONED else status
-        window.fade(A, r, config.weights, config.window_s, s.born[b], s.own[b])
-
-
-@compiled
-def fade(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
-    """`ResidualWindow.fade` of each axis."""
-    config = c.config[0]
-    for k in range(lo, hi):
-        b = axes[k]
-        window.fade(arrays_of(handles[b]), s.numbers[b].window, config.weights, config.window_s, s.born[b], s.own[b])
 
 
 @compiled
 def let_go(lo: int, hi: int, handles: IntArray, axes: IntArray, s: Rows, c: Fixed) -> None:
     """`ResidualWindow.let_go` of each axis."""
-    most = c.config[0].weights.before_change
+    most = c.config[0].before_change
     for k in range(lo, hi):
         b = axes[k]
-        window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b], s.own[b])
+        window.let_go(arrays_of(handles[b]), s.numbers[b].window, most, s.born[b])
 
 
 class CompiledWindows:
@@ -132,7 +122,7 @@ class CompiledWindows:
         return out
 
     def learn(self, axes: IntArray, w: Any) -> IntArray:
-        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn` and ``fade``."""
+        """(k,) status of one step of each window with its record of ``w``; see `ResidualWindow.learn`."""
         self.write(axes.tolist())
         out = np.empty(axes.size, dtype=np.int64)
         self._threads.share(axes.size, learn, self._handles, axes, self._rows, self._fixed, w, out)

@@ -220,7 +220,7 @@ def _expect_change(c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, 
 @shared
 def update(
     c: DriftConfig, s: DriftState, x: FloatArray, P: FloatArray, walks: FloatArray, bursts: FloatArray, span_V: float,
-    step_s: float, basis: FloatArray, target_V: float, moving: bool, weight: float, k: FloatArray, row: FloatArray,
+    step_s: float, basis: FloatArray, target_V: float, moving: bool, k: FloatArray, row: FloatArray,
 ) -> str:  # fmt: skip
     """See `DriftFilter.update`. ``walks``, ``bursts`` (p,) : variances added by a step and by a sudden change, V².
 
@@ -231,7 +231,7 @@ def update(
     else:
         P[0, 0] += walks[0]
         innovation, variance = innovation_of(x, P, basis, target_V, row)
-    noise_V2 = max((c.noise * span_V) ** 2, c.alike_s / step_s * s.slow_V2) / weight
+    noise_V2 = max((c.noise * span_V) ** 2, c.alike_s / step_s * s.slow_V2)
     if innovation * innovation > c.gate_sigma**2 * (variance + noise_V2) and s.rejected < c.gate_persistence:
         s.rejected += 1
         return "outlier"
@@ -307,7 +307,7 @@ class DriftFilter:
         """(p,) variances that each coefficient gains with a step, and with a sudden change, V²."""
         return self._walk.copy(), self._burst.copy()
 
-    def update(self, basis: FloatArray, target_V: float, moving: bool, weight: float = 1.0) -> str:
+    def update(self, basis: FloatArray, target_V: float, moving: bool) -> str:
         """Update with one measurement ``target_V`` of ``basis' beta``; ``basis`` (p,).
 
         Returns "updated", "outlier" (refused) or "burst" (updated, and a sudden change was detected).
@@ -315,7 +315,7 @@ class DriftFilter:
         At rest (``moving`` False) only the constant has process noise and is estimated, because all samples have the
         same basis. The other coefficients keep their values and variances (Schmidt-Kalman filter). Otherwise minutes at
         one position would change the model at all others, and would give too much weight to the next motion's first
-        samples. ``weight`` : of the measurement, above 0; its noise variance is divided by it.
+        samples.
         """
         x, P, walk, burst = self._x, self._P, self._walk, self._burst
         span_V, step_s = self.span_V, self.step_s
@@ -331,7 +331,6 @@ class DriftFilter:
             basis,
             target_V,
             moving,
-            weight,
             self._k,
             self._row,
         )

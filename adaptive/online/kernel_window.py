@@ -1,4 +1,4 @@
-"""The learner's window: a sliding LSSVM on the residual of the linear part, its eviction rule and sample weights."""
+"""The learner's window: a sliding LSSVM on the residual of the linear part, its eviction rule, its old samples."""
 
 from __future__ import annotations
 
@@ -20,55 +20,6 @@ from adaptive.window.arrays import Status, WindowArrays
 from adaptive.window.healing import Healing, HealingState
 from adaptive.window.window import SolverConfig, SolverState, Window, WindowConfig
 
-#: Least share of its own weight that an old sample keeps.
-LEAST_FADED = 1e-3
-
-# --- Sample weights: a weight w means 1/w times the noise variance, in window and filter. An ordinary sample has 1.
-
-
-@dataclass(frozen=True, slots=True)
-class WeightConfig:
-    """Weights of doubtful and old samples. By default only samples from before a change count less.
-
-    near_bad : weight of a pair where the smoother has used a refused reading.
-    on_probation : weight while a jump may still be undone.
-    acceleration : noise that acceleration adds at full scale of the feature map, as a share of the ordinary noise: the
-    weight is 1/(1 + (acceleration a/scale)²). The smoother's error is largest where the motion turns fast.
-    half_life_s : time after which a sample of the window counts half, s; 0 for never.
-    before_change : largest weight of samples from before a detected change of the stage; 1 keeps them all.
-    """
-
-    near_bad: float = 1.0
-    on_probation: float = 1.0
-    acceleration: float = 0.0
-    half_life_s: float = 0.0
-    before_change: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("near_bad", "on_probation", "before_change"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise InputError(f"weights.{name}: got {getattr(self, name)}, expected a weight above 0, up to 1")
-        for name in ("acceleration", "half_life_s"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"weights.{name}: got {value}, expected a finite number, not negative")
-
-    @shared
-    def of(self, near_bad: bool, on_probation: bool, a_share: float) -> float:
-        """Weight of a pair; ``a_share`` is its acceleration as a share of full scale."""
-        weight = (self.near_bad if near_bad else 1.0) * (self.on_probation if on_probation else 1.0)
-        if self.acceleration > 0.0:
-            weight /= 1.0 + (self.acceleration * a_share) ** 2
-        return weight
-
-    @shared
-    def faded(self, weight: float, age_s: float) -> float:
-        """Weight of a sample after ``age_s`` in the window, s; at least a thousandth of its own."""
-        return weight * max(float(0.5 ** (age_s / self.half_life_s)), LEAST_FADED) if self.half_life_s > 0.0 else weight
-
-
-# Compiled code knows methods by plain names only.
-_faded = WeightConfig.faded
 Eviction = Literal["nearest", "fifo"]
 #: A sample with a kernel value above this to a held one takes its slot even where there are free slots.
 SAME = 0.98
@@ -126,7 +77,6 @@ class KernelState:
     """What a `ResidualWindow` holds beside the arrays of its solver."""
 
     born: Annotated[IntArray, Entry("step that each sample came with", "", "N")]
-    own_weights: Annotated[FloatArray, Entry("weight that each sample came with", "", "N")]
     turn: Annotated[Turn, Entry("place in the window", name="")]
     share: Annotated[KernelShare, Entry("how much of the kernel part counts", name="")]
     kernel_variance: Annotated[float, Entry("variance of the kernel part away from samples", "V²", low=0.0)]
@@ -152,46 +102,32 @@ _SOLVER = frozenset(row.name for row in rows(SolverState))
 
 
 @shared
-def learn(
-    A: WindowArrays, turn: Turn, x: FloatArray, target_V: float, weight: float, born: IntArray, own: FloatArray,
-    fifo: bool,
-) -> int:  # fmt: skip
-    """See `ResidualWindow.learn`: the status of the step. born, own (N,) : step and weight that a sample came with."""
+def learn(A: WindowArrays, turn: Turn, x: FloatArray, target_V: float, born: IntArray, fifo: bool) -> int:
+    """See `ResidualWindow.learn`: the status of the step. born (N,) : step that a sample came with."""
     n = A.C[ws.COUNT]
     slot, value = steps.nearest(A, x)
     turn.clock += 1
     room = n < A.S.shape[0] and value < SAME
     if room:
         slot = n
-        status = steps.append(A, x, target_V, weight)
+        status = steps.append(A, x, target_V, 1.0)
     else:
         if fifo:
             slot = int(np.argmin(born[:n]))
-        status = steps.replace(A, slot, x, target_V, weight)
+        status = steps.replace(A, slot, x, target_V, 1.0)
     if status == ws.ACCEPTED:
         born[slot] = turn.clock
-        own[slot] = weight
     return int(status)
 
 
 @shared
-def fade(A: WindowArrays, turn: Turn, weights: WeightConfig, step_s: float, born: IntArray, own: FloatArray) -> None:
-    """See `ResidualWindow.fade`."""
-    n = A.C[ws.COUNT]
-    if weights.half_life_s > 0.0 and n > 0:
-        slot = turn.clock % n
-        steps.reweight(A, slot, _faded(weights, own[slot], float(turn.clock - born[slot]) * step_s))
-
-
-@shared
-def let_go(A: WindowArrays, turn: Turn, most: float, born: IntArray, own: FloatArray) -> None:
+def let_go(A: WindowArrays, turn: Turn, most: float, born: IntArray) -> None:
     """See `ResidualWindow.let_go`."""
     while 0 <= turn.next < A.C[ws.COUNT]:
         slot = turn.next
         turn.next += 1
-        if born[slot] <= turn.changed and own[slot] > most:
-            if steps.reweight(A, slot, most) == ws.ACCEPTED:
-                own[slot] = most
+        if born[slot] <= turn.changed and A.V[ws.W, slot] > most:
+            steps.reweight(A, slot, most)
             return
     turn.next = NOWHERE
 
@@ -220,8 +156,6 @@ class ResidualWindow:
         self._window = Window(self._config, arrays)
         self._healing = Healing(self._window)
         self._born = np.zeros(capacity, dtype=np.int64)
-        # The weights that samples came with, before they faded.
-        self._own = np.ones(capacity)
         self._turn = Turn()
         self._share = KernelShare(0.0, 0.0)
 
@@ -311,23 +245,18 @@ class ResidualWindow:
         """Take one measurement for the share; see `KernelShare.take`."""
         self._share.take(kernel_V, left_V, step_s)
 
-    def learn(self, kernel: FloatArray, target_V: float, weight: float = 1.0) -> str:
-        """Learn one sample with a noise weight. Returns "learnt", or "numerics" where the step was refused and undone.
+    def learn(self, kernel: FloatArray, target_V: float) -> str:
+        """Learn one sample. Returns "learnt", or "numerics" where the step was refused and undone.
 
         A numerical refusal starts the healing of the window. The same solution is served, and steps that fail are
         refused, until a new factorisation is swapped in `adaptive.window.healing.STEPS` samples later.
         """
         self._healing.step()
         A, n, x = self._window.arrays, len(self._window), np.ascontiguousarray(kernel, dtype=np.float64)
-        fifo = self.eviction == "fifo"
-        status = learn(A, self._turn, x, float(target_V), float(weight), self._born, self._own, fifo)
+        status = learn(A, self._turn, x, float(target_V), self._born, self.eviction == "fifo")
         if status == Status.ILL_CONDITIONED and n:
             self._healing.begin()
         return admission.LEARNT if status == Status.ACCEPTED else admission.NUMERICS
-
-    def fade(self, weights: WeightConfig, step_s: float) -> None:
-        """Reweight one sample by its age, the next one at each call; ``step_s``: time between two steps, s."""
-        fade(self._window.arrays, self._turn, weights, step_s, self._born, self._own)
 
     def expect_change(self) -> None:
         """The stage has changed: mark all samples as from before the change. See `let_go`."""
@@ -338,12 +267,13 @@ class ResidualWindow:
         self._turn.next = NOWHERE
 
     def let_go(self, most: float) -> None:
-        """Limit the weight of one sample from before the last change to ``most``, the next one at each call.
+        """Limit the weight of one sample from before the last change to ``most``, the next one at each call. A weight w
+        means 1/w times the noise variance.
 
         Old samples are down-weighted, not removed: where nothing newer has come they are the best there are. One per
         call, because 500 steps of the window at once would delay a sample.
         """
-        let_go(self._window.arrays, self._turn, most, self._born, self._own)
+        let_go(self._window.arrays, self._turn, most, self._born)
 
     def arrays(self) -> tuple[FloatArray, FloatArray, float]:
         """Kernel inputs (n, d), dual weights (n,) and bias, V, of the share that is served. Copies."""
@@ -384,7 +314,7 @@ class ResidualWindow:
         made = object.__new__(ResidualWindow)
         c = self._config
         made.eviction, made._turn, made._born = self.eviction, replace(self._turn), self._born.copy()
-        made._own, made._share = self._own.copy(), replace(self._share)
+        made._share = replace(self._share)
         widths = tuple(float(w) for w in hyper.widths)
         if len(widths) != c.dimension:
             raise InputError(f"widths: got {len(widths)}, expected {c.dimension}, one an input of the kernel")
@@ -407,8 +337,7 @@ class ResidualWindow:
         """All arrays under flat names, and their hyper-parameters; ``arrays=False``: without those of the solver."""
         c, healing = self._config, self._healing.state()
         kept = (
-            self._born.copy(), self._own.copy(), self._turn, self._share,
-            self.kernel_variance, c.gamma, c.widths, healing,
+            self._born.copy(), self._turn, self._share, self.kernel_variance, c.gamma, c.widths, healing,
         )  # fmt: skip
         return save(KernelSolverState(*kept, self._window.state()) if arrays else KernelState(*kept), copies=False)
 
@@ -429,5 +358,5 @@ class ResidualWindow:
         solver = state.solver if isinstance(state, KernelSolverState) else None
         self._window = Window(self._config, kept) if solver is None else Window.of(self._config, solver)
         self._healing = Healing.of(self._window, state.healing)
-        self._born, self._own, self._turn, self._share = state.born, state.own_weights, state.turn, state.share
+        self._born, self._turn, self._share = state.born, state.turn, state.share
         self.kernel_variance = state.kernel_variance

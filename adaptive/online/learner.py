@@ -294,13 +294,13 @@ class Parts:
         self.filter.expect_change()
         self.window.expect_change()
 
-    def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, weight: float, rest: bool) -> bool:
+    def follow(self, basis: FloatArray, kernel_V: float, pair: Pair, rest: bool) -> bool:
         """One step of the filter at basis (p,) of ``pair``; False for an outlier, not learnt then.
 
         ``kernel_V`` : the whole kernel part there. ``rest`` : whether the stage is at rest.
         """
         left_V = pair.u_V - float(basis.dot(self.filter.beta))
-        said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest, weight)
+        said = self.filter.update(basis, pair.u_V - self.window.share * kernel_V, not rest)
         if said == "outlier":
             return False
         if not rest:
@@ -308,7 +308,7 @@ class Parts:
         if said == "burst":
             self.window.expect_change()
         if self.judgement.valid and not self.intake.on_probation:
-            self.window.let_go(self.config.weights.before_change)
+            self.window.let_go(self.config.before_change)
         self.take_rest(pair.u_V, moving=not rest)
         if self.judgement.valid and not rest:
             self.widen_domain((pair.y_um, pair.v_um_per_s, pair.a_um_per_s2))
@@ -681,8 +681,6 @@ class Learner:
         motion = (pair.y_um, pair.v_um_per_s, pair.a_um_per_s2)
         track.features.fill(*motion, track.memory, self._basis, parts.point)
         rest = intake.rests(pair.y_um)
-        a_share = pair.a_um_per_s2 / self.base.features.a_scale_um_per_s2
-        weight = c.weights.of(pair.near_bad, intake.on_probation, a_share)
         kernel_V = parts.window.predict(parts.point)
         target = pair.u_V - parts.window.share * kernel_V
         beta = parts.filter.beta
@@ -704,16 +702,14 @@ class Learner:
             return admission.FROZEN
         if intake.stands_still:
             return admission.UNTRUSTED
-        if not parts.follow(self._basis, kernel_V, pair, weight, rest):
+        if not parts.follow(self._basis, kernel_V, pair, rest):
             return admission.OUTLIER
         if rest:
             return admission.UNEXCITED
         # The window learns only what the filter has just taken, and what that left. Alone it would take the first
         # samples of a changed stage, which the filter still refuses, and the change would become local for good.
         if due(pair.now // c.filter_every, c.window_every) and not intake.on_probation:
-            outcome = parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)), weight)
-            parts.window.fade(c.weights, c.window_every * parts.filter.step_s)
-            return outcome
+            return parts.window.learn(parts.point, pair.u_V - float(self._basis.dot(parts.filter.beta)))
         return admission.LEARNT
 
     def _waits(self, pair: Pair) -> str:

@@ -32,8 +32,7 @@ class Pair(NamedTuple):
     """One smoothed instant to learn: its number, motion (µm, µm/s, µm/s²), and its voltage, V, smoothed alike.
 
     rates : of that voltage, V/s and V/s². applied_V : the voltages that were applied at that instant and just before
-    it, V. good : whether the readings at that instant and before it are good. near_bad : whether the smoother has used
-    a bad reading for it.
+    it, V. good : whether the readings at that instant and before it are good.
     """
 
     now: int
@@ -44,7 +43,6 @@ class Pair(NamedTuple):
     rates: tuple[float, float]
     applied_V: tuple[float, float]
     good: bool
-    near_bad: bool
 
 
 class Taken(NamedTuple):
@@ -226,11 +224,8 @@ class Track:
         now = self.state.count - 1 - self.lag
         at, before = now % slots, (now - 1) % slots
         # As bytes: numpy's own "all" of so few costs as much as a step of the smoother.
-        near_bad = 0 in self.good.tobytes()
-        good = not near_bad or bool(self.good[at] and self.good[before])
-        return Pair(
-            now, *self.motion, self.smooth_V, self.rates, (self.u_V.item(at), self.u_V.item(before)), good, near_bad
-        )
+        good = 0 not in self.good.tobytes() or bool(self.good[at] and self.good[before])
+        return Pair(now, *self.motion, self.smooth_V, self.rates, (self.u_V.item(at), self.u_V.item(before)), good)
 
     def remember(self, memory: FloatArray) -> None:
         """Go on with another (m,) hysteresis memory, given in the frame that is served."""

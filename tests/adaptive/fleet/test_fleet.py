@@ -15,7 +15,6 @@ from adaptive.identification import IdentifyConfig, identify_lssvm
 from adaptive.inverse_model import LssvmInverse
 from adaptive.online.config import LearnerConfig
 from adaptive.online.gates import AdmissionConfig
-from adaptive.online.kernel_window import WeightConfig
 from adaptive.online.learner import MODEL_LEFT_ENVELOPE, Learner
 from adaptive.online.sensor_trust import SENSOR_STUCK
 from adaptive.types import Sample
@@ -276,9 +275,8 @@ def test_a_state_moves_between_fleet_and_single_learner(models: list[LssvmInvers
 
 
 @pytest.mark.parametrize("device", ["cpu", "cpu:0"])
-def test_axes_with_fading_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], device: str) -> None:
-    weights, solver = WeightConfig(half_life_s=0.3, acceleration=1.0), SolverConfig(form="inverse")
-    config = LearnerConfig(window=60, eviction="fifo", weights=weights, solver=solver)
+def test_axes_with_kept_samples_and_fifo_equal_single_learners(models: list[LssvmInverse], device: str) -> None:
+    config = LearnerConfig(window=60, eviction="fifo", before_change=0.2, solver=SolverConfig(form="inverse"))
     fleet = Fleet(models, FleetConfig(config, device))
     singles = [Learner(model, config) for model in models]
     u, y = samples(1200)

@@ -139,13 +139,13 @@ def test_the_compiled_filter_agrees_with_filterpy_through_changes_and_rests(monk
     for k, row in enumerate(rows(900)):
         truth = TRUE * (0.94 if k > 300 else 1.0)
         target = float(row @ truth) + 1e-4 * np.sin(37.0 * k)
-        moving, weight = not 600 <= k < 700, 1.0 if k % 5 else 0.3
+        moving = not 600 <= k < 700
         with monkeypatch.context() as patched:
             patched.setattr(
                 drift, "take_in", lambda x, P, h, e, v, noise, k, row, z=target: by_filterpy(x, P, h, z, noise, k, row)
             )
-            outcome = reference.update(row, target, moving, weight)
-        assert compiled.update(row, target, moving, weight) == outcome
+            outcome = reference.update(row, target, moving)
+        assert compiled.update(row, target, moving) == outcome
         outcomes.add(outcome)
     assert {"burst", "updated"} <= outcomes
     np.testing.assert_allclose(reference.beta, compiled.beta, rtol=0.0, atol=1e-8)
