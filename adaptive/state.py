@@ -24,7 +24,7 @@ import types
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from math import inf, isfinite
 from typing import (
@@ -225,25 +225,6 @@ def _save(record: Any, prefix: str, state: StateDict, copies: bool) -> None:
                 _save(one, f"{name}{i}.", state, copies)
         elif value is not None:
             _save(value, f"{name}." if slot.name else prefix, state, copies)
-
-
-def copied(record: T) -> T:
-    """An independent copy of a record; its undeclared fields, and what is frozen, are shared."""
-    params = vars(type(record)).get("__dataclass_params__")
-    if params is None or params.frozen:
-        return record
-    changes: dict[str, Any] = {}
-    for slot in _slots(_type(record)):
-        value = getattr(record, slot.field)
-        if value is None:
-            continue
-        if slot.kind in ("array", "named"):
-            changes[slot.field] = value.copy()
-        elif slot.kind in ("values", "records", "arrays"):
-            changes[slot.field] = slot.make(copied(x) if slot.kind == "records" else x for x in value)
-        elif slot.kind == "record":
-            changes[slot.field] = copied(value)
-    return replace(record, **changes)  # type: ignore[type-var]
 
 
 # --- Loading.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,17 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
 
 from adaptive.inverse_model import LssvmInverse
+from adaptive.online.gates import DUPLICATE, OUT_OF_ORDER
 from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample
+from adaptive.types import FloatArray, InverseModel, OnlineModel, Sample, StateDict
 from service.answers.guard import Limits
 from service.config.settings import AxisConfig
+from service.intake.sequence import AHEAD
 from service.protocol.query import STAND_IN, FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
-from service.server.learner_supervisor import fingerprint
+from service.server.learner_supervisor import UNUSABLE, fingerprint
 from service.storage.model_file import Bundle, BundleMeta
 from tests.online_models import PlainLearner
 from tests.service.conftest import DT_S, make_models
@@ -246,3 +251,46 @@ def test_a_standby_goes_back_to_the_same_state(at: int) -> None:
         assert "learner_went_back" in bench.events
     assert one.axis.newest.seq == other.axis.newest.seq
     assert fingerprint(one.axis.newest.models[NAME]) == fingerprint(other.axis.newest.models[NAME])
+
+
+# ---- what is refused changes nothing
+
+#: What samples teach: the model, the place and the memories, how good the model has been, and what is served.
+_TAUGHT = (
+    "learner.filter.", "learner.window.", "learner.front.track.", "learner.judgement.", "learner.domain",
+    "learner.rest", "learner.delay", "learner.mark", "tracker.", "memory.", "served.", "model.",
+)  # fmt: skip
+_numbers = st.one_of(st.floats(allow_nan=True, allow_infinity=True, width=64), st.floats(0.0, 90.0))
+
+
+@functools.lru_cache(maxsize=1)
+def _learnt() -> StateDict:
+    bench = Bench(make_axis())
+    bench.run(1010)
+    return bench.axis.state_dict()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seq=st.sampled_from((1010,) * 6 + (1009, 700, 10**9, 2**62)),
+    t_s=st.one_of(st.just(1.010), st.just(1.010), _numbers), u_V=st.one_of(st.just(4.0), _numbers), y_um=_numbers,
+)  # fmt: skip
+def test_what_is_refused_teaches_and_moves_nothing(seq: int, t_s: float, u_V: float, y_um: float) -> None:
+    axis = make_axis()
+    axis.restore(dict(_learnt()))
+    before = axis.state_dict()
+    (verdict,) = axis.handle(SampleBatch(*(np.array([value]) for value in (seq, t_s, u_V, y_um))))
+    after = axis.state_dict()
+    event(verdict)
+    if verdict not in UNUSABLE | {DUPLICATE, OUT_OF_ORDER, AHEAD}:
+        return
+    for name in before:
+        # Counters of the window's numerics are in C; a state is made of a copy that counts the copying.
+        if name.startswith(_TAUGHT) and name != "learner.window.C":
+            assert np.array_equal(
+                np.asarray(before[name]), np.asarray(after[name]), equal_nan=_is_float(before[name])
+            ), name
+
+
+def _is_float(value: Any) -> bool:
+    return bool(np.asarray(value).dtype.kind == "f")
