@@ -133,10 +133,14 @@ class FollowedModels:
 
 # --- The process.
 
-#: How long to wait for the stage's next samples, and for the service to learn far enough, s.
-STALL_S, BEHIND_S = 10.0, 0.1
-#: How long to wait for the model that a block is planned with, s, and states of it that are kept.
-MODEL_S, KEPT = 0.002, 64
+#: How long to wait for the stage's next samples, s.
+STALL_S = 10.0
+#: How long to wait for the model that a block is planned with, s: the stage's clock stands still meanwhile, or does not
+#: (followed, queried).
+MODEL_S = 0.5
+STRICT_MODEL_S, STRICT_QUERY_S = 0.002, 0.1
+#: States of a followed model that are kept.
+KEPT = 64
 #: Ticks of the reference that are published at once.
 TOLD = 20
 
@@ -197,7 +201,7 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
                     return 1
                 seen = twins.seen[TEACHER]
                 fresh, stop = blocks_now(plan, block, seen)
-                models.wait(fresh, MODEL_S)
+                models.wait(fresh, STRICT_MODEL_S if plan.strict else MODEL_S)
                 if block == 0:  # the stage's clock starts when every twin has commands
                     for name, begin, u_V in models.constant(0):
                         commands[name].put(wire.encode_command(begin, u_V))
@@ -290,7 +294,8 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                     due = fresh * size if name == TEACHER else None
                     asked = slice(part.start if due is None else due, part.stop)
                     motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
-                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), due)
+                    wait_s = STRICT_QUERY_S if plan.strict else MODEL_S
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), wait_s, due)
                     late += waited
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
@@ -334,6 +339,7 @@ def ask(
     model: str,
     after: Trajectory | None,
     as_of: int,
+    wait_s: float,
     begin: int | None = None,
 ) -> tuple[Trajectory, bool]:
     """The voltages for a block, and whether they had to be asked for more than once.
@@ -345,7 +351,7 @@ def ask(
     wanted, waited = as_of, False
     while True:
         try:
-            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=BEHIND_S)
+            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=wait_s)
             return answer, waited
         except (BehindError, ReplyTimeoutError, RefusedError) as error:
             too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST
