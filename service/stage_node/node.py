@@ -30,6 +30,7 @@ from service.protocol.keys import Keys
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
 from service.security.authenticator import own_authenticator
+from service.security.lease import CommandGate
 from service.stage_node.exchange import CommandBuffer, SampleRing, Sender
 from service.stage_node.faults import Injector, fault_key, sound_key
 from sim.stage.config import StageConfig
@@ -132,12 +133,10 @@ class AxisPort:
         put_sound = None if sound is None else sound.put
         self.ring = SampleRing(config.stage.dt_s, put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
-        self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
+        self.gate = CommandGate(session, keys, by, self.commands.receive)
+        self._subscribers: list[Any] = [self.gate]
         if self.injector is not None:
             self._subscribers.append(session.declare_subscriber(fault_key(config.name, axis), self._take_fault))
-
-    def _take_command(self, sample: zenoh.Sample) -> None:
-        self.commands.receive(sample.payload.to_bytes())
 
     def _take_fault(self, sample: zenoh.Sample) -> None:
         assert self.injector is not None
@@ -167,6 +166,7 @@ class AxisPort:
             "lost": self.ring.lost,
             "slew_limited": self.limited,
             "commands": dict(self.commands.counts),
+            "command": self.gate.to_json(),
             "error": self.commands.error,
         }
         if self.injector is not None:
@@ -175,7 +175,7 @@ class AxisPort:
 
     def close(self) -> None:
         for subscriber in self._subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+            subscriber.undeclare()
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
         if self._sound is not None:
             self._sound.undeclare()  # type: ignore[no-untyped-call]
