@@ -30,6 +30,7 @@ from service.protocol import samples as wire
 from service.protocol.errors import error_from_json, error_to_json
 from service.protocol.keys import Keys
 from service.security.authenticator import Authenticator
+from service.security.lease import read_token
 from service.stage_node.faults import decode_fault
 from service.storage import checkpoint
 
@@ -130,6 +131,17 @@ def _claims() -> Target:
     return target
 
 
+def _owners() -> Target:
+    """The same of the token of the controller that commands."""
+    keys, by = Keys("demo", "x"), Authenticator(b"0123456789abcdef")
+
+    def target(data: bytes) -> None:
+        if read_token(by, keys, f"{keys.base}/owner/{data.decode(errors='replace')}") is not None:
+            raise AssertionError("a token without a tag was believed")
+
+    return target
+
+
 def _state() -> Target:
     """A valid state with entries replaced: an axis refuses it, or takes it and learns and answers from it."""
     axis = make_axis(alone=True)
@@ -170,6 +182,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "checkpoint": lambda: _framed_checkpoint,
     "state": _state,
     "claim": _claims,
+    "owner": _owners,
     "parts": lambda: _parts,
     "fault": lambda: _refusing(decode_fault),
     "operate": lambda: _refusing(decode_request),
@@ -223,6 +236,10 @@ def seeds(target: str) -> list[bytes]:
         "framed": framed,
         "checkpoint": [kept[8:10] + kept[32:], b""],
         "state": [struct.pack("<HB8s", entry, change, bytes(8)) for entry, change in ((0, 0), (40, 3), (90, 41))],
+        "owner": [
+            b"1795875430000/0123456789abcdef/4711/lab1/00ff00ff00ff00ff00ff00ff00ff00ff",
+            b"1/0123456789abcdef/2/lab1",
+        ],
         "claim": [b"3/i-rogue/00ff00ff00ff00ff00ff00ff00ff00ff", b"999999999/i-rogue"],
         "parts": [b"".join(struct.pack("<II3s", i, 3, b"abc") for i in range(3))],
         "fault": [b'{"fault": "nan", "duration_s": 1}', b'{"fault": "change", "values": {"gain_drift.gain": -0.06}}'],

@@ -29,6 +29,8 @@ from service.protocol.errors import BehindError, RefusedError, ReplyTimeoutError
 from service.protocol.keys import Keys
 from service.protocol.query import NEWEST, FeedforwardQuery, Trajectory
 from service.runtime.session import SURELY, open_client, wait_followed
+from service.security.authenticator import own_authenticator
+from service.security.lease import CommandLease
 
 # --- The voltages by followed models, in real time and in one process alike.
 #
@@ -133,10 +135,14 @@ class FollowedModels:
 
 # --- The process.
 
-#: How long to wait for the stage's next samples, and for the service to learn far enough, s.
-STALL_S, BEHIND_S = 10.0, 0.1
-#: How long to wait for the model that a block is planned with, s, and states of it that are kept.
-MODEL_S, KEPT = 0.002, 64
+#: How long to wait for the stage's next samples, s.
+STALL_S = 10.0
+#: How long to wait for the model that a block is planned with, s: the stage's clock stands still meanwhile, or does not
+#: (followed, queried).
+MODEL_S = 0.5
+STRICT_MODEL_S, STRICT_QUERY_S = 0.002, 0.1
+#: States of a followed model that are kept.
+KEPT = 64
 #: Ticks of the reference that are published at once.
 TOLD = 20
 
@@ -197,7 +203,7 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
                     return 1
                 seen = twins.seen[TEACHER]
                 fresh, stop = blocks_now(plan, block, seen)
-                models.wait(fresh, MODEL_S)
+                models.wait(fresh, STRICT_MODEL_S if plan.strict else MODEL_S)
                 if block == 0:  # the stage's clock starts when every twin has commands
                     for name, begin, u_V in models.constant(0):
                         commands[name].put(wire.encode_command(begin, u_V))
@@ -217,29 +223,28 @@ def follow(plan: Plan, endpoint: str, out: Path) -> int:
             complete = twins.wait(n)
         finally:
             twins.close()
-            for publisher in (*commands.values(), event):
-                publisher.undeclare()  # type: ignore[no-untyped-call]
+            for lease in commands.values():
+                lease.undeclare()
+            event.undeclare()  # type: ignore[no-untyped-call]
         counts = models.counts()
     _write(out, twins, models.std_V, models.durations_s, int(counts["late_models"]), counts)
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
 
 
-def _publishers(session: zenoh.Session) -> tuple[dict[str, zenoh.Publisher], zenoh.Publisher]:
-    """Publishers of the commands by model, and of events."""
-    commands = {
-        name: session.declare_publisher(Keys(STAGE, UNITS[name]).command, congestion_control=SURELY, express=True)
-        for name in MODELS
-    }
+def _publishers(session: zenoh.Session) -> tuple[dict[str, CommandLease], zenoh.Publisher]:
+    """Leases to command the twins, by model, and the publisher of events."""
+    by = own_authenticator()
+    commands = {name: CommandLease(session, Keys(STAGE, UNITS[name]), by) for name in MODELS}
     return commands, session.declare_publisher(Keys(STAGE, AXIS).event, congestion_control=SURELY)
 
 
-def _wait_for_stage(commands: dict[str, zenoh.Publisher]) -> None:
+def _wait_for_stage(commands: dict[str, CommandLease]) -> None:
     """Wait until every twin takes commands. Raises ServiceError if one does not."""
     # The subscriptions must have reached the stage before the first commands start its clock.
     time.sleep(0.3)
-    for name, publisher in commands.items():
-        if not wait_followed(publisher, STALL_S):
+    for name, lease in commands.items():
+        if not wait_followed(lease.publisher, STALL_S):
             raise ServiceError(f"{UNITS[name]}: no stage takes commands within {STALL_S:g} s; does it run?")
 
 
@@ -267,7 +272,7 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
     # The first answers precede all samples, and the first commands start the stage's clock: these commands are held
     # until all such answers are there.
     blind = sum(plan.as_of(block) < 0 for block in range(n // size))
-    held: list[tuple[zenoh.Publisher, bytes]] = []
+    held: list[tuple[CommandLease, bytes]] = []
     # Two sessions, so that an answer does not wait behind the samples of five twins.
     with Client.connect(endpoint, STAGE, AXIS, wait_s=20.0) as client, open_client(endpoint) as session:
         twins = Twins(plan, session)
@@ -290,15 +295,16 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
                     due = fresh * size if name == TEACHER else None
                     asked = slice(part.start if due is None else due, part.stop)
                     motion = (wanted[0][asked], wanted[1][asked], wanted[2][asked])
-                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), due)
+                    wait_s = STRICT_QUERY_S if plan.strict else MODEL_S
+                    answer, waited = ask(client, motion, name, answers[name], plan.as_of(fresh), wait_s, due)
                     late += waited
                     durations.append(time.perf_counter() - begin)
                     answers[name] = answer
                     std_V[name][asked] = answer.std_V
                     held.append((commands[name], wire.encode_command(asked.start, answer.u_V)))
                     if block >= blind or len(held) == blind * len(MODELS):
-                        for publisher, command in held:
-                            publisher.put(command)
+                        for lease, command in held:
+                            lease.put(command)
                         held.clear()
                 late += twins.seen[TEACHER] > part.start
                 if part.start <= plan.change_tick < part.stop:
@@ -308,8 +314,9 @@ def control(plan: Plan, endpoint: str, out: Path) -> int:
             complete = twins.wait(n)
         finally:
             twins.close()
-            for publisher in (*commands.values(), event):
-                publisher.undeclare()  # type: ignore[no-untyped-call]
+            for lease in commands.values():
+                lease.undeclare()
+            event.undeclare()  # type: ignore[no-untyped-call]
     _write(out, twins, std_V, durations, late, {})
     print(json.dumps({"done": complete, "received": twins.seen}), flush=True)
     return 0 if complete else 1
@@ -334,6 +341,7 @@ def ask(
     model: str,
     after: Trajectory | None,
     as_of: int,
+    wait_s: float,
     begin: int | None = None,
 ) -> tuple[Trajectory, bool]:
     """The voltages for a block, and whether they had to be asked for more than once.
@@ -345,7 +353,7 @@ def ask(
     wanted, waited = as_of, False
     while True:
         try:
-            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=BEHIND_S)
+            answer = client.trajectory(*motion, model=model, after=after, begin=begin, as_of=wanted, wait_s=wait_s)
             return answer, waited
         except (BehindError, ReplyTimeoutError, RefusedError) as error:
             too_old = isinstance(error, RefusedError) and error.field == "as_of" and wanted != NEWEST

@@ -9,6 +9,9 @@ The controller follows the model and evaluates it itself; with ``ahead`` it quer
 margin gives the samples time to be learnt, and the model time to arrive, so that a run in real time and a fast one use
 the same models and get the same voltages. Each block of a followed model also commands the ``reserve`` ticks after it:
 where the controller stalls, the stage goes on along the reference by a model that is as much older.
+
+That is with ``strict``. Otherwise stage and controller wait for each other, up to ``LOCK_STEP_S``: a busy machine makes
+the run longer, not its voltages late, and a reserve is not needed.
 """
 
 from __future__ import annotations
@@ -41,9 +44,13 @@ MODELS: dict[str, str] = {
 TEACHER = "lssvm_adaptive"
 STAGE, AXIS = "demo", "x"
 #: Fields of a plan whose controller queries ahead.
-ASKING_AHEAD = {"ahead": True, "block": 20, "lead": 60, "margin": 20, "reserve": 0}
+ASKING_AHEAD = {"ahead": True, "block": 20, "lead": 60, "margin": 20}
+#: Ticks of the reserve of a controller that follows a model in real time.
+RESERVE = 60
 #: Ticks between two snapshots of the service.
 SNAPSHOT_EVERY = 20
+#: Longest time, s, for which the stage's clock stands still until a voltage comes.
+LOCK_STEP_S = 5.0
 #: Axis name, in keys, of the twin that each model drives; the teacher has the axis itself.
 UNITS: dict[str, str] = {name: AXIS if name == TEACHER else f"{AXIS}_{name}" for name in MODELS}
 
@@ -59,7 +66,8 @@ class Plan:
     low_um, high_um : range of the reference, µm.
     ahead : query the service ahead of time instead of following the model.
     block, lead, margin : ticks per block, ticks that it is computed ahead, ticks left for samples and model to arrive.
-    reserve : ticks after each block that are commanded as well; 0 with ``ahead``.
+    reserve : ticks after each block that are commanded as well; only with ``strict``, and not with ``ahead``.
+    strict : the stage's clock keeps real time, also where a voltage is late.
     seed : of the stage's noise and of the reference.
     drive_low_V, drive_high_V : range of the identification signal, V.
     slowness : factor by which the reference is slower than the usual one.
@@ -79,7 +87,8 @@ class Plan:
     block: int = 5
     lead: int = 5
     margin: int = 10
-    reserve: int = 60
+    reserve: int = 0
+    strict: bool = False
     seed: int = 20
     drive_low_V: float = 0.0
     drive_high_V: float = 8.0
@@ -160,9 +169,9 @@ class Plan:
         return replace(config, changes=(*config.changes, (at_s, change)))
 
 
-def make_plan(run_s: float, seed: int, ahead: bool = False) -> Plan:
+def make_plan(run_s: float, seed: int, ahead: bool = False, strict: bool = False) -> Plan:
     """The plan on the usual stage."""
-    base = Plan(run_s=run_s, seed=seed)
+    base = Plan(run_s=run_s, seed=seed, strict=strict, reserve=RESERVE if strict and not ahead else 0)
     return replace(base, **ASKING_AHEAD) if ahead else base  # type: ignore[arg-type]
 
 
@@ -174,13 +183,13 @@ DRIVE_SHARE, LOW_SHARE, HIGH_SHARE = 0.8, 0.045, 0.9
 QUICK_S = 4e-3
 
 
-def plan_for(path: Path, folder: Path, run_s: float, seed: int, ahead: bool = False) -> Plan:
+def plan_for(path: Path, folder: Path, run_s: float, seed: int, ahead: bool = False, strict: bool = False) -> Plan:
     """The plan for the stage in the file ``path``; the stage that is run is written into ``folder``.
 
     Voltages stay within ``DRIVE_SHARE`` of the file's limits; the commanded range is a share of what they reach. The
     sample time is the plan's own. Raises InputError if the stage does not move, or diverges.
     """
-    base = make_plan(run_s, seed, ahead)
+    base = make_plan(run_s, seed, ahead, strict)
     config = replace(_able_to_drift(_from_zero(load_stage(path))), dt_s=base.dt_s, seed=seed)
     high = DRIVE_SHARE * config.u_max_V
     # A stage of one polarity keeps it; a bipolar stage is driven both ways.

@@ -66,6 +66,18 @@ def clock_missed(ticks: dict[str, int]) -> str:
     )
 
 
+def pace(summary: dict[str, Any]) -> str:
+    """How much slower than real time the stage ran; "" for a run without a clock."""
+    found = summary["pace"]
+    if not found:
+        return ""
+    stage_s, ran_s, waited_s = found["stage_s"], found["ran_s"], found["waited_s"]
+    return (
+        f"{stage_s:g} s of the stage took {ran_s:.1f} s ({ran_s / stage_s:.2f} times real time); "
+        f"its clock stood still for {waited_s:.1f} s of them, until voltages came"
+    )
+
+
 def table(summary: dict[str, Any]) -> str:
     """The result as a table: one row per model. The second line says which seconds of the run a column scores."""
     width = max(len(title) for title in MODELS.values())
@@ -106,6 +118,8 @@ class DemoRun:
     ticks : counts ``count``, ``late`` (no command in time) and ``bare_late`` (late ticks of the bare loop).
     notes : records for the viewer (events, diagnostics, status), in order.
     followed : of a followed model, see `Followed.counts`; empty where the service was queried ahead.
+    pace : of a run with a clock, s: ``stage_s`` of the stage's time, ``ran_s`` that it took, and ``waited_s`` for which
+    the stage's clock stood still. Empty without a clock.
     """
 
     y_um: dict[str, FloatArray]
@@ -117,6 +131,7 @@ class DemoRun:
     ticks: dict[str, int]
     notes: list[Any] = field(default_factory=list)
     followed: dict[str, float] = field(default_factory=dict)
+    pace: dict[str, float] = field(default_factory=dict)
 
     def summary(self, plan: Plan, reference_um: FloatArray) -> dict[str, Any]:
         """The content of ``summary.json``."""
@@ -131,6 +146,7 @@ class DemoRun:
             "queries": latency(self.query_s, self.late_queries),
             "samples": self.samples,
             "ticks": self.ticks,
+            "pace": self.pace,
             "change": {
                 "t_s": plan.change_tick * plan.dt_s,
                 "gain": plan.gain_change,

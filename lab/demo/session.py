@@ -16,7 +16,7 @@ import zenoh
 from adaptive.errors import InputError
 from adaptive.types import FloatArray
 from lab.demo.controller import KEPT, FollowedModels
-from lab.demo.plan import AXIS, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
+from lab.demo.plan import AXIS, LOCK_STEP_S, MODELS, SNAPSHOT_EVERY, STAGE, TEACHER, UNITS, Plan, make_plan, plan_for
 from lab.demo.result import DemoRun, draw_loops, draw_tracking, empty
 from lab.testbed.identified_stage import READY_S, Rig, write_service_config
 from lab.testbed.processes import Child
@@ -42,7 +42,7 @@ from service.viewer.rerun_sink import write_recording
 from sim.recordings import read, repaired
 from sim.stage.stage import Stage
 
-# --- In real time: stage, service, controller, viewer stream and a bare paced loop as processes over zenoh.
+# --- In real time or slower: stage, service, controller, viewer stream and a bare paced loop as processes over zenoh.
 
 
 #: A process may end so much later than planned, s.
@@ -91,7 +91,7 @@ def record_identification(plan: Plan, recorder: Recorder, logs: Path, progress: 
 
 
 def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], progress: Progress) -> DemoRun:
-    """Run the plan in real time on the processes of ``rig``; ``config`` is that of the service.
+    """Run the plan on the processes of ``rig``, in real time or slower; ``config`` is that of the service.
 
     Raises ServiceError if a process fails.
     """
@@ -107,7 +107,7 @@ def run_live(plan: Plan, config: Path, rig: Rig, rrd: Path, view: list[str], pro
         loop = rig.start_paced_loop(plan.dt_s, plan.ticks, wait=False)
         program = ["-m", "lab.demo.controller", str(plan_file), rig.endpoint, str(result)]
         controller = rig.start("controller", program, wait=False)
-        _follow(controller, server, plan, progress)
+        _follow(controller, server, progress)
         if stage.wait(_OVERTIME_S) != 0:
             raise ServiceError(f"the stage failed: {stage.output_tail()}")
         loop.wait(_OVERTIME_S)
@@ -121,20 +121,21 @@ def _stage_options(plan: Plan, ticks: int, *, changing: bool) -> list[str]:
     options = ["--rate", f"{1.0 / plan.dt_s:g}", "--seed", str(plan.seed), "--duration", repr(ticks * plan.dt_s)]
     options += ["--file", plan.stage_file] if plan.stage_file else []
     options += ["--batch", str(1 if plan.ahead else plan.block)]
+    options += [] if plan.strict else ["--lock-step", repr(LOCK_STEP_S)]
     for t_s, values in plan.stage(changing=changing).changes:
         options += ["--change", f"{t_s!r}:" + ",".join(f"{name}={value!r}" for name, value in values.items())]
     return options
 
 
-def _follow(controller: Child, server: Child, plan: Plan, progress: Progress) -> None:
+def _follow(controller: Child, server: Child, progress: Progress) -> None:
     """Report the controller's progress until it ends. Raises ServiceError if it or the service fails."""
-    until = time.monotonic() + plan.ticks * plan.dt_s + READY_S + _OVERTIME_S
-    read = 0
+    limit_s = READY_S + _OVERTIME_S  # until the next report, of a second of the stage's time
+    until, read = time.monotonic() + limit_s, 0
     while controller.running and time.monotonic() < until:
         if not server.running and controller.running:
             raise ServiceError(f"{server.name} ended before its time: {server.output_tail()}")
         for line in controller.lines[read:]:
-            read += 1
+            read, until = read + 1, time.monotonic() + limit_s
             message = json.loads(line)
             if "error" in message:
                 raise ServiceError(f"controller: {message['error']}")
@@ -168,8 +169,10 @@ def _collect(result: Path, server: Child, stage: Child, loop: Child) -> DemoRun:
         "stage_late": summary["late"],
         "bare_late": loop.last_json()["late"],
     }
+    stage_s = summary["tick"] * summary["dt_s"]
+    pace = {"stage_s": stage_s, "ran_s": summary["ran_s"], "waited_s": summary["waited_s"]}
     return DemoRun(
-        y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks, followed=followed
+        y_um, u_V, std_V, query_s=query_s, late_queries=late, samples=samples, ticks=ticks, followed=followed, pace=pace
     )
 
 
@@ -334,10 +337,12 @@ def run(
     say: Say,
     stage: Path | None = None,
     ahead: bool = False,
+    strict: bool = False,
 ) -> Done:
     """Run everything and write the results into ``out``; ``stage`` is a stage file in place of the usual stage.
 
-    ``ahead`` : the controller queries the service ahead of time instead of following the model.
+    ``ahead`` : the controller queries the service ahead of time instead of following the model. ``strict`` : the
+    stage's clock waits for no voltage.
 
     Raises InputError on a folder that cannot be used, ServiceError if a process fails.
     """
@@ -345,13 +350,15 @@ def run(
     clear_output(out, OURS)
     logs = out / "logs"
     logs.mkdir()
-    plan = make_plan(duration_s, seed, ahead) if own is None else plan_for(own, logs, duration_s, seed, ahead)
+    how = (duration_s, seed, ahead, strict)
+    plan = make_plan(*how) if own is None else plan_for(own, logs, *how)
     say(f"[1/4] recording {plan.identify_s:g} s of the chapter's training signal on a rested stage")
     _record(plan, out / "identification", logs, fast, _Bar(plan.identify_s, say))
     say("[2/4] identifying five inverse models from 10 s at 1 kHz")
     model = out / "model.npz"
     _identify(plan, out / "identification", model, say)
-    kind = "as fast as possible, in one process" if fast else "in real time, in processes over zenoh"
+    live = "in real time" if strict else f"in real time, waiting up to {LOCK_STEP_S:g} s for each other"
+    kind = "as fast as possible, in one process" if fast else f"in processes over zenoh, {live}"
     say(f"[3/4] {plan.run_s:g} s of a reference that no model has seen, {kind}")
     say(f"      after {plan.run_s / 2:g} s the stage changes: {plan.change_text}")
     rig = Rig(logs)

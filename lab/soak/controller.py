@@ -27,8 +27,10 @@ from service.protocol import samples as wire
 from service.protocol.errors import ServiceError
 from service.protocol.keys import Keys
 from service.protocol.query import Trajectory
-from service.runtime.session import SURELY, open_client
+from service.runtime.session import open_client
 from service.runtime.stopping import StopSignal
+from service.security.authenticator import own_authenticator
+from service.security.lease import CommandLease
 from service.stage_node.node import status_key
 from sim.signals.references import DemoReference
 
@@ -231,8 +233,7 @@ class Controller:
         self._client = client
         self._session = session
         self._dwells = session.declare_subscriber(dwell_key(), self._rest)
-        key = Keys(STAGE, AXIS).command
-        self._commands = session.declare_publisher(key, congestion_control=SURELY, express=True)
+        self._commands = CommandLease(session, Keys(STAGE, AXIS), own_authenticator())
         self._last_V = math.nan
         self._error = ""
 
@@ -269,7 +270,7 @@ class Controller:
         finally:
             clock.close()
             self._dwells.undeclare()  # type: ignore[no-untyped-call]
-            self._commands.undeclare()  # type: ignore[no-untyped-call]
+            self._commands.undeclare()
 
     def _block(self, first: int, begin: int, after: Trajectory | None, clock: StageClock) -> Trajectory | None:
         """Ask for a block and send it. None if no answer came before it was due."""

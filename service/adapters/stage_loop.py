@@ -36,6 +36,7 @@ class LoopSummary:
         are no samples. worst_late_ms : lateness of the samples, ms.
     limited : voltages changed by the limits of voltage or slew rate. published, lost : samples by the network.
     missing : voltages that had not come in time, where they come over the network.
+    foreign : commands that were left out because another controller owns ``.../command``.
     """
 
     samples: int
@@ -45,6 +46,7 @@ class LoopSummary:
     published: int
     lost: int
     missing: int
+    foreign: int
 
 
 class SampleLog:
@@ -183,6 +185,7 @@ class StageLoop:
         return LoopSummary(
             self._log.written, ticks.late, 1e3 * ticks.worst_late_s, self._limited,
             self._log.published, self._log.lost, self._commands.counts["missing"],
+            0 if subscriber is None else subscriber.foreign,
         )  # fmt: skip
 
     def _commanded(self, seq: int) -> float:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import zenoh
@@ -47,6 +47,7 @@ from service.protocol.query import MAX_PENDING, NEWEST, Answer, Pending, Point, 
 from service.protocol.samples import check_finite, check_seq, column, encode_command, encode_reference, encode_samples
 from service.runtime.session import DEFAULT_ENDPOINT, SURELY, open_client
 from service.security.authenticator import EVERYBODY, Authenticator, Heard, Question, Signed, own_authenticator
+from service.security.lease import CommandGate, CommandLease
 
 # --- How a query continues from the answer before it: its memory, its last voltage, and what is under way.
 #
@@ -347,12 +348,6 @@ _SETTLE_S: Final = 0.5
 _SETTLE_PAUSE_S: Final = 0.05
 
 
-class Subscription(Protocol):
-    """A subscription of zenoh."""
-
-    def undeclare(self) -> None: ...
-
-
 class Client:
     """A connection to one axis of a service; use as a context manager, or call :meth:`close`.
 
@@ -376,6 +371,7 @@ class Client:
         self._session = session
         self._owns = owns_session
         self._followers: list[Follower] = []
+        self._lease: CommandLease | None = None
         self._queries = RetryingQueries(session, keys, timeout_s, retry_s, self._by)
 
     @classmethod
@@ -429,7 +425,10 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close followers and queries, and the session if this client opened it."""
+        """Close followers, lease and queries, and the session if this client opened it."""
+        if self._lease is not None:
+            self._lease.undeclare()
+            self._lease = None
         for follower in self._followers:
             follower.close()
         self._followers = []
@@ -563,7 +562,9 @@ class Client:
         """Publish voltages, (n,) V, for the samples ``seq``, ``seq + 1``, … of the stage; returns (n,) flags.
 
         The published voltages keep the limits of the axis, and its slew limit from the previous command on; the flags
-        mark changed voltages. Raises InputError if a voltage is not finite.
+        mark changed voltages. The first call takes the lease of ``.../command`` (:meth:`take_command`).
+
+        Raises InputError if a voltage is not finite, CommandHeldError if another controller commands the axis.
         """
         wanted = column("u_V", u_V)
         check_finite("u_V", wanted)
@@ -576,9 +577,24 @@ class Client:
             reach = gap * limits.slew_V_per_s * self.dt_s
             before = min(max(float(wanted[0]), before - reach), before + reach)
         safe, flags = guard(wanted, np.ones(wanted.size, dtype=np.bool_), self.dt_s, limits, before)
-        self._session.put(self.keys.command, encode_command(seq, safe), express=True, congestion_control=SURELY)
+        self._own().put(encode_command(seq, safe))
         self._commanded = (seq + safe.size, float(safe[-1]))
         return flags
+
+    def take_command(self, wait_s: float = 0.0, *, force: bool = False) -> None:
+        """Become the one controller of the axis until :meth:`close`; :meth:`command` does so by itself.
+
+        wait_s : longest time to wait until another controller has ended, s. force : take it over from a controller that
+            goes on; its voltages are left out from then on.
+
+        Raises CommandHeldError, which names the other controller.
+        """
+        self._own().take(wait_s, force)
+
+    def _own(self) -> CommandLease:
+        if self._lease is None:
+            self._lease = CommandLease(self._session, self.keys, self._by)
+        return self._lease
 
     def reference(self, seq: int, y_um: ArrayLike) -> None:
         """Publish the desired motion, (n,) µm, at the samples ``seq``, ``seq + 1``, …; for diagnostics only."""
@@ -601,15 +617,13 @@ class Client:
         attached = self._by.published(key, payload)
         self._session.put(key, payload, attachment=attached, express=True, congestion_control=SURELY)
 
-    def subscribe_commands(self, receive: Callable[[bytes], None]) -> Subscription:
-        """Call ``receive`` with the payload of each message on ``.../command``, in a thread of zenoh.
+    def subscribe_commands(self, receive: Callable[[bytes], None]) -> CommandGate:
+        """Call ``receive`` with the payload of each command of the owner of ``.../command``, in a thread of zenoh.
 
-        For a stage, which applies them (:class:`service.adapters.StageLoop`). ``undeclare()`` of the result ends it.
+        For a stage, which applies them (:class:`service.adapters.StageLoop`). The result counts the commands of others,
+        which are left out, as ``foreign``, and names who sent the last one as ``stranger``; ``undeclare()`` ends it.
         """
-        subscriber: Subscription = self._session.declare_subscriber(
-            self.keys.command, lambda sample: receive(sample.payload.to_bytes())
-        )
-        return subscriber
+        return CommandGate(self._session, self.keys, self._by, receive)
 
     def _known(self) -> Known:
         if self._queries.known is None:

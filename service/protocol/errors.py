@@ -8,6 +8,7 @@
     │   └── UnsignedReplyError  somebody answered, and none of the replies carries the authenticator of the service
     ├── ReplyTimeoutError   the service is running but did not answer in time (also the built-in TimeoutError)
     ├── RefusedError        the service refused the request; has field, got and expected
+    ├── CommandHeldError    another controller commands the axis
     ├── BusyError           the service has too much to do; has the time to ask again after
     └── BehindError         the service has not yet handled the samples that ``as_of`` covers
 """
@@ -71,6 +72,14 @@ class BusyError(ServiceError):
     def __init__(self, retry_after_s: float, message: str = "") -> None:
         super().__init__(message or f"others ask for too much at present: ask again in {retry_after_s:.3f} s")
         self.retry_after_s = retry_after_s
+
+
+class CommandHeldError(ServiceError):
+    """Another controller commands the axis; ``holder`` is its process, its host, and since when."""
+
+    def __init__(self, message: str, holder: str) -> None:
+        super().__init__(message)
+        self.holder = holder
 
 
 class FieldError(InputError):

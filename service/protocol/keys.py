@@ -125,6 +125,16 @@ class Keys:
         key = f"{self.base}/claim/{epoch}/{check_name('instance', instance)}"
         return f"{key}/{tag}" if tag else key
 
+    @property
+    def owner_any(self) -> str:
+        """Matches the tokens of all controllers of this axis."""
+        return f"{self.base}/owner/**"
+
+    def owner(self, holder: str, tag: str = "") -> str:
+        """Liveliness: a controller owns `command`; see `service.security.lease`. ``tag`` : as of a claim."""
+        key = f"{self.base}/owner/{holder}"
+        return f"{key}/{tag}" if tag else key
+
     def standby(self, instance: str) -> str:
         """Liveliness, and publication 1 Hz: JSON, the status of a standby."""
         return f"{self.base}/standby/{check_name('instance', instance)}"

@@ -67,6 +67,7 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
         _rule("listen", _LISTEN, [_ALL]),
         _rule("query", ("query",), _keys(_QUERIES)),
         _rule("voltages", ("put",), _keys(_OF_CONTROLLER)),
+        _rule("own", ("liveliness_token",), [f"{ROOT}/*/*/owner/**"]),
         _rule("operate", ("query",), _keys((_OPERATE,))),
         _rule("serve", (*_SERVE, "query", "put"), [_ALL]),
         _rule("ask", ("query", *_LISTEN), [_ALL], "egress"),
@@ -77,7 +78,7 @@ def access_control(users: Mapping[str, str], stages: Mapping[str, str] | None = 
     ]
     allowed: dict[str, tuple[str, ...]] = {
         CLIENT: ("out", "listen", "query"),
-        CONTROLLER: ("out", "listen", "query", "voltages"),
+        CONTROLLER: ("out", "listen", "query", "voltages", "own"),
         OPERATOR: ("out", "listen", "query", "operate"),
         SERVICE: ("out", "ask", "listen", "serve", "not_of_service", "not_commanding"),
         ROUTER: ("out", "ask", "listen", "pass_on"),

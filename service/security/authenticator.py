@@ -55,13 +55,13 @@ class Authenticator:
 
     Attributes
     ----------
-    path : of the file with the key; None where there is none.
+    path : of the file with the key; None where there is none. sender : the first 8 bytes of its stamps.
     """
 
     def __init__(self, key: bytes = b"", path: Path | None = None) -> None:
         self.path = path
         self._keyed = hashlib.blake2b(key=key, digest_size=TAG) if key else None
-        self._sender = secrets.token_bytes(SENDER)
+        self.sender = secrets.token_bytes(SENDER)
         self._number = 0
         self._lock = threading.Lock()
         self._asked: OrderedDict[bytes, None] = OrderedDict()
@@ -90,11 +90,11 @@ class Authenticator:
 
     def stamp(self) -> bytes:
         """Of a reply: take it before its payload is made, so that all that was published before is in the payload."""
-        return self._sender + self._number.to_bytes(8, "little")
+        return self.sender + self._number.to_bytes(8, "little")
 
-    def published(self, key: str, payload: bytes) -> bytes | None:
-        """The attachment of the next publication on ``key``; None without a key."""
-        if self._keyed is None:
+    def published(self, key: str, payload: bytes, named: bool = False) -> bytes | None:
+        """The attachment of the next publication on ``key``; without a key None, or the stamp alone if ``named``."""
+        if self._keyed is None and not named:
             return None
         with self._lock:
             self._number += 1
@@ -109,7 +109,7 @@ class Authenticator:
             return None
         stamp = stamp or self.stamp()
         if asked is None:
-            asked = _bytes(query.payload)
+            asked = payload_of(query.payload)
         of = attached.to_bytes()[:STAMP], str(query.parameters), asked
         return stamp + self.tag("reply", key, stamp, *of, payload)
 
@@ -117,9 +117,9 @@ class Authenticator:
         """Whether ``query`` on ``key`` is signed, and comes for the first time; always without a key."""
         if self._keyed is None:
             return True
-        attached = _bytes(query.attachment)
+        attached = payload_of(query.attachment)
         stamp = attached[:STAMP]
-        if not self.proves(attached[STAMP:], "query", key, stamp, str(query.parameters), _bytes(query.payload)):
+        if not self.proves(attached[STAMP:], "query", key, stamp, str(query.parameters), payload_of(query.payload)):
             return False
         with self._lock:
             if stamp in self._asked:
@@ -140,7 +140,7 @@ class Authenticator:
         payload = sample.payload.to_bytes()
         if self._keyed is None:
             return Signed(payload, b"")
-        attached = _bytes(sample.attachment)
+        attached = payload_of(sample.attachment)
         stamp = attached[:STAMP]
         return Signed(payload, stamp) if self.proves(attached[STAMP:], "put", key, stamp, payload) else None
 
@@ -160,7 +160,7 @@ class Question:
         payload = reply.payload.to_bytes()
         if not self._by:
             return Signed(payload, b"")
-        attached = _bytes(reply.attachment)
+        attached = payload_of(reply.attachment)
         stamp = attached[:STAMP]
         right = self._by.proves(attached[STAMP:], "reply", str(reply.key_expr), stamp, *self._of, payload)
         return Signed(payload, stamp) if right else None
@@ -241,7 +241,8 @@ class HeardSamples:
         return signed.payload
 
 
-def _bytes(data: zenoh.ZBytes | None) -> bytes:
+def payload_of(data: zenoh.ZBytes | None) -> bytes:
+    """The bytes of a payload or an attachment; none of one that is not there."""
     return b"" if data is None else data.to_bytes()
 
 

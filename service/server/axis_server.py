@@ -20,6 +20,7 @@ from service.protocol.container import to_json
 from service.protocol.keys import Keys
 from service.protocol.samples import decode_samples
 from service.security.authenticator import NO_KEY, Authenticator, HeardSamples
+from service.security.lease import Holders
 from service.server.axis import Axis
 from service.server.axis_loop import AxisLoop, SampleSink, SampleWatcher
 from service.server.deltas import DeltaStreams
@@ -109,6 +110,7 @@ class AxisServer:
         self._health = Health()
         self._health_at_s = -math.inf
         self._inputs: list[Any] = []
+        self._holders: Holders | None = None
         self._queryables: list[Any] = []
         self._token: Any = None
         self._changing = threading.RLock()
@@ -118,7 +120,8 @@ class AxisServer:
     def listen(self) -> None:
         """Take samples from now on."""
         self.loop.start()
-        self._inputs = [self._session.declare_subscriber(self.keys.sample, self._on_sample)]
+        self._holders = Holders(self._session, self.keys, self.authenticator)
+        self._inputs = [self._session.declare_subscriber(self.keys.sample, self._on_sample), self._holders]
         self._publications.listen()
 
     def serve(self) -> None:
@@ -299,6 +302,7 @@ class AxisServer:
                 "states_refused": self._answers.states_refused,
                 "samples_refused": self._samples.refused,
             },
+            command=None if self._holders is None else self._holders.to_json(),
             health=self._health,
             signed=bool(self.authenticator),
         )

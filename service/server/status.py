@@ -53,6 +53,7 @@ def axis_status(
     operations: dict[str, int] | None = None,
     waiting_points: int = 0,
     peers: dict[str, int] | None = None,
+    command: dict[str, Any] | None = None,
     disk: dict[str, float | None] | None = None,
     health: Health | None = None,
     signed: bool = True,
@@ -61,6 +62,7 @@ def axis_status(
 
     ``losses`` : name of the way in which samples are lost. ``checkpoints``, ``operations`` : their counters.
     ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
+    ``command`` : who owns it, see `Holders`.
     ``disk`` : what is written, see `WriteRate`. ``signed`` : whether answers carry an authenticator.
     """
     axis, queue, figures = loop.axis, loop.queue, loop.figures
@@ -123,6 +125,7 @@ def axis_status(
         "checkpoints": checkpoints,
         "operations": operations,
         "peers": peers,
+        "command": command,
         "disk": disk,
         "fingerprint": fingerprint(served.models[learn]) if learn else "",
     }

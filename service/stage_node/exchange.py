@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
@@ -25,6 +26,8 @@ from service.stage_node.faults import Injector
 
 #: Commands for more than this many ticks ahead are refused.
 AHEAD = 65_536
+#: Longest wait for a command at a time, s, so that a stop is noticed.
+_SLICE_S: Final = 0.02
 
 
 class CommandBuffer:
@@ -45,6 +48,9 @@ class CommandBuffer:
         self._numbers = np.full(size, -1, dtype=np.int64)
         self._next = begin
         self._last_V = 0.0
+        self._came = threading.Event()
+        #: Count of blocks when a wait for a voltage was given up; without a further one there is no other wait.
+        self._given_up = 0
 
     def receive(self, payload: bytes) -> None:
         """Take a message. A malformed one is counted, and the error text of the last one is kept."""
@@ -70,12 +76,27 @@ class CommandBuffer:
         slots = numbers[fresh] % self.size
         self._values[slots] = block.values[fresh]
         self._numbers[slots] = numbers[fresh]
+        self._came.set()
         if block.seq == self.begin:
             self.first.set()
 
     def hold(self, u_V: float) -> None:
         """Repeat this voltage, V, until the first command is due."""
         self._last_V = u_V
+
+    def lacks(self, k: int, until_s: float) -> bool:
+        """Whether tick ``k`` still has to wait for its voltage, after up to 20 ms of waiting.
+
+        No longer from ``until_s`` (``time.perf_counter``) on; nor again before the next command, or before the first.
+        """
+        self._came.clear()
+        if self._numbers.item(k % self.size) == k or self.counts["blocks"] == self._given_up:
+            return False
+        if time.perf_counter() >= until_s:
+            self._given_up = self.counts["blocks"]
+            return False
+        self._came.wait(_SLICE_S)
+        return True
 
     def take(self, k: int) -> float:
         """The voltage for tick k, V; if none came in time the last one, counted as missing."""

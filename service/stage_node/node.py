@@ -6,6 +6,9 @@ so that models are compared on the same stage with the same noise.
 Tick k is due at ``start + k dt`` of a monotonic clock, computed from k and not summed. At each tick the sensor of
 every unit is read, then the voltage with that sequence number is applied; if none came in time, the last one is held
 and counted. A tick that begins a full period late is counted, and the loop catches up at once: no sample is left out.
+
+In lock step the clock stands still while a voltage is missing, up to a limit. What controls the stage then gets the
+same samples on a busy machine as on an idle one, only later.
 """
 
 from __future__ import annotations
@@ -27,12 +30,16 @@ from service.protocol.keys import Keys
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
 from service.security.authenticator import own_authenticator
+from service.security.lease import CommandGate
 from service.stage_node.exchange import CommandBuffer, SampleRing, Sender
 from service.stage_node.faults import Injector, fault_key, sound_key
 from sim.stage.config import StageConfig
 from sim.stage.stage import Stage
 
 # --- The node.
+
+#: Longest wait of the clock for a voltage, s.
+MAX_LOCK_STEP_S = 60.0
 
 # --- One axis on the wire
 
@@ -58,6 +65,8 @@ class NodeConfig:
     first : number of the first sample; a restarted stage may begin at any number.
     slew_V_per_s : slew limit of the voltage, V/s, as a driver has one: a command that comes in the middle of its block
     then makes no jump.
+    lock_step_s : longest time, s, for which the clock stands still until the voltages of a tick are there; then they
+    count as missing, and the clock waits for the next ones only after a further command. 0: the clock never waits.
 
     Raises FieldError on values that do not fit.
     """
@@ -72,6 +81,7 @@ class NodeConfig:
     inject: bool = False
     first: int = 0
     slew_V_per_s: float = math.inf
+    lock_step_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.units or len(set(self.units)) < len(self.units):
@@ -89,6 +99,8 @@ class NodeConfig:
         check_seq("first", self.first)
         if not self.slew_V_per_s > 0.0:
             raise FieldError("slew_V_per_s", self.slew_V_per_s, "a positive limit in V/s")
+        if not 0.0 <= self.lock_step_s <= MAX_LOCK_STEP_S:
+            raise FieldError("lock_step_s", self.lock_step_s, f"0 to {MAX_LOCK_STEP_S:g} s")
         if self.ticks is not None and self.ticks < 1:
             raise FieldError("ticks", self.ticks, "at least 1")
 
@@ -121,12 +133,10 @@ class AxisPort:
         put_sound = None if sound is None else sound.put
         self.ring = SampleRing(config.stage.dt_s, put, self.injector, config.first, put_sound)
         self.status = session.declare_publisher(status_key(config.name, axis))
-        self._subscribers = [session.declare_subscriber(keys.command, self._take_command)]
+        self.gate = CommandGate(session, keys, by, self.commands.receive)
+        self._subscribers: list[Any] = [self.gate]
         if self.injector is not None:
             self._subscribers.append(session.declare_subscriber(fault_key(config.name, axis), self._take_fault))
-
-    def _take_command(self, sample: zenoh.Sample) -> None:
-        self.commands.receive(sample.payload.to_bytes())
 
     def _take_fault(self, sample: zenoh.Sample) -> None:
         assert self.injector is not None
@@ -156,6 +166,7 @@ class AxisPort:
             "lost": self.ring.lost,
             "slew_limited": self.limited,
             "commands": dict(self.commands.counts),
+            "command": self.gate.to_json(),
             "error": self.commands.error,
         }
         if self.injector is not None:
@@ -164,7 +175,7 @@ class AxisPort:
 
     def close(self) -> None:
         for subscriber in self._subscribers:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+            subscriber.undeclare()
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
         if self._sound is not None:
             self._sound.undeclare()  # type: ignore[no-untyped-call]
@@ -213,7 +224,8 @@ class StageNode:
         self._ports = [port for unit in self._units for port in unit.ports]
         self._sender = Sender([port.ring for port in self._ports], self._publish_status)
         self._counts: dict[str, Any] = {
-            "state": "waiting", "first": config.first, "tick": config.first, "late": 0, "worst_late_ms": 0.0
+            "state": "waiting", "first": config.first, "tick": config.first, "late": 0, "worst_late_ms": 0.0,
+            "waited_s": 0.0,
         }  # fmt: skip
 
     def stop(self) -> None:
@@ -280,11 +292,11 @@ class StageNode:
         stop = first + self.config.ticks if self.config.ticks is not None else MAX_SEQ
         status_ticks = max(1, round(STATUS_S / dt_s))
         k, late = first, 0
-        worst_s = 0.0
+        worst_s = waited_s = 0.0
         now, wake = time.perf_counter, self._sender.wake
         start = now()
         while k < stop and not self._stop:
-            due = start + (k - first) * dt_s
+            due = start + waited_s + (k - first) * dt_s
             rest = due - now()
             if rest > 0.0:
                 time.sleep(rest)
@@ -292,15 +304,26 @@ class StageNode:
             if behind > dt_s:
                 late += 1
             worst_s = max(worst_s, behind)
+            if self.config.lock_step_s:
+                waited_s += self._wait_for_voltages(k)
             for unit in units:
                 unit.step(k)
             k += 1
             if k % status_ticks == 0:
-                self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s)
+                self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
                 wake(status=True)
             elif k % batch == 0:
                 wake()
-        self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s)
+        self._counts.update(tick=k, late=late, worst_late_ms=1e3 * worst_s, waited_s=waited_s)
+        self._counts["ran_s"] = now() - start
+
+    def _wait_for_voltages(self, k: int) -> float:
+        """Stand still until the voltages of tick ``k`` are there, up to the limit. Returns the time that took, s."""
+        begin = time.perf_counter()
+        for port in self._ports:
+            while port.commands.lacks(k, begin + self.config.lock_step_s) and not self._stop:
+                self._sender.wake()  # the controller may wait for the samples of a message that is not full yet
+        return time.perf_counter() - begin
 
     def _publish_status(self) -> None:
         common = {"stage": self.config.name, "dt_s": self.config.stage.dt_s, **self._counts}

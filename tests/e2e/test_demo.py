@@ -109,13 +109,40 @@ def test_adaptive_is_caught_again_and_better_than_all_frozen_ones(fast: Path) ->
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.alone
-def test_no_voltage_is_missing_even_where_the_machine_stalls(live: tuple[Path, str]) -> None:
-    found = summary(live[0])
-    if found["followed"]["extrapolated"] == 0:
-        assert found["ticks"]["late"] == 0
+def test_no_voltage_is_late_beside_busy_processes_and_the_end_says_what_that_took(tmp_path: Path) -> None:
+    """Two others that never rest. Before lock step some thousand of 60,000 voltages were late, with spikes of 25 %."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        done = demo(tmp_path / "busy", "--real-time")
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert done.returncode == 0, done.stderr
+    found = summary(tmp_path / "busy")
+    assert found["ticks"]["late"] == found["followed"]["extrapolated"] == 0
+    assert found["samples"]["sent"] == found["samples"]["received"] == DURATION_S * 1000
+    models = found["models"]["lssvm_adaptive"]
+    assert models["first_second"]["mae_pct"] <= 0.20
+    assert max(models["before"]["max_pct"], models["settled"]["max_pct"]) < 2.0
+    pace = found["pace"]
+    assert pace["stage_s"] == DURATION_S
+    assert pace["ran_s"] >= DURATION_S + pace["waited_s"] - 0.01
+    assert f"({pace['ran_s'] / DURATION_S:.2f} times real time)" in done.stdout
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+@pytest.mark.alone
+def test_strict_keeps_real_time_and_counts_what_is_late(tmp_path: Path) -> None:
+    done = demo(tmp_path / "strict", "--strict")
+    assert done.returncode == 0, done.stderr
+    found = summary(tmp_path / "strict")
+    assert found["pace"]["waited_s"] == 0.0
+    assert found["pace"]["ran_s"] < 1.1 * DURATION_S
     # A stall of more than the reserve of 60 ms is told, and then the stage has held its voltage.
     assert found["ticks"]["late"] <= found["followed"]["extrapolated"]
-    assert f"{found['followed']['extrapolated']} voltages from the reserve" in live[1]
+    assert f"{found['followed']['extrapolated']} voltages from the reserve" in done.stdout
 
 
 @pytest.mark.e2e
@@ -138,7 +165,8 @@ def test_fast_gives_the_same_numbers_as_real_time(fast: Path, live: tuple[Path, 
     quick, real = summary(fast), summary(live[0])
     followed = real["followed"]
     stalls = {name: followed[name] for name in ("extrapolated", "late_models", "lost", "repairs")}
-    if real["ticks"]["late"] or any(stalls.values()):
+    assert real["ticks"]["late"] == stalls["extrapolated"] == 0
+    if any(stalls.values()):
         pytest.skip(f"this machine stalled: {stalls} in real time, so the runs differ")
     for name in MODELS:
         for phase, figures in quick["models"][name].items():

@@ -55,6 +55,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--first", type=int, default=0, metavar="SEQ", help="number of the first sample (%(default)s)")
     add("--slew", type=float, default=math.inf, metavar="V/S", help="slew limit of the stage, V/s (none)")
+    add(
+        "--lock-step",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="let the clock stand still until a voltage comes, for at most so long, s (0: it never waits)",
+    )
     add("--examples", type=Path, metavar="DIR", help="write the files that the examples of --help name, and exit")
     add("--inject", action="store_true", help="accept faults by command, for tests of the listeners (docs/stage.md)")
     add_shared(parser, "zenoh-config", "key", wait={"default": 10.0}, json={"help": "print the ready line as JSON too"})
@@ -121,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
         inject=args.inject,
         first=args.first,
         slew_V_per_s=args.slew,
+        lock_step_s=args.lock_step,
     )
     endpoint = check_endpoint(
         "--listen" if args.listen else "--endpoint", args.listen or args.endpoint or DEFAULT_ENDPOINT

@@ -84,7 +84,7 @@ class QuietClient:
 
     def subscribe_commands(self, receive: Callable[[bytes], None]) -> Any:
         self.receive = receive
-        return SimpleNamespace(undeclare=lambda: None)
+        return SimpleNamespace(undeclare=lambda: None, foreign=0)
 
 
 WIDE = Limits(0.0, 100.0, 1e9, -10.0, 110.0)

@@ -164,6 +164,7 @@ def test_only_the_roles_meant_to_have_a_right_have_it() -> None:
     assert may["put", "dehyst/v1/*/*/sample"] == {"afm"}
     assert may["put", "dehyst/v1/elsewhere/*/sample"] == {"other"}
     assert may["put", "dehyst/v1/*/*/command"] == {"loop"}
+    assert may["liveliness_token", "dehyst/v1/*/*/owner/**"] == {"loop"}
     assert may["query", "dehyst/v1/*/*/operate"] == {"alice"}
     assert may["put", "dehyst/v1/**"] == every
     assert may["declare_queryable", "dehyst/v1/**"] == every
@@ -256,6 +257,17 @@ def test_voltages_reach_the_stage_from_the_controller_alone(closed: ServeProcess
             time.sleep(0.02)
         time.sleep(0.2)
     assert heard == [b"loop"]
+
+
+@pytest.mark.e2e
+def test_a_controller_alone_may_own_the_command(closed: ServeProcess, folder: Path) -> None:
+    for name in ("plot", "alice", "loop"):
+        with Client.connect(closed.endpoint, timeout_s=5.0, zenoh_config=folder / f"{name}.json5") as client:
+            client.take_command()
+            until = time.monotonic() + (10.0 if name == "loop" else 0.5)
+            while (owner := client.status()["command"]["owner"]) is None and time.monotonic() < until:
+                time.sleep(0.02)
+        assert (owner is not None) == (name == "loop")
 
 
 @pytest.mark.e2e

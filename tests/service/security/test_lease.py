@@ -1,0 +1,289 @@
+"""One controller at a time: real processes and sessions around a real service and a real stage."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.client.client import Client
+from service.protocol import samples as wire
+from service.protocol.errors import CommandHeldError
+from service.protocol.keys import Keys
+from service.runtime.session import SURELY, open_client
+from service.security.authenticator import NO_KEY, Authenticator, own_authenticator
+from service.security.lease import CommandLease, Holder, read_token, tag_of
+from service.stage_node.node import status_key
+
+pytestmark = pytest.mark.e2e
+
+ROOT = Path(__file__).resolve().parents[3]
+KEYS = Keys("demo", "x")
+#: A controller that commands a voltage for the 200 samples after the newest, again and again.
+CONTROLLER = """
+import json, sys, time
+from service.client.client import Client
+from service.protocol import samples as wire
+from service.protocol.errors import CommandHeldError
+newest = [-1]
+with Client.connect(sys.argv[1], timeout_s=5.0, wait_s=10.0) as client:
+    client._session.declare_subscriber(
+        client.keys.sample, lambda s: newest.__setitem__(0, int(wire.decode_samples(s.payload.to_bytes()).seq[-1]))
+    )
+    try:
+        said = False
+        while True:
+            client.command(newest[0] + 20, [float(sys.argv[2])] * 200)
+            if not said:
+                print("commands", flush=True)
+            said = True
+            time.sleep(0.01)
+    except CommandHeldError as error:
+        print(error, flush=True)
+"""
+
+
+class Stage:
+    """A stage that runs free beside the service, what it applied, and what it says."""
+
+    def __init__(self, endpoint: str) -> None:
+        command = [sys.executable, "-m", "lab.cli", "stage", "--endpoint", endpoint, "--free-run", "--batch", "5"]
+        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().startswith("ready")
+        self.session = open_client(endpoint, 10.0)
+        self.u_V: list[float] = []
+        self.seq = -1
+        self.said: dict[str, Any] = {}
+        self.session.declare_subscriber(KEYS.sample, self._take)
+        self.session.declare_subscriber(status_key("demo", "x"), self._hear)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        batch = wire.decode_samples(sample.payload.to_bytes())
+        self.u_V += batch.u_V.tolist()
+        self.seq = int(batch.seq[-1])
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.said = json.loads(sample.payload.to_bytes())["command"]
+
+    def applies(self, u_V: float) -> bool:
+        """Whether the last 50 samples had this voltage."""
+        return self.u_V[-50:] == [u_V] * 50
+
+    def close(self) -> None:
+        self.session.close()  # type: ignore[no-untyped-call]
+        self.process.kill()
+        self.process.communicate(timeout=20)
+
+
+@pytest.fixture
+def stage(serve: Callable[..., Any]) -> Iterator[tuple[Stage, str]]:
+    process = serve()
+    found = Stage(process.endpoint)
+    yield found, process.endpoint
+    found.close()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[[str, float], subprocess.Popen[str]]]:
+    """Starts controllers as processes that command one voltage."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(endpoint: str, u_V: float) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", CONTROLLER, endpoint, str(u_V)]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.communicate(timeout=20)
+
+
+def said_by(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline()
+
+
+def eventually(true: Callable[[], bool], within_s: float = 15.0) -> float:
+    begin = time.monotonic()
+    while not true():
+        assert time.monotonic() - begin < within_s
+        time.sleep(0.01)
+    return time.monotonic() - begin
+
+
+def test_the_second_controller_is_refused_and_the_first_one_named(
+    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+) -> None:
+    """Before, the stage got the voltages of both, in steps of 4 V."""
+    found, endpoint = stage
+    first = start(endpoint, 2.0)
+    assert said_by(first) == "commands\n"
+    eventually(lambda: found.applies(2.0))
+    before = len(found.u_V)
+    error = said_by(start(endpoint, 6.0))
+    assert f"process {first.pid} on {socket.gethostname()} since 2" in error
+    assert "End that one" in error
+    assert "force=True" in error
+    eventually(lambda: len(found.u_V) > before + 500)
+    assert set(found.u_V[before:]) == {2.0}
+    with Client.connect(endpoint, timeout_s=5.0) as client:
+        owner = client.status()["command"]["owner"]
+        assert (owner["process"], owner["host"]) == (first.pid, socket.gethostname())
+        assert abs(owner["since_unix_s"] - time.time()) < 60.0
+        with pytest.raises(CommandHeldError) as held:
+            client.take_command()
+        assert held.value.holder.startswith(f"process {first.pid} on ")
+    eventually(lambda: bool(found.said))
+    assert (found.said["owner"], found.said["foreign"]) == (owner, 0)
+
+
+def test_after_kill_9_the_next_one_gets_through(
+    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+) -> None:
+    found, endpoint = stage
+    first = start(endpoint, 2.0)
+    assert said_by(first) == "commands\n"
+    eventually(lambda: found.applies(2.0))
+    with Client.connect(endpoint, timeout_s=5.0) as client:
+        first.kill()
+        begin = time.monotonic()
+        client.take_command(wait_s=10.0)
+        assert time.monotonic() - begin < 2.0
+        client.command(found.seq + 100, np.full(1000, 3.0))
+        eventually(lambda: found.applies(3.0))
+        assert client.status()["command"]["owner"]["process"] == os.getpid()
+    with Client.connect(endpoint, timeout_s=5.0) as client:
+        eventually(lambda: client.status()["command"]["owner"] is None)
+        client.take_command()
+
+
+def test_one_that_hangs_loses_the_lease_and_is_told_so_when_it_returns(
+    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+) -> None:
+    found, endpoint = stage
+    first = start(endpoint, 2.0)
+    assert said_by(first) == "commands\n"
+    with Client.connect(endpoint, timeout_s=5.0) as client:
+        first.send_signal(signal.SIGSTOP)
+        begin = time.monotonic()
+        client.take_command(wait_s=10.0)
+        assert time.monotonic() - begin < 4.0
+        client.command(found.seq + 100, np.full(5000, 3.0))
+        eventually(lambda: found.applies(3.0))
+        before = len(found.u_V)
+        first.send_signal(signal.SIGCONT)
+        assert f"process {os.getpid()} on " in said_by(first)
+        eventually(lambda: len(found.u_V) > before + 500)
+        assert set(found.u_V[before:]) == {3.0}, "what the first one still sent is left out"
+        client.command(found.seq + 100, [3.0])
+
+
+def test_one_can_be_taken_over_by_force_and_is_told_so(
+    stage: tuple[Stage, str], start: Callable[[str, float], subprocess.Popen[str]]
+) -> None:
+    found, endpoint = stage
+    first = start(endpoint, 2.0)
+    assert said_by(first) == "commands\n"
+    with Client.connect(endpoint, timeout_s=5.0) as client:
+        client.take_command(force=True)
+        assert f"process {os.getpid()} on " in said_by(first)
+        client.command(found.seq + 100, np.full(1000, 3.0))
+        eventually(lambda: found.applies(3.0))
+
+
+def test_a_stranger_without_the_key_is_no_owner_and_his_commands_are_counted_and_named(
+    stage: tuple[Stage, str],
+) -> None:
+    found, endpoint = stage
+    recorded: list[tuple[bytes, Any]] = []
+    with open_client(endpoint, 5.0) as stranger, Client.connect(endpoint, timeout_s=5.0) as client:
+        stranger.declare_subscriber(KEYS.command, lambda s: recorded.append((s.payload.to_bytes(), s.attachment)))
+        later = Holder(9_999_999_999_999, "ab" * 8, 1, "elsewhere")
+        tokens = [
+            stranger.liveliness().declare_token(KEYS.owner(later.name, tag)) for tag in ("", "00" * 16, "nonsense")
+        ]
+        lease = CommandLease(stranger, KEYS, Authenticator(os.urandom(16)))
+        lease.take()
+        client.command(found.seq + 200, np.full(3000, 2.0))
+        eventually(lambda: found.applies(2.0))
+        before = len(found.u_V)
+
+        def lie(attached: Any) -> None:
+            payload = wire.encode_command(found.seq + 10, np.full(20, 7.0))
+            stranger.put(KEYS.command, payload, attachment=attached, congestion_control=SURELY)
+
+        for _ in range(50):
+            lie(None)
+            lie(os.urandom(32))
+            lie(recorded[0][1])
+            lease.put(wire.encode_command(found.seq + 10, np.full(20, 7.0)))
+            stranger.put(KEYS.command, recorded[0][0], attachment=recorded[0][1], congestion_control=SURELY)
+            time.sleep(0.01)
+        eventually(lambda: len(found.u_V) > before + 500)
+        assert set(found.u_V[before:]) == {2.0}
+        eventually(lambda: found.said.get("foreign") == 250)
+        assert found.said["stranger"] == "somebody who repeats the owner's"
+        assert found.said["owner"]["process"] == os.getpid()
+        assert (found.said["others"], found.said["refused"]) == ([], 4)
+        command = client.status()["command"]
+        assert (command["owner"]["host"], command["refused"]) == (socket.gethostname(), 4)
+        lease.undeclare()
+        del tokens
+
+
+def test_without_an_owner_commands_are_applied_as_they_come(stage: tuple[Stage, str]) -> None:
+    """Clients in other languages hold no token; a controller that holds one has precedence from then on."""
+    found, endpoint = stage
+    with open_client(endpoint, 5.0) as plain, Client.connect(endpoint, timeout_s=5.0) as client:
+        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(1000, 2.0)), congestion_control=SURELY)
+        eventually(lambda: found.applies(2.0))
+        client.command(found.seq + 100, np.full(1000, 3.0))
+        eventually(lambda: found.applies(3.0))
+        plain.put(KEYS.command, wire.encode_command(found.seq + 100, np.full(100, 2.0)), congestion_control=SURELY)
+        eventually(lambda: found.said.get("stranger") == "a controller without a token")
+        assert found.applies(3.0)
+
+
+def test_without_a_key_two_controllers_of_one_process_are_two(stage: tuple[Stage, str]) -> None:
+    endpoint = stage[1]
+    with open_client(endpoint, 5.0) as a, open_client(endpoint, 5.0) as b:
+        leases = [CommandLease(session, KEYS, NO_KEY) for session in (a, b)]
+        leases[0].take()
+        with pytest.raises(CommandHeldError, match=rf"process {os.getpid()} on "):
+            leases[1].put(wire.encode_command(0, [1.0]))
+        leases[0].undeclare()
+        leases[1].take(wait_s=5.0)
+        leases[1].undeclare()
+
+
+@given(st.integers(0, 9_999_999_999_999), st.integers(0, 2**32), st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True))
+def test_a_token_says_who_holds_it_and_proves_it(since_ms: int, process: int, host: str) -> None:
+    ours, theirs = own_authenticator(), Authenticator(os.urandom(16))
+    holder = Holder(since_ms, "0123456789abcdef", process, host)
+    key = KEYS.owner(holder.name, tag_of(ours, KEYS, holder))
+    assert read_token(ours, KEYS, key) == holder == read_token(NO_KEY, KEYS, KEYS.owner(holder.name))
+    assert str(holder).startswith(f"process {process} on {host} since ")
+    assert read_token(theirs, KEYS, key) is None
+    assert read_token(ours, Keys("demo", "y"), key.replace("/x/", "/y/")) is None
+    assert read_token(ours, KEYS, KEYS.owner(holder.name)) is None
+
+
+@given(st.text())
+def test_a_token_of_another_form_is_none(text: str) -> None:
+    assert read_token(NO_KEY, KEYS, f"{KEYS.base}/owner/{text}/") is None
