@@ -24,7 +24,7 @@ from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import begin_from, derivatives, trust_by_age
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
-from service.answers.guard import Limits, check_domain, check_voltages, guard, limit_voltage
+from service.answers.guard import Limits, check_domain, guard, limit_voltage
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
@@ -322,7 +322,6 @@ class Follower:
         check_domain(query.y_um, self.limits)
         if query.pending is not None:
             check_domain(query.pending.y_um, self.limits, "pending.y_um")
-            check_voltages(query.pending.u_V, self.limits, "pending.u_V")
         with self._moved:
             kept = tuple(self._kept)
         message = kept[-1]
