@@ -195,7 +195,7 @@ class RetryingQueries:
     Attributes
     ----------
     retries : count of repetitions. refused : replies that were passed over: without the right authenticator, malformed
-    or beyond what is known. known : from the newest status; None before any.
+    or beyond what is known. known : from the newest status; None before any. followers : get the limits of each status.
     """
 
     def __init__(
@@ -204,6 +204,7 @@ class RetryingQueries:
         self.timeout_s, self.retry_s = timeout_s, retry_s
         self.retries = self.refused = 0
         self.known: Known | None = None
+        self.followers: list[Follower] = []
         self._session, self._keys, self._by = session, keys, authenticator
         self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True, **EVERYBODY)
         # Of low priority, so that a megabyte there and back delays no other message, and the service hands it over at
@@ -247,6 +248,8 @@ class RetryingQueries:
     def _read_known(self, once: bool) -> Known:
         keys = self._keys
         known = self.known = self.get(keys.status, "", lambda signed: Known.read(signed.payload, keys), once)
+        for follower in self.followers:
+            follower.limits = known.limits
         return known
 
     def feedforward(self, payload: bytes, wait_s: float, n: int, u_before_V: float) -> Trajectory:
@@ -384,7 +387,6 @@ class Client:
         self._commanded = (-1, math.nan)
         self._session = session
         self._owns = owns_session
-        self._followers: list[Follower] = []
         self._queries = RetryingQueries(session, keys, timeout_s, retry_s, self._by)
 
     @classmethod
@@ -439,9 +441,9 @@ class Client:
 
     def close(self) -> None:
         """Close followers and queries, and the session if this client opened it."""
-        for follower in self._followers:
+        for follower in self._queries.followers:
             follower.close()
-        self._followers = []
+        self._queries.followers = []
         self._queries.close()
         if self._owns:
             self._session.close()  # type: ignore[no-untyped-call]
@@ -555,11 +557,17 @@ class Client:
             heard.meet(signed.stamp)
             return signed.payload
 
+        def fetch() -> bytes:
+            payload = self._queries.get(keys.model, parameters, read)
+            # Who answers may be another instance since, with other limits.
+            self._queries.status()
+            return payload
+
         follower = Follower(
             self._session,
             key,
             name,
-            lambda: self._queries.get(keys.model, parameters, read),
+            fetch,
             self.limits,
             memory,
             deltas=deltas,
@@ -567,7 +575,8 @@ class Client:
             heard=heard,
             dt_s=self.dt_s,
         )
-        self._followers.append(follower)
+        self._queries.followers.append(follower)
+        follower.limits = self.limits
         return follower
 
     def command(self, seq: int, u_V: ArrayLike) -> NDArray[np.uint8]:

@@ -245,6 +245,7 @@ class Follower:
     Attributes
     ----------
     memory : (m,) hysteresis memory after the last answered point.
+    limits : of the axis; a client replaces them when the service has others.
     received, refused : counts of models taken, whole or as changes, and of unusable messages.
     last_error : why the last one was refused.
     changes : counts of the changes, and of lost and repaired ones; None where whole models are followed.

@@ -21,6 +21,7 @@ from service.protocol.query import Answer, FeedforwardQuery, Pending, Trajectory
 from service.server.axis import Axis
 from service.server.process import Service
 from tests.service.conftest import DT_S, make_models, unused_port, write_config
+from tests.service.living import Stage, eventually
 
 LEARNING = "lssvm_adaptive"
 #: 9 V were applied before; 5 V are allowed now, in steps of 0.1 V.
@@ -133,6 +134,26 @@ def test_a_service_restarted_with_narrower_limits_comes_back_by_a_ramp(tmp_path:
             again = client.trajectory(y[:10], after=replaced_end(under, 20), begin=80)
             np.testing.assert_allclose(again.u_V, ramp_V[20:30], atol=1e-12)
             assert client.refused == 0
+
+
+@pytest.mark.parametrize("deltas", [True, False])
+def test_a_follower_takes_the_limits_of_the_service_that_replaces_the_first(tmp_path: Path, deltas: bool) -> None:
+    config = write_config(tmp_path, port := unused_port(), extra=f'served = "{LEARNING}"')
+    text = config.read_text().replace("slew_V_per_s = 2000.0", "slew_V_per_s = 100.0")
+    config.write_text(text)
+    service = Service(read_config(config))
+    service.start()
+    with Client.connect(f"tcp/127.0.0.1:{port}", wait_s=20.0, retry_s=20.0) as client:
+        follower = client.follow(LEARNING, deltas=deltas)
+        before_V = float(follower.trajectory(np.full(100, 80.0))[0][-1])
+        assert before_V > 6.0
+        service.close()
+        config.write_text(text.replace("u_max_V = 10.0", "u_max_V = 5.0"))
+        with Service(read_config(config)), Stage([f"tcp/127.0.0.1:{port}"]):
+            eventually(lambda: follower.limits.u_max_V == 5.0, 20.0)
+            points = np.array([before_V, *[follower.point(80.0) for _ in range(100)]])
+            np.testing.assert_allclose(np.diff(points)[:10], -0.1, atol=1e-9)
+            assert points[-1] == 5.0
 
 
 def replaced_end(answer: Trajectory, kept: int) -> Trajectory:
