@@ -116,7 +116,7 @@ class Victims:
         """
         axis = self.axes[alone]
         axis.take_events()
-        meta = CheckpointMeta("demo", "x", DT_S, 1, 1)
+        meta = CheckpointMeta("demo", "x", DT_S, 1, 1, models=axis.identified)
         if over_wire:
             try:
                 StandbyModel(axis, None).take_state(b"".join(encode_checkpoint(meta, state)))
@@ -124,7 +124,7 @@ class Victims:
                 return f"refused: {error}"
         else:
             with tempfile.TemporaryDirectory() as directory:
-                folder = CheckpointFolder(Path(directory), "demo", "x", DT_S, 4)
+                folder = CheckpointFolder(Path(directory), "demo", "x", DT_S, axis.identified, 4)
                 folder.write(meta, state)
                 if restore_newest(axis, folder) is None:
                     return f"refused: {axis.take_events()[-1]['detail']}"

@@ -27,7 +27,7 @@ from adaptive.online import gates
 from adaptive.online.config import LearnerConfig
 from adaptive.online.kernel_window import ResidualWindow
 from adaptive.online.learner import Learner
-from adaptive.types import FloatArray, IntArray, Sample, StateDict
+from adaptive.types import FloatArray, IntArray, Sample, StateDict, under
 from adaptive.window.arrays import ACCEPTED, ILL_CONDITIONED
 
 if TYPE_CHECKING:
@@ -225,11 +225,12 @@ class Fleet:
 
         Raises ModelFileError, and leaves the axis as it is, where it is of another.
         """
+        # First, because the settings of a damaged state may ask for any memory.
+        if under("config.", state) != self.config.learner.state_dict():
+            raise ModelFileError(f"axis {axis}: the state is of another configuration of the learner")
         given, base = Learner.from_state(state), self.bases[axis]
         if given.base.features != base.features or not np.array_equal(given.base.beta, base.beta):
             raise ModelFileError(f"axis {axis}: the state is of another model; load the one of this axis")
-        if given.config != self.config.learner:
-            raise ModelFileError(f"axis {axis}: the state is of another configuration of the learner")
         self._shells.pop(axis, None)
         self._windows.put(axis, given.parts.window.window_arrays)
         learner = self._learner(axis)

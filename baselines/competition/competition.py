@@ -11,8 +11,6 @@ go on; the favourite can start anew from its last snapshot.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -83,16 +81,6 @@ def with_deviation_of_at_least(model: InverseModel, rms_V: float) -> InverseMode
     if not isinstance(model, _BASELINES) or not 0.0 < rms_V < math.inf:
         return model
     return model if model.voltage_std_V >= rms_V else replace(model, voltage_std_V=rms_V)
-
-
-def fingerprint(model: InverseModel) -> str:
-    """Digest of a model's parameters, 16 hexadecimal digits."""
-    sha = hashlib.blake2b(digest_size=8)
-    for name, value in sorted(model.state_dict().items()):
-        array = isinstance(value, np.ndarray)
-        sha.update(name.encode())
-        sha.update(np.ascontiguousarray(value).tobytes() if array else json.dumps(value).encode())
-    return sha.hexdigest()
 
 
 # --- Scores of a competition: the voltage each contestant would have answered, against the voltage that was applied.
@@ -723,8 +711,6 @@ class Competition:
         state |= prefixed("newest.", ChampionInverse(self.names, self._newest, 0).state_dict())
         state |= self.judge.state_dict(self.names)
         for name, model in zip(self.names, self._models, strict=True):
-            # The identified model, so that a state that belongs to another identification can be told apart.
-            state[f"base.{name}"] = fingerprint(model.base)
             state |= prefixed(f"model.{name}.", model.state_dict())
         return state
 
@@ -756,9 +742,6 @@ class Competition:
         for name, kind in zip(names, kinds, strict=True):
             with part_of(rest, f"model.{name}.") as kept:
                 contestants[name] = _ONLINE_KINDS[kind].from_state(kept)
-        for name, model in contestants.items():
-            if rest.pop(f"base.{name}", None) != fingerprint(model.base):
-                raise Refused(f"base.{name}", "another fingerprint", "that of the identified model")
         try:
             with part_of(rest, "config.") as settings:
                 config = CompetitionConfig(**settings)

@@ -55,7 +55,8 @@ def forged_states(model: Path, seed: int) -> Any:
         name = arrays[int(rng.integers(len(arrays)))]
         value = whole[name]
         state[name] = (value[:0], value.ravel()[:1], np.full(value.shape, np.nan))[number % 3]
-        yield CheckpointMeta(STAGE, AXIS, axis.dt_s, 2**40, 2**40, instance="i0-stranger"), state
+        meta = CheckpointMeta(STAGE, AXIS, axis.dt_s, 2**40, 2**40, instance="i0-stranger", models=axis.identified)
+        yield meta, state
 
 
 class Stranger:

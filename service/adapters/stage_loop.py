@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from adaptive.types import FloatArray
 from service.adapters.adapter import AdapterError, StageAdapter, Ticks, asked, check_range
+from service.answers.guard import limit_voltage
 from service.client.client import Client
 from service.protocol.errors import FieldError
 from service.stage_node.exchange import RING_SIZE, CommandBuffer, Sender, next_message
@@ -34,7 +35,8 @@ class LoopSummary:
     ----------
     samples : taken. late : sample times at which the loop was too late (`service.adapters.adapter.LATE_SHARE`): they
         are no samples. worst_late_ms : lateness of the samples, ms.
-    limited : voltages changed by the limits of voltage or slew rate. published, lost : samples by the network.
+    limited : voltages that were not finite, or changed by the limits of voltage or slew rate.
+    published, lost : samples by the network.
     missing : voltages that had not come in time, where they come over the network.
     foreign : commands that were left out because another controller owns ``.../command``.
     """
@@ -195,11 +197,6 @@ class StageLoop:
         return self._commands.take(seq)
 
     def _limit(self, wanted_V: float, before_V: float) -> float:
-        if not math.isfinite(wanted_V):
-            wanted_V = before_V
-        # Outside the range only at the start: the way back is a ramp too.
-        low_V, high_V = min(self._low_V, before_V), max(self._high_V, before_V)
-        u_V = min(max(wanted_V, self._low_V), self._high_V)
-        u_V = min(max(u_V, before_V - self._step_V, low_V), before_V + self._step_V, high_V)
-        self._limited += u_V != wanted_V
+        u_V, flags = limit_voltage(wanted_V, before_V, self._low_V, self._high_V, self._step_V)
+        self._limited += flags != 0
         return u_V

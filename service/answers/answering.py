@@ -18,7 +18,7 @@ from adaptive.state import Entry
 from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.fallback import Rules, answer_safely
-from service.answers.guard import Limits, check_domain, check_voltages
+from service.answers.guard import Limits, check_domain
 from service.answers.slices import Pace
 from service.config.settings import AxisConfig
 from service.protocol.errors import FieldError
@@ -218,7 +218,6 @@ def answer(
     check_domain(query.y_um, limits)
     if query.pending is not None:
         check_domain(query.pending.y_um, limits, "pending.y_um")
-        check_voltages(query.pending.u_V, limits, "pending.u_V")
         check_count(query.pending)
     if query.memory is None:
         memory, points, resumes_V = begin_from(model, served.memories[name], query, served.seq)

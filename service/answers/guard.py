@@ -1,4 +1,7 @@
-"""What may leave: finite voltages within the limits, and no faster than the slew limit along a trajectory."""
+"""What may leave: finite voltages within the limits, and no faster than the slew limit.
+
+`limit_voltage` is the one rule, for the service, a follower, a client's commands and the loop of a stage alike.
+"""
 
 from __future__ import annotations
 
@@ -77,23 +80,13 @@ def check_domain(y_um: FloatArray, limits: Limits, field: str = "y_um") -> None:
     )
 
 
-def check_voltages(u_V: FloatArray, limits: Limits, field: str) -> None:
-    """InputError naming the first voltage, (n,) V, that the axis could not have answered."""
-    bad = np.flatnonzero(~((u_V >= limits.u_min_V) & (u_V <= limits.u_max_V)))
-    if bad.size:
-        raise FieldError(
-            f"{field}[{bad[0]}]",
-            f"{u_V[bad[0]]:g} V",
-            f"{limits.u_min_V:g} to {limits.u_max_V:g} V",
-            "send the voltages as they were answered",
-        )
-
-
 def limit_voltage(u_V: float, previous_V: float, u_min_V: float, u_max_V: float, step_V: float) -> tuple[float, int]:
-    """(safe voltage, V; flags) of one point; the service compiles it, the follower calls it in Python.
+    """(safe voltage, V; flags) of one point; compiled for a trajectory, called in Python for a point.
 
     In order: a voltage that is not finite becomes ``previous_V`` (mid-range if there is none); the voltage limits; at
-    most ``step_V`` away from ``previous_V``, if that is finite.
+    most ``step_V`` away from ``previous_V``, if that is finite. So from a voltage within the limits none leaves them.
+    From one outside, as after a restart with narrower limits, the way back is a ramp: each voltage is ``step_V``
+    nearer, because a jump makes the stage ring. What it returns it leaves as it is when asked again.
     """
     flags = 0
     known = math.isfinite(previous_V)
@@ -135,8 +128,6 @@ def limit(
     """
     found = 0
     previous = u_before_V
-    if math.isfinite(previous):
-        previous = min(max(previous, u_min_V), u_max_V)
     for i in range(u_V.size):
         previous, bits = _limit_voltage(u_V[i], previous, u_min_V, u_max_V, step_V)
         if not inside[i]:

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from adaptive.errors import DehystError
 from adaptive.types import FloatArray
 from service.answers.answering import derivatives
-from service.answers.guard import Limits, guard
+from service.answers.guard import Limits, guard, limit_voltage
 from service.client.follower import Follower
 from service.protocol.errors import (
     BehindError,
@@ -138,8 +138,6 @@ RETRY_S: Final = 2.0
 _RETRY_PAUSE_S: Final = 0.003
 #: Queries longer than this, bytes, are more than a hundred points, which are not answered at once.
 _SHORT_BYTES: Final = 4096
-#: By which a step may exceed the slew limit through round-off, relative.
-_ROUND_OFF: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,18 +162,28 @@ class Known:
             raise FieldError("dt_s", repr(dt_s)[:80], "a sample time in s")
         return cls(status, Limits.from_json(status["limits"]), dt_s)
 
-    def check(self, answer: Trajectory, n: int) -> None:
-        """Raise FieldError where ``answer`` is not ``n`` voltages within the limits."""
+    def check(self, answer: Trajectory, n: int, u_before_V: float) -> None:
+        """Raise FieldError where ``answer`` is not ``n`` voltages that the limits leave as they are.
+
+        ``u_before_V`` : voltage before the first, V; NaN: none.
+        """
         u_V, limits = answer.u_V, self.limits
-        if n == 1 == u_V.size and limits.u_min_V <= u_V.item(0) <= limits.u_max_V:
-            return  # as fast as it can be
         if u_V.size != n:
             raise FieldError("u_V", f"{u_V.size} voltages", f"{n}, one for each point")
-        if not (limits.u_min_V <= u_V.min() and u_V.max() <= limits.u_max_V):
-            raise FieldError("u_V", f"{u_V.min():g} to {u_V.max():g} V", f"{limits.u_min_V:g} to {limits.u_max_V:g} V")
-        step_V = limits.slew_V_per_s * self.dt_s * (1.0 + _ROUND_OFF) + _ROUND_OFF
-        if n > 1 and not np.abs(np.diff(u_V)).max() <= step_V:
-            raise FieldError("u_V", f"a step of {np.abs(np.diff(u_V)).max():g} V", f"at most {step_V:g} V a sample")
+        if n == 1:  # as fast as it can be
+            step_V = limits.slew_V_per_s * self.dt_s
+            safe_V = np.array(limit_voltage(u_V.item(0), u_before_V, limits.u_min_V, limits.u_max_V, step_V)[:1])
+        else:
+            safe_V = guard(u_V, np.ones(n, dtype=np.bool_), self.dt_s, limits, u_before_V)[0]
+        wrong = np.flatnonzero(safe_V != u_V)
+        if wrong.size:
+            i = int(wrong[0])
+            before_V, most_V = u_V[i - 1] if i else u_before_V, limits.slew_V_per_s * self.dt_s
+            raise FieldError(
+                f"u_V[{i}]",
+                f"{u_V[i]:g} V after {before_V:g} V",
+                f"{limits.u_min_V:g} to {limits.u_max_V:g} V, in steps of at most {most_V:g} V",
+            )
 
 
 class RetryingQueries:
@@ -188,7 +196,7 @@ class RetryingQueries:
     Attributes
     ----------
     retries : count of repetitions. refused : replies that were passed over: without the right authenticator, malformed
-    or beyond what is known. known : from the newest status; None before any.
+    or beyond what is known. known : from the newest status; None before any. followers : get the limits of each status.
     """
 
     def __init__(
@@ -197,6 +205,7 @@ class RetryingQueries:
         self.timeout_s, self.retry_s = timeout_s, retry_s
         self.retries = self.refused = 0
         self.known: Known | None = None
+        self.followers: list[Follower] = []
         self._session, self._keys, self._by = session, keys, authenticator
         self._querier = session.declare_querier(keys.feedforward, timeout=timeout_s, express=True, **EVERYBODY)
         # Of low priority, so that a megabyte there and back delays no other message, and the service hands it over at
@@ -240,11 +249,14 @@ class RetryingQueries:
     def _read_known(self, once: bool) -> Known:
         keys = self._keys
         known = self.known = self.get(keys.status, "", lambda signed: Known.read(signed.payload, keys), once)
+        for follower in self.followers:
+            follower.limits = known.limits
         return known
 
-    def feedforward(self, payload: bytes, wait_s: float, n: int) -> Trajectory:
+    def feedforward(self, payload: bytes, wait_s: float, n: int, u_before_V: float) -> Trajectory:
         """The answer to an encoded query for ``n`` points, which is repeated for ``retry_s`` while there is none.
 
+        ``u_before_V`` : the voltage before the first point that the query names, V; NaN: none.
         ``wait_s`` : longest time to wait, s, until the service has handled all samples that ``as_of`` covers. Raises
         BehindError after that.
         """
@@ -253,12 +265,12 @@ class RetryingQueries:
             answer = decode_reply(signed.payload)
             try:
                 if self.known is not None:
-                    self.known.check(answer, n)
+                    self.known.check(answer, n, u_before_V)
             except FieldError:
                 if not signed.stamp:
                     raise
                 # It is the service: started again with other limits.
-                self._read_known(once=True).check(answer, n)
+                self._read_known(once=True).check(answer, n, u_before_V)
             return answer
 
         def ask() -> Trajectory:
@@ -370,7 +382,6 @@ class Client:
         self._commanded = (-1, math.nan)
         self._session = session
         self._owns = owns_session
-        self._followers: list[Follower] = []
         self._lease: CommandLease | None = None
         self._queries = RetryingQueries(session, keys, timeout_s, retry_s, self._by)
 
@@ -429,9 +440,9 @@ class Client:
         if self._lease is not None:
             self._lease.undeclare()
             self._lease = None
-        for follower in self._followers:
+        for follower in self._queries.followers:
             follower.close()
-        self._followers = []
+        self._queries.followers = []
         self._queries.close()
         if self._owns:
             self._session.close()  # type: ignore[no-untyped-call]
@@ -476,7 +487,8 @@ class Client:
     ) -> Point:
         """The voltage for one point. Arguments as in :meth:`trajectory`."""
         query = continued(memory, model, u_before_V, after, begin)
-        answer = self._queries.feedforward(encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query), wait_s, 1)
+        asked = encode_query(y_um, v_um_per_s, a_um_per_s2, as_of=as_of, **query)
+        answer = self._queries.feedforward(asked, wait_s, 1, query["u_before_V"])
         if begin is not None:
             answer = with_pending(answer, query["pending"], begin, np.array([y_um]))
         return Answer(answer.u_V.item(0), answer.std_V.item(0), answer.flags.item(0), *answer[3:])
@@ -516,7 +528,8 @@ class Client:
         y = np.atleast_1d(np.asarray(y_um, dtype=np.float64))
         v, a = derivatives(y, v_um_per_s, a_um_per_s2, self.dt_s)
         query = continued(memory, model, u_before_V, after, begin)
-        answer = self._queries.feedforward(encode_query(y, v, a, as_of=as_of, **query), wait_s, y.size)
+        asked = encode_query(y, v, a, as_of=as_of, **query)
+        answer = self._queries.feedforward(asked, wait_s, y.size, query["u_before_V"])
         return answer if begin is None else with_pending(answer, query["pending"], begin, y)
 
     def follow(
@@ -543,11 +556,17 @@ class Client:
             heard.meet(signed.stamp)
             return signed.payload
 
+        def fetch() -> bytes:
+            payload = self._queries.get(keys.model, parameters, read)
+            # Who answers may be another instance since, with other limits.
+            self._queries.status()
+            return payload
+
         follower = Follower(
             self._session,
             key,
             name,
-            lambda: self._queries.get(keys.model, parameters, read),
+            fetch,
             self.limits,
             memory,
             deltas=deltas,
@@ -555,7 +574,8 @@ class Client:
             heard=heard,
             dt_s=self.dt_s,
         )
-        self._followers.append(follower)
+        self._queries.followers.append(follower)
+        follower.limits = self.limits
         return follower
 
     def command(self, seq: int, u_V: ArrayLike) -> NDArray[np.uint8]:
@@ -574,8 +594,8 @@ class Client:
             before = math.nan  # the first command, or one that replaces others
         elif gap:
             # In a gap the stage holds the last voltage: the slew limit allows a larger step after it.
-            reach = gap * limits.slew_V_per_s * self.dt_s
-            before = min(max(float(wanted[0]), before - reach), before + reach)
+            reach_V = gap * limits.slew_V_per_s * self.dt_s
+            before = limit_voltage(wanted.item(0), before, limits.u_min_V, limits.u_max_V, reach_V)[0]
         safe, flags = guard(wanted, np.ones(wanted.size, dtype=np.bool_), self.dt_s, limits, before)
         self._own().put(encode_command(seq, safe))
         self._commanded = (seq + safe.size, float(safe[-1]))

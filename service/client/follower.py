@@ -7,6 +7,7 @@ authenticator of the service is passed over, as is a model of another sample tim
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -24,7 +25,7 @@ from adaptive.types import FloatArray, InverseModel
 from baselines.competition.champion import ChampionInverse
 from service.answers.answering import begin_from, derivatives, trust_by_age
 from service.answers.fallback import FADE_S, FADE_SAMPLES, Rules, answer_safely
-from service.answers.guard import Limits, check_domain, check_voltages, guard, limit_voltage
+from service.answers.guard import Limits, check_domain, guard, limit_voltage
 from service.protocol.delta import DeltaMessage, FollowedState, decode_delta
 from service.protocol.errors import FieldError
 from service.protocol.model import ModelMessage, decode_model
@@ -41,6 +42,7 @@ from service.protocol.query import (
 from service.protocol.samples import column
 from service.security.authenticator import NO_KEY, Heard
 
+_LOGGER: Final = logging.getLogger("dehyst.client")
 #: Voltage below which what fades has faded, V.
 _FADED_V: Final = 1e-9
 
@@ -48,6 +50,8 @@ _FADED_V: Final = 1e-9
 _KEPT_CHANGES: Final = 1024
 #: Pauses between two fetches of one repair, s: the first, and the longest.
 _PAUSE_S: Final = (0.005, 1.0)
+#: Longest pause before a repair where no change fits the whole models that are fetched, s.
+_FRUITLESS_S: Final = 60.0
 #: How long `Follower.close` waits for a fetch, s.
 _CLOSE_S: Final = 2.0
 #: Pause between two questions who it is that publishes, s.
@@ -65,11 +69,15 @@ class Changes:
     ----------
     changes, wholes : messages taken. lost : times that a message was missing. mismatches : sums whose fingerprint was
     not that of the service. repairs : whole models fetched for either. refused : messages that could not be decoded.
+    fruitless : whole models fetched in a row after which no change fitted. One happens by a loss; many mean that this
+    process does not get the numbers of the service. Each doubles the pause before the next, up to a minute, and one
+    warning is logged.
     """
 
     def __init__(self, fetch: Callable[[], bytes], took: Callable[[ModelMessage], None]) -> None:
-        self.changes = self.wholes = self.lost = self.mismatches = self.repairs = self.refused = 0
+        self.changes = self.wholes = self.lost = self.mismatches = self.repairs = self.refused = self.fruitless = 0
         self.last_error = ""
+        self._warned = False
         self._fetch, self._took = fetch, took
         self._lock = threading.RLock()
         self._state: FollowedState | None = None
@@ -127,6 +135,7 @@ class Changes:
             self._refuse(error)
             return
         self.wholes += 1
+        self.fruitless = 0
         self._waiting = None
 
     def _apply(self, message: DeltaMessage) -> None:
@@ -149,6 +158,7 @@ class Changes:
             self._refuse(error)
             return
         self.changes += 1
+        self.fruitless = 0
 
     def _set(self, state: FollowedState, model: ModelMessage) -> None:
         self._took(model)
@@ -167,12 +177,26 @@ class Changes:
         if self._waiting is not None:
             return
         self._waiting = deque(kept, maxlen=_KEPT_CHANGES)
-        self._thread = threading.Thread(target=self._fetch_until_joined, name="follower-repair", daemon=True)
+        wait_s = min(_PAUSE_S[0] * 2.0 ** min(self.fruitless, 20), _FRUITLESS_S) if self.fruitless else 0.0
+        if wait_s > _PAUSE_S[1] and not self._warned:
+            self._warned = True
+            self.last_error = (
+                f"fingerprint: got others than those of the service after {self.fruitless} whole models in a row, "
+                f"expected that a change fits; they are fetched ever less often, down to once in {_FRUITLESS_S:.0f} s; "
+                "follow whole models (deltas=False)"
+            )
+            _LOGGER.warning("%s", self.last_error)
+        self._thread = threading.Thread(
+            target=self._fetch_until_joined, args=(wait_s,), name="follower-repair", daemon=True
+        )
         self._thread.start()
 
-    def _fetch_until_joined(self) -> None:
+    def _fetch_until_joined(self, wait_s: float) -> None:
+        self._closed.wait(wait_s)
         pause_s, longest_s = _PAUSE_S
-        while not self._closed.is_set() and self._waiting is not None:
+        this = threading.current_thread()
+        # Another thread where a whole model came meanwhile, and then a gap.
+        while not self._closed.is_set() and self._waiting is not None and self._thread is this:
             try:
                 if self._join(self._fetch()):
                     return
@@ -196,6 +220,7 @@ class Changes:
             if not joined:
                 return False
             self._waiting = None
+            self.fruitless += 1
             for message in waiting[follows:] if follows is not None else []:
                 if self._waiting is None:
                     self._apply(message)
@@ -220,6 +245,7 @@ class Follower:
     Attributes
     ----------
     memory : (m,) hysteresis memory after the last answered point.
+    limits : of the axis; a client replaces them when the service has others.
     received, refused : counts of models taken, whole or as changes, and of unusable messages.
     last_error : why the last one was refused.
     changes : counts of the changes, and of lost and repaired ones; None where whole models are followed.
@@ -322,7 +348,6 @@ class Follower:
         check_domain(query.y_um, self.limits)
         if query.pending is not None:
             check_domain(query.pending.y_um, self.limits, "pending.y_um")
-            check_voltages(query.pending.u_V, self.limits, "pending.u_V")
         with self._moved:
             kept = tuple(self._kept)
         message = kept[-1]

@@ -54,7 +54,10 @@ def restore_from_peer(axis: Axis, files: PeerFiles, stage: str, newest_seq: int)
     """
     if files.checkpoints is None:
         return ""
-    folder = CheckpointFolder(files.checkpoints, stage, axis.config.name, axis.dt_s, axis.config.checkpoints_kept)
+    config = axis.config
+    folder = CheckpointFolder(
+        files.checkpoints, stage, config.name, axis.dt_s, axis.identified, config.checkpoints_kept
+    )
     for number in folder.numbers()[:_MAX_TRIED]:
         try:
             meta, state = folder.read(number)
@@ -154,7 +157,7 @@ class StandbyModel:
         """
         meta, state = decode_checkpoint(data)
         axis = self._axis
-        meta.refuse_unless(meta.stage, axis.config.name, axis.dt_s)
+        meta.refuse_unless(meta.stage, axis.config.name, axis.dt_s, axis.identified)
         if meta.axis != axis.config.name:
             raise ModelFileError(f"axis is {meta.axis!r}, expected {axis.config.name!r}")
         axis.restore(state)

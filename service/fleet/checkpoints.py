@@ -10,12 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 
 from adaptive.errors import DehystError
 from adaptive.fleet.fleet import Fleet
 from adaptive.types import StateDict, prefixed, under
 from service.config.settings import LEARN
+from service.protocol.model import digests
 from service.storage.checkpoint import SUFFIX, CheckpointMeta, decode_checkpoint, encode_checkpoint
 from service.storage.output import atomic_write
 from service.storage.segments import claim
@@ -50,9 +52,10 @@ class FleetCheckpoints:
                 continue
             try:
                 meta, state = decode_checkpoint(self._path(axis).read_bytes())
-                meta.refuse_unless(stage, self._name(axis), dt_s)
-                learner = under("learner.", state)
                 # Of a service with competing models, the one that learns.
+                learns = {name: found for name, found in meta.models.items() if name == LEARN}
+                replace(meta, models=learns).refuse_unless(stage, self._name(axis), dt_s, self._identified(axis))
+                learner = under("learner.", state)
                 self._fleet.load_axis(axis, under(f"model.{LEARN}.", learner) or learner, anew=True)
                 restored.append(axis)
             except (OSError, DehystError) as error:
@@ -93,8 +96,9 @@ class FleetCheckpoints:
         unix_s = time.time()
         samples = int(self._fleet.outcomes()[axis].sum())
         meta = CheckpointMeta(
-            stage, self._name(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance
-        )
+            stage, self._name(axis), self._fleet.bases[0].dt_s, learner.seq, samples, unix_s, instance,
+            models=self._identified(axis),
+        )  # fmt: skip
         self._writing.append(self._writer.submit(self._write, axis, meta, learner.state_dict()))
         return True
 
@@ -105,6 +109,9 @@ class FleetCheckpoints:
             self.counts["written"] += 1
         except OSError:
             self.counts["errors"] += 1
+
+    def _identified(self, axis: int) -> dict[str, str]:
+        return digests({LEARN: self._fleet.bases[axis]})
 
     def _path(self, axis: int) -> Path:
         return self._directory / f"{self._name(axis)}{SUFFIX}"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple, cast
 
@@ -39,6 +41,20 @@ def stored_kind(model: InverseModel) -> str:
     raise ModelFileError(
         f"model {model.name!r}: got the class {path}, expected a registered one: {', '.join(MODEL_CLASSES.values())}"
     )
+
+
+def digests(models: Mapping[str, InverseModel]) -> dict[str, str]:
+    """16 hexadecimal digits over all parameters of each model, by name: equal where it is the same to the last bit."""
+    found = {}
+    for name, model in models.items():
+        made = hashlib.blake2b(digest_size=8)
+        for entry, value in sorted(model.state_dict().items()):
+            array = value if isinstance(value, np.ndarray) else None
+            told = [entry, value] if array is None else [entry, array.dtype.str, array.shape]
+            made.update(json.dumps(told).encode())
+            made.update(b"" if array is None else array.tobytes())
+        found[name] = made.hexdigest()
+    return found
 
 
 def build_model(kind: str, state: StateDict, where: str) -> InverseModel:

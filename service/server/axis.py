@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Any, Final, NamedTuple, Protocol
 
 from adaptive.errors import ModelFileError
@@ -30,7 +31,7 @@ from service.intake.command_witness import CommandWitness
 from service.intake.sequence import AHEAD, NEW_COUNT, REFUSED, RESTARTED, SampleClock, SequenceTracker
 from service.protocol.errors import FieldError
 from service.protocol.keys import AUTO
-from service.protocol.model import Safety, stored_kind
+from service.protocol.model import Safety, digests, stored_kind
 from service.protocol.query import FeedforwardQuery, Trajectory
 from service.protocol.samples import SampleBatch
 from service.server.learner_supervisor import (
@@ -254,6 +255,7 @@ class Axis:
         #: Number of the last sample whose snapshot, if it has one, is available.
         self.handled_seq = -1
         self._archive = archive
+        self._identified = {name: model for name, model in models.items() if name != AUTO}
         self._events = EventLog(stage, config.name)
         self._limiter = EventLimiter(calm=round(1.0 / self.dt_s))
         self._gates: dict[str, int] = {}
@@ -273,6 +275,11 @@ class Axis:
             self.note(event, detail)
 
     # ---- what other threads read
+
+    @cached_property
+    def identified(self) -> dict[str, str]:
+        """Digest of each model of the model file, by name: what a checkpoint must have grown from."""
+        return digests(self._identified)
 
     @property
     def newest(self) -> Served:

@@ -18,6 +18,7 @@ from service.answers import guard
 from service.answers.guard import Limits
 from service.config.settings import COMPETE, AxisConfig
 from service.protocol.errors import FieldError
+from service.protocol.model import digests
 from service.server.axis import Axis
 from service.server.learner_supervisor import champion_of
 from service.storage.checkpoint import CheckpointFolder
@@ -91,7 +92,9 @@ def load_axis(
         models |= champion_of(learner)
     archive = None
     if config.checkpoints is not None:
-        archive = CheckpointFolder(config.checkpoints, stage, config.name, bundle.meta.dt_s, config.checkpoints_kept)
+        archive = CheckpointFolder(
+            config.checkpoints, stage, config.name, bundle.meta.dt_s, digests(bundle.models), config.checkpoints_kept
+        )
     warnings = _warnings(limits, bundle.meta)
     if config.learn and 1.0 / bundle.meta.dt_s > _CERTAIN_HZ:
         warnings |= _rate_warning(warmed, limits)

@@ -88,7 +88,9 @@ class AxisServer:
         queue = SampleQueue(config.name, config.queue_samples)
         folder = None
         if config.checkpoints is not None:
-            folder = CheckpointFolder(config.checkpoints, keys.stage, keys.axis, axis.dt_s, config.checkpoints_kept)
+            folder = CheckpointFolder(
+                config.checkpoints, keys.stage, keys.axis, axis.dt_s, axis.identified, config.checkpoints_kept
+            )
         self.checkpoints = CheckpointKeeper(axis, queue, keys.stage, instance, folder)
         tuned = config.retuning.enabled and axis.learner is not None
         retuner = Retuner(config.retuning, config.recorder) if tuned else None

@@ -319,18 +319,25 @@ def voltages_along(model: InverseModel, y_um: FloatArray) -> FloatArray:
         return np.full(y_um.size, math.nan)
 
 
-# --- Stored states of a learner: whether one fits the learner of an axis, and the fingerprint of a model.
+# --- Stored states of a learner, and the fingerprint of a model.
 
 #: Version of the state of an axis (`service.server.axis.Axis.state_dict`); others are refused.
-STATE_SCHEMA: Final = 4
-#: Entries of a learner's state that learning does not change: its settings, and of the identified model what tuning
-#: does not change. They must equal those of the present learner.
-_FIXED: Final = re.compile(r"(^|\.)(config\.|base\.(beta$|span_V$|features\.))")
+STATE_SCHEMA: Final = 5
+#: Settings in a learner's state.
+_SETTINGS: Final = re.compile(r"(^|\.)config\.")
 
 
 def restored_learner(state: StateDict, like: OnlineModel) -> OnlineModel:
-    """A learner of the kind of ``like`` with ``state``. Raises ModelFileError with the reason if it does not fit."""
-    check_same_learner(state, like)
+    """A learner of the kind and with the settings of ``like``, with ``state``.
+
+    Raises ModelFileError with the reason if it does not fit.
+    """
+    if not state:
+        raise ModelFileError("it holds no learner, but this axis learns")
+    for name, value in like.state_dict().items():
+        if _SETTINGS.search(name) and not (name in state and _equal(value, state[name])):
+            got, wanted = _short(state.get(name)), _short(value)
+            raise ModelFileError(f"it belongs to another setting: {name} is {got}, now {wanted}")
     return like.restored(state)
 
 
@@ -351,20 +358,6 @@ class SupervisorEntries:
     frozen_by: Annotated[str, Entry("who has stopped learning, empty for nobody", most=1000)]
     dead: Annotated[bool, Entry("whether the learner has failed")]
     adoptions: Annotated[str, Entry("hyper-parameters that wait for their sample, as JSON")]
-
-
-def check_same_learner(state: StateDict, like: OnlineModel) -> None:
-    """Raise ModelFileError if ``state`` is of a learner with other settings or another identified model."""
-    if not state:
-        raise ModelFileError("it holds no learner, but this axis learns")
-    for name, value in like.state_dict().items():
-        if not _FIXED.search(name):
-            continue
-        if name not in state or not _equal(value, state[name]):
-            what = "setting" if "config." in name else "identified model"
-            raise ModelFileError(
-                f"it belongs to another {what}: {name} is {_short(state.get(name))}, now {_short(value)}"
-            )
 
 
 def fingerprint(model: InverseModel) -> str:

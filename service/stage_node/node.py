@@ -24,9 +24,11 @@ from typing import Any
 
 import zenoh
 
+from service.answers.guard import limit_voltage
 from service.protocol import samples as wire
 from service.protocol.errors import FieldError
 from service.protocol.keys import Keys
+from service.protocol.query import LIMITED_SLEW
 from service.protocol.samples import MAX_SEQ, check_seq
 from service.runtime.session import SURELY
 from service.security.authenticator import own_authenticator
@@ -114,7 +116,8 @@ class AxisPort:
         keys = Keys(config.name, axis)
         self.axis = axis
         self.limits = (config.stage.u_min_V, config.stage.u_max_V)
-        self.step_V = config.slew_V_per_s * config.stage.dt_s
+        # A step that equals the limit up to round-off is not limited, or it would differ from its command.
+        self.step_V = config.slew_V_per_s * config.stage.dt_s * (1.0 + 1e-9)
         self.limited = 0
         self._u_V = 0.0
         self.commands = CommandBuffer(begin=config.first)
@@ -144,14 +147,9 @@ class AxisPort:
 
     def take(self, k: int) -> float:
         """The voltage for tick k, V, within range and slew limit."""
-        low, high = self.limits
-        wanted = min(max(self.commands.take(k), low), high)
-        # A step that equals the limit up to round-off is not limited, or it would differ from its command.
-        step = self.step_V * (1.0 + 1e-9)
-        u_V = min(max(wanted, self._u_V - step), self._u_V + step)
-        self.limited += u_V != wanted
-        self._u_V = u_V
-        return u_V
+        self._u_V, flags = limit_voltage(self.commands.take(k), self._u_V, *self.limits, self.step_V)
+        self.limited += bool(flags & LIMITED_SLEW)
+        return self._u_V
 
     def write(self, k: int, u_V: float, y_um: float) -> None:
         """Write sample k: the voltage that the stage gets, and its reading."""

@@ -13,8 +13,8 @@ import hashlib
 import struct
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
@@ -42,7 +42,7 @@ _LEAST_KEPT: Final = 2
 
 _META_TYPES: Final[dict[str, tuple[type, ...]]] = {
     "stage": (str,), "axis": (str,), "dt_s": (float, int), "seq": (int,), "samples": (int,),
-    "time_unix_s": (float, int), "instance": (str,), "schema": (int,),
+    "time_unix_s": (float, int), "instance": (str,), "schema": (int,), "models": (dict,),
 }  # fmt: skip
 
 
@@ -53,6 +53,7 @@ class CheckpointMeta:
     Attributes
     ----------
     stage, axis : names on the wire. dt_s : sample time, s. units : those of the model file.
+    models : digest of each model in the model file that the state grew from, by name.
     schema : version of the state. seq : number of the last sample handled. samples : count of all samples handled.
     time_unix_s : time of writing, s; for display only. instance : the instance that wrote it.
     """
@@ -65,6 +66,7 @@ class CheckpointMeta:
     time_unix_s: float = 0.0
     instance: str = ""
     schema: int = STATE_SCHEMA
+    models: dict[str, str] = field(default_factory=dict)
     units: dict[str, str] | None = None
 
     def __post_init__(self) -> None:
@@ -76,8 +78,8 @@ class CheckpointMeta:
             got = f"{str(self.seq)[:40]}, {str(self.samples)[:40]}, {self.dt_s}"
             raise ModelFileError(f"seq, samples, dt_s: got {got}, expected integers within 3 x 2^61 and a time in s")
 
-    def refuse_unless(self, stage: str, axis: str, dt_s: float) -> None:
-        """Raise ModelFileError with the reason if the checkpoint is of another axis or of another version."""
+    def refuse_unless(self, stage: str, axis: str, dt_s: float, models: Mapping[str, str]) -> None:
+        """Raise ModelFileError with the reason if the checkpoint is of another axis, model file or version."""
         for name, got, wanted in (
             ("schema", self.schema, STATE_SCHEMA),
             ("stage", self.stage, stage),
@@ -87,6 +89,13 @@ class CheckpointMeta:
         ):
             if got != wanted:
                 raise ModelFileError(f"{name} is {got!r}, expected {wanted!r}")
+        for name in sorted(self.models.keys() | models.keys()):
+            got, wanted = (str(some.get(name, "missing"))[:40] for some in (self.models, models))
+            if got != wanted:
+                raise ModelFileError(
+                    f"it grew from another model file: the digest of {name!r} is {got}, in the present file {wanted}; "
+                    "the present file serves; put the old one back to continue"
+                )
 
 
 def encode_checkpoint(meta: CheckpointMeta, state: StateDict) -> list[Any]:
@@ -122,10 +131,14 @@ class CheckpointFolder:
     One process writes; any number may read.
     """
 
-    def __init__(self, directory: Path, stage: str, axis: str, dt_s: float, kept: int) -> None:
+    def __init__(
+        self, directory: Path, stage: str, axis: str, dt_s: float, models: Mapping[str, str], kept: int
+    ) -> None:
         self.directory = directory
         self.kept = kept
-        self._belongs = (stage, axis, dt_s)
+        #: Checkpoints that a start refused.
+        self.refused = 0
+        self._belongs = (stage, axis, dt_s, models)
         #: Until when checkpoints are kept, by their number, by ``time.monotonic``, s.
         self._pinned: dict[int, float] = {}
 
@@ -183,7 +196,7 @@ class CheckpointFolder:
         return found
 
     def read(self, number: int) -> tuple[CheckpointMeta, StateDict]:
-        """(meta, state) of one checkpoint. Raises ModelFileError if it is damaged or of another axis."""
+        """(meta, state) of one checkpoint. Raises ModelFileError if it is damaged, or of another axis or model file."""
         path = self.directory / f"checkpoint-{number:09d}{SUFFIX}"
         try:
             meta, state = decode_checkpoint(path.read_bytes())
@@ -391,7 +404,7 @@ class CheckpointKeeper:
         return self._queue.call(lambda: (self._meta(), self._axis.state_dict()), timeout_s)
 
     def counters(self) -> dict[str, Any] | None:
-        """Checkpoints written, age of the newest in s, its size, what a day of them writes, failures of the disk.
+        """Checkpoints written, and refused at the start; age of the newest, s, and its size; failures of the disk.
 
         None if no checkpoints are written.
         """
@@ -400,7 +413,8 @@ class CheckpointKeeper:
         at = self._written_at_s
         a_day = round(self._bytes * 86_400.0 / self._axis.config.checkpoint_s)
         age_s = None if at is None else time.monotonic() - at
-        return {**self._counts, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
+        refused = self.folder.refused
+        return {**self._counts, "refused": refused, "age_s": age_s, "bytes": self._bytes, "bytes_per_day": a_day}
 
     @property
     def bytes_in_all(self) -> int:
@@ -423,8 +437,8 @@ class CheckpointKeeper:
     def _meta(self) -> CheckpointMeta:
         stage, name, instance = self._names
         axis = self._axis
-        meta = CheckpointMeta(stage, name, axis.dt_s, axis.handled_seq, axis.sequence.received, instance=instance)
-        return replace(meta, time_unix_s=time.time())
+        seq, samples, unix_s = axis.handled_seq, axis.sequence.received, time.time()
+        return CheckpointMeta(stage, name, axis.dt_s, seq, samples, unix_s, instance, models=axis.identified)
 
     def _copy(self) -> None:
         meta = self._meta()
@@ -474,6 +488,7 @@ def restore_newest(axis: Axis, folder: CheckpointFolder) -> int | None:
             meta, state = folder.read(number)
             axis.restore(state)
         except ModelFileError as error:
+            folder.refused += 1
             axis.note("checkpoint_refused", f"checkpoint {number}: {error}")
             continue
         axis.note("restored", f"from checkpoint {number}, sample {meta.seq}", checkpoint=number)

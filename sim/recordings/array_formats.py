@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptive.errors import InputError
+from adaptive.npy_sizes import check_npy, check_npz
 from sim.recordings.columns import ColumnMap
 from sim.recordings.matlab_process import MOST_ELEMENTS
 from sim.recordings.table import MAX_BYTES, Table, plain_arrays
@@ -249,11 +250,12 @@ _PICKLED = "a pickled Python object, which is never loaded"
 
 def read_npz(path: Path, content: bytes) -> Table:
     """numpy archives. Pickled objects are left out."""
-    _require_unpacked_size(path, content)
     read: dict[str, NDArray[Any]] = {}
     left_out: list[str] = []
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as members:
+            check_npz(members, MAX_BYTES)
+        with np.lib.npyio.NpzFile(io.BytesIO(content), allow_pickle=False) as archive:
             for name in archive.files:
                 try:
                     read[name] = archive[name]
@@ -275,6 +277,7 @@ def read_npy(path: Path, content: bytes) -> Table:
     Pickled objects are refused.
     """
     try:
+        check_npy(io.BytesIO(content), len(content))
         array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except Exception as error:  # numpy raises many kinds of errors on a damaged file
         if "Object arrays" in str(error):

@@ -153,18 +153,19 @@ def new_axis(bundle: Bundle, limits_V: tuple[float, float, float], learner: dict
 
 def write_checkpoint(axis: Axis, folder: Path) -> None:
     """Write the axis' state as the service does."""
-    meta = CheckpointMeta("demo", "x", axis.dt_s, axis.handled_seq, axis.sequence.received)
-    CheckpointFolder(folder, "demo", "x", axis.dt_s, 4).write(meta, axis.state_dict())
+    meta = CheckpointMeta("demo", "x", axis.dt_s, axis.handled_seq, axis.sequence.received, models=axis.identified)
+    CheckpointFolder(folder, "demo", "x", axis.dt_s, axis.identified, 4).write(meta, axis.state_dict())
 
 
 def read_checkpoint(axis: Axis, folder: Path) -> bool:
     """Let a fresh axis go on from the newest checkpoint."""
-    return restore_newest(axis, CheckpointFolder(folder, "demo", "x", axis.dt_s, 4)) is not None
+    kept = CheckpointFolder(folder, "demo", "x", axis.dt_s, axis.identified, 4)
+    return restore_newest(axis, kept) is not None
 
 
-def checkpoint_entries(folder: Path, dt_s: float) -> tuple[dict[str, Any], dict[str, Any]]:
+def checkpoint_entries(folder: Path, axis: Axis) -> tuple[dict[str, Any], dict[str, Any]]:
     """(meta, state) of the newest checkpoint as it was read back."""
-    kept = CheckpointFolder(folder, "demo", "x", dt_s, 4)
+    kept = CheckpointFolder(folder, "demo", "x", axis.dt_s, axis.identified, 4)
     meta, state = kept.read(kept.numbers()[0])
     told = {key: getattr(meta, key) for key in ("stage", "axis", "dt_s", "seq", "samples", "schema", "units")}
     return told, state
@@ -450,7 +451,7 @@ def run(name: str, jitter: int = 0) -> Result:
             if k == made.checkpoint_at:
                 exact["checkpoint_while"] = f"{standing(axis)['champion']} {axis.newest.trouble or '-'}"
                 write_checkpoint(axis, Path(folder))
-        meta, state = checkpoint_entries(Path(folder), made.dt_s)
+        meta, state = checkpoint_entries(Path(folder), axis)
         other = new_axis(bundle, made.limits_V, made.learner)
         restored = read_checkpoint(other, Path(folder))
     for message in made.messages[made.checkpoint_at :]:

@@ -36,7 +36,7 @@ enum {
 };
 
 typedef struct {
-    double u_V;     /* finite, within the limits, within the slew limit from the point before */
+    double u_V;     /* finite, within the limits (from a voltage outside: nearer), within the slew limit */
     double std_V;   /* one standard deviation; NaN where the model has none */
     uint32_t flags;
 } dehyst_answer;

@@ -88,7 +88,7 @@ pub struct Done {
     pub fallback: bool,
 }
 
-/// The voltage and flags of one point; `before` NaN: none.
+/// The voltage and flags of one point; `before` NaN: none. From a `before` outside the limits the way back is a ramp.
 pub fn limit_voltage(mut u_v: f64, before: f64, limits: &Limits, step_v: f64) -> (f64, u8) {
     let mut flags = 0;
     let known = before.is_finite();
@@ -113,9 +113,6 @@ pub fn limit_voltage(mut u_v: f64, before: f64, limits: &Limits, step_v: f64) ->
 
 fn limit(out: &mut Out, u_before_v: f64, limits: &Limits, step_v: f64) {
     let mut before = u_before_v;
-    if before.is_finite() {
-        before = before.clamp(limits.u_min_v, limits.u_max_v);
-    }
     for (u, flags) in out.u_v.iter_mut().zip(out.flags.iter_mut()) {
         let (safe, found) = limit_voltage(*u, before, limits, step_v);
         (*u, before) = (safe, safe);
@@ -263,10 +260,6 @@ pub fn reply(snapshot: &mut Snapshot, query: &Query, limits: &Limits, age_s: Opt
         Motion { y_um: &pending.y_um, v_um_per_s: &[], a_um_per_s2: &[] }
             .check(limits)
             .map_err(|error| Error { field: format!("pending.{}", error.field), ..error })?;
-        let within = |u: &f64| limits.u_min_v <= *u && *u <= limits.u_max_v;
-        if let Some(i) = pending.u_v.iter().position(|u| !within(u)) {
-            return Err(Error::new(format!("pending.u_V[{i}]"), pending.u_v[i], "a voltage within the limits"));
-        }
     }
     let n = query.y_um.len();
     let (mut u_v, mut std_v, mut flags);

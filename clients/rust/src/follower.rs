@@ -119,7 +119,7 @@ impl Publisher {
 /// One answered point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Point {
-    /// V; finite, within the limits, within the slew limit from the point before.
+    /// V; finite, within the limits (from a voltage outside: nearer), within the slew limit from the point before.
     pub u_v: f64,
     /// One standard deviation, V; NaN where the model has none.
     pub std_v: f64,
@@ -308,9 +308,11 @@ impl Follower {
         answer::reply(&mut self.current.snapshot, &Query::decode(query)?, &self.limits, age_s)
     }
 
-    /// Hold the voltage of the last point within the limits once more: what to apply where no point could be asked for.
-    pub fn hold(&self) -> f64 {
-        limit_voltage(self.u_before_v, f64::NAN, &self.limits, f64::INFINITY).0
+    /// Hold the voltage of the last point once more: what to apply where no point could be asked for.
+    pub fn hold(&mut self) -> f64 {
+        let step_v = self.limits.slew_v_per_s * self.current.snapshot.model.dt_s;
+        self.u_before_v = limit_voltage(f64::NAN, self.u_before_v, &self.limits, step_v).0;
+        self.u_before_v
     }
 
     pub fn memory(&self) -> &[f64] {

@@ -169,3 +169,25 @@ fn the_follower_tells_when_models_no_longer_come() {
     assert_eq!(source, "bouc_wen");
     assert_eq!(follower.hold(), u[0]);
 }
+
+#[test]
+fn from_a_voltage_outside_the_limits_the_way_back_is_a_ramp() {
+    let narrow = Limits { u_max_v: 3.0, slew_v_per_s: 100.0, ..LIMITS };
+    let mut follower = Follower::new(&read("lssvm-jumped"), narrow).unwrap();
+    let mut ramp = vec![9.0; 70];
+    for i in 0..70 {
+        ramp[i] = (if i == 0 { 9.0 } else { ramp[i - 1] } - narrow.slew_v_per_s * follower.report().dt_s).max(3.0);
+    }
+    let still = vec![0.0; 70];
+    let (mut u, mut std, mut flags) = (still.clone(), still.clone(), vec![0u8; 70]);
+    follower.start(9.0);
+    let mut out = Out { u_v: &mut u, std_v: &mut std, flags: &mut flags };
+    follower.block(&[89.0; 70], &still, &still, &mut out).unwrap();
+    assert_eq!(u, ramp);
+    follower.start(9.0);
+    let points: Vec<f64> = (0..70).map(|_| follower.point(89.0, 0.0, 0.0).unwrap().u_v).collect();
+    assert_eq!(points, ramp);
+    follower.start(9.0);
+    let held: Vec<f64> = (0..70).map(|_| follower.hold()).collect();
+    assert_eq!(held, ramp);
+}

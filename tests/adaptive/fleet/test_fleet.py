@@ -378,6 +378,9 @@ def test_what_does_not_fit_is_refused_by_name(models: list[LssvmInverse]) -> Non
         fleet.step(0, 0.0, [1.0, 2.0, 3.0], 0.0)
     with pytest.raises(ModelFileError, match="axis 1: the state is of another model"):
         fleet.load_axis(1, fleet.learner_of(0).state_dict())
+    for window in (61, 2**20):  # the second one's arrays would take 8 TiB
+        with pytest.raises(ModelFileError, match="axis 1: the state is of another configuration"):
+            fleet.load_axis(1, fleet.learner_of(1).state_dict() | {"config.window": window})
     other = replace(models[1], features=replace(models[1].features, dt_s=2e-3))
     with pytest.raises(InputError, match=r"models\[1\].dt_s: got 0.002, expected 0.001"):
         Fleet([models[0], other], config)

@@ -17,7 +17,7 @@ from adaptive.inverse_model import LssvmInverse
 from adaptive.types import Feedforward, FloatArray, InverseModel
 from service.answers.answering import trust_by_age
 from service.answers.fallback import Rules, answer_safely, domain_weight
-from service.answers.guard import Limits, check_domain, guard
+from service.answers.guard import Limits, check_domain, guard, limit_voltage
 from service.config.settings import AxisConfig
 from service.protocol.model import StandIn, decode_model, encode_model
 from service.protocol.query import (
@@ -299,15 +299,31 @@ def test_what_leaves_is_safe_whatever_comes(u: np.ndarray, before: float) -> Non
     safe, flags = guard(u, np.ones(u.size, dtype=np.bool_), GUARD_DT_S, GUARD_LIMITS, before)
     np.testing.assert_array_equal(u, original)
     assert np.isfinite(safe).all()
-    assert (safe >= GUARD_LIMITS.u_min_V).all()
-    assert (safe <= GUARD_LIMITS.u_max_V).all()
-    assert (np.abs(np.diff(safe)) <= GUARD_STEP_V * (1 + 1e-12)).all()
-    if math.isfinite(before):
-        inside = min(max(before, GUARD_LIMITS.u_min_V), GUARD_LIMITS.u_max_V)
-        assert abs(safe[0] - inside) <= GUARD_STEP_V * (1 + 1e-12)
+    course = np.concatenate(([before], safe)) if math.isfinite(before) else safe
+    low, high = GUARD_LIMITS.u_min_V, GUARD_LIMITS.u_max_V
+    # No step is larger than the slew limit; that of numbers as large as 1e300 V is at most their round-off.
+    assert (np.abs(np.diff(course)) <= GUARD_STEP_V + np.spacing(np.abs(course[:-1]).max(initial=high))).all()
+    # Once inside always inside; from outside inwards by a whole step, and never to the other side.
+    outside = np.maximum(0.0, np.maximum(low - course, course - high))
+    assert (outside[1:] <= np.maximum(0.0, outside[:-1] - GUARD_STEP_V) + np.spacing(np.abs(course[:-1]))).all()
+    if not math.isfinite(before):
+        assert not outside.any()
     # A point that carries no flag is the model's own.
     np.testing.assert_array_equal(safe[flags == 0], u[flags == 0])
     np.testing.assert_array_equal((flags & NOT_FINITE_REPLACED) > 0, ~np.isfinite(u))
+    # What was limited once is not limited again: so a client checks an answer.
+    again = guard(safe, np.ones(u.size, dtype=np.bool_), GUARD_DT_S, GUARD_LIMITS, before)[0]
+    np.testing.assert_array_equal(again, safe)
+
+
+@settings(deadline=None)
+@given(arrays(np.float64, st.integers(1, 20), elements=st.floats()), st.floats(allow_infinity=False))
+def test_the_points_of_a_trajectory_are_limited_as_each_point_is_alone(u: np.ndarray, before: float) -> None:
+    safe, flags = guard(u, np.ones(u.size, dtype=np.bool_), GUARD_DT_S, GUARD_LIMITS, before)
+    for wanted_V, got_V, bits in zip(u.tolist(), safe.tolist(), flags.tolist(), strict=True):
+        low_V, high_V = GUARD_LIMITS.u_min_V, GUARD_LIMITS.u_max_V
+        before, alone = limit_voltage(wanted_V, before, low_V, high_V, GUARD_STEP_V)
+        assert (before, alone) == (got_V, bits)
 
 
 def test_each_flag_says_what_was_done() -> None:

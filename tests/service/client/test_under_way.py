@@ -125,16 +125,11 @@ def test_the_memory_is_that_of_the_samples_carried_along_what_is_pending_before(
         np.testing.assert_array_equal(plain.u_V, axis.answer(FeedforwardQuery(y, v, a, memory, name)).u_V)
 
 
-@pytest.mark.parametrize(
-    ("y", "u", "field"), [([40.0, 99.0], [4.0, 4.0], "pending.y_um[1]"), ([40.0], [-1.0], "pending.u_V[0]")]
-)
-def test_what_no_answer_can_have_been_is_refused(
-    models: dict[str, InverseModel], y: list[float], u: list[float], field: str
-) -> None:
+def test_what_no_answer_can_have_been_for_is_refused(models: dict[str, InverseModel]) -> None:
     axis = make_axis(models)
     with pytest.raises(FieldError) as refused:
-        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(0, np.array(y), np.array(u))))
-    assert refused.value.field == field
+        axis.answer(FeedforwardQuery(*motion(0, 1), pending=Pending(0, np.array([40.0, 99.0]), np.array([4.0, 4.0]))))
+    assert refused.value.field == "pending.y_um[1]"
 
 
 def answer_of(begin: int, y: FloatArray, before: Trajectory | None = None, seen: int = 0) -> Trajectory:

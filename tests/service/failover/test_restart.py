@@ -18,11 +18,15 @@ import numpy as np
 import pytest
 
 from service.client.client import Client
+from service.config.settings import read_config
 from service.protocol.query import STALE
 from service.runtime.session import open_service
+from service.server.axis_loading import load_axis
+from service.server.learner_supervisor import fingerprint
 from service.storage.checkpoint import CheckpointFolder, decode_checkpoint
+from service.storage.model_file import BundleMeta, write_bundle
 from sim.recordings import read
-from tests.service.conftest import unused_port, write_config
+from tests.service.conftest import DT_S, make_models, unused_port, write_config
 from tests.service.living import Asker, Process, Stage, eventually
 
 pytestmark = pytest.mark.e2e
@@ -101,7 +105,7 @@ def test_a_killed_service_goes_on_with_all_that_it_had(tmp_path: Path, processes
     kept = sorted((tmp_path / "kept").glob("*.ckpt"))
     meta, state = decode_checkpoint(kept[-2].read_bytes())
     kept[-1].write_bytes(kept[-1].read_bytes()[:-100])
-    of_y = CheckpointFolder(tmp_path / "kept", "demo", "y", meta.dt_s, 1000).write(replace(meta, axis="y"), state)
+    of_y = CheckpointFolder(tmp_path / "kept", "demo", "y", meta.dt_s, {}, 1000).write(replace(meta, axis="y"), state)
     assert of_y > kept[-1]
     # What is told at a start is told to whoever listens already.
     ear = f"tcp/127.0.0.1:{unused_port()}"
@@ -200,3 +204,37 @@ def test_the_wall_clock_decides_nothing() -> None:
                 if "unix" not in line and "wall_s" not in line:
                     found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {line.strip()}")
     assert not found
+
+
+def turned(name: str) -> dict[str, Any]:
+    """The models of the file, of which one has its gain, or what it has learnt, times -1."""
+    models: dict[str, Any] = dict(make_models())
+    model = models[name]
+    if name == "linear":
+        gain = model.parameters.gain_um_per_V
+        models[name] = replace(model, parameters=replace(model.parameters, gain_um_per_V=-gain))
+    else:
+        models[name] = replace(model, alpha=-model.alpha)
+    return models
+
+
+@pytest.mark.parametrize("name", ["linear", "lssvm_adaptive"])
+def test_a_checkpoint_of_another_model_file_is_refused_and_the_file_serves(
+    tmp_path: Path, processes: list[Process], name: str
+) -> None:
+    config = write_config(tmp_path, port := unused_port(), extra=EXTRA)
+    serve = ("serve", "--config", str(config))
+    processes.append(Process(*serve))
+    with Client.connect(f"tcp/127.0.0.1:{port}", timeout_s=2.0, wait_s=20.0, retry_s=20.0) as client:
+        with Stage([f"tcp/127.0.0.1:{port}"]):
+            eventually(lambda: client.status()["checkpoints"]["written"] > 1)
+        processes[0].send(signal.SIGTERM)
+        assert processes[0].process.wait(30) == 0
+        write_bundle(tmp_path / "x.npz", turned(name), BundleMeta("demo", "x", DT_S, y_min_um=0.0, y_max_um=90.0))
+        processes.append(Process(*serve))
+        status = client.status()
+        assert status["seq"] == -1
+        assert status["checkpoints"]["refused"] >= 2
+        begun = load_axis("demo", read_config(config).axes[0])
+        assert status["fingerprint"] == fingerprint(begun.newest.models["lssvm_adaptive"])
+        assert client.point(40.0, model="linear").u_V == (0.0 if name == "linear" else 39.0 / 11.0)

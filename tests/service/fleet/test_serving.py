@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from service.fleet.checkpoints import FleetCheckpoints
 from service.operating.remote import operate
 from service.protocol.errors import RefusedError
 from service.protocol.keys import Keys
-from service.protocol.model import decode_model
+from service.protocol.model import decode_model, digests
 from service.protocol.query import LIMITED_VOLTAGE
 from service.protocol.samples import SampleBatch
 from service.runtime.session import open_client
@@ -328,13 +329,21 @@ def test_an_axis_continues_from_the_file_of_a_service_of_one_axis(tmp_path: Path
     config, single = LearnerConfig(window=60), Learner(base, LearnerConfig(window=60))
     for k, t_s, u_V, y_um in zip(*motion(0, 300), strict=True):
         single.handle(Sample(int(k), float(t_s), float(u_V[0]), float(y_um[0])))
-    meta = CheckpointMeta("mirror", "axis-0001", base.dt_s, single.seq, 300, 0.0, "i1")
+    found = digests({"lssvm_adaptive": base})
+    meta = CheckpointMeta("mirror", "axis-0001", base.dt_s, single.seq, 300, 0.0, "i1", models=found)
     state = prefixed("learner.", single.state_dict()) | {"seq": single.seq}
     (tmp_path / "axis-0001.ckpt").write_bytes(b"".join(bytes(part) for part in encode_checkpoint(meta, state)))
     fleet = Fleet([base] * 3, FleetConfig(config))
     kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
     assert kept.restore(range(3)) == [1]
     assert fleet.learner_of(1).counters() == single.counters()
+    kept.close()
+    # Not where its model was replaced since, in what it had learnt least of all.
+    fleet = Fleet([base, replace(base, alpha=-base.alpha), base], FleetConfig(config))
+    kept = FleetCheckpoints(fleet, tmp_path, "mirror", "i2", 60.0)
+    assert kept.restore([1]) == []
+    assert kept.counts["refused"] == 1
+    assert "axis-0001.ckpt: it grew from another model file: the digest of 'lssvm_adaptive' is" in kept.error
     kept.close()
     # And back.
     restored = Learner.from_state(under("learner.", decode_checkpoint((tmp_path / "axis-0001.ckpt").read_bytes())[1]))
@@ -353,7 +362,7 @@ def test_an_axis_continues_from_the_file_of_a_service_with_competing_models(tmp_
     seq, t_s, u_V, y_um = motion(0, 300)
     axis.handle(SampleBatch(seq, t_s, u_V[:, 0], y_um[:, 0]))
     assert len(str(axis.state_dict()["learner.names"]).split(",")) > 1
-    meta = CheckpointMeta("mirror", "axis-0001", DT_S, 299, 300, 0.0, "i1")
+    meta = CheckpointMeta("mirror", "axis-0001", DT_S, 299, 300, 0.0, "i1", models=axis.identified)
     (tmp_path / "axis-0001.ckpt").write_bytes(b"".join(map(bytes, encode_checkpoint(meta, axis.state_dict()))))
     # The way back is refused, because such a service keeps more than a learner.
     base = models["lssvm_adaptive"]

@@ -641,7 +641,7 @@ def _limited(
     u: list[float], inside: list[bool], dt_s: float, limits: Limits, u_before_V: float
 ) -> tuple[list[float], list[int]]:
     low, high, slew = limits
-    before = max(low, min(high, u_before_V)) if math.isfinite(u_before_V) else math.nan
+    before = u_before_V
     safe, flags = [], []
     for value, within in zip(u, inside, strict=True):
         flag = 0 if within else OUTSIDE

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +18,7 @@ from service.answers.guard import Limits
 from service.client.follower import Follower
 from service.config.settings import AxisConfig
 from service.protocol.delta import FollowedState, decode_delta
+from service.protocol.model import check_model
 from service.protocol.query import FeedforwardQuery
 from service.protocol.samples import SampleBatch
 from service.security.access import access_control
@@ -148,6 +152,50 @@ def test_long_messages_move_at_the_same_samples(models: dict[str, InverseModel])
         seen.append(numbers)
     assert seen[0] == seen[1] == seen[2]
     assert len(seen[0]) > 200
+
+
+def test_a_reader_that_gets_other_numbers_does_not_fetch_the_model_for_ever(
+    models: dict[str, InverseModel], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As one of JSON that does not round to the nearest double: no fingerprint of a fetched model is the service's."""
+    axis = make_axis(models, ())
+    wire = Wire(axis, "lssvm_adaptive")
+    changes = wire.follower.changes
+    assert changes is not None
+    fetches, rounds = 0, False
+
+    def fetch() -> bytes:
+        nonlocal fetches
+        fetches += 1
+        payload = wire.streams.payload("lssvm_adaptive") or b""
+        if rounds:
+            return payload
+        header, arrays, seq = check_model(payload)
+        values = dict(header["values"])
+        values["span_V"] = math.nextafter(values["span_V"], math.inf)
+        return FollowedState.of({**header, "values": values}, arrays, seq).payload()
+
+    changes._fetch = fetch
+    changes._state = FollowedState.decode(fetch())
+    begin_s, until_s = time.monotonic(), math.inf
+    for batch in itertools.islice(batches(60_000), 12_000):
+        axis.handle(batch)
+        for payload in wire.tick():
+            wire.pass_on(payload)
+        time.sleep(2e-3)
+        now_s = time.monotonic()
+        if now_s - begin_s > 2.0 and not rounds:
+            # 10, 20, 40 ... ms: the ninth is due after 1.27 s, and the tenth after 2.55 s.
+            assert 3 <= fetches <= 10
+            assert [r.getMessage() for r in caplog.records if "fingerprint: got others" in r.getMessage()] == [
+                changes.last_error
+            ]
+            rounds, until_s = True, now_s + 5.0
+        if now_s > until_s or (rounds and changes.changes > 3):
+            break
+    assert changes.changes > 3
+    assert changes.fruitless == 0
+    assert len([r for r in caplog.records if "fingerprint" in r.getMessage()]) == 1
 
 
 def test_only_a_service_may_publish_changes() -> None:

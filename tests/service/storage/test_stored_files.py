@@ -21,6 +21,7 @@ from service.answers.guard import Limits
 from service.config.settings import AxisConfig
 from service.intake.sample_queue import SampleQueue
 from service.operating.verbs import Request, Verbs
+from service.protocol.model import digests
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
 from service.server.axis_loading import load_axis, make_learner
@@ -61,11 +62,11 @@ def recording(first: int, n: int) -> SampleBatch:
 
 
 def folder(directory: Path, kept: int = 32) -> CheckpointFolder:
-    return CheckpointFolder(directory, "demo", "x", DT_S, kept)
+    return CheckpointFolder(directory, "demo", "x", DT_S, digests(make_models()), kept)
 
 
 def meta(of: Axis, **changes: Any) -> CheckpointMeta:
-    made = CheckpointMeta("demo", "x", DT_S, of.handled_seq, of.sequence.received)
+    made = CheckpointMeta("demo", "x", DT_S, of.handled_seq, of.sequence.received, models=of.identified)
     return replace(made, **changes)
 
 
@@ -106,6 +107,8 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
         ({"axis": "y"}, "axis is 'y'"),
         ({"dt_s": 2e-3}, "sample time is 0.002"),
         ({"schema": 99}, "schema is 99"),
+        ({"models": {}}, "another model file: the digest of 'linear' is missing"),
+        ({"models": digests(_shifted(make_models()))}, "another model file: the digest of 'lssvm_adaptive' is "),
     ):
         foreign = kept.write(meta(axis, **changes), state)
         fresh = make_axis()
@@ -129,17 +132,33 @@ def test_the_newest_that_is_whole_and_matches_is_taken_and_the_others_are_refuse
         fresh = make_axis()
         assert restore_newest(fresh, kept) == 1
         assert [e["event"] for e in fresh.take_events()] == ["checkpoint_refused", "restored"]
-    # A learner with other settings, or one that began as another model, has nothing to do with what is kept.
+    # A learner with other settings has nothing to do with what is kept.
     path.unlink()
-    for other, words in (
-        (make_axis(learner={"window": 100}), "another setting: .*config.window is 500, now 100"),
-        (make_axis(_shifted(make_models())), "another identified model: .*base.beta"),
-    ):
-        before = fingerprint(other.newest.models["lssvm_adaptive"])
-        with pytest.raises(ModelFileError, match=words):
-            other.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(axis), state)))[1])
-        assert fingerprint(other.newest.models["lssvm_adaptive"]) == before
-        assert other.handled_seq == -1
+    other = make_axis(learner={"window": 100})
+    before = fingerprint(other.newest.models["lssvm_adaptive"])
+    with pytest.raises(ModelFileError, match=r"another setting: .*config.window is 500, now 100"):
+        other.restore(decode_checkpoint(b"".join(encode_checkpoint(meta(axis), state)))[1])
+    assert fingerprint(other.newest.models["lssvm_adaptive"]) == before
+    assert other.handled_seq == -1
+
+
+def test_the_state_of_a_learner_that_began_anew_from_a_learnt_model_is_its_own(tmp_path: Path) -> None:
+    axis = make_axis()
+    for first in range(0, 6000, 20):
+        axis.handle(recording(first, 20))
+    learnt: Any = axis.newest.models["lssvm_adaptive"]
+    identified: Any = make_models()["lssvm_adaptive"]
+    assert not np.array_equal(learnt.beta, identified.beta)
+    supervisor = axis.supervisor
+    assert supervisor._revive is not None
+    supervisor._start_again(supervisor._revive, learnt)
+    axis.handle(recording(6000, 500))
+    folder(tmp_path).write(meta(axis), axis.state_dict())
+    again = make_axis()
+    assert restore_newest(again, folder(tmp_path)) == 1
+    assert again.learner is not None
+    assert supervisor.learner is not None
+    assert fingerprint(again.learner.snapshot()) == fingerprint(supervisor.learner.snapshot())
 
 
 def _shifted(models: dict[str, InverseModel]) -> dict[str, InverseModel]:
