@@ -14,6 +14,7 @@ import queue
 import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ from service.viewer.records import Record, SceneConfig
 #: How long a child may take to start, s: it imports Rerun and numpy.
 START_S = 60.0
 _NICE: Final = 5
+#: How long a child may draw what waits after its parent has gone, s.
+GRACE_S: Final = 5.0
 _URL = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy\Z")
 
 
@@ -155,11 +158,13 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
     greeting.close()
     scene = Scene(sink, config.scene)
     parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
     while True:
         try:
             batch = batches.get(timeout=1.0)
         except queue.Empty:
-            if parent is not None and not parent.is_alive():
+            if not parent.is_alive():
                 break
             continue
         if batch is None:
@@ -169,3 +174,11 @@ def _draw(config: OutputConfig, batches: Queue[Sequence[Record] | None], greetin
         sink.close()
     except ServiceError:
         sys.exit(1)  # The parent reports it; Rerun has already printed the reason.
+
+
+def _end_after(parent: multiprocessing.process.BaseProcess) -> None:
+    """End this process some time after its parent. A parent that is killed while it writes a batch leaves half of it in
+    the pipe, for the rest of which the main thread would wait for ever."""
+    parent.join()
+    time.sleep(GRACE_S)
+    os._exit(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
+import sys
 import time
 import urllib.request
 from collections import defaultdict
@@ -220,3 +221,33 @@ def test_the_web_viewer_serves_its_page_on_this_machine_only() -> None:
         viewer.terminate()
         viewer.wait(10.0)
     assert "rerun" in text.lower()
+
+
+#: Killed while it writes a batch: four bytes that announce a thousand more, and one of them.
+KILLED = """
+import os, signal, struct, sys
+from pathlib import Path
+from service.viewer.output import Output, OutputConfig
+from service.viewer.records import SceneConfig
+if __name__ == "__main__":
+    output = Output(OutputConfig(SceneConfig("demo/x", ("linear",)), rrd=Path(sys.argv[1])))
+    print(output.pid, flush=True)
+    os.write(output._queue._writer.fileno(), struct.pack("!i", 1000) + b"x")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_child_of_a_process_that_is_killed_in_the_middle_of_a_batch_ends(tmp_path: Path) -> None:
+    program = tmp_path / "killed.py"
+    program.write_text(KILLED, encoding="utf-8")
+    said = subprocess.run(
+        [sys.executable, str(program), str(tmp_path / "run.rrd")],
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=90,
+        check=False,
+    )
+    pid, until = int(said.stdout), time.monotonic() + 30.0
+    while Path(f"/proc/{pid}/exe").exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{pid}/exe").exists()
