@@ -251,6 +251,8 @@ class Axis:
         #: Number of the last sample whose snapshot, if it has one, is available.
         self.handled_seq = -1
         self._archive = archive
+        #: Whose its files are, see `service.storage.owner`.
+        self.owner = f"{stage}/{config.name}"
         self._events = EventLog(stage, config.name)
         self._limiter = EventLimiter(calm=round(1.0 / self.dt_s))
         self._gates: dict[str, int] = {}

@@ -14,19 +14,20 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from service.protocol.errors import FieldError
+from service.storage.owner import FolderOwner
 from service.storage.segments import (
+    LOCK,
     RECORD,
     Closer,
     Journal,
     Rows,
     Syncer,
-    claim,
     journal_of,
     left_open,
     make_room,
@@ -49,6 +50,7 @@ class RecorderConfig:
     Attributes
     ----------
     directory : folder of the segments; created if missing. Each axis needs its own.
+    owner : stage and axis, as ``demo/x``, to which the folder belongs from then on; "" for any.
     segment_rows : samples per segment (600,000 are ten minutes at 1 kHz, about 15 MB).
     max_bytes : size of all files together; beyond it the oldest closed segments are removed. The journals of the
         newest two segments, 40 bytes per sample, count too; segments are shorter where they would take more than half.
@@ -60,6 +62,7 @@ class RecorderConfig:
     """
 
     directory: Path
+    owner: str = ""
     segment_rows: int = 600_000
     max_bytes: int = 2_000_000_000
     queue_samples: int = 100_000
@@ -95,11 +98,19 @@ class Recorder:
     """Records the samples of one axis. Thread-safe; use it as a context manager, or call `close`.
 
     A failing disk never raises: a directory that cannot be created or written shows in `counters` and is tried again.
+
+    Parameters
+    ----------
+    index : number of the next sample in the order in which the axis handles them.
+    hold_s : how long to wait for a process that still holds the folder, s. FieldError is then raised where it belongs
+        to another. None: the folder is held from the first sample on, and another's shows in `counters`.
     """
 
-    def __init__(self, config: RecorderConfig, index: int = 0) -> None:
+    def __init__(self, config: RecorderConfig, index: int = 0, hold_s: float | None = None) -> None:
         self.config = config
-        #: Number of the next sample in the order in which the axis handles them.
+        self._folder = FolderOwner(config.directory, LOCK, config.owner)
+        if hold_s is not None:
+            self._folder.hold("recorder", hold_s)
         self.index = index
         self._queue: deque[tuple[int, Rows]] = deque()
         self._waiting = 0
@@ -111,7 +122,6 @@ class Recorder:
         self._salvaged = 0
         self._error = ""
         self._segment: Journal | None = None
-        self._claim: IO[bytes] | None = None
         # Whether there may be journals to close, and whether one of them is from this recorder.
         self._left_open, self._own = True, False
         self._closer: Closer | None = None
@@ -210,8 +220,7 @@ class Recorder:
         if self._segment is not None:
             self._segment.close()
         self._close_all()
-        if self._claim is not None:
-            self._claim.close()
+        self._folder.release()
 
     def _take(self) -> tuple[Rows, NDArray[np.int64]] | None:
         with self._lock:
@@ -236,9 +245,7 @@ class Recorder:
 
     def _begin_segment(self) -> Journal:
         directory = self.config.directory
-        directory.mkdir(parents=True, exist_ok=True)
-        if self._claim is None:
-            self._claim = claim(directory)
+        self._folder.take()
         self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
         return Journal(journal_of(directory, next_number(directory)))
 
@@ -283,9 +290,6 @@ class Recorder:
             return
         self._segment.close()
         self._segment = None
-        if self._claim is not None:
-            self._claim.close()
-            self._claim = None
         self._told_until = now + self.config.retry_s
         with self._lock:
             self._counts["errors"] += 1
@@ -323,20 +327,12 @@ class Recorder:
         """Wait for the segments that are being closed, then close the rest."""
         if self._closer is not None:
             self._take_result(self._closer)
-        if self._claim is None and not self._claim_leftovers():
+        if not left_open(self.config.directory):
             return
         self._own = self._own or self._segment is not None
         try:
+            # One that has recorded nothing holds no folder yet, and leaves another's alone.
+            self._folder.take()
             self._take_result(Closer(self.config.directory, None))
         except OSError as error:
             self._failed(error)
-
-    def _claim_leftovers(self) -> bool:
-        """Whether an earlier recorder left journals and this one, which has recorded nothing, could lock the folder."""
-        if not left_open(self.config.directory):
-            return False
-        try:
-            self._claim = claim(self.config.directory)
-        except OSError:
-            return False  # another process holds it, or the disk cannot be written
-        return True

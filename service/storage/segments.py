@@ -12,7 +12,6 @@ process of its own, because the conversion needs memory and the interpreter's lo
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from adaptive.types import FloatArray
 from service.background.job import step_back
 from service.protocol.errors import FieldError
 from service.storage.output import PART, atomic_write
+from service.storage.owner import FolderOwner, is_still_at, owner_of
 
 # --- The journal of a recording: samples appended as rows of fixed size, readable up to the last row after any crash.
 #
@@ -215,6 +215,8 @@ def read_journal(path: Path) -> tuple[Rows, NDArray[np.int64]]:
 
 
 OPEN, CLOSED = ".journal", ".parquet"
+#: File that says whose recording a folder holds, see `FolderOwner`.
+LOCK: Final = ".lock"
 #: Suffix of the journal of a closed segment.
 DONE: Final = ".done"
 #: Prefix of the names of journals: readers that take the folder as one data set, such as pyarrow, skip such files.
@@ -306,11 +308,14 @@ class Closer:
         return int(out)
 
 
-def rows_behind(directory: Path, index: int) -> Rows | None:
+def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
     """The rows from the ``index``-th handled sample on, in the order of handling, up to the first missing one.
 
-    Returns None if the journals do not reach back to that sample, or hold no later one.
+    Returns None if the journals do not reach back to that sample, hold no later one, or are not those of ``owner``
+    (see `FolderOwner`).
     """
+    if owner_of(directory, LOCK) not in ("", owner):
+        return None
     columns: list[list[Any]] = [[] for _ in range(5)]
     for path in [*_sorted(directory, DONE), *_sorted(directory, OPEN)]:
         try:
@@ -334,42 +339,6 @@ def rows_behind(directory: Path, index: int) -> Rows | None:
         return None
     seq, t_s, u_V, y_um, reason = columns
     return Rows(np.array(seq, dtype=np.int64), np.array(t_s), np.array(u_V), np.array(y_um), reason)
-
-
-def claim(directory: Path, name: str = ".lock", what: str = "records into") -> IO[bytes]:
-    """Lock the directory for this process until the returned file is closed.
-
-    Two recorders in one directory would each treat the open segment of the other as left by a crash. Raises
-    BlockingIOError if another process holds the lock; ``what`` it then does.
-    """
-    lock = open(directory / name, "wb")  # noqa: SIM115 - stays open as long as the recorder
-    try:
-        _lock_now(lock.fileno())
-    except OSError as error:
-        lock.close()
-        raise BlockingIOError(error.errno, f"another process {what} {directory}") from error
-    return lock
-
-
-def _lock_now(descriptor: int) -> None:
-    """Lock an open file until it is closed. Raises OSError where another process holds it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        msvcrt = importlib.import_module("msvcrt")
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_still_at(descriptor: int, path: Path) -> bool:
-    """Whether the open file is still the one at ``path``: neither removed nor renamed, nor its folder."""
-    try:
-        there = path.stat()
-    except OSError:
-        return False
-    here = os.fstat(descriptor)
-    return (here.st_dev, here.st_ino) == (there.st_dev, there.st_ino)
 
 
 def number_of(path: Path) -> int:
@@ -432,7 +401,7 @@ def main() -> int:
         step_back()
     try:
         if but is None:
-            held = claim(directory)  # noqa: F841 - held until the process ends
+            FolderOwner(directory, LOCK).take()  # until the process ends
         print(len(close_left_open(directory, None if but in (None, _NONE) else Path(but))))
     except OSError as error:
         print(f"{error.strerror or error}", file=sys.stderr)
