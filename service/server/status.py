@@ -59,7 +59,8 @@ def axis_status(
 ) -> dict[str, Any]:
     """The fields for clients, operators and viewers; JSON values only. From any thread.
 
-    ``losses`` : name of the way in which samples are lost. ``checkpoints``, ``operations`` : their counters.
+    ``losses`` : name of the way in which samples are lost, on the way here or to the disk. ``checkpoints``,
+    ``operations`` : their counters.
     ``waiting_points`` : of long queries that are not answered yet. ``peers`` : what was refused to or from strangers.
     ``disk`` : what is written, see `WriteRate`. ``signed`` : whether answers carry an authenticator.
     """
