@@ -128,6 +128,8 @@ MOST_CONNECTIONS: Final = 16
 class _Server(ThreadingHTTPServer):
     """Closes at once what comes while there are `MOST_CONNECTIONS`."""
 
+    request_queue_size = 128
+
     def __init__(self, *args: Any) -> None:
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(*args)

@@ -59,6 +59,7 @@ LEVELS: Final = {
     "stale": logging.WARNING,
     "samples_dropped": logging.WARNING,
     "thinned": logging.WARNING,
+    "stopped_behind": logging.WARNING,
     "limits_narrow": logging.WARNING,
     "model_clipped": logging.WARNING,
     "rate_too_high": logging.WARNING,

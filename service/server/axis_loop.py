@@ -25,8 +25,10 @@ from service.server.learner_supervisor import standing_of
 DROPPED: Final = "dropped"
 #: Verdict, in a recording, on samples that were left out because the learner cannot keep up.
 THINNED: Final = "thinned"
+#: Verdict, in a recording, on samples that still waited when the service stopped; the next start learns them.
+WAITED: Final = "waited"
 #: Longest time for which the samples that wait are handled at the end, s.
-DRAIN_S: Final = 2.0
+DRAIN_S: Final = 0.5
 
 #: Interval at which diagnostics are read, s of samples, and how many such intervals pass between two readings of the
 #: window's points.
@@ -265,10 +267,20 @@ class AxisLoop:
         self._thread.start()
 
     def close(self) -> None:
-        """Handle what is queued, for `DRAIN_S` at most, then end the thread; what is left is recorded aside."""
+        """Handle what is queued, for `DRAIN_S` at most, then end the thread; the rest is recorded without being learnt.
+
+        It is recorded as the next in the order of handling, so that a start from the last checkpoint learns it.
+        """
         self.queue.close(DRAIN_S)
         if self._thread.is_alive():
             self._thread.join()
-        for batch in self.queue.leave():
+        left = self.queue.leave()
+        if not left:
+            return
+        for batch in left:
             if self.sink is not None:
-                self.sink.put_aside(batch.seq, batch.t_s, batch.u_V, batch.y_um, DROPPED)
+                self.sink.put(batch.seq, batch.t_s, batch.u_V, batch.y_um, WAITED)
+        config = self.axis.config
+        learns = "and the next start learns them" if config.checkpoints is not None else "and are not learnt"
+        where = "lost: nothing is recorded" if self.sink is None else f"in the recording, {learns}"
+        self.axis.note("stopped_behind", f"{sum(map(len, left))} samples still waited; they are {where}")

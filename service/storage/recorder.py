@@ -9,9 +9,11 @@ pause a new segment is started.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,11 +30,12 @@ from service.storage.segments import (
     Journal,
     Rows,
     Syncer,
+    close_left_open,
     journal_of,
     left_open,
     make_room,
     next_number,
-    segments,
+    number_of,
 )
 
 #: Folder inside that of a recorder for samples that the axis never handled; readers skip names with an underscore.
@@ -122,8 +125,8 @@ class Recorder:
         self._salvaged = 0
         self._error = ""
         self._segment: Journal | None = None
-        # Whether there may be journals to close, and whether one of them is from this recorder.
-        self._left_open, self._own = True, False
+        # Whether there may be journals to close, and the number of the first one that is of this recorder.
+        self._left_open, self._first = True, sys.maxsize
         self._closer: Closer | None = None
         # Records the samples that the axis does not handle; made with the first of them.
         self._aside: Recorder | None = None
@@ -247,7 +250,9 @@ class Recorder:
         directory = self.config.directory
         self._folder.take()
         self._count(removed=make_room(directory, self.config.max_bytes, self.config.journal_bytes))
-        return Journal(journal_of(directory, next_number(directory)))
+        number = next_number(directory)
+        self._first = min(self._first, number)
+        return Journal(journal_of(directory, number))
 
     def _write(self, rows: Rows, index: NDArray[np.int64]) -> None:
         # After a failure: pause, except at the end, where one more attempt costs nothing.
@@ -266,7 +271,7 @@ class Recorder:
                 done = stop
                 if self._segment.rows >= self.config.rows:
                     self._segment.close()
-                    self._segment, self._left_open, self._own = None, True, True
+                    self._segment, self._left_open = None, True
             if self._segment is not None:
                 self._syncer.look(self._segment)
             if time.monotonic() >= max(self._not_before, self._told_until):
@@ -307,32 +312,30 @@ class Recorder:
                 self._failed(error)
         elif closer is not None and not closer.running:
             self._closer = None
-            self._take_result(closer)
+            self._take_result(closer.result)
 
-    def _take_result(self, closer: Closer) -> None:
+    def _take_result(self, closed: Callable[[], list[Path]]) -> None:
+        """``closed`` : closes segments, or waits until they are; returns them."""
         try:
-            made = closer.result()
-            newest = segments(self.config.directory)[-made:] if made else []
-            self._count(bytes=sum(path.stat().st_size for path in newest))
-            if self._own:
-                self._count(segments=made)
-            else:
-                self._salvaged += made
+            made = closed()
+            own = sum(number_of(path) >= self._first for path in made)
+            self._count(bytes=sum(path.stat().st_size for path in made), segments=own)
+            self._salvaged += len(made) - own
             self._count(removed=make_room(self.config.directory, self.config.max_bytes))
         except OSError as error:
             self._left_open = True
             self._failed(error)
 
     def _close_all(self) -> None:
-        """Wait for the segments that are being closed, then close the rest."""
+        """Close what is open, in this thread: a process takes longer to start, and one that runs has stepped back."""
         if self._closer is not None:
-            self._take_result(self._closer)
+            self._closer.kill()
         if not left_open(self.config.directory):
             return
-        self._own = self._own or self._segment is not None
-        try:
+
+        def closed() -> list[Path]:
             # One that has recorded nothing holds no folder yet, and leaves another's alone.
             self._folder.take()
-            self._take_result(Closer(self.config.directory, None))
-        except OSError as error:
-            self._failed(error)
+            return close_left_open(self.config.directory)
+
+        self._take_result(closed)

@@ -6,7 +6,8 @@ the newest closed segment stays until the next segment is closed: a restart lear
 it.
 
 ``python -m service.storage.segments DIRECTORY`` closes all open segments in a directory. The recorder starts it as a
-process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service.
+process of its own, because the conversion needs memory and the interpreter's lock, which would delay the service; at
+its end it closes them itself.
 """
 
 from __future__ import annotations
@@ -223,8 +224,6 @@ DONE: Final = ".done"
 HIDDEN: Final = "_"
 #: Command-line argument for "no journal is being written".
 _NONE: Final = "-"
-#: Longest time for closing segments, s.
-_CONVERT_S: Final = 120.0
 
 
 def schema() -> Any:
@@ -294,18 +293,18 @@ class Closer:
         """Whether the process still runs."""
         return self._process.poll() is None
 
-    def result(self, timeout_s: float = _CONVERT_S) -> int:
-        """Wait for the process; returns the number of new segments. Raises OSError with its message if it failed."""
-        try:
-            out, err = self._process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
-            raise OSError(f"closing a segment took more than {timeout_s:g} s") from None
+    def kill(self) -> None:
+        """End the process: what it has not closed stays open."""
+        self._process.kill()
+        self._process.communicate()
+
+    def result(self) -> list[Path]:
+        """Wait for the process; returns the new segments. Raises OSError with its message if it failed."""
+        out, err = self._process.communicate()
         if self._process.returncode:
             words = err.strip().splitlines() or [f"ended with status {self._process.returncode}"]
             raise OSError(f"closing a segment: {words[-1]}")
-        return int(out)
+        return [Path(line) for line in out.splitlines()]
 
 
 def rows_behind(directory: Path, index: int, owner: str) -> Rows | None:
@@ -390,7 +389,7 @@ def _sorted(directory: Path, suffix: str) -> list[Path]:
 
 
 def main() -> int:
-    """Close the open segments in the directory given as first argument, and print their number.
+    """Close the open segments in the directory given as first argument, and print the path of each.
 
     A recorder, which holds the lock, passes the journal that it writes as second argument, or ``-``. Without a second
     argument this process takes the lock itself.
@@ -402,7 +401,8 @@ def main() -> int:
     try:
         if but is None:
             FolderOwner(directory, LOCK).take()  # until the process ends
-        print(len(close_left_open(directory, None if but in (None, _NONE) else Path(but))))
+        for path in close_left_open(directory, None if but in (None, _NONE) else Path(but)):
+            print(path)
     except OSError as error:
         print(f"{error.strerror or error}", file=sys.stderr)
         return 1
