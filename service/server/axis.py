@@ -263,7 +263,7 @@ class Axis:
         self._recent: list[tuple[int, float]] = [(-1, 0.0)] * _RECENT
         self._refused = self._foreign = 0
         #: Counts up to the last message; replaced as a whole, for readers in other threads.
-        self.counts = SampleCounts(-1, self.sequence.counters(), {})
+        self.counts = SampleCounts(-1, {**self.sequence.counters(), "left_out": 0}, {})
         self._age_s: float | None = None
         #: Queries whose samples under way began far ahead of the stage; and whether the last one did.
         self.far_ahead = 0
@@ -429,7 +429,7 @@ class Axis:
         return verdict
 
     def _update_counts(self) -> None:
-        counts = self.sequence.counters()
+        counts = {**self.sequence.counters(), "left_out": self.sequence.left_out}
         self.counts = SampleCounts(self.handled_seq, counts, self.gates, self._refused, self._foreign)
 
     def _count_refused(self, order: str, seq: int, y_um: float) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 from numpy.typing import ArrayLike
 
 from service.background.retuner import Retuner
-from service.intake.sample_queue import Job, SampleQueue, Thinner
+from service.intake.sample_queue import Arrived, Job, SampleQueue, Thinner
 from service.intake.sequence import AHEAD
 from service.protocol.samples import SampleBatch
 from service.server.axis import Axis
@@ -176,14 +176,19 @@ class AxisLoop:
                 del item  # an exception in it refers to the work
                 self._announce()
                 continue
-            handled = True
-            try:
-                self.handle(item.batch)
-            except Exception as error:
-                # The samples after it are handled: clients wait for their snapshots.
-                handled = False
-                self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
-            self.queue.finish(item, handled)
+            self.take(item)
+
+    def take(self, item: Arrived) -> None:
+        """Handle what the queue has handed out; in the thread of the axis."""
+        handled = True
+        self.axis.sequence.leave_out(item.left_out)
+        try:
+            self.handle(item.batch)
+        except Exception as error:
+            # The samples after it are handled: clients wait for their snapshots.
+            handled = False
+            self.axis.note("internal_error", f"handling samples: {type(error).__name__}: {error}")
+        self.queue.finish(item, handled)
 
     def handle(self, batch: SampleBatch) -> None:
         """One batch through the whole axis; in the thread of the axis, or before it has started."""
@@ -217,8 +222,10 @@ class AxisLoop:
         if self.thinner.watch(self.queue.waiting, time.monotonic()):
             self._note_thinning()
         kept, left_out = self.thinner.split(batch)
-        if left_out is not None and self.sink is not None:
-            self.sink.put_aside(left_out.seq, left_out.t_s, left_out.u_V, left_out.y_um, THINNED)
+        if left_out is not None:
+            self.queue.leave_out(len(left_out))
+            if self.sink is not None:
+                self.sink.put_aside(left_out.seq, left_out.t_s, left_out.u_V, left_out.y_um, THINNED)
         return kept is None or self._queue(kept)
 
     def _note_thinning(self) -> None:

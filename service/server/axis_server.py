@@ -270,8 +270,7 @@ class AxisServer:
     def _look_for_losses(self, now_s: float) -> None:
         """Note when samples come and are lost, and when that is over."""
         queue, counts, before = self.loop.queue, self.axis.counts, self._losses.trouble
-        received, left_out = counts.samples["received"], queue.dropped + self.loop.thinner.thinned
-        lost = max(0, counts.samples["lost"] - left_out)
+        received, lost = counts.samples["received"], counts.samples["lost"]
         arrivals = Arrivals(received, counts.refused, counts.foreign, queue.dropped, queue.malformed, lost)
         if self._losses.look(now_s, arrivals):
             self._note_trouble(before, self._losses.trouble, self._losses.why)
